@@ -1,0 +1,51 @@
+"""netkf: a discrete-event, asynchronous network simulator for distributed Kalman filters."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
+
+if TYPE_CHECKING:
+    from netkf import theory
+    from netkf.experiments.simulate import simulate
+    from netkf.scenario.reading import load
+    from netkf.scenario.scenario import Scenario
+    from netkf.trace.run import Run, first_difference
+
+__version__ = "0.1.0"
+
+_WHERE = {
+    "Run": "netkf.trace.run",
+    "Scenario": "netkf.scenario.scenario",
+    "first_difference": "netkf.trace.run",
+    "load": "netkf.scenario.reading",
+    "simulate": "netkf.experiments.simulate",
+    "theory": "netkf.theory",
+}
+
+__all__ = [
+    "EngineError",
+    "NetkfError",
+    "Run",
+    "Scenario",
+    "ScenarioError",
+    "TheoryError",
+    "first_difference",
+    "load",
+    "simulate",
+    "theory",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # Imported at first use, so that `import netkf` stays quick.
+    if name not in _WHERE:
+        raise AttributeError(f"module 'netkf' has no attribute {name!r}")
+    module = importlib.import_module(_WHERE[name])
+    return module if name == "theory" else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -1,0 +1,142 @@
+"""Flow filters: node algorithms that live in continuous time and may be interrupted at any instant.
+
+A flow filter is a frozen dataclass of parameters. Its state is a NamedTuple of arrays that nothing
+changes in place; every method returns a new one. The host calls ``flow`` and then, where the node
+has sensors, ``measure`` for the interval that just passed, and ``emit``/``absorb`` for messages.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.gains import GainTable, gain_table, gain_update
+from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
+from netkf.core.arrays import FloatArray
+from netkf.core.fields import Part
+
+
+@dataclass(frozen=True, eq=False)
+class FlowModel:
+    """What one node believes: ``dx = A x dt + dw``, ``cov(dw) = Q dt``; ``dy = H x dt + dv``,
+    ``cov(dv) = R dt``.
+
+    ``A, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0; ``horizon`` is the longest gap and
+    ``interval`` the longest stretch of readings used at once, both in seconds.
+    """
+
+    A: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+    horizon: float
+    interval: float
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """``G = H' R^-1 H`` (n, n)."""
+        return np.asarray(self.H.T @ np.linalg.solve(self.R, self.H))
+
+    @cached_property
+    def riccati(self) -> RiccatiTable:
+        """The flow of P with this node's readings."""
+        return riccati_table(self.A, self.Q, self.information, self.horizon)
+
+    @cached_property
+    def prediction(self) -> RiccatiTable:
+        """The flow of P without readings."""
+        return riccati_table(self.A, self.Q, np.zeros_like(self.A), self.horizon)
+
+    @cached_property
+    def gains(self) -> GainTable:
+        """How this node's readings are used."""
+        return gain_table(self.A, self.Q, self.H, self.R, self.interval)
+
+
+class Reading(NamedTuple):
+    """What the sensors of a node (p rows in all) saw over the last ``gap`` seconds.
+
+    moments : (2 p,) ``int dy`` and then ``int (2 (s - a) / gap - 1) dy``, see core/legendre
+    """
+
+    moments: FloatArray
+    gap: float
+
+
+class FlowState(NamedTuple):
+    """Estimate ``xhat`` (n,), its covariance ``P`` (n, n) and the model they move by."""
+
+    xhat: FloatArray
+    P: FloatArray
+    model: FlowModel
+
+
+class Payload(NamedTuple):
+    """What a message carries: the sender's estimate and covariance when it was sent."""
+
+    xhat: FloatArray
+    P: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class FlowFilter(Part):
+    """The contract of every filter in continuous time.
+
+    The base class is the Kalman-Bucy filter of H (4a), (4b); filters differ mostly in ``absorb``.
+    ``talks`` says whether its nodes exchange messages, ``pooled`` whether one filter reads the
+    sensors of all nodes at once.
+    """
+
+    talks: ClassVar[bool] = True
+    pooled: ClassVar[bool] = False
+
+    def init(self, model: FlowModel, mean: FloatArray, cov: FloatArray) -> Any:
+        """The state at time 0."""
+        return FlowState(mean, cov, model)
+
+    def flow(self, state: Any, gap: float) -> Any:
+        """The state ``gap`` > 0 seconds later; its covariance counts the readings of the gap
+        already, its estimate does not yet."""
+        P, xhat = riccati_step(state.model.riccati, state.P, state.xhat, gap)
+        return state._replace(xhat=xhat, P=P)
+
+    def measure(self, state: Any, reading: Reading) -> Any:
+        """The state once the readings of the gap that just passed are used."""
+        xhat = gain_update(
+            state.model.gains, state.P, state.xhat, reading.moments, reading.gap
+        )
+        return state._replace(xhat=xhat)
+
+    def emit(self, state: Any) -> Any:
+        """What the node sends now."""
+        return Payload(state.xhat, state.P)
+
+    @abstractmethod
+    def absorb(self, state: Any, messages: Sequence[tuple[float, Any, float]]) -> Any:
+        """The state after all ``(weight, payload, age)`` that arrived at this instant, at most
+        one from each neighbour, are used together. Payloads are left as they are."""
+
+    def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:
+        """``xhat`` (n,) and ``P`` (n, n) of the node now."""
+        return state.xhat, state.P
+
+    def weight(self, degree: int, peer_degree: int) -> float:
+        """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
+        return 1.0 / (1.0 + max(degree, peer_degree))
+
+    def largest_degree(self) -> float:
+        """The largest number of links a node may have for the weights to make sense."""
+        return np.inf
+
+
+def predict(model: FlowModel, payload: Payload, age: float) -> Payload:
+    """A payload moved ``age`` seconds on by the model alone, without readings."""
+    if age <= 0.0:
+        return payload
+    P, xhat = riccati_step(model.prediction, payload.P, payload.xhat, age)
+    return Payload(xhat, P)

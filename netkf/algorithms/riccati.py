@@ -1,0 +1,134 @@
+"""The flow of the Riccati equation dP = A P + P A' + Q - P G P over gaps of any length.
+
+The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian
+``M = [[-A', G], [Q, A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``.
+One exponential over a long gap loses every digit, so a gap is cut into whole units, in which
+``|M| unit <= 1``, and a rest. The rest uses a Taylor series whose coefficients are tabulated;
+the whole units use their binary digits: the flow over ``unit * 2^k`` is tabulated as the triple
+``(F, G, Q)`` with ``P -> Q + F P (I + G P)^-1 F'``, and a triple follows from the one before it by
+the doubling formulas (Davison and Maki 1973; Anderson 1978), which only add positive terms.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray, symmetric
+
+TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
+
+
+class RiccatiTable(NamedTuple):
+    """Everything that depends on ``A, Q, G`` and not on ``P`` or the gap.
+
+    series : (terms, 5 n n) Taylor coefficients of the blocks of ``exp(M g)`` and of ``exp(A g)``
+    unit   : gap that the series covers, seconds
+    jump, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
+    """
+
+    n: int
+    unit: float
+    series: FloatArray
+    jump: FloatArray
+    F: FloatArray
+    G: FloatArray
+    Q: FloatArray
+
+
+def exponential_series(M: FloatArray, terms: int) -> FloatArray:
+    """(terms, n, n) with ``exp(M g) = sum_k g^k series[k]``."""
+    series = np.empty((terms, *M.shape), dtype=M.dtype)
+    series[0] = np.eye(len(M))
+    for k in range(1, terms):
+        series[k] = series[k - 1] @ M / k
+    return series
+
+
+def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray, float]:
+    """The Hamiltonian of ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``."""
+    size_Q, size_G = float(np.abs(Q).max()), float(np.abs(G).max())
+    scale = (size_Q / size_G) ** 0.5 if size_Q > 0.0 and size_G > 0.0 else 1.0
+    return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
+
+
+def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -> RiccatiTable:
+    """Tabulate the flow for gaps up to ``longest`` seconds; ``A, Q, G`` are (n, n)."""
+    n = len(A)
+    M, scale = hamiltonian(A, Q, G)
+    norm = float(np.abs(M).sum(axis=0).max())
+    # A power of two, so that a whole number of units is exact.
+    unit = 2.0 ** np.floor(np.log2(min(1.0 / max(norm, 1e-300), longest)))
+    blocks = exponential_series(M, TAYLOR_TERMS)
+    blocks[:, :n, n:] /= scale
+    blocks[:, n:, :n] *= scale
+    flat = [blocks, exponential_series(A, TAYLOR_TERMS)]
+    series = np.concatenate([block.reshape(TAYLOR_TERMS, -1) for block in flat], axis=1)
+    levels = max(1, int(longest / unit).bit_length())
+    return RiccatiTable(n, unit, series, *_triples(M, scale, A, unit, levels))
+
+
+def _triples(
+    M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    # Doubling also doubles the relative error, so it works in extended precision (where the
+    # machine has it): after 2^14 units a table in double would have lost 1e-12.
+    n, wide = len(A), np.longdouble
+    E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
+    inverse = _inverse(E[:n, :n])
+    F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
+    jump = np.tensordot(wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1)
+    tables = tuple(np.empty((levels, n, n)) for _ in range(4))
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable blind plant overflows late
+        for level in range(levels):
+            G, Q = symmetric(G), symmetric(Q)
+            for table, value in zip(tables, (jump, F, G / scale, Q * scale), strict=True):
+                table[level] = value
+            W = _inverse(np.eye(n) + G @ Q)
+            jump, F, G, Q = jump @ jump, F @ W.T @ F, G + F.T @ W @ G @ F, Q + F @ Q @ W @ F.T
+    return tables  # type: ignore[return-value]
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """The inverse in the precision of ``matrix``, by Newton's iteration from double."""
+    if not np.isfinite(matrix).all():
+        return np.full_like(matrix, np.nan)
+    inverse = np.linalg.inv(matrix.astype(np.float64)).astype(matrix.dtype)
+    for _ in range(2):
+        inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
+    return inverse
+
+
+def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, FloatArray]:
+    """``exp(M gap)`` (2n, 2n) and ``exp(A gap)`` (n, n) for a gap of at most one unit."""
+    series, n = table.series, table.n
+    powers = np.empty(len(series))
+    powers[0] = 1.0
+    powers[1:] = gap
+    values = np.multiply.accumulate(powers) @ series
+    return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
+
+
+def riccati_step(
+    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
+) -> tuple[FloatArray, FloatArray]:
+    """``P`` (n, n) moved by the flow over ``gap`` seconds, and ``x`` (n,) by ``exp(A gap)``."""
+    n, whole = table.n, int(gap / table.unit)
+    level = 0
+    while whole >> level:
+        if whole >> level & 1:
+            F = table.F[level]
+            middle = np.linalg.solve(np.eye(n) + P @ table.G[level], P)
+            P = table.Q[level] + F @ middle @ F.T
+            P = 0.5 * (P + P.T)
+            x = table.jump[level] @ x
+        level += 1
+    rest = gap - whole * table.unit
+    if rest <= 0.0:
+        return P, x
+    E, transition = evaluate_hamiltonian(table, rest)
+    X = E[:n, :n] + E[:n, n:] @ P
+    Y = E[n:, :n] + E[n:, n:] @ P
+    P = np.linalg.solve(X.T, Y.T)
+    return 0.5 * (P + P.T), transition @ x

@@ -1,0 +1,310 @@
+"""Settings that check themselves: the parts of a scenario are frozen dataclasses of these.
+
+``setting(rule)`` declares a field; the rule converts what a file or a script gives and says in one
+line what is wrong with it. Files and Python meet the same rules because both go through
+``Part.__post_init__``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray, frozen, is_semidefinite
+from netkf.core.errors import ScenarioError
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a value must be, in words; how to convert it; what to do when it is not.
+
+    ``convert`` returns the value to keep or raises ``TypeError``/``ValueError``; the message of a
+    ValueError, where there is one, replaces ``words``.
+    """
+
+    words: str
+    convert: Callable[[Any], Any]
+    remedy: str = ""
+
+    def __call__(self, key: str, value: object) -> Any:
+        try:
+            return self.convert(value)
+        except ScenarioError as error:
+            raise error.under(key) from None
+        except (TypeError, ValueError, OverflowError) as error:
+            words = str(error) if isinstance(error, _Because) else self.words
+            raise ScenarioError(key, words, value, self.remedy) from None
+
+
+class _Because(ValueError):
+    """A ValueError whose message is meant for the user."""
+
+
+def setting(rule: Rule, default: Any = MISSING) -> Any:
+    """A dataclass field whose values obey ``rule``; ``None`` as a default may stay None."""
+    return dataclasses.field(default=default, metadata={"rule": rule}, kw_only=default is not MISSING)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Base of everything that a scenario is made of.
+
+    Parts are equal when they are of one class and their settings are.
+    """
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, rule = getattr(self, field.name), field.metadata.get("rule")
+            if rule is not None and not (value is None and field.default is None):
+                object.__setattr__(self, field.name, rule(field.name, value))
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return all(
+            _same(getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self)
+        )
+
+    def __hash__(self) -> int:
+        return hash((type(self), len(dataclasses.fields(self))))
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        return one is not None and other is not None and np.array_equal(one, other)
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return bool(one == other)
+
+
+def number(
+    *,
+    above: float = -math.inf,
+    low: float = -math.inf,
+    below: float = math.inf,
+    high: float = math.inf,
+) -> Rule:
+    """A finite number inside the given bounds."""
+    bounds = [
+        f"{word} {bound:g}"
+        for word, bound in (
+            ("above", above),
+            ("at least", low),
+            ("below", below),
+            ("at most", high),
+        )
+        if math.isfinite(bound)
+    ]
+
+    def convert(value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+            raise TypeError
+        result = float(value)
+        if not (math.isfinite(result) and above < result < below and low <= result <= high):
+            raise ValueError
+        return result
+
+    words = " and ".join(bounds)
+    return Rule(
+        f"must be a finite number{' ' if words else ''}{words}",
+        convert,
+        f"give a number {words}" if words else "give a finite number",
+    )
+
+
+positive = number(above=0.0)
+probability = number(low=0.0, high=1.0)
+
+
+def integer(low: int | None = None) -> Rule:
+    """A whole number, at least ``low`` where that is given."""
+
+    def convert(value: Any) -> int:
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise TypeError
+        if low is not None and value < low:
+            raise ValueError
+        return int(value)
+
+    bound = "" if low is None else f" of at least {low}"
+    return Rule(f"must be an integer{bound}", convert, f"give an integer{bound}")
+
+
+def _is(kind: type) -> Callable[[Any], Any]:
+    def convert(value: Any) -> Any:
+        if not isinstance(value, kind) or value == "":
+            raise TypeError
+        return value
+
+    return convert
+
+
+boolean = Rule("must be true or false", _is(bool), "write true or false without quotes")
+text = Rule("must be a string that is not empty", _is(str), 'write it as "text"')
+
+
+def instance(kind: type) -> Rule:
+    """An object of a class (a part of a scenario)."""
+    return Rule(
+        f"must be a {kind.__name__.lower()}", _is(kind), f'write a table {{ kind = "...", ... }}'
+    )
+
+
+def choice(*names: str) -> Rule:
+    """One of a few strings."""
+
+    def convert(value: Any) -> str:
+        if value not in names:
+            raise ValueError
+        return str(value)
+
+    listed = ", ".join(f'"{name}"' for name in names)
+    return Rule(f"must be one of {listed}", convert, "choose one of them")
+
+
+def either(first: Rule, second: Rule) -> Rule:
+    """What obeys one of two rules."""
+
+    def convert(value: Any) -> Any:
+        try:
+            return first.convert(value)
+        except (TypeError, ValueError):
+            return second.convert(value)
+
+    words = f"{first.words}, or {second.words.removeprefix('must be ')}"
+    return Rule(words, convert, first.remedy)
+
+
+def array(dimensions: int, kind: str) -> Rule:
+    """A finite real array with that many dimensions."""
+
+    def convert(value: Any) -> FloatArray:
+        if isinstance(value, (str, bytes)) or _has_bool(value):
+            raise TypeError
+        result = frozen(value)
+        if result.ndim != dimensions or result.size == 0:
+            raise _Because(f"must be a {kind}")
+        if not np.isfinite(result).all():
+            raise _Because(f"must be a {kind} of finite numbers")
+        return result
+
+    remedy = "write rows of equal length, [[a, b], [c, d]]" if dimensions == 2 else "write [a, b]"
+    return Rule(f"must be a {kind} of finite numbers", convert, remedy)
+
+
+def _has_bool(value: Any) -> bool:
+    if isinstance(value, (list, tuple)):
+        return any(map(_has_bool, value))
+    return isinstance(value, (bool, str))
+
+
+vector = array(1, "vector")
+matrix = array(2, "matrix")
+
+
+def _square(value: Any) -> FloatArray:
+    result = matrix.convert(value)
+    if result.shape[0] != result.shape[1]:
+        raise _Because(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
+    return np.asarray(result)
+
+
+square = Rule("must be a square matrix of finite numbers", _square, matrix.remedy)
+
+
+def _symmetric(value: Any) -> FloatArray:
+    result = _square(value)
+    if not np.allclose(result, result.T, rtol=1e-9, atol=1e-12 * np.abs(result).max()):
+        raise _Because("must be a symmetric matrix")
+    return result
+
+
+def _covariance(value: Any) -> FloatArray:
+    result = _symmetric(value)
+    if not is_semidefinite(result):
+        least = np.linalg.eigvalsh(result)[0]
+        raise _Because(f"must be positive semidefinite (least eigenvalue {least:.3g})")
+    return result
+
+
+def _definite(value: Any) -> FloatArray:
+    result = _symmetric(value)
+    values = np.linalg.eigvalsh(result)
+    if not values[0] > 1e-14 * abs(values[-1]):
+        raise _Because(f"must be positive definite (least eigenvalue {values[0]:.3g})")
+    return result
+
+
+covariance = Rule(
+    "must be a covariance matrix", _covariance, "give a symmetric matrix without negative eigenvalues"
+)
+definite_covariance = Rule(
+    "must be a positive definite covariance matrix",
+    _definite,
+    "give a symmetric matrix with positive eigenvalues",
+)
+
+
+def several(rule: Rule, what: str, least: int = 1) -> Rule:
+    """A list of values that each obey ``rule``; a mistake is shown with its place in the list."""
+
+    def convert(value: Any) -> tuple[Any, ...]:
+        if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
+            raise TypeError
+        if len(value) < least:
+            raise ValueError
+        return tuple(rule(f"[{k}]", item) for k, item in enumerate(value))
+
+    return Rule(f"must be a list of {what}", convert, f"write a list of {what}")
+
+
+def row(*rules: Rule, what: str) -> Rule:
+    """A list of a fixed length whose entries obey one rule each."""
+
+    def convert(value: Any) -> tuple[Any, ...]:
+        if not isinstance(value, (list, tuple, np.ndarray)) or len(value) != len(rules):
+            raise TypeError
+        return tuple(rule(f"[{k}]", v) for k, (rule, v) in enumerate(zip(rules, value, strict=True)))
+
+    return Rule(f"must be {what}", convert, f"write {what}")
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A file that a scenario names: its path as written, and the folder that it is relative to."""
+
+    name: str
+    folder: Path
+
+    @property
+    def full(self) -> Path:
+        """Where the file is."""
+        return self.folder / self.name
+
+
+def _source(value: Any) -> SourceFile:
+    if isinstance(value, SourceFile):
+        source = value
+    elif isinstance(value, (str, Path)) and str(value):
+        source = SourceFile(str(value), Path.cwd())
+        if Path(value).is_absolute():
+            source = SourceFile(Path(value).name, Path(value).parent)
+    else:
+        raise TypeError
+    folder = source.folder.resolve()
+    if Path(source.name).is_absolute() or not source.full.resolve().is_relative_to(folder):
+        raise _Because("must stay inside the folder of the scenario file")
+    if not source.full.is_file():
+        raise _Because(f"no such file in {source.folder}")
+    return source
+
+
+source_file = Rule(
+    "must be the path of a file", _source, "give a path relative to the scenario file"
+)

@@ -1,0 +1,52 @@
+"""What every engine promises, and the order of things that happen at one instant.
+
+1. Simultaneous events run by (time, rank, entity), never by accident of insertion.
+2. All randomness comes from core.streams, one generator for each purpose and entity.
+3. A message is known by its directed link and its number on that link.
+4. The horizon is half open, [0, T); a sample at T is taken after everything before T.
+5. Nothing is sent at time 0.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from enum import IntEnum
+
+from netkf.core.streams import Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import Recorder
+
+
+class Rank(IntEnum):
+    """Order of kinds of happening at one instant.
+
+    Readings end first; then links activate, and both ends snapshot what they send; then delayed
+    messages arrive; then every node with mail absorbs all of it at once; samples see the result.
+    """
+
+    SENSE = 1
+    TICK = 2
+    DELIVER = 3
+    ABSORB = 4
+    PROBE = 5
+
+
+Progress = Callable[[float], None]
+"""Called with the simulated time now and then."""
+
+
+class Engine(ABC):
+    """Runs scenarios."""
+
+    name: str
+
+    @abstractmethod
+    def refusal(self, scenario: Scenario) -> str | None:
+        """Why this engine cannot run the scenario, with the remedy; None where it can."""
+
+    @abstractmethod
+    def run(
+        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+    ) -> str:
+        """Simulate up to the horizon; returns the status, complete or diverged."""

@@ -1,0 +1,107 @@
+"""The reference engine: SimPy processes for sensors, link clocks and samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import simpy
+
+from netkf.core.streams import Streams
+from netkf.engines.base import Engine, Progress, Rank
+from netkf.engines.processes.hosts import Host, make_hosts
+from netkf.engines.processes.links import LinkProcess
+from netkf.engines.processes.timeline import Timeline
+from netkf.plants.diffusion import DiffusionPath
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
+
+SENSE, DIVERGED = CODES["sense"], CODES["diverged"]
+Processes = list[Generator[simpy.Event, Any, None]]
+
+
+class Diverged(Exception):
+    """A covariance is no longer finite."""
+
+
+@dataclass
+class ProcessesEngine(Engine):
+    """Runs every scenario. ``arrange`` may reorder the processes before they start; nothing that
+    happens depends on it."""
+
+    arrange: Callable[[Processes], Processes] = list
+    name = "processes"
+
+    def refusal(self, scenario: Scenario) -> str | None:
+        """None: this engine defines what a scenario means."""
+        return None
+
+    def run(
+        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+    ) -> str:
+        """Simulate up to the horizon; returns complete or diverged."""
+        timeline = Timeline()
+        truth = scenario.truth.path(streams.generator("plant"), streams.generator("probe"))
+        hosts = make_hosts(scenario, streams, timeline, recorder, truth)
+        processes: Processes = [_sampling(timeline, scenario, truth, hosts, recorder, progress)]
+        processes += _sensing(timeline, scenario, truth, hosts, recorder)
+        if scenario.filter.algorithm.talks:
+            processes += [
+                LinkProcess(scenario, streams, timeline, recorder, hosts, link, k).ticking()
+                for k, link in enumerate(scenario.topology.links)
+            ]
+        for process in self.arrange(processes):
+            timeline.process(process)
+        with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
+            try:
+                timeline.run()
+            except Diverged:
+                return "diverged"
+            finally:
+                recorder.flush()
+        return "complete"
+
+
+def _sensing(
+    timeline: Timeline,
+    scenario: Scenario,
+    truth: DiffusionPath,
+    hosts: dict[int, Host],
+    recorder: Recorder,
+) -> Processes:
+    def sense(node: int, entity: int) -> Generator[simpy.Event, Any, None]:
+        host, k = hosts[node], 1
+        while (time := truth.grid(k)) < scenario.horizon:
+            yield timeline.at(time, Rank.SENSE, entity)
+            recorder.append((time, SENSE, node, -1, -1, -1, NAN))
+            host.advance(time)
+            k += 1
+
+    return [sense(node, scenario.topology.index[node]) for node in scenario.sensing]
+
+
+def _sampling(
+    timeline: Timeline,
+    scenario: Scenario,
+    truth: DiffusionPath,
+    hosts: dict[int, Host],
+    recorder: Recorder,
+    progress: Progress,
+) -> Generator[simpy.Event, Any, None]:
+    for time in scenario.times.tolist():
+        yield timeline.at(time, Rank.PROBE, 0)
+        x = truth.state(time)
+        estimates = [hosts[node].estimate(time) for node in scenario.nodes]
+        xhat = np.array([estimate for estimate, _ in estimates])
+        P = np.array([cov for _, cov in estimates])
+        recorder.sample(time, x, xhat, P)
+        recorder.flush_if_full()
+        progress(time)
+        broken = np.flatnonzero(~np.isfinite(P).all(axis=(1, 2)))
+        if broken.size:
+            for k in broken:
+                recorder.append((time, DIVERGED, scenario.nodes[k], -1, -1, -1, NAN))
+            raise Diverged

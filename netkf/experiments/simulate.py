@@ -1,0 +1,87 @@
+"""One run: choose an engine, record, return."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from netkf.core.errors import EngineError
+from netkf.core.fields import integer
+from netkf.core.streams import Streams
+from netkf.engines.base import Engine, Progress
+from netkf.engines.processes.engine import ProcessesEngine
+from netkf.trace.recorder import MemorySink, Recorder, Sink
+from netkf.trace.run import Run
+from netkf.trace.schema import EVENT
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+ENGINES = ("auto", "processes", "compiled")
+
+
+def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
+    """The engine of a name; raises EngineError where it cannot run the scenario."""
+    if isinstance(name, Engine):
+        engine = name
+    elif name in ("auto", "processes"):
+        engine = ProcessesEngine()
+    elif name == "compiled":
+        raise EngineError('engine "compiled" is not part of this version; use engine="processes"')
+    else:
+        raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name!r}")
+    refusal = engine.refusal(scenario)
+    if refusal is not None:
+        raise EngineError(refusal)
+    return engine
+
+
+def simulate(
+    scenario: Scenario,
+    seed: int | None = None,
+    replica: int = 0,
+    engine: str | Engine = "auto",
+    sinks: Sequence[Sink] = (),
+    progress: Progress = lambda time: None,
+) -> Run:
+    """Run a scenario once and keep all of it in memory.
+
+    ``seed`` defaults to the scenario's; runs of one seed differ by ``replica``. More ``sinks``
+    receive the same rows and samples as they come. Raises EngineError and ScenarioError.
+    """
+    seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
+    replica = integer(low=0)("replica", replica)
+    chosen = choose_engine(engine, scenario)
+    memory = MemorySink()
+    recorder = Recorder([memory, *sinks])
+    status = chosen.run(scenario, Streams(seed, replica), recorder, progress)
+    return collect(scenario, memory, recorder, seed, replica, chosen.name, status)
+
+
+def collect(
+    scenario: Scenario,
+    memory: MemorySink,
+    recorder: Recorder,
+    seed: int,
+    replica: int,
+    engine: str,
+    status: str,
+) -> Run:
+    """A Run from what a recorder gathered."""
+    count, n = len(scenario.nodes), scenario.plant.n
+    samples = memory.samples
+    return Run(
+        times=np.array([sample[0] for sample in samples]),
+        nodes=scenario.nodes,
+        x=np.array([sample[1] for sample in samples]).reshape(-1, n),
+        xhat=np.array([sample[2] for sample in samples]).reshape(-1, count, n),
+        P=np.array([sample[3] for sample in samples]).reshape(-1, count, n, n),
+        log=np.concatenate([np.empty(0, dtype=EVENT), *memory.blocks]),
+        seed=seed,
+        replica=replica,
+        engine=engine,
+        status=status,
+        fingerprint=recorder.fingerprint,
+    )

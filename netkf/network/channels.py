@@ -1,0 +1,358 @@
+"""Channels: whether a message is lost and, if not, how long it takes."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import (
+    Part,
+    SourceFile,
+    boolean,
+    instance,
+    number,
+    positive,
+    probability,
+    setting,
+    source_file,
+)
+from netkf.core.tables import read_columns, whole
+from netkf.network.graphs import Link, Topology
+
+
+@dataclass(frozen=True, eq=False)
+class Loss(Part):
+    """The contract of a loss model.
+
+    For each activation the engine draws one uniform number; a message is delivered when that is
+    below ``chance``. Both directions share the number when the channel is symmetric.
+    """
+
+    @abstractmethod
+    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
+        """Probability that message number ``message`` from link[0] reaches link[1];
+        ``measured`` is what the graph's table says of that direction (1 where it says nothing)."""
+
+    def weather(self, bad: bool | None, random: np.random.Generator) -> bool:
+        """Whether the link is in its bad state at the next activation (None: at the first)."""
+        return False
+
+    @property
+    def certain(self) -> bool:
+        """Whether every chance is 0 or 1 and nothing is drawn."""
+        return False
+
+    def mean_delivery(self, link: Link, measured: float) -> float:
+        """Delivered fraction in the long run; nan where it is not known beforehand."""
+        return self.chance(link, 0, False, measured)
+
+    @property
+    def independent(self) -> bool:
+        """Whether the fates of different activations are independent."""
+        return True
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError where the settings do not fit the graph."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoLoss(Loss):
+    """Every message arrives."""
+
+    @property
+    def certain(self) -> bool:
+        """True."""
+        return True
+
+    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
+        """1."""
+        return 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Bernoulli(Loss):
+    """A message arrives with probability ``delivery``."""
+
+    delivery: float = setting(probability)
+
+    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
+        """``delivery``."""
+        return self.delivery
+
+
+@dataclass(frozen=True, eq=False)
+class PerLink(Loss):
+    """A message arrives with the delivery probability that the graph's table gives its link."""
+
+    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
+        """``measured``."""
+        return measured
+
+    def check(self, topology: Topology) -> None:
+        """The graph has probabilities."""
+        if topology.delivery is None:
+            raise ScenarioError(
+                "kind", "per-link needs a graph with delivery probabilities", "per-link",
+                'use graph = { kind = "csv" } with a column delivery_probability',
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class GilbertElliott(Loss):
+    """A two-state chain, one step an activation.
+
+    Either ``to_bad``, ``to_good``, ``deliver_good`` (default 1) and ``deliver_bad`` (default 0),
+    or ``mean_loss`` and ``mean_burst`` (activations) for a chain that loses all in its bad state.
+    """
+
+    to_bad: float | None = setting(probability, default=None)
+    to_good: float | None = setting(number(above=0.0, high=1.0), default=None)
+    deliver_good: float | None = setting(probability, default=None)
+    deliver_bad: float | None = setting(probability, default=None)
+    mean_loss: float | None = setting(number(low=0.0, below=1.0), default=None)
+    mean_burst: float | None = setting(number(low=1.0), default=None)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        chain = {name: getattr(self, name) for name in ("to_bad", "to_good")}
+        means = {name: getattr(self, name) for name in ("mean_loss", "mean_burst")}
+        if any(value is not None for value in means.values()):
+            extra = {**chain, "deliver_good": self.deliver_good, "deliver_bad": self.deliver_bad}
+            for name, value in extra.items():
+                if value is not None:
+                    raise ScenarioError(name, "cannot stand beside mean_loss and mean_burst",
+                                        value, "keep one of the two forms")
+            chain = means
+        for name, value in chain.items():
+            if value is None:
+                raise ScenarioError(name, "is missing", None,
+                                    "give to_bad and to_good, or mean_loss and mean_burst")
+        if self._steps[0] > 1.0:
+            raise ScenarioError("mean_burst", "is too short for that mean_loss", self.mean_burst,
+                                "lengthen the bursts or lower the loss")
+
+    @property
+    def _steps(self) -> tuple[float, float]:
+        if self.mean_loss is not None and self.mean_burst is not None:
+            to_good = 1.0 / self.mean_burst
+            return to_good * self.mean_loss / (1.0 - self.mean_loss), to_good
+        assert self.to_bad is not None and self.to_good is not None
+        return self.to_bad, self.to_good
+
+    def weather(self, bad: bool | None, random: np.random.Generator) -> bool:
+        """One step of the chain; the first state is stationary."""
+        to_bad, to_good = self._steps
+        u = random.random()
+        if bad is None:
+            return bool(u < to_bad / (to_bad + to_good))
+        return bool(u >= to_good if bad else u < to_bad)
+
+    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
+        """Delivery probability of the state."""
+        if bad:
+            return 0.0 if self.deliver_bad is None else self.deliver_bad
+        return 1.0 if self.deliver_good is None else self.deliver_good
+
+    def mean_delivery(self, link: Link, measured: float) -> float:
+        """Under the stationary law."""
+        to_bad, to_good = self._steps
+        bad = to_bad / (to_bad + to_good)
+        return bad * self.chance(link, 0, True, 1.0) + (1.0 - bad) * self.chance(link, 0, False, 1.0)
+
+    @property
+    def independent(self) -> bool:
+        """Only when the chain forgets its state in one step."""
+        return sum(self._steps) == 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLoss(Loss):
+    """Fates read from a table ``sender,receiver,message,delivered`` (0 or 1, messages of a
+    directed link counted from 0); what the table does not list is delivered."""
+
+    path: SourceFile = setting(source_file)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._lost  # a bad file is refused now
+
+    @cached_property
+    def _lost(self) -> dict[Link, frozenset[int]]:
+        names = ("sender", "receiver", "message", "delivered")
+        table = read_columns(self.path, names)
+        rows = zip(*(whole(self.path, name, table[name]) for name in names), strict=True)
+        lost: dict[Link, set[int]] = {}
+        for sender, receiver, message, delivered in rows:
+            if message < 0 or delivered not in (0, 1):
+                raise ScenarioError(
+                    "path", f"{self.path.name}: message counts from 0 and delivered is 0 or 1",
+                    [sender, receiver, message, delivered], "mend the row",
+                )
+            fates = lost.setdefault((sender, receiver), set())
+            if not delivered:
+                fates.add(message)
+        return {link: frozenset(fates) for link, fates in lost.items()}
+
+    @property
+    def certain(self) -> bool:
+        """True."""
+        return True
+
+    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
+        """0 or 1."""
+        return 0.0 if message in self._lost.get(link, ()) else 1.0
+
+    def mean_delivery(self, link: Link, measured: float) -> float:
+        """Not known beforehand."""
+        return math.nan
+
+    @property
+    def independent(self) -> bool:
+        """A record is one outcome, not a law."""
+        return False
+
+    def check(self, topology: Topology) -> None:
+        """Every recorded pair is a link."""
+        links = set(topology.links)
+        if not topology.directed:
+            links |= {(j, i) for i, j in links}
+        strange = sorted(self._lost.keys() - links)
+        if strange:
+            raise ScenarioError(
+                "path", f"{self.path.name}: every pair must be a link of the graph",
+                list(strange[0]), "add the link or remove the rows",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Delay(Part):
+    """The contract of a delay model."""
+
+    @abstractmethod
+    def draw(self, random: np.random.Generator) -> float:
+        """Seconds, not negative."""
+
+    @property
+    def fixed(self) -> float | None:
+        """The delay where it is always the same, else None."""
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class NoDelay(Delay):
+    """A message arrives when it is sent."""
+
+    def draw(self, random: np.random.Generator) -> float:
+        """0."""
+        return 0.0
+
+    @property
+    def fixed(self) -> float | None:
+        """0."""
+        return 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantDelay(Delay):
+    """``seconds`` for every message."""
+
+    seconds: float = setting(number(low=0.0))
+
+    def draw(self, random: np.random.Generator) -> float:
+        """``seconds``."""
+        return self.seconds
+
+    @property
+    def fixed(self) -> float | None:
+        """``seconds``."""
+        return self.seconds
+
+
+@dataclass(frozen=True, eq=False)
+class ExponentialDelay(Delay):
+    """Exponential with the given ``mean`` in seconds."""
+
+    mean: float = setting(positive)
+
+    def draw(self, random: np.random.Generator) -> float:
+        """One draw."""
+        return self.mean * random.standard_exponential()
+
+
+@dataclass(frozen=True, eq=False)
+class UniformDelay(Delay):
+    """Uniform between ``low`` and ``high`` seconds."""
+
+    low: float = setting(number(low=0.0))
+    high: float = setting(number(low=0.0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.high < self.low:
+            raise ScenarioError("high", "must be at least low", self.high, "swap the two")
+
+    def draw(self, random: np.random.Generator) -> float:
+        """One draw."""
+        return self.low + (self.high - self.low) * random.random()
+
+
+@dataclass(frozen=True, eq=False)
+class LognormalDelay(Delay):
+    """Lognormal with ``mean`` seconds; ``sigma`` is the standard deviation of its logarithm."""
+
+    mean: float = setting(positive)
+    sigma: float = setting(number(low=0.0))
+
+    def draw(self, random: np.random.Generator) -> float:
+        """One draw."""
+        return self.mean * math.exp(self.sigma * (random.standard_normal() - 0.5 * self.sigma))
+
+
+@dataclass(frozen=True, eq=False)
+class Channel(Part):
+    """Loss and delay of every message.
+
+    ``symmetric``: the two messages of one activation share one draw of each, so that with equal
+    probabilities both arrive or none; else each direction has its own.
+    """
+
+    loss: Loss = setting(instance(Loss), default=NoLoss())
+    delay: Delay = setting(instance(Delay), default=NoDelay())
+    symmetric: bool = setting(boolean, default=True)
+
+
+class Fates:
+    """What one link (symmetric) or one direction of it draws, activation after activation.
+
+    ``generator`` makes the streams "loss", "weather" and "delay" of that link or direction; those
+    that are not needed are not made.
+    """
+
+    def __init__(
+        self, channel: Channel, generator: Callable[[str], np.random.Generator]
+    ) -> None:
+        self._loss, self._delay = channel.loss, channel.delay
+        self._fixed = channel.delay.fixed
+        self._bad: bool | None = None
+        self._luck = self._sky = self._post = None
+        if not self._loss.certain:
+            self._luck, self._sky = generator("loss"), generator("weather")
+        if self._fixed is None:
+            self._post = generator("delay")
+
+    def draw(self) -> tuple[float, bool, float]:
+        """A uniform number, whether the link is in its bad state, and a delay in seconds."""
+        luck, bad, delay = 0.0, False, self._fixed
+        if self._luck is not None and self._sky is not None:
+            luck = float(self._luck.random())
+            self._bad = bad = self._loss.weather(self._bad, self._sky)
+        if delay is None:
+            assert self._post is not None
+            delay = self._delay.draw(self._post)
+        return luck, bad, delay

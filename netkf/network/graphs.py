@@ -1,0 +1,365 @@
+"""Who can hear whom: the graph kinds of a scenario and the topology that each of them builds."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import (
+    Part,
+    SourceFile,
+    boolean,
+    integer,
+    number,
+    positive,
+    probability,
+    row,
+    setting,
+    several,
+    source_file,
+)
+from netkf.core.tables import read_columns, whole
+
+if TYPE_CHECKING:
+    import networkx
+
+Link = tuple[int, int]
+MOST_TRIES = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Nodes and links of one network.
+
+    nodes     : ids in increasing order
+    links     : sorted pairs, (i, j) with i < j unless ``directed`` (then from i to j)
+    delivery  : measured probability that a message from i reaches j, where the graph has them
+    positions : (x, y) of each node, where the graph has them
+    notes     : one line each about what was left out
+    """
+
+    nodes: tuple[int, ...]
+    links: tuple[Link, ...]
+    directed: bool = False
+    delivery: dict[Link, float] | None = None
+    positions: dict[int, tuple[float, float]] | None = None
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def index(self) -> dict[int, int]:
+        """Place of each node id in ``nodes``."""
+        return {node: k for k, node in enumerate(self.nodes)}
+
+    @cached_property
+    def degrees(self) -> dict[int, int]:
+        """Number of links at each node (incoming ones where the graph is directed)."""
+        degrees = dict.fromkeys(self.nodes, 0)
+        for i, j in self.links:
+            degrees[j] += 1
+            if not self.directed:
+                degrees[i] += 1
+        return degrees
+
+    @cached_property
+    def components(self) -> list[set[int]]:
+        """The connected parts (weakly connected where the graph is directed), largest first."""
+        import networkx
+
+        graph: networkx.Graph[int] = networkx.Graph(self.links)
+        graph.add_nodes_from(self.nodes)
+        return sorted(networkx.connected_components(graph), key=len, reverse=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Graph(Part):
+    """The contract of a graph kind; ``seed`` is the root seed for the random ones."""
+
+    @abstractmethod
+    def build(self, seed: int) -> Topology:
+        """The nodes and links; raises ScenarioError where there are none to build."""
+
+
+def _topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topology:
+    pairs = {(min(link), max(link)) for link in links}
+    return Topology(tuple(sorted(nodes)), tuple(sorted(pairs)), **more)
+
+
+def _from_networkx(graph: networkx.Graph[Any], **more: Any) -> Topology:
+    return _topology(graph.nodes, graph.edges, **more)
+
+
+_count = integer(low=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle(Graph):
+    """``nodes`` in a ring."""
+
+    nodes: int = setting(integer(low=3))
+
+    def build(self, seed: int) -> Topology:
+        """Links (k, k + 1) and (0, nodes - 1)."""
+        return _topology(range(self.nodes), [(k, (k + 1) % self.nodes) for k in range(self.nodes)])
+
+
+@dataclass(frozen=True, eq=False)
+class PathGraph(Graph):
+    """``nodes`` in a row."""
+
+    nodes: int = setting(_count)
+
+    def build(self, seed: int) -> Topology:
+        """Links (k, k + 1)."""
+        return _topology(range(self.nodes), [(k, k + 1) for k in range(self.nodes - 1)])
+
+
+@dataclass(frozen=True, eq=False)
+class Complete(Graph):
+    """Every pair of ``nodes`` is linked."""
+
+    nodes: int = setting(_count)
+
+    def build(self, seed: int) -> Topology:
+        """All pairs."""
+        pairs = [(i, j) for i in range(self.nodes) for j in range(i + 1, self.nodes)]
+        return _topology(range(self.nodes), pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class Star(Graph):
+    """``nodes`` in all, node 0 in the middle."""
+
+    nodes: int = setting(_count)
+
+    def build(self, seed: int) -> Topology:
+        """Links (0, k)."""
+        return _topology(range(self.nodes), [(0, k) for k in range(1, self.nodes)])
+
+
+@dataclass(frozen=True, eq=False)
+class Grid(Graph):
+    """``rows`` by ``columns``; node ids run along the rows."""
+
+    rows: int = setting(_count)
+    columns: int = setting(_count)
+
+    def build(self, seed: int) -> Topology:
+        """Links to the right and below; positions on the lattice."""
+        ids = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
+        right = zip(ids[:, :-1].ravel().tolist(), ids[:, 1:].ravel().tolist(), strict=True)
+        below = zip(ids[:-1].ravel().tolist(), ids[1:].ravel().tolist(), strict=True)
+        places = {int(ids[r, c]): (float(c), -float(r)) for r, c in np.ndindex(*ids.shape)}
+        return _topology(ids.ravel().tolist(), [*right, *below], positions=places)
+
+
+@dataclass(frozen=True, eq=False)
+class RandomGraph(Graph):
+    """Random kinds: ``seed`` of their own (default: the root seed); with ``connected`` they are
+    drawn again, with the next seed, until they are connected."""
+
+    seed: int | None = setting(integer(low=0), default=None)
+    connected: bool = setting(boolean, default=False)
+
+    def _draw(
+        self, seed: int, make: Callable[[np.random.RandomState], networkx.Graph[Any]]
+    ) -> networkx.Graph[Any]:
+        import networkx
+
+        first = seed if self.seed is None else self.seed
+        for attempt in range(MOST_TRIES if self.connected else 1):
+            # networkx takes legacy generators only for its older functions.
+            state = np.random.RandomState((first + attempt) % 2**32)
+            try:
+                graph = make(state)
+            except networkx.NetworkXError as error:
+                raise ScenarioError("", f"must be a graph that exists: {error}") from None
+            if not self.connected or networkx.is_connected(graph):
+                return graph
+        raise ScenarioError(
+            "connected",
+            f"none of {MOST_TRIES} graphs drawn was connected",
+            self.connected,
+            "make links more likely",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Regular(RandomGraph):
+    """``nodes`` with ``degree`` random links each."""
+
+    nodes: int = setting(_count)
+    degree: int = setting(integer(low=0))
+
+    def build(self, seed: int) -> Topology:
+        """networkx.random_regular_graph."""
+        import networkx
+
+        return _from_networkx(
+            self._draw(seed, lambda s: networkx.random_regular_graph(self.degree, self.nodes, s))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ErdosRenyi(RandomGraph):
+    """``nodes`` of which each pair is linked with probability ``p``."""
+
+    nodes: int = setting(_count)
+    p: float = setting(probability)
+
+    def build(self, seed: int) -> Topology:
+        """networkx.fast_gnp_random_graph."""
+        import networkx
+
+        return _from_networkx(
+            self._draw(seed, lambda s: networkx.fast_gnp_random_graph(self.nodes, self.p, s))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Geometric(RandomGraph):
+    """``nodes`` at random places of the unit square, linked when closer than ``radius``."""
+
+    nodes: int = setting(_count)
+    radius: float = setting(positive)
+
+    def build(self, seed: int) -> Topology:
+        """networkx.random_geometric_graph, with its positions."""
+        import networkx
+
+        def make(state: np.random.RandomState) -> networkx.Graph[Any]:
+            places = {k: tuple(p) for k, p in enumerate(state.random_sample((self.nodes, 2)))}
+            return networkx.random_geometric_graph(self.nodes, self.radius, pos=places)
+
+        graph = self._draw(seed, make)
+        places = {k: (float(x), float(y)) for k, (x, y) in graph.nodes(data="pos")}
+        return _from_networkx(graph, positions=places)
+
+
+@dataclass(frozen=True, eq=False)
+class Edges(Graph):
+    """Links written out; ``nodes = N`` names the nodes 0 .. N - 1, else the links do."""
+
+    edges: tuple[Link, ...] = setting(
+        several(row(integer(), integer(), what="a pair of node ids"), "pairs of node ids", least=0)
+    )
+    nodes: int | None = setting(_count, default=None)
+    directed: bool = setting(boolean, default=False)
+
+    def build(self, seed: int) -> Topology:
+        """The links as given."""
+        named = {node for edge in self.edges for node in edge}
+        if self.nodes is not None:
+            for k, edge in enumerate(self.edges):
+                for node in edge:
+                    if not 0 <= node < self.nodes:
+                        raise ScenarioError(
+                            f"edges[{k}]", f"node ids must be 0 .. {self.nodes - 1}", list(edge),
+                            "mend the pair or raise nodes",
+                        )
+        for k, (i, j) in enumerate(self.edges):
+            if i == j:
+                raise ScenarioError(
+                    f"edges[{k}]", "a link must join two nodes", [i, j], "leave it out"
+                )
+        nodes = named if self.nodes is None else range(self.nodes)
+        if not nodes:
+            raise ScenarioError("edges", "must name at least one node", [], "add nodes = N")
+        if self.directed:
+            return Topology(tuple(sorted(nodes)), tuple(sorted(set(self.edges))), directed=True)
+        return _topology(nodes, self.edges)
+
+
+@dataclass(frozen=True, eq=False)
+class CsvGraph(Graph):
+    """Links from a table ``sender,receiver`` with an optional ``delivery_probability``.
+
+    ``minimum`` keeps a link only if it reaches that probability, in both directions where the
+    graph is undirected; nodes left without a link are left out, and a note says so. A table that
+    lists no link in both directions means each row both ways. ``positions`` is a table whose
+    first three columns are node, x and y.
+    """
+
+    path: SourceFile = setting(source_file)
+    minimum: float | None = setting(number(low=0.0, high=1.0), default=None)
+    directed: bool = setting(boolean, default=False)
+    positions: SourceFile | None = setting(source_file, default=None)
+
+    def build(self, seed: int) -> Topology:
+        """The links of the table."""
+        delivery, measured = self._delivery()
+        nodes = {node for link in delivery for node in link}
+        if not self.directed and not any((j, i) in delivery for i, j in delivery):
+            delivery.update({(j, i): p for (i, j), p in list(delivery.items())})
+        least = 0.0 if self.minimum is None else self.minimum
+        if self.minimum is not None and not measured:
+            raise ScenarioError(
+                "minimum", "needs a column delivery_probability in the table", self.minimum,
+                "add the column or leave minimum out",
+            )
+        both = (lambda i, j: True) if self.directed else (
+            lambda i, j: delivery.get((j, i), 0.0) >= least
+        )
+        links = {(i, j) for (i, j), p in delivery.items() if p >= least and both(i, j)}
+        if not links:
+            raise ScenarioError("path", "no link of the table is left", self.path.name,
+                                "lower minimum or add rows")
+        kept = {node for link in links for node in link}
+        notes = _left_out(nodes - kept)
+        more: dict[str, Any] = {"notes": notes, "positions": self._positions(kept)}
+        if measured:
+            pairs = links if self.directed else links | {(j, i) for i, j in links}
+            more["delivery"] = {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
+        if self.directed:
+            return Topology(tuple(sorted(kept)), tuple(sorted(links)), directed=True, **more)
+        return _topology(kept, links, **more)
+
+    def _delivery(self) -> tuple[dict[Link, float], bool]:
+        table = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
+        senders = whole(self.path, "sender", table["sender"])
+        receivers = whole(self.path, "receiver", table["receiver"])
+        measured = "delivery_probability" in table
+        values = table["delivery_probability"].tolist() if measured else [1.0] * len(senders)
+        for i, j, p in zip(senders, receivers, values, strict=True):
+            if i == j or not 0.0 <= p <= 1.0:
+                raise ScenarioError(
+                    "path", f"{self.path.name}: rows must join two nodes with a probability",
+                    [i, j, p], "mend the row",
+                )
+        return dict(zip(zip(senders, receivers, strict=True), values, strict=True)), measured
+
+    def _positions(self, nodes: set[int]) -> dict[int, tuple[float, float]] | None:
+        if self.positions is None:
+            return None
+        header = self.positions.full.read_text(encoding="utf-8-sig").partition("\n")[0]
+        names = tuple(name.strip() for name in header.split(","))[:3]
+        try:
+            if len(names) < 3:
+                raise ScenarioError("path", f"{self.positions.name} must have the columns "
+                                    "node, x, y", header, "add what is missing")
+            table = read_columns(self.positions, names)
+            ids = whole(self.positions, names[0], table[names[0]])
+        except ScenarioError as error:
+            raise ScenarioError("positions", error.rule, error.value, error.remedy) from None
+        places = dict(
+            zip(ids, zip(table[names[1]].tolist(), table[names[2]].tolist(), strict=True),
+                strict=True)
+        )
+        missing = sorted(nodes - places.keys())
+        if missing:
+            raise ScenarioError("positions", f"{self.positions.name} must place every node",
+                                missing, "add their rows")
+        return {node: places[node] for node in sorted(nodes)}
+
+
+def _left_out(nodes: set[int]) -> tuple[str, ...]:
+    if not nodes:
+        return ()
+    listed = ", ".join(map(str, sorted(nodes)))
+    one = len(nodes) == 1
+    return (f"node{'' if one else 's'} {listed} left out: no link reaches the minimum",)

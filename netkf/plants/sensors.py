@@ -1,0 +1,104 @@
+"""Sensors in continuous time, dy = H x dt + dv, and the readings of one run.
+
+The noise of a sensor is drawn on the sensing grid from the sensor's own stream, as its two moments
+over each step. When the network wakes a node inside a step, the step is cut: the two moments of
+the first part are drawn given those of the whole (exactly, from a second stream), and the rest
+keeps what is left. The noise on the grid therefore never depends on the network.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.fields import (
+    Part,
+    definite_covariance,
+    integer,
+    matrix,
+    setting,
+    several,
+)
+from netkf.plants.diffusion import BLOCK, DiffusionPath
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSensor(Part):
+    """Each of ``nodes`` sees ``dy = H x dt + dv``, cov(dv) = R dt, H (3), with noise of its own.
+
+    ``H`` (p, n), ``R`` (p, p).
+    """
+
+    nodes: tuple[int, ...] = setting(several(integer(), "node ids"))
+    H: FloatArray = setting(matrix)
+    R: FloatArray = setting(definite_covariance)
+
+    def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
+        """The readings of one of the nodes in one run."""
+        return SensorPath(self.H, self.R, random, cutting)
+
+
+class SensorPath:
+    """Readings of one sensor on one node, asked for in order of time."""
+
+    def __init__(
+        self,
+        H: FloatArray,
+        R: FloatArray,
+        random: np.random.Generator,
+        cutting: np.random.Generator,
+    ) -> None:
+        self.H, self._root = H, np.linalg.cholesky(R)
+        self._random, self._cutting = random, cutting
+        self._drawn = np.empty((0, 2, len(R)))
+        self._used = 0
+        self._end = 0.0
+        self._rest = np.zeros((2, len(R)))
+
+    def moments(
+        self, truth: DiffusionPath, seen: FloatArray, start: float, end: float
+    ) -> FloatArray:
+        """(2, p) moments of dy over ``[start, end]`` inside the truth's present step, where x has
+        the moments ``seen``; ``start`` is where the last call ended."""
+        last = truth.step_end()
+        if last != self._end:
+            self._rest, self._end = self._draw(truth.period), last
+        if end < last:
+            noise, self._rest = self._cut((end - start) / (last - start), last - start)
+        else:
+            noise = self._rest
+        return np.asarray(seen @ self.H.T + noise @ self._root.T)
+
+    def _draw(self, period: float) -> FloatArray:
+        if self._used == len(self._drawn):
+            self._drawn = self._random.standard_normal((BLOCK, *self._drawn.shape[1:]))
+            self._used = 0
+        normals = self._drawn[self._used]
+        self._used += 1
+        # The moments of white noise are independent with variances g and g / 3.
+        return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
+
+    def _cut(self, u: float, length: float) -> tuple[FloatArray, FloatArray]:
+        """Moments of the first share u of an interval and of the rest, given those of the whole."""
+        whole, tilted = self._rest
+        normals = self._cutting.standard_normal(self._rest.shape)
+        # Exact conditional law of four independent moments given two linear sums of them.
+        variance = u * (1.0 - u) * (1.0 - 3.0 * u * (1.0 - u)) * length
+        covariance = u**3 * (1.0 - u) * length
+        other = u * (1.0 - u**3) / 3.0 * length
+        deviation = math.sqrt(max(variance, 0.0))
+        slope = covariance / deviation if deviation > 0.0 else 0.0
+        left = u * whole + 3.0 * u * (u - 1.0) * tilted + deviation * normals[0]
+        left_tilted = (
+            u * u * tilted
+            + slope * normals[0]
+            + math.sqrt(max(other - slope * slope, 0.0)) * normals[1]
+        )
+        right = whole - left
+        right_tilted = np.zeros_like(right)
+        if 1.0 - u > 1e-9:  # else the difference below is rounding, and its variance nothing
+            right_tilted = (tilted - (u - 1.0) * left - u * left_tilted - u * right) / (1.0 - u)
+        return np.stack([left, left_tilted]), np.stack([right, right_tilted])

@@ -1,0 +1,182 @@
+"""What the parts of a scenario owe each other; each rule raises ScenarioError in one line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from netkf.algorithms.gains import longest_interval
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import ScenarioError
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+MOST_SAMPLES = 10_000_000
+
+
+def check(scenario: Scenario) -> None:
+    """Everything that no single part can know."""
+    _times(scenario)
+    _plant(scenario)
+    _sensors(scenario)
+    _network(scenario)
+    _filter(scenario)
+    _sensing_period(scenario)
+
+
+def _times(scenario: Scenario) -> None:
+    probe, horizon = scenario.probe, scenario.horizon
+    if not isinstance(probe, np.ndarray):
+        if probe > horizon:
+            raise ScenarioError("probe", f"must be at most the horizon {horizon:g}", probe,
+                                "shorten the period")
+        if horizon / probe > MOST_SAMPLES:
+            raise ScenarioError("probe", f"must ask for at most {MOST_SAMPLES:,} samples", probe,
+                                "lengthen the period")
+        return
+    outside = probe[(probe < 0.0) | (probe > horizon)]
+    if outside.size:
+        raise ScenarioError("probe", f"times must lie in [0, {horizon:g}]", outside[0].item(),
+                            "leave it out or lengthen the horizon")
+    if (np.diff(probe) <= 0.0).any():
+        raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
+
+
+def _shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
+    fits = len(value.shape) == len(shape) and all(
+        want is None or have == want for have, want in zip(value.shape, shape, strict=True)
+    )
+    if not fits:
+        words = " x ".join("any" if want is None else str(want) for want in shape)
+        got = " x ".join(map(str, value.shape))
+        raise ScenarioError(key, f"must be {words}, not {got}, because {why}", value,
+                            "mend the shape")
+
+
+def _plant(scenario: Scenario) -> None:
+    plant, n = scenario.plant, scenario.plant.n
+    why = f"plant.A has {n} rows"
+    _shape("plant.B", plant.B, (n, None), why)
+    if plant.mean is not None:
+        _shape("plant.mean", plant.mean, (n,), why)
+    if plant.cov is not None:
+        _shape("plant.cov", plant.cov, (n, n), why)
+
+
+def _sensors(scenario: Scenario) -> None:
+    n, known = scenario.plant.n, scenario.topology.index
+    for k, sensor in enumerate(scenario.sensors):
+        key = f"sensors[{k}]"
+        _shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
+        p = len(sensor.H)
+        _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
+        for place, node in enumerate(sensor.nodes):
+            if node not in known:
+                raise ScenarioError(f"{key}.nodes[{place}]", "must be a node of the graph", node,
+                                    f"node ids here are {_ids(scenario.nodes)}")
+        if len(set(sensor.nodes)) < len(sensor.nodes):
+            raise ScenarioError(f"{key}.nodes", "must name each node once", list(sensor.nodes),
+                                "write a second [[sensors]] entry for a second sensor")
+
+
+def _ids(nodes: tuple[int, ...]) -> str:
+    return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
+
+
+def _network(scenario: Scenario) -> None:
+    network, topology = scenario.network, scenario.topology
+    algorithm = scenario.filter.algorithm
+    for key, part in (
+        ("network.activation", network.activation),
+        ("network.channel.loss", network.channel.loss),
+    ):
+        if part is not None:
+            try:
+                part.check(topology)
+            except ScenarioError as error:
+                raise error.under(key) from None
+    if not algorithm.talks:
+        return
+    name = type(algorithm).__name__.lower()
+    if network.activation is None:
+        raise ScenarioError("network.activation", f"is missing, and the {name} filter talks", None,
+                            'add activation = { kind = "poisson", rate = ... }')
+    if topology.directed:
+        raise ScenarioError("network.graph.directed",
+                            f"must be false for the {name} filter, whose links work both ways",
+                            True, "give an undirected graph")
+    if len(topology.components) > 1:
+        smallest = sorted(topology.components[-1])
+        raise ScenarioError("network.graph", f"must be connected for the {name} filter",
+                            f"{len(topology.components)} parts, one of them {smallest}",
+                            "add links, or connected = true for a random graph")
+
+
+def _filter(scenario: Scenario) -> None:
+    filtering, n = scenario.filter, scenario.plant.n
+    why = f"the state has {n} components"
+    for key, value, shape in (
+        ("filter.mean", filtering.mean, (n,)),
+        ("filter.cov", filtering.cov, (n, n)),
+    ):
+        if isinstance(value, tuple):
+            if len(value) != len(scenario.nodes):
+                raise ScenarioError(key, f"must have one entry for each of {len(scenario.nodes)} "
+                                    "nodes", f"{len(value)} entries", "add or remove some")
+            if filtering.algorithm.pooled:
+                raise ScenarioError(key, "must be one for the filter that all nodes share",
+                                    f"{len(value)} entries", "give one")
+            for k, item in enumerate(value):
+                _shape(f"{key}[{k}]", item, shape, why)
+        elif value is not None:
+            _shape(key, value, shape, why)
+    model = filtering.model
+    if model.A is not None:
+        _shape("filter.model.A", model.A, (n, n), why)
+    if model.B is not None:
+        _shape("filter.model.B", model.B, (n, None), why)
+    _believed_noise(scenario)
+    _degrees(scenario)
+
+
+def _believed_noise(scenario: Scenario) -> None:
+    R, sensors = scenario.filter.model.R, scenario.sensors
+    if R is None:
+        return
+    if isinstance(R, tuple) and len(R) != len(sensors):
+        raise ScenarioError("filter.model.R", f"must have one entry for each of {len(sensors)} "
+                            "[[sensors]]", f"{len(R)} entries", "add or remove some")
+    for k, sensor in enumerate(sensors):
+        key, own = ("filter.model.R", R) if not isinstance(R, tuple) else (
+            f"filter.model.R[{k}]", R[k])
+        p = len(sensor.H)
+        _shape(key, own, (p, p), f"sensors[{k}].H has {p} rows")
+
+
+def _degrees(scenario: Scenario) -> None:
+    algorithm = scenario.filter.algorithm
+    if not algorithm.talks or not scenario.topology.links:
+        return
+    node, degree = max(scenario.topology.degrees.items(), key=lambda item: item[1])
+    if degree > algorithm.largest_degree():
+        raise ScenarioError(
+            "filter.epsilon", f"must be at most 1 / {degree}, because node {node} has {degree} links",
+            getattr(algorithm, "epsilon", None), f"give at most {1.0 / degree:.6g}",
+        )
+
+
+def _sensing_period(scenario: Scenario) -> None:
+    period = scenario.truth.sensing_period
+    assert period is not None
+    A, Q = scenario.belief
+    pooled = scenario.filter.algorithm.pooled
+    models = [scenario.pooled_model] if pooled else list({id(m): m for m in scenario.models}.values())
+    for model in models:
+        longest = longest_interval(A, Q, model.H, model.R)
+        if len(model.H) and min(period, scenario.horizon) > longest:
+            raise ScenarioError(
+                "plant.sensing_period", "is too long for the readings of the most precise node",
+                period, f"give at most {longest:.3g}, or leave it out",
+            )

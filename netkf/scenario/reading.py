@@ -1,0 +1,185 @@
+"""TOML to scenario: every mistake is found here, with the path of its key."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import Part, SourceFile, integer, source_file
+from netkf.network.channels import Channel
+from netkf.scenario.registry import find
+from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
+from netkf.scenario.writing import as_table
+
+FORMAT = 1
+
+
+def load(path: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
+    """The scenario of a file, with some keys changed. Raises ScenarioError with one line."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return from_table(with_changes(table, changes or {}), path.parent)
+    except OSError as error:
+        raise ScenarioError("", f"cannot be read ({error.strerror})", None,
+                            "check the path", str(path)) from None
+    except UnicodeDecodeError:
+        raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8", str(path)) from None
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError("", f"is not valid TOML: {error}", None, "mend that line",
+                            str(path)) from None
+    except ScenarioError as error:
+        raise error.in_file(str(path)) from None
+
+
+def changed(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
+    """The scenario with some keys changed, see Scenario.replace."""
+    folder = next((s.folder for s in source_files(scenario)), Path.cwd())
+    return from_table(with_changes(as_table(scenario), changes), folder)
+
+
+def source_files(part: Any) -> list[SourceFile]:
+    """Every file that a scenario names."""
+    if isinstance(part, SourceFile):
+        return [part]
+    if isinstance(part, tuple):
+        return [source for item in part for source in source_files(item)]
+    if isinstance(part, Part):
+        values = [getattr(part, field.name) for field in dataclasses.fields(part)]
+        return [source for value in values for source in source_files(value)]
+    return []
+
+
+def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of the table with the values at some key paths replaced or added."""
+    for path, value in changes.items():
+        keys = path.replace("[", ".").replace("]", "").split(".")
+        table = _set(table, keys, value, path)
+    return table
+
+
+def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
+    if not keys:
+        return value
+    key, rest = keys[0], keys[1:]
+    if isinstance(node, (list, tuple)):
+        if not key.isdigit() or int(key) >= len(node):
+            raise ScenarioError(path, f"has no entry {key!r} in a list of {len(node)}", None,
+                                "count from 0")
+        place = int(key)
+        return [*node[:place], _set(node[place], rest, value, path), *node[place + 1 :]]
+    if node is None:
+        node = {}
+    if not isinstance(node, dict) or not key:
+        raise ScenarioError(path, "is not a key path of a scenario", None, "see the file's keys")
+    return {**node, key: _set(node.get(key), rest, value, path)}
+
+
+def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
+    """A scenario from the tables of a file that lies in ``folder``."""
+    table = dict(table)
+    version = table.pop("format", None)
+    if version is None:
+        raise ScenarioError("format", "is missing", None, f"write format = {FORMAT} first")
+    if integer()("format", version) != FORMAT:
+        raise ScenarioError("format", f"must be {FORMAT}", version, "this netkf reads no other")
+    readers = {
+        "plant": lambda value: _kind("plant", value, folder),
+        "sensors": lambda value: _list(value, folder),
+        "network": lambda value: _network(value, folder),
+        "filter": lambda value: _filtering(value, folder),
+    }
+    table.setdefault("sensors", [])
+    for key, reader in readers.items():
+        if key in table:
+            table[key] = _under(key, reader, table[key])
+    return _part(Scenario, table, folder)
+
+
+def _under(key: str, reader: Any, value: Any) -> Any:
+    try:
+        return reader(value)
+    except ScenarioError as error:
+        raise error.under(key) from None
+
+
+def _part(cls: type[Any], table: dict[str, Any], folder: Path) -> Any:
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    for key in table:
+        if key not in fields:
+            raise ScenarioError(key, "is not a key here", table[key],
+                                f"keys are {', '.join(_written(fields))}")
+    for name, field in fields.items():
+        if (field.default is dataclasses.MISSING and name not in table
+                and field.default_factory is dataclasses.MISSING):
+            raise ScenarioError(name, "is missing", None, f"add {name} = ...")
+    values = {
+        name: SourceFile(value, folder)
+        if fields[name].metadata.get("rule") is source_file and isinstance(value, str)
+        else value
+        for name, value in table.items()
+    }
+    return cls(**values)
+
+
+def _written(fields: Mapping[str, Any]) -> list[str]:
+    return [name for name in fields if not name.startswith("_")] or ["kind only"]
+
+
+def _kind(family: str, value: Any, folder: Path, default: str | None = None) -> Any:
+    table = _table(value)
+    kind = table.pop("kind", default)
+    if kind is None:
+        raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
+    return _part(find(family, kind, folder), table, folder)
+
+
+def _table(value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ScenarioError("", "must be a table", value, "write key = value pairs")
+    return dict(value)
+
+
+def _list(value: Any, folder: Path) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
+    return tuple(
+        _under(f"[{k}]", lambda item: _kind("sensor", item, folder, "linear"), item)
+        for k, item in enumerate(value)
+    )
+
+
+def _network(value: Any, folder: Path) -> Network:
+    table = _table(value)
+    for family in ("graph", "activation"):
+        if family in table:
+            table[family] = _under(family, lambda v: _kind(family, v, folder), table[family])
+    if "channel" in table:
+        table["channel"] = _under("channel", lambda v: _channel(v, folder), table["channel"])
+    network: Network = _part(Network, table, folder)
+    return network
+
+
+def _channel(value: Any, folder: Path) -> Channel:
+    table = _table(value)
+    for family in ("loss", "delay"):
+        if family in table:
+            table[family] = _under(family, lambda v: _kind(family, v, folder), table[family])
+    channel: Channel = _part(Channel, table, folder)
+    return channel
+
+
+def _filtering(value: Any, folder: Path) -> Filtering:
+    table = _table(value)
+    shared = {key: table.pop(key) for key in ("mean", "cov", "model") if key in table}
+    if "model" in shared:
+        shared["model"] = _under(
+            "model", lambda v: _part(Belief, _table(v), folder), shared["model"]
+        )
+    algorithm = _kind("filter", table, folder)
+    filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, folder)
+    return filtering

@@ -1,0 +1,111 @@
+"""The one table that turns the names of a scenario file into classes, and back."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import cast
+
+from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.hybrid import Hybrid
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import Part
+from netkf.network import channels, clocks, graphs
+from netkf.plants.diffusion import Diffusion
+from netkf.plants.sensors import LinearSensor
+
+FAMILIES: dict[str, type[Part]] = {
+    "plant": Diffusion,
+    "sensor": LinearSensor,
+    "graph": graphs.Graph,
+    "activation": clocks.LinkClock,
+    "loss": channels.Loss,
+    "delay": channels.Delay,
+    "filter": FlowFilter,
+}
+"""The contract that the classes of each family keep."""
+
+KINDS: dict[str, dict[str, type[Part]]] = {
+    "plant": {"diffusion": Diffusion},
+    "sensor": {"linear": LinearSensor},
+    "graph": {
+        "cycle": graphs.Cycle,
+        "path": graphs.PathGraph,
+        "complete": graphs.Complete,
+        "star": graphs.Star,
+        "grid": graphs.Grid,
+        "regular": graphs.Regular,
+        "erdos-renyi": graphs.ErdosRenyi,
+        "geometric": graphs.Geometric,
+        "edges": graphs.Edges,
+        "csv": graphs.CsvGraph,
+    },
+    "activation": {
+        "poisson": clocks.Poisson,
+        "renewal": clocks.Renewal,
+        "periodic": clocks.Periodic,
+        "recorded": clocks.RecordedClock,
+    },
+    "loss": {
+        "none": channels.NoLoss,
+        "bernoulli": channels.Bernoulli,
+        "per-link": channels.PerLink,
+        "gilbert-elliott": channels.GilbertElliott,
+        "recorded": channels.RecordedLoss,
+    },
+    "delay": {
+        "none": channels.NoDelay,
+        "constant": channels.ConstantDelay,
+        "exponential": channels.ExponentialDelay,
+        "uniform": channels.UniformDelay,
+        "lognormal": channels.LognormalDelay,
+    },
+    "filter": {"hybrid": Hybrid, "local": Local, "central": Central},
+}
+
+
+def find(family: str, kind: object, folder: Path) -> type[Part]:
+    """The class of ``kind``: a name of the table, or ``"package.module:Class"``, looked up beside
+    the scenario file and in the current folder too."""
+    names = KINDS[family]
+    if isinstance(kind, str) and kind in names:
+        return names[kind]
+    if isinstance(kind, str) and ":" in kind:
+        return _imported(family, kind, folder)
+    listed = ", ".join(f'"{name}"' for name in names)
+    raise ScenarioError(
+        "kind", f"must be one of {listed}", kind, 'choose one, or write "package.module:Class"'
+    )
+
+
+def _imported(family: str, kind: str, folder: Path) -> type[Part]:
+    module_name, _, class_name = kind.partition(":")
+    places = [place for place in (str(folder), str(Path.cwd())) if place not in sys.path]
+    sys.path.extend(places)
+    try:
+        found = getattr(importlib.import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ScenarioError(
+            "kind", f"could not be imported ({error})", kind,
+            "put the module beside the scenario file or on the Python path",
+        ) from None
+    finally:
+        for place in places:
+            sys.path.remove(place)
+    contract = FAMILIES[family]
+    if not (isinstance(found, type) and issubclass(found, contract)):
+        raise ScenarioError(
+            "kind", f"must be a subclass of netkf's {contract.__name__}", kind,
+            f"derive the class from {contract.__module__}.{contract.__name__}",
+        )
+    return cast("type[Part]", found)
+
+
+def name_of(family: str, part: Part) -> str:
+    """The ``kind`` that :func:`find` would turn into the class of ``part``."""
+    for name, candidate in KINDS[family].items():
+        if type(part) is candidate:
+            return name
+    return f"{type(part).__module__}:{type(part).__qualname__}"

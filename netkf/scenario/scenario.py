@@ -1,0 +1,265 @@
+"""A scenario: everything that determines a run, checked as a whole when it is made."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.flow import FlowFilter, FlowModel
+from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.core.fields import (
+    Part,
+    Rule,
+    array,
+    covariance,
+    definite_covariance,
+    either,
+    instance,
+    integer,
+    matrix,
+    number,
+    positive,
+    setting,
+    several,
+    square,
+    text,
+    vector,
+)
+from netkf.network.channels import Channel
+from netkf.network.clocks import LinkClock
+from netkf.network.graphs import Graph, Link, Topology
+from netkf.plants.diffusion import Diffusion, default_sensing_period
+from netkf.plants.sensors import LinearSensor
+
+
+@dataclass(frozen=True, eq=False)
+class Network(Part):
+    """Who can talk to whom, when, and what becomes of a message."""
+
+    graph: Graph = setting(instance(Graph))
+    activation: LinkClock | None = setting(instance(LinkClock), default=None)
+    channel: Channel = setting(instance(Channel), default=Channel())
+
+
+@dataclass(frozen=True, eq=False)
+class Belief(Part):
+    """What the filters believe where it differs from the truth: ``A`` (n, n), ``B`` (n, m) of the
+    plant, ``R`` of the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry."""
+
+    A: FloatArray | None = setting(square, default=None)
+    B: FloatArray | None = setting(matrix, default=None)
+    R: FloatArray | tuple[FloatArray, ...] | None = setting(
+        either(definite_covariance, several(definite_covariance, "covariance matrices")),
+        default=None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Filtering(Part):
+    """The filter of every node: its ``algorithm``, its start and what it believes.
+
+    ``mean`` (n,) and ``cov`` (n, n) are one for all nodes or a tuple with one per node in the
+    order of node ids; both default to the plant's.
+    """
+
+    algorithm: FlowFilter = setting(instance(FlowFilter))
+    mean: FloatArray | tuple[FloatArray, ...] | None = setting(
+        either(vector, several(vector, "vectors, one per node")), default=None
+    )
+    cov: FloatArray | tuple[FloatArray, ...] | None = setting(
+        either(covariance, several(covariance, "covariance matrices, one per node")), default=None
+    )
+    model: Belief = setting(instance(Belief), default=Belief())
+
+
+class Placed(NamedTuple):
+    """One sensor on one node: its place in ``sensors`` and its number on that node."""
+
+    entry: int
+    ordinal: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario(Part):
+    """What is simulated. Every value is checked on construction, alone and against the others;
+    ScenarioError says what is wrong in one line.
+
+    ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
+    samples or a tuple of increasing times.
+    """
+
+    name: str = setting(text)
+    horizon: float = setting(positive)
+    plant: Diffusion = setting(instance(Diffusion))
+    sensors: tuple[LinearSensor, ...] = setting(several(instance(LinearSensor), "sensors", least=0))
+    network: Network = setting(instance(Network))
+    filter: Filtering = setting(instance(Filtering))
+    probe: float | FloatArray = setting(either(positive, array(1, "list of times")))
+    claim: str = setting(Rule("must be a string", str), default="")
+    seed: int = setting(integer(low=0), default=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        from netkf.scenario.checks import check
+
+        check(self)
+
+    def replace(self, changes: Mapping[str, Any]) -> Scenario:
+        """A scenario with some keys changed, e.g. ``{"network.activation.rate": 5.0}``.
+
+        Keys are paths as in a scenario file; entries of a list are numbered, ``sensors.0.R``.
+        Raises ScenarioError for a key that does not exist or a value that breaks a rule.
+        """
+        from netkf.scenario.reading import changed
+
+        return changed(self, changes)
+
+    @cached_property
+    def topology(self) -> Topology:
+        """Nodes and links."""
+        try:
+            return self.network.graph.build(self.seed)
+        except Exception as error:
+            from netkf.core.errors import ScenarioError
+
+            if isinstance(error, ScenarioError):
+                raise error.under("network.graph") from None
+            raise
+
+    @cached_property
+    def nodes(self) -> tuple[int, ...]:
+        """Node ids in increasing order."""
+        return self.topology.nodes
+
+    @cached_property
+    def times(self) -> FloatArray:
+        """(T,) times of the state samples in seconds."""
+        if isinstance(self.probe, np.ndarray):
+            return self.probe
+        count = int(np.floor(self.horizon / self.probe * (1.0 + 1e-12)))
+        return np.minimum(np.round(self.probe * np.arange(count + 1), 12), self.horizon)
+
+    @cached_property
+    def truth(self) -> Diffusion:
+        """The plant with every default filled in."""
+        plant, n = self.plant, self.plant.n
+        filled = dataclasses.replace(
+            plant,
+            mean=np.zeros(n) if plant.mean is None else plant.mean,
+            cov=np.zeros((n, n)) if plant.cov is None else plant.cov,
+        )
+        if filled.sensing_period is not None:
+            return filled
+        informations = [
+            H.T @ np.linalg.solve(R, H) for H, R in {
+                (H.tobytes(), R.tobytes()): (H, R)
+                for H, R in (self.observation(node) for node in self.sensing)
+            }.values()
+        ]
+        return dataclasses.replace(
+            filled, sensing_period=default_sensing_period(filled, informations)
+        )
+
+    @cached_property
+    def placed(self) -> dict[int, tuple[Placed, ...]]:
+        """The sensors of each node that has any."""
+        found: dict[int, list[Placed]] = {}
+        for entry, sensor in enumerate(self.sensors):
+            for node in sensor.nodes:
+                here = found.setdefault(node, [])
+                here.append(Placed(entry, len(here)))
+        return {node: tuple(found[node]) for node in sorted(found)}
+
+    @property
+    def sensing(self) -> tuple[int, ...]:
+        """Ids of the nodes that have a sensor."""
+        return tuple(self.placed)
+
+    def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
+        """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together; p may be 0. With
+        ``believed``, R is what the filter takes it to be."""
+        return self._stacked(self.placed.get(node, ()), believed)
+
+    def _stacked(
+        self, placed: tuple[Placed, ...], believed: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        H = [self.sensors[place.entry].H for place in placed]
+        R = [self._noise(place.entry, believed) for place in placed]
+        empty = np.zeros((0, self.plant.n))
+        return np.concatenate([empty, *H]), block_diagonal(R)
+
+    def _noise(self, entry: int, believed: bool) -> FloatArray:
+        R = self.filter.model.R
+        if not believed or R is None:
+            return self.sensors[entry].R
+        return R[entry] if isinstance(R, tuple) else R
+
+    @cached_property
+    def belief(self) -> tuple[FloatArray, FloatArray]:
+        """``A`` and ``Q = B B'`` (n, n) as the filters have them."""
+        model = self.filter.model
+        A = self.plant.A if model.A is None else model.A
+        B = self.plant.B if model.B is None else model.B
+        return A, np.asarray(B @ B.T)
+
+    @cached_property
+    def models(self) -> tuple[FlowModel, ...]:
+        """What each node believes, in the order of ``nodes``; equal models are one object."""
+        made: dict[bytes, FlowModel] = {}
+        return tuple(
+            self._model(self.observation(node, believed=True), made) for node in self.nodes
+        )
+
+    @cached_property
+    def pooled_model(self) -> FlowModel:
+        """The model of a filter that reads the sensors of all nodes at once."""
+        everywhere = tuple(place for node in self.placed for place in self.placed[node])
+        return self._model(self._stacked(everywhere, believed=True), {})
+
+    def _model(
+        self, observation: tuple[FloatArray, FloatArray], made: dict[bytes, FlowModel]
+    ) -> FlowModel:
+        H, R = observation
+        key = b"".join((H.tobytes(), b"|", R.tobytes()))
+        if key not in made:
+            interval = self.truth.sensing_period or 0.0
+            made[key] = FlowModel(*self.belief, H, R, self.horizon, min(interval, self.horizon))
+        return made[key]
+
+    def start(self, node: int) -> tuple[FloatArray, FloatArray]:
+        """``xhat`` (n,) and ``P`` (n, n) of a node at time 0."""
+        index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
+        first = self.truth.mean if mean is None else mean
+        spread = self.truth.cov if cov is None else cov
+        return (
+            first[index] if isinstance(first, tuple) else first,
+            spread[index] if isinstance(spread, tuple) else spread,
+        )
+
+    def weight(self, receiver: int, sender: int) -> float:
+        """The weight a node gives to a message: pi_ij of H (7)."""
+        degrees = self.topology.degrees
+        return self.filter.algorithm.weight(degrees[receiver], degrees[sender])
+
+    def measured(self, link: Link) -> float:
+        """The delivery probability that the graph's table gives a direction, 1 where it has none."""
+        delivery = self.topology.delivery
+        return 1.0 if delivery is None else delivery.get(link, 0.0)
+
+    def effective_rates(self) -> dict[Link, float]:
+        """Messages per second that arrive on each direction (sender, receiver) in the long run;
+        nan where that is not known beforehand."""
+        clock, loss = self.network.activation, self.network.channel.loss
+        rates: dict[Link, float] = {}
+        if clock is None or not self.filter.algorithm.talks:
+            return rates
+        for i, j in self.topology.links:
+            for link in ((i, j), (j, i)):
+                delivered = loss.mean_delivery(link, self.measured(link))
+                rates[link] = clock.mean_rate((i, j)) * delivered
+        return rates

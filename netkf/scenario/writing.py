@@ -1,0 +1,111 @@
+"""Scenario to TOML, so that a run directory carries what was run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+
+from netkf.core.fields import Part, SourceFile
+from netkf.scenario.registry import name_of
+from netkf.scenario.scenario import Filtering, Scenario
+
+
+def as_table(scenario: Scenario) -> dict[str, Any]:
+    """The tables of a file that says what the scenario was given, defaults left out."""
+    return _scenario(scenario, defaults=False)
+
+
+def resolved(scenario: Scenario) -> dict[str, Any]:
+    """The tables of a file with every default written out; it gives the same runs."""
+    filled = dataclasses.replace(
+        scenario,
+        plant=scenario.truth,
+        filter=dataclasses.replace(
+            scenario.filter,
+            mean=scenario.truth.mean if scenario.filter.mean is None else scenario.filter.mean,
+            cov=scenario.truth.cov if scenario.filter.cov is None else scenario.filter.cov,
+        ),
+    )
+    return _scenario(filled, defaults=True)
+
+
+def _scenario(scenario: Scenario, defaults: bool) -> dict[str, Any]:
+    network, table = scenario.network, _fields(scenario, defaults)
+    table["plant"] = _kind("plant", scenario.plant, defaults)
+    table["sensors"] = [_kind("sensor", sensor, defaults) for sensor in scenario.sensors]
+    table["network"] = {"graph": _kind("graph", network.graph, defaults)}
+    if network.activation is not None:
+        table["network"]["activation"] = _kind("activation", network.activation, defaults)
+    channel = _fields(network.channel, True)
+    channel["loss"] = _kind("loss", network.channel.loss, defaults)
+    channel["delay"] = _kind("delay", network.channel.delay, defaults)
+    table["network"]["channel"] = channel
+    table["filter"] = _filtering(scenario.filter, defaults)
+    return {"format": 1, **table}
+
+
+def _filtering(filtering: Filtering, defaults: bool) -> dict[str, Any]:
+    table = _kind("filter", filtering.algorithm, defaults)
+    for name, value in _fields(filtering, defaults).items():
+        if name in ("mean", "cov"):
+            table[name] = value
+    model = _fields(filtering.model, defaults)
+    return {**table, "model": model} if model else table
+
+
+def _kind(family: str, part: Part, defaults: bool) -> dict[str, Any]:
+    return {"kind": name_of(family, part), **_fields(part, defaults)}
+
+
+def _fields(part: Part, defaults: bool) -> dict[str, Any]:
+    table: dict[str, Any] = {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        is_default = field.default is not dataclasses.MISSING and (
+            value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
+        )
+        if value is not None and (defaults or not is_default):
+            table[field.name] = _plain(value)
+    return table
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, SourceFile):
+        return value.name
+    return value
+
+
+def to_toml(table: dict[str, Any]) -> str:
+    """TOML text of nested tables of numbers, strings and lists; equal tables give equal text."""
+    lines = [f"{key} = {_value(v)}" for key, v in table.items() if not _is_section(v)]
+    for key, value in table.items():
+        if isinstance(value, dict):
+            lines += ["", f"[{key}]", *(f"{k} = {_value(v)}" for k, v in value.items())]
+        elif _is_section(value):
+            for entry in value:
+                lines += ["", f"[[{key}]]", *(f"{k} = {_value(v)}" for k, v in entry.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _is_section(value: Any) -> bool:
+    tables = isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)
+    return isinstance(value, dict) or tables
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return repr(value)

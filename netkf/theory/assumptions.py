@@ -1,0 +1,141 @@
+"""The assumptions of H Theorems 2 and 3, checked one by one with evidence."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from netkf.algorithms.hybrid import Hybrid
+from netkf.scenario.scenario import Scenario
+from netkf.theory.coupled import coupling
+from netkf.theory.matrices import unobservable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Row = tuple[str, str, bool, str]
+
+
+def assumptions(scenario: Scenario) -> pd.DataFrame:
+    """A table with a row for each assumption: assumption, source, holds, evidence."""
+    import pandas as pd
+
+    rows = _plant(scenario)
+    if scenario.filter.algorithm.talks:
+        rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
+    rows += _start(scenario)
+    return pd.DataFrame(rows, columns=["assumption", "source", "holds", "evidence"])
+
+
+def _graph(scenario: Scenario) -> list[Row]:
+    topology, algorithm = scenario.topology, scenario.filter.algorithm
+    parts = len(topology.components)
+    rows: list[Row] = [
+        (
+            "the graph is undirected and connected",
+            "H II-B a",
+            parts == 1 and not topology.directed,
+            f"{len(topology.nodes)} nodes, {len(topology.links)} links, {parts} part"
+            + ("" if parts == 1 else "s"),
+        )
+    ]
+    if isinstance(algorithm, Hybrid):
+        most = max(topology.degrees.values())
+        low = 1.0 - algorithm.epsilon * most
+        rows.append(
+            (
+                "Pi is doubly stochastic, 0 < epsilon <= 1/max degree",
+                "H (5)",
+                low >= -1e-12,
+                f"epsilon {algorithm.epsilon:g}, largest degree {most}, least diagonal entry "
+                f"{low:.3g}",
+            )
+        )
+    return rows
+
+
+def _plant(scenario: Scenario) -> list[Row]:
+    plant = scenario.truth
+    lost = unobservable(plant.A.T, plant.Q)
+    information = np.zeros((plant.n, plant.n))
+    for node in scenario.sensing:
+        H, R = scenario.observation(node)
+        information += H.T @ np.linalg.solve(R, H)
+    hidden = unobservable(plant.A, information)
+    alone = [
+        node
+        for node in scenario.nodes
+        if unobservable(plant.A, _own_information(scenario, node)) is None
+    ]
+    A, Q = scenario.belief
+    same = np.array_equal(A, plant.A) and np.array_equal(Q, plant.Q) and (
+        scenario.filter.model.R is None
+    )
+    return [
+        ("(A, B) is controllable", "H II-A", lost is None,
+         "every mode is driven by the noise" if lost is None
+         else f"the mode with eigenvalue {lost:.6g} is not driven"),
+        ("(A, H) is observable, all sensors together", "H II-A", hidden is None,
+         f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
+         if hidden is None else f"the mode with eigenvalue {hidden:.6g} is not seen"),
+        ("the filters know the plant and the sensors", "H (4)", same,
+         "same A, B and R" if same else "filter.model differs from the truth"),
+    ]
+
+
+def _own_information(scenario: Scenario, node: int) -> np.ndarray:
+    H, R = scenario.observation(node)
+    return np.asarray(H.T @ np.linalg.solve(R, H))
+
+
+def _clocks(scenario: Scenario) -> list[Row]:
+    clock = scenario.network.activation
+    assert clock is not None
+    rates = np.array([clock.mean_rate(link) for link in scenario.topology.links])
+    known = rates[np.isfinite(rates)]
+    positive = len(known) == len(rates) and bool((known > 0.0).all())
+    spread = f"{known.min():g} .. {known.max():g} per second" if known.size else "no rate known"
+    return [
+        ("the rates of all links are positive", "H II-B b", positive, spread),
+        ("the link clocks are independent Poisson processes", "H II-B b, Theorem 2",
+         clock.memoryless,
+         "exponential gaps" if clock.memoryless
+         else f"the gaps of {type(clock).__name__} are not exponential: H(12) is not promised"),
+        ("all links have one rate", "H Theorem 3", positive and np.ptp(rates) == 0.0
+         if rates.size else True,
+         "the limit S does not need it when the rates grow together"),
+    ]
+
+
+def _channel(scenario: Scenario) -> list[Row]:
+    channel = scenario.network.channel
+    rates = list(scenario.effective_rates().values())
+    c = coupling(scenario).toarray() if np.isfinite(rates).all() else None
+    fixed = channel.delay.fixed
+    symmetric = c is not None and bool(np.allclose(c, c.T, rtol=1e-12))
+    return [
+        ("losses are independent of each other and of the past", "H Theorem 2, derived",
+         channel.loss.independent,
+         "arrivals are Poisson processes of lower rates" if channel.loss.independent
+         else "arrivals come in bursts: H(12) is not promised"),
+        ("messages take no time, or one fixed time", "H (7), derived", fixed is not None,
+         "random delay: H(12) is not promised" if fixed is None
+         else "no delay" if fixed == 0.0
+         else f"{fixed:g} s; covariances are predicted to their arrival"),
+        ("both directions of a link arrive at one rate", "H (12), (13)", symmetric,
+         "the limit is S" if symmetric else "the limit is not S but weighs the nodes differently"),
+    ]
+
+
+def _start(scenario: Scenario) -> list[Row]:
+    plant, worst = scenario.truth, np.inf
+    for node in scenario.nodes:
+        mean, cov = scenario.start(node)
+        offset = plant.mean - mean
+        gap = cov - plant.cov - np.outer(offset, offset)
+        worst = min(worst, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
+    return [
+        ("P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']", "H (9), (10)", worst >= -1e-12,
+         f"least eigenvalue of the difference {worst:.3g}")
+    ]

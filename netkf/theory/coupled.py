@@ -1,0 +1,148 @@
+"""The coupled Riccati equations H(12) of a scenario, as arrays.
+
+d P_i = A P_i + P_i A' + Q - P_i G_i P_i + sum_j c_ij (T P_j T' + q - P_i)
+
+``c_ij`` is the rate at which messages from j arrive at i times the weight they get. A message that
+took a fixed time d is predicted first, ``T = exp(A d)`` and ``q`` the noise of d seconds, and
+P_j is then the one from d seconds ago; without delay ``T = I``, ``q = 0``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.riccati import riccati_step, riccati_table
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import TheoryError
+from netkf.scenario.scenario import Scenario
+
+
+class Coupled(NamedTuple):
+    """A (n, n), Q (n, n), G (N, n, n), coupling (N, N) sparse, T (n, n), q (n, n), delay (s),
+    start (N, n, n)."""
+
+    A: FloatArray
+    Q: FloatArray
+    G: FloatArray
+    coupling: scipy.sparse.csr_array
+    T: FloatArray
+    q: FloatArray
+    delay: float
+    start: FloatArray
+
+
+def not_promised(scenario: Scenario) -> str | None:
+    """Why H Theorem 2 does not speak about the scenario, in words; None where it does."""
+    algorithm, network = scenario.filter.algorithm, scenario.network
+    if not algorithm.talks:
+        return None
+    if not isinstance(algorithm, Hybrid):
+        return f"H(12) is about the hybrid filter, not {type(algorithm).__name__}"
+    assert network.activation is not None
+    if not network.activation.memoryless:
+        return (
+            "not promised: the link clocks are not Poisson processes, and for other clocks of the "
+            "same rate the mean covariance can lie above H(12)"
+        )
+    if network.channel.delay.fixed is None:
+        return "not promised: H(12) holds for no delay or a fixed one, and the delay is random"
+    if not network.channel.loss.independent:
+        return "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
+    return None
+
+
+def promised(scenario: Scenario) -> None:
+    """Raise TheoryError with the reason where H Theorem 2 does not apply."""
+    reason = not_promised(scenario)
+    if reason is not None:
+        raise TheoryError(reason)
+
+
+def informations(scenario: Scenario) -> FloatArray:
+    """(N, n, n): ``G_i`` as the filters believe it; every node has all where one filter reads all."""
+    if scenario.filter.algorithm.pooled:
+        return np.stack([scenario.pooled_model.information] * len(scenario.nodes))
+    return np.stack([model.information for model in scenario.models])
+
+
+def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
+    """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times their weight."""
+    index, size = scenario.topology.index, len(scenario.nodes)
+    entries = [
+        (index[receiver], index[sender], rate * scenario.weight(receiver, sender))
+        for (sender, receiver), rate in scenario.effective_rates().items()
+        if rate > 0.0
+    ]
+    rows, columns, values = zip(*entries, strict=True) if entries else ((), (), ())
+    return scipy.sparse.csr_array((values, (rows, columns)), shape=(size, size), dtype=np.float64)
+
+
+def coupled(scenario: Scenario) -> Coupled:
+    """The equations of a scenario; raises TheoryError where H(12) does not apply."""
+    promised(scenario)
+    A, Q = scenario.belief
+    n = scenario.plant.n
+    delay = scenario.network.channel.delay.fixed or 0.0
+    if not scenario.filter.algorithm.talks:
+        delay = 0.0
+    T, q = np.eye(n), np.zeros((n, n))
+    if delay > 0.0:
+        table = riccati_table(A, Q, np.zeros((n, n)), delay)
+        q, _ = riccati_step(table, q, np.zeros(n), delay)
+        T = np.column_stack([riccati_step(table, q, e, delay)[1] for e in np.eye(n)])
+    start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
+    return Coupled(A, Q, informations(scenario), coupling(scenario), T, q, delay, start)
+
+
+def slope(equations: Coupled, P: FloatArray, sent: FloatArray) -> FloatArray:
+    """The right-hand side at ``P`` (N, n, n), where ``sent`` are the covariances that arrive."""
+    A, c = equations.A, equations.coupling
+    drift = A @ P
+    arriving = equations.T @ sent @ equations.T.T + equations.q
+    mixed = (c @ arriving.reshape(len(P), -1)).reshape(P.shape)
+    leaving = np.asarray(c.sum(axis=1)).reshape(-1, 1, 1)
+    change = drift + np.swapaxes(drift, 1, 2) + equations.Q - P @ equations.G @ P
+    return np.asarray(change + mixed - leaving * P)
+
+
+def linear_operator(equations: Coupled, gains: FloatArray) -> scipy.sparse.csr_array:
+    """(N n n, N n n): ``X_i -> (A - K_i) X_i + X_i (A - K_i)' + sum_j c_ij (T X_j T' - X_i)`` on
+    row-major vec(X), where ``K_i = gains[i]`` stands for L_i H_i."""
+    n, eye = len(equations.A), np.eye(len(equations.A))
+    leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)
+    blocks = [
+        np.kron(equations.A - K, eye) + np.kron(eye, equations.A - K) - out * np.eye(n * n)
+        for K, out in zip(gains, leaving, strict=True)
+    ]
+    between = scipy.sparse.kron(equations.coupling, np.kron(equations.T, equations.T))
+    return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks) + between)
+
+
+def left_weights(scenario: Scenario) -> FloatArray:
+    """(N,): the weights with which the nodes' information enters when links tick ever faster.
+
+    The left null vector of the coupling, scaled to sum 1: 1/N where both directions of a link
+    arrive at one rate. Raises TheoryError where some node is never heard.
+    """
+    c = coupling(scenario).toarray()
+    size = len(c)
+    if size == 1:
+        return np.ones(1)
+    laplacian = np.diag(c.sum(axis=1)) - c
+    if not np.isfinite(laplacian).all() or math.isclose(float(np.abs(c).max()), 0.0):
+        raise TheoryError("the rates of the links are not known, or no message ever arrives")
+    laplacian /= np.abs(laplacian).max()
+    system = np.concatenate([laplacian.T, np.ones((1, size))])
+    target = np.concatenate([np.zeros(size), [1.0]])
+    w, _, rank, _ = np.linalg.lstsq(system, target, rcond=None)
+    if rank < size or not np.abs(system @ w - target).max() < RESIDUAL_WEIGHTS:
+        raise TheoryError("the messages that arrive do not join all nodes")
+    return np.asarray(np.maximum(w, 0.0) / np.maximum(w, 0.0).sum())
+
+
+RESIDUAL_WEIGHTS = 1e-9

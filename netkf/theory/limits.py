@@ -1,0 +1,53 @@
+"""What the filters come to when links tick ever faster, and the filter that has everything."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import TheoryError
+from netkf.scenario.scenario import Scenario
+from netkf.theory.coupled import informations, left_weights
+from netkf.theory.matrices import algebraic_riccati, lyapunov
+
+
+def limit_covariance(scenario: Scenario) -> FloatArray:
+    """(n, n): S of H(13), to which H(12) comes as the rates grow (H Theorem 3).
+
+    Where the two directions of links arrive at different rates the nodes' information is weighted
+    by the left null vector of the coupling instead of 1/N (derived). Raises TheoryError where S
+    does not exist.
+    """
+    A, Q = scenario.belief
+    w = left_weights(scenario)
+    return algebraic_riccati(A, Q, np.tensordot(w, informations(scenario), 1))
+
+
+def true_limit_covariance(scenario: Scenario) -> FloatArray:
+    """(n, n): the limit, as the rates grow, of the true covariance of x - xhat_i (derived).
+
+    All nodes then share one estimate with the gains of S; it averages the sensors' noises, which S
+    does not know: 0 = (A - S Gw) X + X (A - S Gw)' + Q + S (sum w_i^2 G_i) S. A filter's own R and
+    Q may differ from the truth, its A may not. Raises TheoryError where the limit does not exist.
+    """
+    A, _ = scenario.belief
+    if not np.array_equal(A, scenario.plant.A):
+        raise TheoryError("the filters' A differs from the plant's: the error follows the state")
+    S, w = limit_covariance(scenario), left_weights(scenario)
+    closed = A - S @ np.tensordot(w, informations(scenario), 1)
+    noise = scenario.truth.Q.copy()
+    for weight, node in zip(w, scenario.nodes, strict=True):
+        H, R = scenario.observation(node)
+        gain = S @ np.linalg.solve(scenario.observation(node, believed=True)[1], H).T
+        noise += weight**2 * gain @ R @ gain.T
+    return lyapunov(closed, noise)
+
+
+def central_covariance(scenario: Scenario) -> FloatArray:
+    """(n, n): steady covariance of the Kalman-Bucy filter that reads all sensors and knows the
+    true model. Raises TheoryError where it does not exist."""
+    G = np.zeros((scenario.plant.n, scenario.plant.n))
+    for node in scenario.sensing:
+        H, R = scenario.observation(node)
+        G += H.T @ np.linalg.solve(R, H)
+    return algebraic_riccati(scenario.truth.A, scenario.truth.Q, G)

@@ -1,0 +1,96 @@
+"""What a run leaves behind, gathered with as little work in the loop as Python allows.
+
+Events are appended to a list as tuples and leave it in blocks; states come as one block a sample
+time. Both go to a sink, which keeps them in memory or writes them to files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.trace.schema import CODES, EVENT, KINDS
+
+BLOCK = 1 << 16
+NAN = math.nan
+
+
+class Sink(ABC):
+    """Where a recorder's blocks go."""
+
+    @abstractmethod
+    def events(self, rows: np.ndarray) -> None:
+        """A block of EVENT rows that follows the one before."""
+
+    @abstractmethod
+    def states(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+        """One sample: x (n,), xhat (N, n), P (N, n, n)."""
+
+
+class MemorySink(Sink):
+    """Keeps everything."""
+
+    def __init__(self) -> None:
+        self.blocks: list[np.ndarray] = []
+        self.samples: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+
+    def events(self, rows: np.ndarray) -> None:
+        """Appended."""
+        self.blocks.append(rows)
+
+    def states(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+        """Appended."""
+        self.samples.append((t, x, xhat, P))
+
+
+class Recorder:
+    """Takes events and samples from an engine, counts them, fingerprints the events."""
+
+    def __init__(self, sinks: Sequence[Sink]) -> None:
+        self._sinks = tuple(sinks)
+        self._rows: list[tuple[float, int, int, int, int, int, float]] = []
+        self._hash = hashlib.sha256()
+        self._counts = np.zeros(len(KINDS), dtype=np.int64)
+        self.append: Callable[[tuple[float, int, int, int, int, int, float]], None]
+        self.append = self._rows.append
+        """``append((t, kind code, node, peer, message, phase, age))`` records one event."""
+
+    def flush_if_full(self) -> None:
+        """Pass the gathered events on once there are enough of them."""
+        if len(self._rows) >= BLOCK:
+            self.flush()
+
+    def flush(self) -> None:
+        """Pass the gathered events on."""
+        if not self._rows:
+            return
+        rows = np.array(self._rows, dtype=EVENT)
+        self._rows.clear()
+        self._hash.update(rows.tobytes())
+        self._counts += np.bincount(rows["kind"], minlength=len(KINDS))
+        for sink in self._sinks:
+            sink.events(rows)
+
+    def sample(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+        """Record one sample of the truth (n,) and of all nodes (N, n), (N, n, n)."""
+        for sink in self._sinks:
+            sink.states(t, x, xhat, P)
+
+    def count(self, kind: str) -> int:
+        """Events of a kind that were flushed."""
+        return int(self._counts[CODES[kind]])
+
+    @property
+    def total(self) -> int:
+        """Events that were flushed."""
+        return int(self._counts.sum())
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the flushed events, independent of blocks and machines."""
+        return self._hash.hexdigest()

@@ -1,0 +1,136 @@
+"""A finished run in memory: arrays first, pandas tables on request."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What happened in one run.
+
+    times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n); ``log`` holds the events as a
+    structured array (trace.schema.EVENT). ``status`` is complete, interrupted or diverged.
+    """
+
+    times: FloatArray
+    nodes: tuple[int, ...]
+    x: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+    log: np.ndarray = field(repr=False)
+    seed: int
+    replica: int
+    engine: str
+    status: str
+    fingerprint: str
+
+    @cached_property
+    def events(self) -> pd.DataFrame:
+        """Table of events, columns as trace.schema.EVENT_COLUMNS."""
+        import pandas as pd
+
+        return pd.DataFrame(event_columns(self.log, self.replica, 0))
+
+    @cached_property
+    def states(self) -> pd.DataFrame:
+        """Table of state samples, columns as trace.schema.state_columns."""
+        import pandas as pd
+
+        columns = state_table(self.replica, self.times, self.nodes, self.x, self.xhat, self.P)
+        return pd.DataFrame(columns)
+
+    def count(self, kind: str) -> int:
+        """Number of events of a kind."""
+        return int((self.log["kind"] == CODES[kind]).sum())
+
+
+def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
+    """EVENT rows as named columns; ``first`` is the sequence number of the first row."""
+    import pandas as pd
+
+    kinds = pd.Categorical.from_codes(rows["kind"].astype(np.int8), categories=list(KINDS))
+    run = np.full(len(rows), replica, dtype=np.int64)
+    columns = {"run": run, "seq": np.arange(first, first + len(rows)), "kind": kinds}
+    return {
+        name: columns[name] if name in columns else rows[name] for name in EVENT_COLUMNS
+    }
+
+
+def errors(x: FloatArray, xhat: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared error and NEES ``e' P^-1 e``, (T, N) each, of x (T, n), xhat (T, N, n) and
+    P (T, N, n, n); NEES is nan where P is singular."""
+    e = x[:, None, :] - xhat
+    with np.errstate(all="ignore"):
+        try:
+            solved = np.linalg.solve(P, e[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            solved = np.full_like(e, np.nan)
+            for place in np.ndindex(*e.shape[:2]):
+                if np.linalg.matrix_rank(P[place], hermitian=True) == P.shape[-1]:
+                    solved[place] = np.linalg.solve(P[place], e[place])
+        return (e * e).sum(axis=-1), (e * solved).sum(axis=-1)
+
+
+def state_table(
+    replica: int,
+    times: FloatArray,
+    nodes: tuple[int, ...],
+    x: FloatArray,
+    xhat: FloatArray,
+    P: FloatArray,
+) -> dict[str, Any]:
+    """Samples as named columns, a row a time and node."""
+    count, n = len(nodes), x.shape[1]
+    rows = len(times) * count
+    upper = np.triu_indices(n)
+    sq_error, nees = errors(x, xhat, P)
+    values = [
+        np.full(rows, replica, dtype=np.int64),
+        np.repeat(times, count),
+        np.tile(np.array(nodes, dtype=np.int64), len(times)),
+        *np.repeat(x, count, axis=0).T,
+        *xhat.reshape(rows, n).T,
+        *P[:, :, upper[0], upper[1]].reshape(rows, -1).T,
+        sq_error.reshape(rows),
+        nees.reshape(rows),
+    ]
+    return dict(zip(state_columns(n), values, strict=True))
+
+
+def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None:
+    """One line about the first event in which two runs differ, None where all are equal.
+
+    Takes runs or event tables; nan equals nan.
+    """
+    one, other = (t.events if isinstance(t, Run) else t for t in (a, b))
+    names = [name for name in EVENT_COLUMNS if name not in ("run", "seq")]
+    shorter = min(len(one), len(other))
+    differs = np.zeros(shorter, dtype=bool)
+    for name in names:
+        left, right = (np.asarray(t[name].to_numpy()[:shorter]) for t in (one, other))
+        unequal = left != right
+        if left.dtype.kind == "f":
+            unequal &= ~(np.isnan(left) & np.isnan(right))
+        differs |= unequal.astype(bool)
+    if differs.any():
+        row = int(np.argmax(differs))
+    elif len(one) != len(other):
+        row = shorter
+    else:
+        return None
+    shown = [
+        " ".join(f"{name}={t[name].iloc[row]}" for name in names) if row < len(t) else "no event"
+        for t in (one, other)
+    ]
+    return f"event {row}: {shown[0]} | {shown[1]}"

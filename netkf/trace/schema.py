@@ -1,0 +1,56 @@
+"""The names and types of everything that is recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+
+KINDS = (
+    "sense",
+    "tick",
+    "send",
+    "deliver",
+    "lost",
+    "late",
+    "absorb",
+    "swap",
+    "round",
+    "stop",
+    "crash",
+    "restart",
+    "diverged",
+)
+"""Event kinds; a row stores the place of its kind in this tuple.
+
+sense    node took the reading that ends at t
+tick     the link node - peer activated
+send     node sent message number ``message`` to peer
+lost     that message (node to peer) was lost by the channel
+deliver  node received message number ``message`` from peer, ``age`` seconds after it was sent
+absorb   node used all that had arrived at t in one reset; ``age`` is that of the oldest message
+diverged the covariance of node was no longer finite
+"""
+
+CODES = {kind: code for code, kind in enumerate(KINDS)}
+
+EVENT = np.dtype(
+    [
+        ("t", "<f8"),
+        ("kind", "u1"),
+        ("node", "<i8"),
+        ("peer", "<i8"),
+        ("message", "<i8"),
+        ("phase", "<i4"),
+        ("age", "<f8"),
+    ]
+)
+"""One event; -1 or nan where a column means nothing."""
+
+EVENT_COLUMNS = ("run", "seq", "t", "kind", "node", "peer", "message", "phase", "age")
+
+
+def state_columns(n: int) -> list[str]:
+    """Columns of the table of states for an n-dimensional plant, P by rows of its upper triangle."""
+    join = "" if n <= 10 else "_"
+    upper = [f"P{i}{join}{j}" for i in range(n) for j in range(i, n)]
+    states = [f"{name}{i}" for name in ("x", "xhat") for i in range(n)]
+    return ["run", "t", "node", *states, *upper, "sq_error", "nees"]
