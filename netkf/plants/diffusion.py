@@ -5,7 +5,8 @@ two moments of x over the step (core/legendre), all from one stream and whatever
 Between grid points, filters that are woken by the network need part of a step. There the path is
 the response to the state at the grid point plus the cubic that agrees with the step's end and with
 its two moments; what that leaves out of a reading is of third order in h and less than 1e-4 h^3 of
-the noise intensity. A state that is *shown* off the grid is drawn from its exact conditional law.
+the noise intensity. Where a state is to be *shown* off the grid, the step is cut there beforehand:
+state and moments are drawn from their exact law given the step, from a second stream.
 """
 
 from __future__ import annotations
@@ -50,30 +51,29 @@ class Diffusion(Part):
         """``B B'`` (n, n)."""
         return np.asarray(self.B @ self.B.T)
 
-    def path(self, random: np.random.Generator, probing: np.random.Generator) -> DiffusionPath:
-        """A path of its own; ``probing`` is used only for states shown off the sensing grid."""
-        return DiffusionPath(self, random, probing)
+    def path(
+        self, random: np.random.Generator, probing: np.random.Generator, shown: FloatArray
+    ) -> DiffusionPath:
+        """A path of its own that can be asked for its state on the sensing grid and at the times
+        ``shown`` (increasing); ``probing`` is used only for those off the grid."""
+        return DiffusionPath(self, random, probing, shown)
 
 
 def default_sensing_period(plant: Diffusion, informations: list[FloatArray]) -> float:
     """The sensing period for which the errors' covariance is within 1e-3 of the exact one.
 
     ``informations`` are the matrices H' R^-1 H of the nodes that sense. The period is a fraction
-    of the fastest time constant of the plant, of a node's own filter and of the first transient,
-    rounded down to 1, 2 or 5 times a power of ten. It depends on nothing else, so that filters
-    and networks are compared on the same truth.
+    of the fastest time constant of the plant and of a node's own filter (a large first
+    covariance asks for nothing shorter, see algorithms/gains), rounded down to 1, 2 or 5 times a
+    power of ten. It depends on nothing else, so that filters and networks meet the same truth.
     """
-    fastest = 0.0
-    spread = square_root(plant.cov)
+    fastest = float(np.abs(np.linalg.eigvals(plant.A)).max())
     for G in informations:
         M = np.block([[-plant.A.T, G], [plant.Q, plant.A]])
         fastest = max(fastest, float(np.abs(np.linalg.eigvals(M)).max()))
-        start = float(np.linalg.eigvalsh(spread.T @ G @ spread)[-1])
-        fastest = max(fastest, 0.5 * start)
-    fastest = max(fastest, float(np.linalg.norm(plant.A, 2)))
     if fastest == 0.0:
         return 1.0
-    wanted = 0.25 / fastest
+    wanted = 0.5 / fastest
     power = 10.0 ** math.floor(math.log10(wanted))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= wanted * (1.0 + 1e-9))
     return float(f"{digit * power:.12g}")
@@ -95,12 +95,16 @@ class DiffusionPath:
     """The path of one run, produced step by step as time passes."""
 
     def __init__(
-        self, plant: Diffusion, random: np.random.Generator, probing: np.random.Generator
+        self,
+        plant: Diffusion,
+        random: np.random.Generator,
+        probing: np.random.Generator,
+        shown: FloatArray,
     ) -> None:
         assert plant.sensing_period is not None
         self.period = plant.sensing_period
         self._A, self._B, self._n = plant.A, plant.B, plant.n
-        self._random, self._probing = random, probing
+        self._random, self._probing, self._shown = random, probing, shown
         terms = 30
         powers = [np.eye(self._n)]
         for k in range(1, terms):
@@ -159,6 +163,10 @@ class DiffusionPath:
         start, end = self.grid(self._index), self.grid(self._index + 1)
         cubic = _cubic(self.period, noise[0], noise[1:])
         self._steps = [_Step(start, end, before.x_end, values[0], values[1:], cubic)]
+        first, last = np.searchsorted(self._shown, [start, end], side="right")
+        for time in self._shown[first:last].tolist():
+            if time < end:
+                self._split(self._steps.pop(), time)
 
     def _at(self, time: float) -> _Step:
         while self._steps[-1].end < time:
@@ -185,16 +193,13 @@ class DiffusionPath:
         return np.asarray(self.responses(gap)[1:] @ x + from_noise)
 
     def state(self, time: float) -> FloatArray:
-        """x(time), for a time not before the last one asked for."""
+        """x(time) on the sensing grid or at a time shown, not before the last one asked for."""
         step = self._at(time)
-        if time == step.end:
-            return step.x_end
-        if time == step.start:
-            return step.x_start
-        return self._split(step, time)
+        assert time == step.end, f"{time} is neither on the sensing grid nor among the times shown"
+        return step.x_end
 
-    def _split(self, step: _Step, time: float) -> FloatArray:
-        """Draw the path at ``time`` given the whole step, and go on with two steps."""
+    def _split(self, step: _Step, time: float) -> None:
+        """Draw the path at ``time`` given the whole step, and put two steps in its place."""
         n, length, left = self._n, step.end - step.start, time - step.start
         places = np.concatenate([_NODES * left, left + _NODES * (length - left)])
         weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])
@@ -225,12 +230,11 @@ class DiffusionPath:
         rest = self.responses(length - left) @ x
         later = np.concatenate([step.x_end[None], second]) - rest
         noise = noise.reshape(3, n)
-        self._steps = [
+        self._steps += [
             _Step(step.start, time, step.x_start, x, first, _cubic(left, noise[0], noise[1:])),
             _Step(time, step.end, x, step.x_end, second,
                   _cubic(length - left, later[0], later[1:])),
         ]
-        return np.asarray(x)
 
 
 def _factor(noise: FloatArray) -> FloatArray:

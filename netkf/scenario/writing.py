@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.fields import Part, SourceFile
+from netkf.network.graphs import RandomGraph
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Filtering, Scenario
 
@@ -20,9 +21,14 @@ def as_table(scenario: Scenario) -> dict[str, Any]:
 
 def resolved(scenario: Scenario) -> dict[str, Any]:
     """The tables of a file with every default written out; it gives the same runs."""
+    network = scenario.network
+    if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
+        graph = dataclasses.replace(network.graph, seed=scenario.seed)
+        network = dataclasses.replace(network, graph=graph)
     filled = dataclasses.replace(
         scenario,
         plant=scenario.truth,
+        network=network,
         filter=dataclasses.replace(
             scenario.filter,
             mean=scenario.truth.mean if scenario.filter.mean is None else scenario.filter.mean,

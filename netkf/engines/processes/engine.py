@@ -44,7 +44,9 @@ class ProcessesEngine(Engine):
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
         timeline = Timeline()
-        truth = scenario.truth.path(streams.generator("plant"), streams.generator("probe"))
+        truth = scenario.truth.path(
+            streams.generator("plant"), streams.generator("probe"), scenario.times
+        )
         hosts = make_hosts(scenario, streams, timeline, recorder, truth)
         processes: Processes = [_sampling(timeline, scenario, truth, hosts, recorder, progress)]
         processes += _sensing(timeline, scenario, truth, hosts, recorder)

@@ -78,6 +78,7 @@ class LinkProcess:
                 self._activate(now)
             if not times:
                 return
+            self._recorder.flush_if_full()
             index += len(times)
             count = min(2 * count, LONGEST_BLOCK)
 

@@ -1,0 +1,166 @@
+"""The command line: thin, it calls experiments and prints."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import netkf
+from netkf.core.errors import NetkfError, ScenarioError
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+BAD_USAGE, INTERRUPTED = 2, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0 done, 2 bad usage or file, 130 interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        status: int = options.command(options)
+    except NetkfError as error:
+        print(f"netkf: {error}", file=sys.stderr)
+        return BAD_USAGE
+    except KeyboardInterrupt:
+        print("netkf: interrupted; what was finished is kept", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    return status
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> Any:
+        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        raise SystemExit(BAD_USAGE)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="netkf", description="Simulate distributed Kalman filters on random "
+                     "networks and hold them against what theory promises.")
+    parser.add_argument("--version", action="version", version=f"netkf {netkf.__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+    run = _command(commands, "run", _run, "simulate a scenario once and keep what happened")
+    run.add_argument("--seed", type=_seed, help="root seed instead of the scenario's")
+    run.add_argument("--engine", default="auto", choices=["auto", "processes", "compiled"])
+    run.add_argument("--out", type=Path, help="directory for the run (default: runs/NAME-k)")
+    run.add_argument("--trace", default="full", choices=["full", "first", "none"],
+                     help="which runs leave tables of events and states")
+    run.add_argument("--no-plot", action="store_true", help="no picture")
+    theory = _command(commands, "theory", _theory, "what is promised; no simulation")
+    theory.add_argument("--json", action="store_true", help="one JSON document, nothing else")
+    return parser
+
+
+def _command(
+    commands: Any, name: str, command: Callable[[argparse.Namespace], int], words: str
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=words, description=words)
+    parser.add_argument("scenario", type=Path, help="scenario file (TOML)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY.PATH=VALUE",
+                        help="change a key of the scenario; VALUE as in TOML")
+    parser.set_defaults(command=command)
+    return parser
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a non-negative integer, got {text!r}")
+    return int(text)
+
+
+def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
+    """``key.path=value`` texts as a mapping; values are TOML, and bare words are strings."""
+    changes: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        key, text = key.strip(), text.strip()
+        if not equals or not key or not text:
+            raise ScenarioError("--set", "must be KEY.PATH=VALUE", setting, "write it that way")
+        try:
+            changes[key] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            if text[0] in "[{\"'":
+                raise ScenarioError("--set", f"value of {key} is not valid TOML", text,
+                                    "mend it; quote the argument for your shell") from None
+            changes[key] = text
+    return changes
+
+
+def _load(options: argparse.Namespace) -> Scenario:
+    from netkf.scenario.reading import load
+
+    scenario = load(options.scenario, parse_changes(options.set))
+    for note in scenario.topology.notes:
+        print(f"note: {note}", file=sys.stderr)
+    return scenario
+
+
+def _run(options: argparse.Namespace) -> int:
+    from netkf.experiments.run import run_to_directory
+    from netkf.experiments.tables import summary_table
+
+    scenario = _load(options)
+    if options.seed is not None:
+        scenario = scenario.replace({"seed": options.seed})
+    meter = _Meter(scenario.horizon)
+    finished = run_to_directory(scenario, options.out, options.engine, options.trace, meter)
+    meter.close()
+    print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
+    print()
+    print(summary_table(finished.summary))
+    rate = finished.events / max(finished.seconds, 1e-9)
+    print(f"events: {finished.events:,} in {finished.seconds:.2f} s, {rate:,.0f} per second")
+    if finished.status != "complete":
+        print(f"status: {finished.status}, a covariance overflowed before the horizon")
+    if not options.no_plot:
+        _picture(scenario, finished)
+    print(f"written to {finished.directory}")
+    return 0
+
+
+def _picture(scenario: Scenario, finished: Any) -> None:
+    try:
+        from netkf.experiments.plots import run_picture
+    except ImportError:
+        print('no picture: matplotlib is missing (pip install "netkf[plot]")')
+        return
+    run_picture(scenario, finished)
+
+
+class _Meter:
+    """Progress on a terminal, silence in a pipe."""
+
+    def __init__(self, horizon: float) -> None:
+        self._horizon, self._shown = horizon, -1
+        self._live = sys.stderr.isatty()
+
+    def __call__(self, time: float) -> None:
+        percent = int(100.0 * time / self._horizon)
+        if self._live and percent != self._shown:
+            self._shown = percent
+            print(f"\r{percent:3d} % of {self._horizon:g} simulated seconds", end="",
+                  file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        if self._shown >= 0:
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+
+def _theory(options: argparse.Namespace) -> int:
+    from netkf.experiments.promises import promises, promises_text
+
+    scenario = _load(options)
+    found = promises(scenario)
+    if options.json:
+        print(json.dumps(found, indent=2))
+    else:
+        print(promises_text(scenario, found))
+    return 0

@@ -1,0 +1,147 @@
+"""The picture of a run. The only module that knows matplotlib."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+import matplotlib as mpl
+import networkx
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from netkf.core.arrays import FloatArray
+from netkf.experiments.run import Finished
+from netkf.scenario.scenario import Scenario
+
+SENSING, RELAY, PROMISE, DARK = "#c1440e", "#3b6ea5", "#222222", "#555555"
+MOST_LINES = 60
+
+
+def run_picture(scenario: Scenario, finished: Finished) -> None:
+    """Write ``run.png``: errors and square roots of trace P over time against the bound and the
+    limits, and the network with its link activity."""
+    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(11.0, 6.4), layout="constrained")
+        FigureCanvasAgg(figure)
+        grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0])
+        _errors(figure.add_subplot(grid[0, 0]), scenario, finished)
+        _covariances(figure.add_subplot(grid[1, 0]), scenario, finished)
+        _network(figure, figure.add_subplot(grid[:, 1]), scenario, finished)
+        title = scenario.name if not scenario.claim else f"{scenario.name}: {scenario.claim}"
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+        path = finished.directory / "run.png"
+        part = path.with_name("run.png.part")
+        figure.savefig(part, dpi=130, format="png")
+        os.replace(part, path)
+
+
+def _lines(axes: Any, times: FloatArray, values: FloatArray, scenario: Scenario) -> None:
+    """A thin line a node, sensing nodes on top; at most MOST_LINES evenly chosen ones."""
+    sensing = np.array([node in scenario.placed for node in scenario.nodes])
+    for group, colour, order in ((~sensing, RELAY, 1), (sensing, SENSING, 2)):
+        places = np.flatnonzero(group)
+        if len(places) > MOST_LINES:
+            places = places[np.linspace(0, len(places) - 1, MOST_LINES).astype(int)]
+        segments = [np.column_stack([times, values[:, k]]) for k in places]
+        width = 1.1 if len(scenario.nodes) <= 12 else 0.5
+        axes.add_collection(LineCollection(segments, colors=colour, linewidths=width, alpha=0.6,
+                                           zorder=order))
+    axes.autoscale()
+
+
+def _scale(axes: Any, values: FloatArray) -> None:
+    """Logarithmic where the values span more than a factor of 100."""
+    positive = values[np.isfinite(values) & (values > 0.0)]
+    if positive.size and positive.max() > 100.0 * np.median(positive):
+        axes.set_yscale("log")
+        axes.set_ylim(positive.min() * 0.7, positive.max() * 1.5)
+    elif positive.size:
+        axes.set_ylim(0.0, positive.max() * 1.06)
+
+
+def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
+    times = np.array(finished.samples.times)
+    error = np.sqrt(np.array(finished.samples.sq_error))
+    _lines(axes, times, error, scenario)
+    axes.plot(times, np.sqrt((error**2).mean(axis=1)), color=PROMISE, lw=1.6,
+              label="root mean square of all nodes", zorder=3)
+    axes.plot([], [], color=SENSING, label="nodes with a sensor")
+    axes.plot([], [], color=RELAY, label="nodes without")
+    _scale(axes, error)
+    axes.set(ylabel="error |x - xhat|", xlabel="simulated seconds")
+    axes.legend(frameon=False, fontsize=8, loc="upper right")
+
+
+def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
+    times, promised = np.array(finished.samples.times), finished.promised
+    root = np.sqrt(np.maximum(np.array(finished.samples.trace), 0.0))
+    _lines(axes, times, root, scenario)
+    if promised.bound is not None:
+        bound = np.sqrt(promised.bound)
+        axes.plot(times, bound.max(axis=1), color=PROMISE, ls="--", lw=1.3,
+                  label="bound on E[P], H(12): largest", zorder=3)
+        axes.plot(times, bound.min(axis=1), color=PROMISE, ls=":", lw=1.3,
+                  label="and smallest over nodes", zorder=3)
+    for value, words, style in (
+        (promised.limit, "its limit S, H(13)", "-."),
+        (promised.central, "centralised filter", "-"),
+    ):
+        if math.isfinite(value):
+            axes.axhline(math.sqrt(value), color="#2e8b57", ls=style, lw=1.1, label=words)
+    shown = root if promised.bound is None else np.concatenate([root, np.sqrt(promised.bound)])
+    _scale(axes, shown)
+    axes.set(ylabel="square root of trace P", xlabel="simulated seconds")
+    axes.legend(frameon=False, fontsize=8, loc="best", ncols=2)
+
+
+def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) -> None:
+    topology = scenario.topology
+    places = topology.positions or _layout(scenario)
+    ticks = finished.samples.ticks
+    counts = np.array([ticks.get(link, 0) for link in topology.links], dtype=float)
+    if len(counts):
+        share = counts / max(float(counts.max()), 1.0)
+        axes.add_collection(LineCollection(
+            [(places[i], places[j]) for i, j in topology.links],
+            linewidths=0.3 + 2.2 * share, colors=DARK, alpha=0.45, zorder=1))
+    rms = {row["node"]: row["rms_error"] for row in finished.summary["nodes"]}
+    for sensing, marker, words in ((False, "o", "relays"), (True, "s", "has a sensor")):
+        nodes = [n for n in scenario.nodes if (n in scenario.placed) == sensing]
+        if not nodes:
+            continue
+        xy = np.array([places[n] for n in nodes])
+        values = [rms[n] for n in scenario.nodes if math.isfinite(rms[n])] or [0.0, 1.0]
+        dots = axes.scatter(xy[:, 0], xy[:, 1], c=[rms[n] for n in nodes], marker=marker,
+                            cmap="viridis_r", vmin=min(values), vmax=max(values),
+                            s=max(12.0, min(90.0, 4000.0 / len(scenario.nodes))),
+                            edgecolors=PROMISE, linewidths=0.5, zorder=2, label=words)
+    if len(scenario.nodes) <= 60:
+        for node in scenario.nodes:
+            axes.annotate(str(node), places[node], xytext=(4, 4), textcoords="offset points",
+                          fontsize=7, color=DARK, zorder=3)
+    axes.set_aspect("equal")
+    axes.margins(0.08)
+    axes.axis("off")
+    axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))
+    total = finished.summary["messages"]
+    axes.set_title(f"links as wide as they ticked; {total['sent']:,} messages, "
+                   f"{total['lost']:,} lost", fontsize=9)
+    figure.colorbar(dots, ax=axes, shrink=0.5, label="RMS error", pad=0.01)
+
+
+def _layout(scenario: Scenario) -> dict[int, tuple[float, float]]:
+    topology = scenario.topology
+    graph: networkx.Graph[int] = networkx.Graph(topology.links)
+    graph.add_nodes_from(topology.nodes)
+    degrees = set(topology.degrees.values())
+    if len(topology.nodes) <= 30 and degrees <= {0, 2}:
+        placed = networkx.circular_layout(sorted(graph))
+    elif len(topology.nodes) <= 150:
+        placed = networkx.kamada_kawai_layout(graph)
+    else:
+        placed = networkx.spring_layout(graph, seed=0, iterations=30)
+    return {node: (float(x), float(y)) for node, (x, y) in placed.items()}

@@ -1,0 +1,75 @@
+"""Tables for a terminal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+MOST_NODES = 30
+
+
+def number(value: float | None) -> str:
+    """Four significant digits; a dash where there is no number."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:.4g}"
+
+
+def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
+    """Aligned columns, the first ``left`` to the left and the others to the right."""
+    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
+    lines = [
+        "  ".join(
+            cell.ljust(w) if k < left else cell.rjust(w)
+            for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in [header, *rows]
+    ]
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+
+
+def summary_table(summary: dict[str, Any]) -> str:
+    """The table that ends a run: nodes (the worst and the best where there are many), all of them
+    together, and the messages."""
+    nodes = sorted(summary["nodes"], key=lambda row: row["node"])
+    shown, left_out = nodes, 0
+    if len(nodes) > MOST_NODES:
+        ranked = sorted(nodes, key=lambda row: -_key(row["rms_error"]))
+        half = MOST_NODES // 2
+        chosen = {row["node"] for row in (*ranked[:half], *ranked[-half:])}
+        shown = [row for row in nodes if row["node"] in chosen]
+        left_out = len(nodes) - len(shown)
+    rows = [_cells(str(row["node"]), row) for row in shown]
+    if left_out:
+        rows.append([f"({left_out} more)", *[""] * 5])
+    rows.append(_cells("all", summary["overall"]))
+    header = ["node", "RMS error", "mean trace P", "bound", "ratio", "NEES"]
+    sent = summary["messages"]
+    lines = [table(header, rows), ""]
+    if left_out:
+        lines.insert(1, f"the {MOST_NODES // 2} nodes with the largest and the "
+                        f"{MOST_NODES // 2} with the smallest RMS error; all are in summary.json")
+    if all(row["bound"] is None for row in nodes):
+        lines.append(f"bound: {summary['bound']}")
+    references = [
+        f"{words} {number(value)}"
+        for words, value in (("limit S of H(13)", summary["limit"]),
+                             ("centralised filter", summary["central"]))
+        if value is not None and math.isfinite(value)
+    ]
+    if references:
+        lines.append("traces to compare: " + ", ".join(references))
+    lines.append(
+        f"messages: {sent['sent']:,} sent, {sent['delivered']:,} delivered, {sent['lost']:,} lost"
+        + (f", {sent['in_flight']:,} on their way at the end" if sent["in_flight"] else "")
+    )
+    return "\n".join(lines)
+
+
+def _key(value: float | None) -> float:
+    return math.inf if value is None or not math.isfinite(value) else value
+
+
+def _cells(name: str, row: dict[str, Any]) -> list[str]:
+    keys = ("rms_error", "mean_trace", "bound", "ratio", "mean_nees")
+    return [name, *(number(row[key]) for key in keys)]
