@@ -20,7 +20,7 @@ BAD_USAGE, INTERRUPTED = 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0 done, 2 bad usage or file, 130 interrupted."""
+    """Run the command line; the exit status is 0 done, 2 bad usage or file, 130 interrupted."""
     options = _parser().parse_args(arguments)
     try:
         status: int = options.command(options)
@@ -43,16 +43,23 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="netkf", description="Simulate distributed Kalman filters on random "
-                     "networks and hold them against what theory promises.")
+    parser = _Parser(
+        prog="netkf",
+        description="Simulate distributed Kalman filters on random "
+        "networks and hold them against what theory promises.",
+    )
     parser.add_argument("--version", action="version", version=f"netkf {netkf.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
     run = _command(commands, "run", _run, "simulate a scenario once and keep what happened")
     run.add_argument("--seed", type=_seed, help="root seed instead of the scenario's")
     run.add_argument("--engine", default="auto", choices=["auto", "processes", "compiled"])
     run.add_argument("--out", type=Path, help="directory for the run (default: runs/NAME-k)")
-    run.add_argument("--trace", default="full", choices=["full", "first", "none"],
-                     help="which runs leave tables of events and states")
+    run.add_argument(
+        "--trace",
+        default="full",
+        choices=["full", "first", "none"],
+        help="which runs leave tables of events and states",
+    )
     run.add_argument("--no-plot", action="store_true", help="no picture")
     theory = _command(commands, "theory", _theory, "what is promised; no simulation")
     theory.add_argument("--json", action="store_true", help="one JSON document, nothing else")
@@ -64,8 +71,13 @@ def _command(
 ) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(name, help=words, description=words)
     parser.add_argument("scenario", type=Path, help="scenario file (TOML)")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY.PATH=VALUE",
-                        help="change a key of the scenario; VALUE as in TOML")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY.PATH=VALUE",
+        help="change a key of the scenario; VALUE as in TOML",
+    )
     parser.set_defaults(command=command)
     return parser
 
@@ -88,8 +100,12 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
             changes[key] = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             if text[0] in "[{\"'":
-                raise ScenarioError("--set", f"value of {key} is not valid TOML", text,
-                                    "mend it; quote the argument for your shell") from None
+                raise ScenarioError(
+                    "--set",
+                    f"value of {key} is not valid TOML",
+                    text,
+                    "mend it; quote the argument for your shell",
+                ) from None
             changes[key] = text
     return changes
 
@@ -146,8 +162,12 @@ class _Meter:
         percent = int(100.0 * time / self._horizon)
         if self._live and percent != self._shown:
             self._shown = percent
-            print(f"\r{percent:3d} % of {self._horizon:g} simulated seconds", end="",
-                  file=sys.stderr, flush=True)
+            print(
+                f"\r{percent:3d} % of {self._horizon:g} simulated seconds",
+                end="",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def close(self) -> None:
         if self._shown >= 0:

@@ -1,0 +1,1 @@
+"""Node algorithms: pure numerics. No time source, no randomness, no network, no SimPy."""

@@ -101,15 +101,14 @@ class FlowFilter(Part):
 
     def flow(self, state: Any, gap: float) -> Any:
         """The state ``gap`` > 0 seconds later; its covariance counts the readings of the gap
-        already, its estimate does not yet."""
+        already, its estimate does not yet.
+        """
         P, xhat = riccati_step(state.model.riccati, state.P, state.xhat, gap)
         return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
         """The state once the readings of the gap that just passed are used."""
-        xhat = gain_update(
-            state.model.gains, state.P, state.xhat, reading.moments, reading.gap
-        )
+        xhat = gain_update(state.model.gains, state.P, state.xhat, reading.moments, reading.gap)
         return state._replace(xhat=xhat)
 
     def emit(self, state: Any) -> Any:
@@ -119,7 +118,8 @@ class FlowFilter(Part):
     @abstractmethod
     def absorb(self, state: Any, messages: Sequence[tuple[float, Any, float]]) -> Any:
         """The state after all ``(weight, payload, age)`` that arrived at this instant, at most
-        one from each neighbour, are used together. Payloads are left as they are."""
+        one from each neighbour, are used together. Payloads are left as they are.
+        """
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:
         """``xhat`` (n,) and ``P`` (n, n) of the node now."""

@@ -35,7 +35,8 @@ def gain_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> GainTable:
     """Tabulate the gains for intervals up to ``longest`` seconds; raises ValueError above
-    :func:`longest_interval`."""
+    :func:`longest_interval`.
+    """
     n, p = len(A), len(H)
     HR = np.linalg.solve(R, H).T
     M, scale = hamiltonian(A, Q, HR @ H)

@@ -26,9 +26,9 @@ class Hybrid(FlowFilter):
         own = 1.0 - sum(weight for weight, _, _ in messages)
         xhat, P = own * state.xhat, own * state.P
         for weight, payload, age in messages:
-            payload = predict(state.model, payload, age)
-            xhat = xhat + weight * payload.xhat
-            P = P + weight * payload.P
+            arrived = predict(state.model, payload, age)
+            xhat = xhat + weight * arrived.xhat
+            P = P + weight * arrived.P
         return state._replace(xhat=xhat, P=P)
 
     def weight(self, degree: int, peer_degree: int) -> float:

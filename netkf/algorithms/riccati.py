@@ -130,5 +130,5 @@ def riccati_step(
     E, transition = evaluate_hamiltonian(table, rest)
     X = E[:n, :n] + E[:n, n:] @ P
     Y = E[n:, :n] + E[n:, n:] @ P
-    P = np.linalg.solve(X.T, Y.T)
-    return 0.5 * (P + P.T), transition @ x
+    moved = np.linalg.solve(X.T, Y.T)
+    return np.asarray(0.5 * (moved + moved.T)), transition @ x

@@ -1,0 +1,1 @@
+"""Shared words: types, errors, settings, random streams, small matrix helpers."""

@@ -33,22 +33,25 @@ class Rule:
     remedy: str = ""
 
     def __call__(self, key: str, value: object) -> Any:
+        """The value to keep; raises ScenarioError at ``key``."""
         try:
             return self.convert(value)
         except ScenarioError as error:
             raise error.under(key) from None
         except (TypeError, ValueError, OverflowError) as error:
-            words = str(error) if isinstance(error, _Because) else self.words
+            words = str(error) if isinstance(error, _BecauseError) else self.words
             raise ScenarioError(key, words, value, self.remedy) from None
 
 
-class _Because(ValueError):
+class _BecauseError(ValueError):
     """A ValueError whose message is meant for the user."""
 
 
 def setting(rule: Rule, default: Any = MISSING) -> Any:
     """A dataclass field whose values obey ``rule``; ``None`` as a default may stay None."""
-    return dataclasses.field(default=default, metadata={"rule": rule}, kw_only=default is not MISSING)
+    return dataclasses.field(
+        default=default, metadata={"rule": rule}, kw_only=default is not MISSING
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +155,7 @@ text = Rule("must be a string that is not empty", _is(str), 'write it as "text"'
 def instance(kind: type) -> Rule:
     """An object of a class (a part of a scenario)."""
     return Rule(
-        f"must be a {kind.__name__.lower()}", _is(kind), f'write a table {{ kind = "...", ... }}'
+        f"must be a {kind.__name__.lower()}", _is(kind), 'write a table { kind = "...", ... }'
     )
 
 
@@ -189,9 +192,9 @@ def array(dimensions: int, kind: str) -> Rule:
             raise TypeError
         result = frozen(value)
         if result.ndim != dimensions or result.size == 0:
-            raise _Because(f"must be a {kind}")
+            raise _BecauseError(f"must be a {kind}")
         if not np.isfinite(result).all():
-            raise _Because(f"must be a {kind} of finite numbers")
+            raise _BecauseError(f"must be a {kind} of finite numbers")
         return result
 
     remedy = "write rows of equal length, [[a, b], [c, d]]" if dimensions == 2 else "write [a, b]"
@@ -211,7 +214,7 @@ matrix = array(2, "matrix")
 def _square(value: Any) -> FloatArray:
     result = matrix.convert(value)
     if result.shape[0] != result.shape[1]:
-        raise _Because(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
+        raise _BecauseError(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
     return np.asarray(result)
 
 
@@ -221,7 +224,7 @@ square = Rule("must be a square matrix of finite numbers", _square, matrix.remed
 def _symmetric(value: Any) -> FloatArray:
     result = _square(value)
     if not np.allclose(result, result.T, rtol=1e-9, atol=1e-12 * np.abs(result).max()):
-        raise _Because("must be a symmetric matrix")
+        raise _BecauseError("must be a symmetric matrix")
     return result
 
 
@@ -229,7 +232,7 @@ def _covariance(value: Any) -> FloatArray:
     result = _symmetric(value)
     if not is_semidefinite(result):
         least = np.linalg.eigvalsh(result)[0]
-        raise _Because(f"must be positive semidefinite (least eigenvalue {least:.3g})")
+        raise _BecauseError(f"must be positive semidefinite (least eigenvalue {least:.3g})")
     return result
 
 
@@ -237,12 +240,14 @@ def _definite(value: Any) -> FloatArray:
     result = _symmetric(value)
     values = np.linalg.eigvalsh(result)
     if not values[0] > 1e-14 * abs(values[-1]):
-        raise _Because(f"must be positive definite (least eigenvalue {values[0]:.3g})")
+        raise _BecauseError(f"must be positive definite (least eigenvalue {values[0]:.3g})")
     return result
 
 
 covariance = Rule(
-    "must be a covariance matrix", _covariance, "give a symmetric matrix without negative eigenvalues"
+    "must be a covariance matrix",
+    _covariance,
+    "give a symmetric matrix without negative eigenvalues",
 )
 definite_covariance = Rule(
     "must be a positive definite covariance matrix",
@@ -270,7 +275,9 @@ def row(*rules: Rule, what: str) -> Rule:
     def convert(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (list, tuple, np.ndarray)) or len(value) != len(rules):
             raise TypeError
-        return tuple(rule(f"[{k}]", v) for k, (rule, v) in enumerate(zip(rules, value, strict=True)))
+        return tuple(
+            rule(f"[{k}]", v) for k, (rule, v) in enumerate(zip(rules, value, strict=True))
+        )
 
     return Rule(f"must be {what}", convert, f"write {what}")
 
@@ -299,9 +306,9 @@ def _source(value: Any) -> SourceFile:
         raise TypeError
     folder = source.folder.resolve()
     if Path(source.name).is_absolute() or not source.full.resolve().is_relative_to(folder):
-        raise _Because("must stay inside the folder of the scenario file")
+        raise _BecauseError("must stay inside the folder of the scenario file")
     if not source.full.is_file():
-        raise _Because(f"no such file in {source.folder}")
+        raise _BecauseError(f"no such file in {source.folder}")
     return source
 
 

@@ -22,4 +22,4 @@ def forward_coefficients(terms: int) -> FloatArray:
 
 def backward_coefficients(terms: int) -> FloatArray:
     """(2, terms): ``int_0^1 u^k P_j(1 - 2 u) du``, for ``exp(-M (b - s))`` integrated from b."""
-    return forward_coefficients(terms) * np.array([[1.0], [-1.0]])
+    return np.asarray(forward_coefficients(terms) * np.array([[1.0], [-1.0]]))

@@ -54,7 +54,9 @@ def _numbers(
             value = math.nan
         if not math.isfinite(value):
             raise ScenarioError(
-                "path", f"{where}: {header[place]} must be a finite number", entries[place],
+                "path",
+                f"{where}: {header[place]} must be a finite number",
+                entries[place],
                 "mend the row",
             )
         numbers.append(value)
@@ -66,7 +68,9 @@ def whole(source: SourceFile, name: str, column: FloatArray) -> list[int]:
     wrong = np.flatnonzero(column != np.round(column))
     if wrong.size:
         raise ScenarioError(
-            "path", f"{source.name}: {name} must hold integers", float(column[wrong[0]]),
+            "path",
+            f"{source.name}: {name} must hold integers",
+            float(column[wrong[0]]),
             "mend the row",
         )
     return [int(value) for value in column]

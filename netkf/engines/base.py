@@ -36,6 +36,10 @@ Progress = Callable[[float], None]
 """Called with the simulated time now and then."""
 
 
+def silent(time: float) -> None:
+    """No progress."""
+
+
 class Engine(ABC):
     """Runs scenarios."""
 

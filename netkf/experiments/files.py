@@ -53,8 +53,12 @@ def new_directory(wanted: Path | None, name: str) -> Path:
     """Where a run goes: ``wanted``, which must be new or empty, or the first free runs/NAME-k."""
     if wanted is not None:
         if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
-            raise ScenarioError("--out", "must be a new or empty directory", str(wanted),
-                                "choose another, or remove it first")
+            raise ScenarioError(
+                "--out",
+                "must be a new or empty directory",
+                str(wanted),
+                "choose another, or remove it first",
+            )
         return wanted
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip(".") or "run"
     return next(

@@ -23,7 +23,8 @@ MOST_LINES = 60
 
 def run_picture(scenario: Scenario, finished: Finished) -> None:
     """Write ``run.png``: errors and square roots of trace P over time against the bound and the
-    limits, and the network with its link activity."""
+    limits, and the network with its link activity.
+    """
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(11.0, 6.4), layout="constrained")
         FigureCanvasAgg(figure)
@@ -48,8 +49,9 @@ def _lines(axes: Any, times: FloatArray, values: FloatArray, scenario: Scenario)
             places = places[np.linspace(0, len(places) - 1, MOST_LINES).astype(int)]
         segments = [np.column_stack([times, values[:, k]]) for k in places]
         width = 1.1 if len(scenario.nodes) <= 12 else 0.5
-        axes.add_collection(LineCollection(segments, colors=colour, linewidths=width, alpha=0.6,
-                                           zorder=order))
+        axes.add_collection(
+            LineCollection(segments, colors=colour, linewidths=width, alpha=0.6, zorder=order)
+        )
     axes.autoscale()
 
 
@@ -67,8 +69,14 @@ def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
     times = np.array(finished.samples.times)
     error = np.sqrt(np.array(finished.samples.sq_error))
     _lines(axes, times, error, scenario)
-    axes.plot(times, np.sqrt((error**2).mean(axis=1)), color=PROMISE, lw=1.6,
-              label="root mean square of all nodes", zorder=3)
+    axes.plot(
+        times,
+        np.sqrt((error**2).mean(axis=1)),
+        color=PROMISE,
+        lw=1.6,
+        label="root mean square of all nodes",
+        zorder=3,
+    )
     axes.plot([], [], color=SENSING, label="nodes with a sensor")
     axes.plot([], [], color=RELAY, label="nodes without")
     _scale(axes, error)
@@ -82,10 +90,24 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
     _lines(axes, times, root, scenario)
     if promised.bound is not None:
         bound = np.sqrt(promised.bound)
-        axes.plot(times, bound.max(axis=1), color=PROMISE, ls="--", lw=1.3,
-                  label="bound on E[P], H(12): largest", zorder=3)
-        axes.plot(times, bound.min(axis=1), color=PROMISE, ls=":", lw=1.3,
-                  label="and smallest over nodes", zorder=3)
+        axes.plot(
+            times,
+            bound.max(axis=1),
+            color=PROMISE,
+            ls="--",
+            lw=1.3,
+            label="bound on E[P], H(12): largest",
+            zorder=3,
+        )
+        axes.plot(
+            times,
+            bound.min(axis=1),
+            color=PROMISE,
+            ls=":",
+            lw=1.3,
+            label="and smallest over nodes",
+            zorder=3,
+        )
     for value, words, style in (
         (promised.limit, "its limit S, H(13)", "-."),
         (promised.central, "centralised filter", "-"),
@@ -105,9 +127,15 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
     counts = np.array([ticks.get(link, 0) for link in topology.links], dtype=float)
     if len(counts):
         share = counts / max(float(counts.max()), 1.0)
-        axes.add_collection(LineCollection(
-            [(places[i], places[j]) for i, j in topology.links],
-            linewidths=0.3 + 2.2 * share, colors=DARK, alpha=0.45, zorder=1))
+        axes.add_collection(
+            LineCollection(
+                [(places[i], places[j]) for i, j in topology.links],
+                linewidths=0.3 + 2.2 * share,
+                colors=DARK,
+                alpha=0.45,
+                zorder=1,
+            )
+        )
     rms = {row["node"]: row["rms_error"] for row in finished.summary["nodes"]}
     for sensing, marker, words in ((False, "o", "relays"), (True, "s", "has a sensor")):
         nodes = [n for n in scenario.nodes if (n in scenario.placed) == sensing]
@@ -115,21 +143,40 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
             continue
         xy = np.array([places[n] for n in nodes])
         values = [rms[n] for n in scenario.nodes if math.isfinite(rms[n])] or [0.0, 1.0]
-        dots = axes.scatter(xy[:, 0], xy[:, 1], c=[rms[n] for n in nodes], marker=marker,
-                            cmap="viridis_r", vmin=min(values), vmax=max(values),
-                            s=max(12.0, min(90.0, 4000.0 / len(scenario.nodes))),
-                            edgecolors=PROMISE, linewidths=0.5, zorder=2, label=words)
+        dots = axes.scatter(
+            xy[:, 0],
+            xy[:, 1],
+            c=[rms[n] for n in nodes],
+            marker=marker,
+            cmap="viridis_r",
+            vmin=min(values),
+            vmax=max(values),
+            s=max(12.0, min(90.0, 4000.0 / len(scenario.nodes))),
+            edgecolors=PROMISE,
+            linewidths=0.5,
+            zorder=2,
+            label=words,
+        )
     if len(scenario.nodes) <= 60:
         for node in scenario.nodes:
-            axes.annotate(str(node), places[node], xytext=(4, 4), textcoords="offset points",
-                          fontsize=7, color=DARK, zorder=3)
+            axes.annotate(
+                str(node),
+                places[node],
+                xytext=(4, 4),
+                textcoords="offset points",
+                fontsize=7,
+                color=DARK,
+                zorder=3,
+            )
     axes.set_aspect("equal")
     axes.margins(0.08)
     axes.axis("off")
     axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))
     total = finished.summary["messages"]
-    axes.set_title(f"links as wide as they ticked; {total['sent']:,} messages, "
-                   f"{total['lost']:,} lost", fontsize=9)
+    axes.set_title(
+        f"links as wide as they ticked; {total['sent']:,} messages, {total['lost']:,} lost",
+        fontsize=9,
+    )
     figure.colorbar(dots, ax=axes, shrink=0.5, label="RMS error", pad=0.01)
 
 
@@ -139,7 +186,7 @@ def _layout(scenario: Scenario) -> dict[int, tuple[float, float]]:
     graph.add_nodes_from(topology.nodes)
     degrees = set(topology.degrees.values())
     if len(topology.nodes) <= 30 and degrees <= {0, 2}:
-        placed = networkx.circular_layout(sorted(graph))
+        placed: dict[int, Any] = networkx.circular_layout(graph)
     elif len(topology.nodes) <= 150:
         placed = networkx.kamada_kawai_layout(graph)
     else:

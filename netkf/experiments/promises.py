@@ -24,15 +24,19 @@ from netkf.theory import (
 
 LIMITS: tuple[tuple[str, str, Callable[[Scenario], FloatArray]], ...] = (
     ("limit_covariance", "limit of the bound as links tick ever faster, H(13)", limit_covariance),
-    ("true_limit_covariance", "limit of the true error covariance (derived)",
-     true_limit_covariance),
+    (
+        "true_limit_covariance",
+        "limit of the true error covariance (derived)",
+        true_limit_covariance,
+    ),
     ("central_covariance", "centralised filter with all readings", central_covariance),
 )
 
 
 def promises(scenario: Scenario) -> dict[str, Any]:
     """Assumptions, bound at the horizon and in the steady state, limits; a text says why where a
-    number does not exist. Plain JSON values."""
+    number does not exist. Plain JSON values.
+    """
     rows = assumptions(scenario)
     ends = np.array([scenario.horizon])
     found: dict[str, Any] = {
@@ -63,19 +67,24 @@ def _value(function: Callable[[], FloatArray]) -> dict[str, Any]:
 
 def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
     """The same for a terminal."""
-    lines = [f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name, "",
-             "assumptions"]
+    lines = [
+        f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name,
+        "",
+        "assumptions",
+    ]
     for row in found["assumptions"]:
         mark = "holds" if row["holds"] else "FAILS"
         lines.append(f"  {mark}  {row['assumption']}  [{row['source']}]")
-        lines += textwrap.wrap(row["evidence"], 92, initial_indent=" " * 9,
-                               subsequent_indent=" " * 9)
+        lines += textwrap.wrap(
+            row["evidence"], 92, initial_indent=" " * 9, subsequent_indent=" " * 9
+        )
     lines += ["", "trace of the bound on E[P_i]"]
     columns = [found["bound_at_horizon"], found["steady_bound"]]
     for words, column in zip((f"at {scenario.horizon:g} s", "steady state"), columns, strict=True):
         if column["reason"]:
-            lines += textwrap.wrap(f"{words}: {column['reason']}", 98, initial_indent="  ",
-                                   subsequent_indent="    ")
+            lines += textwrap.wrap(
+                f"{words}: {column['reason']}", 98, initial_indent="  ", subsequent_indent="    "
+            )
     if any(column["trace"] for column in columns):
         lines.append(textwrap.indent(_by_node(scenario, columns), "  "))
     lines += ["", "traces to compare"]

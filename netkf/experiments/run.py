@@ -12,7 +12,7 @@ import numpy as np
 
 import netkf
 from netkf.core.streams import Streams
-from netkf.engines.base import Progress
+from netkf.engines.base import Progress, silent
 from netkf.experiments.files import ParquetSink, new_directory, write_json, write_scenario
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, SummarySink, promise, summarise
@@ -38,7 +38,7 @@ def run_to_directory(
     out: Path | None = None,
     engine: str = "auto",
     trace: str = "full",
-    progress: Progress = lambda time: None,
+    progress: Progress = silent,
 ) -> Finished:
     """Run once and write scenario.toml, manifest.json, the Parquet tables and summary.json.
 
@@ -54,8 +54,11 @@ def run_to_directory(
     recorder = Recorder([samples, tables])
     manifest = {
         "name": scenario.name,
-        "versions": {"netkf": netkf.__version__, "numpy": np.__version__,
-                     "python": platform.python_version()},
+        "versions": {
+            "netkf": netkf.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
         "seed": scenario.seed,
         "runs": {"wanted": 1, "done": 0},
         "engine": chosen.name,
@@ -67,12 +70,18 @@ def run_to_directory(
         seconds = time.perf_counter() - began
         tables.close()
         manifest["runs"] = {"wanted": 1, "done": int(status == "complete")}
-        manifest |= {"status": status, "events": recorder.total,
-                     "fingerprint": recorder.fingerprint}
+        manifest |= {
+            "status": status,
+            "events": recorder.total,
+            "fingerprint": recorder.fingerprint,
+        }
         write_json(directory / "manifest.json", manifest)
     promised = promise(scenario, np.array(samples.times))
-    messages = {"sent": recorder.count("send"), "delivered": recorder.count("deliver"),
-                "lost": recorder.count("lost")}
+    messages = {
+        "sent": recorder.count("send"),
+        "delivered": recorder.count("deliver"),
+        "lost": recorder.count("lost"),
+    }
     summary = summarise(scenario, samples, promised, messages)
     write_json(directory / "summary.json", summary)
     return Finished(directory, status, summary, samples, promised, recorder.total, seconds)

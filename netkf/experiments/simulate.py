@@ -10,7 +10,7 @@ import numpy as np
 from netkf.core.errors import EngineError
 from netkf.core.fields import integer
 from netkf.core.streams import Streams
-from netkf.engines.base import Engine, Progress
+from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.processes.engine import ProcessesEngine
 from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
@@ -44,7 +44,7 @@ def simulate(
     replica: int = 0,
     engine: str | Engine = "auto",
     sinks: Sequence[Sink] = (),
-    progress: Progress = lambda time: None,
+    progress: Progress = silent,
 ) -> Run:
     """Run a scenario once and keep all of it in memory.
 

@@ -19,7 +19,8 @@ from netkf.trace.schema import CODES
 
 class SummarySink(Sink):
     """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES; and
-    how often each link ticked."""
+    how often each link ticked.
+    """
 
     def __init__(self) -> None:
         self.times: list[float] = []
@@ -68,8 +69,12 @@ def promise(scenario: Scenario, times: FloatArray) -> Promise:
             bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
     except TheoryError as error:
         words = str(error)
-    return Promise(bound, _trace(limit_covariance, scenario), _trace(central_covariance, scenario),
-                   words or not_promised(scenario) or "")
+    return Promise(
+        bound,
+        _trace(limit_covariance, scenario),
+        _trace(central_covariance, scenario),
+        words or not_promised(scenario) or "",
+    )
 
 
 def _trace(function: Any, scenario: Scenario) -> float:
@@ -83,7 +88,8 @@ def summarise(
     scenario: Scenario, sink: SummarySink, promised: Promise, messages: dict[str, int]
 ) -> dict[str, Any]:
     """Per node and overall: time-averaged RMS error, mean trace of P, bound and their ratio, mean
-    NEES over the samples after time 0; messages sent, delivered, lost and still on their way."""
+    NEES over the samples after time 0; messages sent, delivered, lost and still on their way.
+    """
     times = np.array(sink.times)
     used = times > 0.0 if (times > 0.0).any() else times >= 0.0
     with np.errstate(all="ignore"):
@@ -96,7 +102,10 @@ def summarise(
             for k, node in enumerate(scenario.nodes)
         ]
         overall = _row(
-            -1, mean_square.mean(), trace.mean(), None if bound is None else bound.mean(),
+            -1,
+            mean_square.mean(),
+            trace.mean(),
+            None if bound is None else bound.mean(),
             nees.mean(),
         )
     del overall["node"]
@@ -106,8 +115,10 @@ def summarise(
         "limit": promised.limit,
         "central": promised.central,
         "bound": promised.words or "H(12), promised by H Theorem 2",
-        "messages": {**messages, "in_flight": messages["sent"] - messages["delivered"]
-                     - messages["lost"]},
+        "messages": {
+            **messages,
+            "in_flight": messages["sent"] - messages["delivered"] - messages["lost"],
+        },
     }
 
 

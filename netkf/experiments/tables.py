@@ -30,7 +30,8 @@ def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
 
 def summary_table(summary: dict[str, Any]) -> str:
     """The table that ends a run: nodes (the worst and the best where there are many), all of them
-    together, and the messages."""
+    together, and the messages.
+    """
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     shown, left_out = nodes, 0
     if len(nodes) > MOST_NODES:
@@ -47,14 +48,19 @@ def summary_table(summary: dict[str, Any]) -> str:
     sent = summary["messages"]
     lines = [table(header, rows), ""]
     if left_out:
-        lines.insert(1, f"the {MOST_NODES // 2} nodes with the largest and the "
-                        f"{MOST_NODES // 2} with the smallest RMS error; all are in summary.json")
+        lines.insert(
+            1,
+            f"the {MOST_NODES // 2} nodes with the largest and the "
+            f"{MOST_NODES // 2} with the smallest RMS error; all are in summary.json",
+        )
     if all(row["bound"] is None for row in nodes):
         lines.append(f"bound: {summary['bound']}")
     references = [
         f"{words} {number(value)}"
-        for words, value in (("limit S of H(13)", summary["limit"]),
-                             ("centralised filter", summary["central"]))
+        for words, value in (
+            ("limit S of H(13)", summary["limit"]),
+            ("centralised filter", summary["central"]),
+        )
         if value is not None and math.isfinite(value)
     ]
     if references:

@@ -1,0 +1,1 @@
+"""Topology, clocks and channels: who talks when, and what becomes of a message."""

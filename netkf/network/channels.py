@@ -37,7 +37,8 @@ class Loss(Part):
     @abstractmethod
     def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
         """Probability that message number ``message`` from link[0] reaches link[1];
-        ``measured`` is what the graph's table says of that direction (1 where it says nothing)."""
+        ``measured`` is what the graph's table says of that direction (1 where it says nothing).
+        """
 
     def weather(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Whether the link is in its bad state at the next activation (None: at the first)."""
@@ -98,7 +99,9 @@ class PerLink(Loss):
         """The graph has probabilities."""
         if topology.delivery is None:
             raise ScenarioError(
-                "kind", "per-link needs a graph with delivery probabilities", "per-link",
+                "kind",
+                "per-link needs a graph with delivery probabilities",
+                "per-link",
                 'use graph = { kind = "csv" } with a column delivery_probability',
             )
 
@@ -126,23 +129,33 @@ class GilbertElliott(Loss):
             extra = {**chain, "deliver_good": self.deliver_good, "deliver_bad": self.deliver_bad}
             for name, value in extra.items():
                 if value is not None:
-                    raise ScenarioError(name, "cannot stand beside mean_loss and mean_burst",
-                                        value, "keep one of the two forms")
+                    raise ScenarioError(
+                        name,
+                        "cannot stand beside mean_loss and mean_burst",
+                        value,
+                        "keep one of the two forms",
+                    )
             chain = means
         for name, value in chain.items():
             if value is None:
-                raise ScenarioError(name, "is missing", None,
-                                    "give to_bad and to_good, or mean_loss and mean_burst")
+                raise ScenarioError(
+                    name, "is missing", None, "give to_bad and to_good, or mean_loss and mean_burst"
+                )
         if self._steps[0] > 1.0:
-            raise ScenarioError("mean_burst", "is too short for that mean_loss", self.mean_burst,
-                                "lengthen the bursts or lower the loss")
+            raise ScenarioError(
+                "mean_burst",
+                "is too short for that mean_loss",
+                self.mean_burst,
+                "lengthen the bursts or lower the loss",
+            )
 
     @property
     def _steps(self) -> tuple[float, float]:
         if self.mean_loss is not None and self.mean_burst is not None:
             to_good = 1.0 / self.mean_burst
             return to_good * self.mean_loss / (1.0 - self.mean_loss), to_good
-        assert self.to_bad is not None and self.to_good is not None
+        assert self.to_bad is not None
+        assert self.to_good is not None
         return self.to_bad, self.to_good
 
     def weather(self, bad: bool | None, random: np.random.Generator) -> bool:
@@ -163,7 +176,9 @@ class GilbertElliott(Loss):
         """Under the stationary law."""
         to_bad, to_good = self._steps
         bad = to_bad / (to_bad + to_good)
-        return bad * self.chance(link, 0, True, 1.0) + (1.0 - bad) * self.chance(link, 0, False, 1.0)
+        return bad * self.chance(link, 0, True, 1.0) + (1.0 - bad) * self.chance(
+            link, 0, False, 1.0
+        )
 
     @property
     def independent(self) -> bool:
@@ -174,13 +189,14 @@ class GilbertElliott(Loss):
 @dataclass(frozen=True, eq=False)
 class RecordedLoss(Loss):
     """Fates read from a table ``sender,receiver,message,delivered`` (0 or 1, messages of a
-    directed link counted from 0); what the table does not list is delivered."""
+    directed link counted from 0); what the table does not list is delivered.
+    """
 
     path: SourceFile = setting(source_file)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._lost  # a bad file is refused now
+        _ = self._lost  # a bad file is refused now
 
     @cached_property
     def _lost(self) -> dict[Link, frozenset[int]]:
@@ -191,8 +207,10 @@ class RecordedLoss(Loss):
         for sender, receiver, message, delivered in rows:
             if message < 0 or delivered not in (0, 1):
                 raise ScenarioError(
-                    "path", f"{self.path.name}: message counts from 0 and delivered is 0 or 1",
-                    [sender, receiver, message, delivered], "mend the row",
+                    "path",
+                    f"{self.path.name}: message counts from 0 and delivered is 0 or 1",
+                    [sender, receiver, message, delivered],
+                    "mend the row",
                 )
             fates = lost.setdefault((sender, receiver), set())
             if not delivered:
@@ -225,8 +243,10 @@ class RecordedLoss(Loss):
         strange = sorted(self._lost.keys() - links)
         if strange:
             raise ScenarioError(
-                "path", f"{self.path.name}: every pair must be a link of the graph",
-                list(strange[0]), "add the link or remove the rows",
+                "path",
+                f"{self.path.name}: every pair must be a link of the graph",
+                list(strange[0]),
+                "add the link or remove the rows",
             )
 
 
@@ -334,9 +354,7 @@ class Fates:
     that are not needed are not made.
     """
 
-    def __init__(
-        self, channel: Channel, generator: Callable[[str], np.random.Generator]
-    ) -> None:
+    def __init__(self, channel: Channel, generator: Callable[[str], np.random.Generator]) -> None:
         self._loss, self._delay = channel.loss, channel.delay
         self._fixed = channel.delay.fixed
         self._bad: bool | None = None

@@ -47,7 +47,8 @@ class LinkClock(Part):
         count: int,
     ) -> FloatArray:
         """Times of up to ``count`` ticks from number ``index`` on; tick ``index - 1`` was at
-        ``now`` (0.0 before the first). Empty when the clock has stopped for good."""
+        ``now`` (0.0 before the first). Empty when the clock has stopped for good.
+        """
 
     def origin(self, link: Link, random: np.random.Generator) -> float:
         """What is drawn once for a link at its start, such as a phase."""
@@ -77,7 +78,8 @@ _link_rate = row(integer(), integer(), positive, what="a triple [i, j, rate]")
 @dataclass(frozen=True, eq=False)
 class Poisson(LinkClock):
     """Independent Poisson processes of ``rate`` ticks a second; ``rates = [[i, j, rate], ...]``
-    sets single links over that default."""
+    sets single links over that default.
+    """
 
     rate: float | None = setting(positive, default=None)
     rates: tuple[tuple[int, int, float], ...] = setting(
@@ -121,7 +123,9 @@ class Poisson(LinkClock):
         bare = sorted(links - self._by_link.keys())
         if self.rate is None and bare:
             raise ScenarioError(
-                "rate", f"is missing, and link {bare[0]} has no rate of its own", None,
+                "rate",
+                f"is missing, and link {bare[0]} has no rate of its own",
+                None,
                 "add rate = ... as the default of all links",
             )
 
@@ -150,13 +154,16 @@ class Renewal(LinkClock):
         if uniform:
             self._demand("mean", False)
             self._demand("rate", False)
-            assert self.low is not None and self.high is not None
+            assert self.low is not None
+            assert self.high is not None
             if self.high < self.low:
                 raise ScenarioError("high", "must be at least low", self.high, "swap the two")
         elif (self.mean is None) == (self.rate is None):
             raise ScenarioError(
-                "mean", "either mean or rate must be given, and not both",
-                self.mean, "keep one of them",
+                "mean",
+                "either mean or rate must be given, and not both",
+                self.mean,
+                "keep one of them",
             )
 
     def _demand(self, name: str, used: bool) -> None:
@@ -171,7 +178,8 @@ class Renewal(LinkClock):
     @property
     def _mean(self) -> float:
         if self.distribution == "uniform":
-            assert self.low is not None and self.high is not None
+            assert self.low is not None
+            assert self.high is not None
             return 0.5 * (self.low + self.high)
         return self.mean if self.mean is not None else 1.0 / float(self.rate or math.nan)
 
@@ -201,7 +209,8 @@ class Renewal(LinkClock):
             scale = self._mean / math.gamma(1.0 + 1.0 / shape)
             gaps = random.standard_exponential(count) ** (1.0 / shape) * scale
         elif self.distribution == "uniform":
-            assert self.low is not None and self.high is not None
+            assert self.low is not None
+            assert self.high is not None
             gaps = self.low + (self.high - self.low) * random.random(count)
         else:
             return _lattice(0.0, self._mean, index + 1, count)
@@ -263,7 +272,7 @@ class RecordedClock(LinkClock):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._times  # a bad file is refused now
+        _ = self._times  # a bad file is refused now
 
     @cached_property
     def _times(self) -> dict[Link, FloatArray]:
@@ -272,8 +281,10 @@ class RecordedClock(LinkClock):
         early = np.flatnonzero(table["t"] <= 0.0)
         if early.size:
             raise ScenarioError(
-                "path", f"{self.path.name}: t must be above 0, nothing is sent at time 0",
-                float(table["t"][early[0]]), "shift the times or remove the row",
+                "path",
+                f"{self.path.name}: t must be above 0, nothing is sent at time 0",
+                float(table["t"][early[0]]),
+                "shift the times or remove the row",
             )
         times: dict[Link, list[float]] = {}
         for t, i, j in zip(table["t"].tolist(), nodes, peers, strict=True):
@@ -297,6 +308,8 @@ class RecordedClock(LinkClock):
         strange = sorted(self._times.keys() - set(topology.links))
         if strange:
             raise ScenarioError(
-                "path", f"{self.path.name}: every pair must be a link of the graph",
-                list(strange[0]), "add the link or remove the rows",
+                "path",
+                f"{self.path.name}: every pair must be a link of the graph",
+                list(strange[0]),
+                "add the link or remove the rows",
             )

@@ -161,7 +161,8 @@ class Grid(Graph):
 @dataclass(frozen=True, eq=False)
 class RandomGraph(Graph):
     """Random kinds: ``seed`` of their own (default: the root seed); with ``connected`` they are
-    drawn again, with the next seed, until they are connected."""
+    drawn again, with the next seed, until they are connected.
+    """
 
     seed: int | None = setting(integer(low=0), default=None)
     connected: bool = setting(boolean, default=False)
@@ -259,7 +260,9 @@ class Edges(Graph):
                 for node in edge:
                     if not 0 <= node < self.nodes:
                         raise ScenarioError(
-                            f"edges[{k}]", f"node ids must be 0 .. {self.nodes - 1}", list(edge),
+                            f"edges[{k}]",
+                            f"node ids must be 0 .. {self.nodes - 1}",
+                            list(edge),
                             "mend the pair or raise nodes",
                         )
         for k, (i, j) in enumerate(self.edges):
@@ -299,16 +302,20 @@ class CsvGraph(Graph):
         least = 0.0 if self.minimum is None else self.minimum
         if self.minimum is not None and not measured:
             raise ScenarioError(
-                "minimum", "needs a column delivery_probability in the table", self.minimum,
+                "minimum",
+                "needs a column delivery_probability in the table",
+                self.minimum,
                 "add the column or leave minimum out",
             )
-        both = (lambda i, j: True) if self.directed else (
-            lambda i, j: delivery.get((j, i), 0.0) >= least
-        )
-        links = {(i, j) for (i, j), p in delivery.items() if p >= least and both(i, j)}
+        links = {
+            (i, j)
+            for (i, j), p in delivery.items()
+            if p >= least and (self.directed or delivery.get((j, i), 0.0) >= least)
+        }
         if not links:
-            raise ScenarioError("path", "no link of the table is left", self.path.name,
-                                "lower minimum or add rows")
+            raise ScenarioError(
+                "path", "no link of the table is left", self.path.name, "lower minimum or add rows"
+            )
         kept = {node for link in links for node in link}
         notes = _left_out(nodes - kept)
         more: dict[str, Any] = {"notes": notes, "positions": self._positions(kept)}
@@ -328,8 +335,10 @@ class CsvGraph(Graph):
         for i, j, p in zip(senders, receivers, values, strict=True):
             if i == j or not 0.0 <= p <= 1.0:
                 raise ScenarioError(
-                    "path", f"{self.path.name}: rows must join two nodes with a probability",
-                    [i, j, p], "mend the row",
+                    "path",
+                    f"{self.path.name}: rows must join two nodes with a probability",
+                    [i, j, p],
+                    "mend the row",
                 )
         return dict(zip(zip(senders, receivers, strict=True), values, strict=True)), measured
 
@@ -340,20 +349,31 @@ class CsvGraph(Graph):
         names = tuple(name.strip() for name in header.split(","))[:3]
         try:
             if len(names) < 3:
-                raise ScenarioError("path", f"{self.positions.name} must have the columns "
-                                    "node, x, y", header, "add what is missing")
+                raise ScenarioError(
+                    "path",
+                    f"{self.positions.name} must have the columns node, x, y",
+                    header,
+                    "add what is missing",
+                )
             table = read_columns(self.positions, names)
             ids = whole(self.positions, names[0], table[names[0]])
         except ScenarioError as error:
             raise ScenarioError("positions", error.rule, error.value, error.remedy) from None
         places = dict(
-            zip(ids, zip(table[names[1]].tolist(), table[names[2]].tolist(), strict=True),
-                strict=True)
+            zip(
+                ids,
+                zip(table[names[1]].tolist(), table[names[2]].tolist(), strict=True),
+                strict=True,
+            )
         )
         missing = sorted(nodes - places.keys())
         if missing:
-            raise ScenarioError("positions", f"{self.positions.name} must place every node",
-                                missing, "add their rows")
+            raise ScenarioError(
+                "positions",
+                f"{self.positions.name} must place every node",
+                missing,
+                "add their rows",
+            )
         return {node: places[node] for node in sorted(nodes)}
 
 

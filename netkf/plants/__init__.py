@@ -1,0 +1,1 @@
+"""How the state moves and is sensed; the truth of one run."""

@@ -37,14 +37,24 @@ class Diffusion(Part):
 
     A: FloatArray = setting(square)
     B: FloatArray = setting(matrix)
-    mean: FloatArray = setting(vector, default=None)
-    cov: FloatArray = setting(covariance, default=None)
+    mean: FloatArray | None = setting(vector, default=None)
+    cov: FloatArray | None = setting(covariance, default=None)
     sensing_period: float | None = setting(positive, default=None)
 
     @property
     def n(self) -> int:
         """Dimension of the state."""
         return len(self.A)
+
+    @property
+    def start_mean(self) -> FloatArray:
+        """(n,) mean of x(0), zeros by default."""
+        return np.zeros(self.n) if self.mean is None else self.mean
+
+    @property
+    def start_cov(self) -> FloatArray:
+        """(n, n) covariance of x(0), zeros by default."""
+        return np.zeros((self.n, self.n)) if self.cov is None else self.cov
 
     @cached_property
     def Q(self) -> FloatArray:
@@ -55,7 +65,8 @@ class Diffusion(Part):
         self, random: np.random.Generator, probing: np.random.Generator, shown: FloatArray
     ) -> DiffusionPath:
         """A path of its own that can be asked for its state on the sensing grid and at the times
-        ``shown`` (increasing); ``probing`` is used only for those off the grid."""
+        ``shown`` (increasing); ``probing`` is used only for those off the grid.
+        """
         return DiffusionPath(self, random, probing, shown)
 
 
@@ -81,7 +92,8 @@ def default_sensing_period(plant: Diffusion, informations: list[FloatArray]) -> 
 
 class _Step(NamedTuple):
     """One stretch of the path: times, states at its ends, (2, n) moments and the cubic's (4, n)
-    Legendre coefficients of what noise added."""
+    Legendre coefficients of what noise added.
+    """
 
     start: float
     end: float
@@ -115,13 +127,16 @@ class DiffusionPath:
         self._spread = _factor(self._noise(self.period))
         self._normals = np.empty((0, 3 * self._n))
         self._used = 0
-        start = plant.mean + square_root(plant.cov) @ random.standard_normal(self._n)
+        start = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(self._n)
         self._index = -1
-        self._steps = [_Step(0.0, 0.0, start, start, np.zeros((2, self._n)), np.zeros((4, self._n)))]
+        self._steps = [
+            _Step(0.0, 0.0, start, start, np.zeros((2, self._n)), np.zeros((4, self._n)))
+        ]
 
     def grid(self, k: int) -> float:
         """Time of the k-th point of the sensing grid, rounded so that lattices of other periods
-        meet it."""
+        meet it.
+        """
         return float(round(k * self.period, 12))
 
     def responses(self, gap: float) -> FloatArray:
@@ -141,7 +156,8 @@ class DiffusionPath:
 
     def _impulse(self, gap: float, start: float, end: float, s: float) -> FloatArray:
         """(3 n, m): what dw at time s adds to x(end) and to the moments over [start, end] of
-        length ``gap``."""
+        length ``gap``.
+        """
         if s >= end:
             return np.zeros((3 * self._n, self._B.shape[1]))
         since = max(s, start)
@@ -179,7 +195,8 @@ class DiffusionPath:
 
     def moments(self, start: float, end: float) -> FloatArray:
         """(2, n) moments of x over ``[start, end]``, which lies inside one sensing step; ``end``
-        never decreases from call to call."""
+        never decreases from call to call.
+        """
         step = self._at(end)
         if start == step.start and end == step.end:
             return step.moments
@@ -232,8 +249,9 @@ class DiffusionPath:
         noise = noise.reshape(3, n)
         self._steps += [
             _Step(step.start, time, step.x_start, x, first, _cubic(left, noise[0], noise[1:])),
-            _Step(time, step.end, x, step.x_end, second,
-                  _cubic(length - left, later[0], later[1:])),
+            _Step(
+                time, step.end, x, step.x_end, second, _cubic(length - left, later[0], later[1:])
+            ),
         ]
 
 
@@ -249,7 +267,8 @@ def _factor(noise: FloatArray) -> FloatArray:
 
 def _cubic(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
     """(4, n) Legendre coefficients of the cubic on [0, 1] that starts at 0, ends at ``end`` and
-    has these moments."""
+    has these moments.
+    """
     mean, slope = moments[0] / length, 3.0 * moments[1] / length
     return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope])
 

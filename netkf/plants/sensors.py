@@ -62,7 +62,8 @@ class SensorPath:
         self, truth: DiffusionPath, seen: FloatArray, start: float, end: float
     ) -> FloatArray:
         """(2, p) moments of dy over ``[start, end]`` inside the truth's present step, where x has
-        the moments ``seen``; ``start`` is where the last call ended."""
+        the moments ``seen``; ``start`` is where the last call ended.
+        """
         last = truth.step_end()
         if last != self._end:
             self._rest, self._end = self._draw(truth.period), last

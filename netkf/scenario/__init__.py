@@ -1,0 +1,1 @@
+"""What is simulated: TOML to checked dataclasses and back."""

@@ -30,16 +30,25 @@ def _times(scenario: Scenario) -> None:
     probe, horizon = scenario.probe, scenario.horizon
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
-            raise ScenarioError("probe", f"must be at most the horizon {horizon:g}", probe,
-                                "shorten the period")
+            raise ScenarioError(
+                "probe", f"must be at most the horizon {horizon:g}", probe, "shorten the period"
+            )
         if horizon / probe > MOST_SAMPLES:
-            raise ScenarioError("probe", f"must ask for at most {MOST_SAMPLES:,} samples", probe,
-                                "lengthen the period")
+            raise ScenarioError(
+                "probe",
+                f"must ask for at most {MOST_SAMPLES:,} samples",
+                probe,
+                "lengthen the period",
+            )
         return
     outside = probe[(probe < 0.0) | (probe > horizon)]
     if outside.size:
-        raise ScenarioError("probe", f"times must lie in [0, {horizon:g}]", outside[0].item(),
-                            "leave it out or lengthen the horizon")
+        raise ScenarioError(
+            "probe",
+            f"times must lie in [0, {horizon:g}]",
+            outside[0].item(),
+            "leave it out or lengthen the horizon",
+        )
     if (np.diff(probe) <= 0.0).any():
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
 
@@ -51,8 +60,9 @@ def _shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str)
     if not fits:
         words = " x ".join("any" if want is None else str(want) for want in shape)
         got = " x ".join(map(str, value.shape))
-        raise ScenarioError(key, f"must be {words}, not {got}, because {why}", value,
-                            "mend the shape")
+        raise ScenarioError(
+            key, f"must be {words}, not {got}, because {why}", value, "mend the shape"
+        )
 
 
 def _plant(scenario: Scenario) -> None:
@@ -74,11 +84,19 @@ def _sensors(scenario: Scenario) -> None:
         _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for place, node in enumerate(sensor.nodes):
             if node not in known:
-                raise ScenarioError(f"{key}.nodes[{place}]", "must be a node of the graph", node,
-                                    f"node ids here are {_ids(scenario.nodes)}")
+                raise ScenarioError(
+                    f"{key}.nodes[{place}]",
+                    "must be a node of the graph",
+                    node,
+                    f"node ids here are {_ids(scenario.nodes)}",
+                )
         if len(set(sensor.nodes)) < len(sensor.nodes):
-            raise ScenarioError(f"{key}.nodes", "must name each node once", list(sensor.nodes),
-                                "write a second [[sensors]] entry for a second sensor")
+            raise ScenarioError(
+                f"{key}.nodes",
+                "must name each node once",
+                list(sensor.nodes),
+                "write a second [[sensors]] entry for a second sensor",
+            )
 
 
 def _ids(nodes: tuple[int, ...]) -> str:
@@ -101,17 +119,27 @@ def _network(scenario: Scenario) -> None:
         return
     name = type(algorithm).__name__.lower()
     if network.activation is None:
-        raise ScenarioError("network.activation", f"is missing, and the {name} filter talks", None,
-                            'add activation = { kind = "poisson", rate = ... }')
+        raise ScenarioError(
+            "network.activation",
+            f"is missing, and the {name} filter talks",
+            None,
+            'add activation = { kind = "poisson", rate = ... }',
+        )
     if topology.directed:
-        raise ScenarioError("network.graph.directed",
-                            f"must be false for the {name} filter, whose links work both ways",
-                            True, "give an undirected graph")
+        raise ScenarioError(
+            "network.graph.directed",
+            f"must be false for the {name} filter, whose links work both ways",
+            True,
+            "give an undirected graph",
+        )
     if len(topology.components) > 1:
         smallest = sorted(topology.components[-1])
-        raise ScenarioError("network.graph", f"must be connected for the {name} filter",
-                            f"{len(topology.components)} parts, one of them {smallest}",
-                            "add links, or connected = true for a random graph")
+        raise ScenarioError(
+            "network.graph",
+            f"must be connected for the {name} filter",
+            f"{len(topology.components)} parts, one of them {smallest}",
+            "add links, or connected = true for a random graph",
+        )
 
 
 def _filter(scenario: Scenario) -> None:
@@ -123,11 +151,19 @@ def _filter(scenario: Scenario) -> None:
     ):
         if isinstance(value, tuple):
             if len(value) != len(scenario.nodes):
-                raise ScenarioError(key, f"must have one entry for each of {len(scenario.nodes)} "
-                                    "nodes", f"{len(value)} entries", "add or remove some")
+                raise ScenarioError(
+                    key,
+                    f"must have one entry for each of {len(scenario.nodes)} nodes",
+                    f"{len(value)} entries",
+                    "add or remove some",
+                )
             if filtering.algorithm.pooled:
-                raise ScenarioError(key, "must be one for the filter that all nodes share",
-                                    f"{len(value)} entries", "give one")
+                raise ScenarioError(
+                    key,
+                    "must be one for the filter that all nodes share",
+                    f"{len(value)} entries",
+                    "give one",
+                )
             for k, item in enumerate(value):
                 _shape(f"{key}[{k}]", item, shape, why)
         elif value is not None:
@@ -146,11 +182,16 @@ def _believed_noise(scenario: Scenario) -> None:
     if R is None:
         return
     if isinstance(R, tuple) and len(R) != len(sensors):
-        raise ScenarioError("filter.model.R", f"must have one entry for each of {len(sensors)} "
-                            "[[sensors]]", f"{len(R)} entries", "add or remove some")
+        raise ScenarioError(
+            "filter.model.R",
+            f"must have one entry for each of {len(sensors)} [[sensors]]",
+            f"{len(R)} entries",
+            "add or remove some",
+        )
     for k, sensor in enumerate(sensors):
-        key, own = ("filter.model.R", R) if not isinstance(R, tuple) else (
-            f"filter.model.R[{k}]", R[k])
+        key, own = (
+            ("filter.model.R", R) if not isinstance(R, tuple) else (f"filter.model.R[{k}]", R[k])
+        )
         p = len(sensor.H)
         _shape(key, own, (p, p), f"sensors[{k}].H has {p} rows")
 
@@ -162,8 +203,10 @@ def _degrees(scenario: Scenario) -> None:
     node, degree = max(scenario.topology.degrees.items(), key=lambda item: item[1])
     if degree > algorithm.largest_degree():
         raise ScenarioError(
-            "filter.epsilon", f"must be at most 1 / {degree}, because node {node} has {degree} links",
-            getattr(algorithm, "epsilon", None), f"give at most {1.0 / degree:.6g}",
+            "filter.epsilon",
+            f"must be at most 1 / {degree}, because node {node} has {degree} links",
+            getattr(algorithm, "epsilon", None),
+            f"give at most {1.0 / degree:.6g}",
         )
 
 
@@ -172,11 +215,15 @@ def _sensing_period(scenario: Scenario) -> None:
     assert period is not None
     A, Q = scenario.belief
     pooled = scenario.filter.algorithm.pooled
-    models = [scenario.pooled_model] if pooled else list({id(m): m for m in scenario.models}.values())
+    models = (
+        [scenario.pooled_model] if pooled else list({id(m): m for m in scenario.models}.values())
+    )
     for model in models:
         longest = longest_interval(A, Q, model.H, model.R)
         if len(model.H) and min(period, scenario.horizon) > longest:
             raise ScenarioError(
-                "plant.sensing_period", "is too long for the readings of the most precise node",
-                period, f"give at most {longest:.3g}, or leave it out",
+                "plant.sensing_period",
+                "is too long for the readings of the most precise node",
+                period,
+                f"give at most {longest:.3g}, or leave it out",
             )

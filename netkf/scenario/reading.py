@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,15 @@ def load(path: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario
         table = tomllib.loads(path.read_text(encoding="utf-8"))
         return from_table(with_changes(table, changes or {}), path.parent)
     except OSError as error:
-        raise ScenarioError("", f"cannot be read ({error.strerror})", None,
-                            "check the path", str(path)) from None
+        raise ScenarioError(
+            "", f"cannot be read ({error.strerror})", None, "check the path", str(path)
+        ) from None
     except UnicodeDecodeError:
         raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8", str(path)) from None
     except tomllib.TOMLDecodeError as error:
-        raise ScenarioError("", f"is not valid TOML: {error}", None, "mend that line",
-                            str(path)) from None
+        raise ScenarioError(
+            "", f"is not valid TOML: {error}", None, "mend that line", str(path)
+        ) from None
     except ScenarioError as error:
         raise error.in_file(str(path)) from None
 
@@ -68,8 +71,9 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
     key, rest = keys[0], keys[1:]
     if isinstance(node, (list, tuple)):
         if not key.isdigit() or int(key) >= len(node):
-            raise ScenarioError(path, f"has no entry {key!r} in a list of {len(node)}", None,
-                                "count from 0")
+            raise ScenarioError(
+                path, f"has no entry {key!r} in a list of {len(node)}", None, "count from 0"
+            )
         place = int(key)
         return [*node[:place], _set(node[place], rest, value, path), *node[place + 1 :]]
     if node is None:
@@ -88,7 +92,7 @@ def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
     if integer()("format", version) != FORMAT:
         raise ScenarioError("format", f"must be {FORMAT}", version, "this netkf reads no other")
     readers = {
-        "plant": lambda value: _kind("plant", value, folder),
+        "plant": lambda value: _kind("plant", folder, value),
         "sensors": lambda value: _list(value, folder),
         "network": lambda value: _network(value, folder),
         "filter": lambda value: _filtering(value, folder),
@@ -97,7 +101,8 @@ def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
     for key, reader in readers.items():
         if key in table:
             table[key] = _under(key, reader, table[key])
-    return _part(Scenario, table, folder)
+    scenario: Scenario = _part(Scenario, table, folder)
+    return scenario
 
 
 def _under(key: str, reader: Any, value: Any) -> Any:
@@ -109,13 +114,17 @@ def _under(key: str, reader: Any, value: Any) -> Any:
 
 def _part(cls: type[Any], table: dict[str, Any], folder: Path) -> Any:
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    for key in table:
+    for key, value in table.items():
         if key not in fields:
-            raise ScenarioError(key, "is not a key here", table[key],
-                                f"keys are {', '.join(_written(fields))}")
+            raise ScenarioError(
+                key, "is not a key here", value, f"keys are {', '.join(_written(fields))}"
+            )
     for name, field in fields.items():
-        if (field.default is dataclasses.MISSING and name not in table
-                and field.default_factory is dataclasses.MISSING):
+        if (
+            field.default is dataclasses.MISSING
+            and name not in table
+            and field.default_factory is dataclasses.MISSING
+        ):
             raise ScenarioError(name, "is missing", None, f"add {name} = ...")
     values = {
         name: SourceFile(value, folder)
@@ -130,7 +139,7 @@ def _written(fields: Mapping[str, Any]) -> list[str]:
     return [name for name in fields if not name.startswith("_")] or ["kind only"]
 
 
-def _kind(family: str, value: Any, folder: Path, default: str | None = None) -> Any:
+def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:
     table = _table(value)
     kind = table.pop("kind", default)
     if kind is None:
@@ -148,7 +157,7 @@ def _list(value: Any, folder: Path) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     return tuple(
-        _under(f"[{k}]", lambda item: _kind("sensor", item, folder, "linear"), item)
+        _under(f"[{k}]", lambda item: _kind("sensor", folder, item, "linear"), item)
         for k, item in enumerate(value)
     )
 
@@ -157,7 +166,7 @@ def _network(value: Any, folder: Path) -> Network:
     table = _table(value)
     for family in ("graph", "activation"):
         if family in table:
-            table[family] = _under(family, lambda v: _kind(family, v, folder), table[family])
+            table[family] = _under(family, partial(_kind, family, folder), table[family])
     if "channel" in table:
         table["channel"] = _under("channel", lambda v: _channel(v, folder), table["channel"])
     network: Network = _part(Network, table, folder)
@@ -168,18 +177,20 @@ def _channel(value: Any, folder: Path) -> Channel:
     table = _table(value)
     for family in ("loss", "delay"):
         if family in table:
-            table[family] = _under(family, lambda v: _kind(family, v, folder), table[family])
+            table[family] = _under(family, partial(_kind, family, folder), table[family])
     channel: Channel = _part(Channel, table, folder)
     return channel
 
 
 def _filtering(value: Any, folder: Path) -> Filtering:
     table = _table(value)
-    shared = {key: table.pop(key) for key in ("mean", "cov", "model") if key in table}
+    shared: dict[str, Any] = {
+        key: table.pop(key) for key in ("mean", "cov", "model") if key in table
+    }
     if "model" in shared:
         shared["model"] = _under(
             "model", lambda v: _part(Belief, _table(v), folder), shared["model"]
         )
-    algorithm = _kind("filter", table, folder)
+    algorithm = _kind("filter", folder, table)
     filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, folder)
     return filtering

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
-from typing import cast
 
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.flow import FlowFilter
@@ -68,7 +67,8 @@ KINDS: dict[str, dict[str, type[Part]]] = {
 
 def find(family: str, kind: object, folder: Path) -> type[Part]:
     """The class of ``kind``: a name of the table, or ``"package.module:Class"``, looked up beside
-    the scenario file and in the current folder too."""
+    the scenario file and in the current folder too.
+    """
     names = KINDS[family]
     if isinstance(kind, str) and kind in names:
         return names[kind]
@@ -88,7 +88,9 @@ def _imported(family: str, kind: str, folder: Path) -> type[Part]:
         found = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ScenarioError(
-            "kind", f"could not be imported ({error})", kind,
+            "kind",
+            f"could not be imported ({error})",
+            kind,
             "put the module beside the scenario file or on the Python path",
         ) from None
     finally:
@@ -97,10 +99,12 @@ def _imported(family: str, kind: str, folder: Path) -> type[Part]:
     contract = FAMILIES[family]
     if not (isinstance(found, type) and issubclass(found, contract)):
         raise ScenarioError(
-            "kind", f"must be a subclass of netkf's {contract.__name__}", kind,
+            "kind",
+            f"must be a subclass of netkf's {contract.__name__}",
+            kind,
             f"derive the class from {contract.__module__}.{contract.__name__}",
         )
-    return cast("type[Part]", found)
+    return found
 
 
 def name_of(family: str, part: Part) -> str:

@@ -22,7 +22,6 @@ from netkf.core.fields import (
     instance,
     integer,
     matrix,
-    number,
     positive,
     setting,
     several,
@@ -49,7 +48,8 @@ class Network(Part):
 @dataclass(frozen=True, eq=False)
 class Belief(Part):
     """What the filters believe where it differs from the truth: ``A`` (n, n), ``B`` (n, m) of the
-    plant, ``R`` of the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry."""
+    plant, ``R`` of the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry.
+    """
 
     A: FloatArray | None = setting(square, default=None)
     B: FloatArray | None = setting(matrix, default=None)
@@ -147,16 +147,13 @@ class Scenario(Part):
     @cached_property
     def truth(self) -> Diffusion:
         """The plant with every default filled in."""
-        plant, n = self.plant, self.plant.n
-        filled = dataclasses.replace(
-            plant,
-            mean=np.zeros(n) if plant.mean is None else plant.mean,
-            cov=np.zeros((n, n)) if plant.cov is None else plant.cov,
-        )
+        plant = self.plant
+        filled = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
         if filled.sensing_period is not None:
             return filled
         informations = [
-            H.T @ np.linalg.solve(R, H) for H, R in {
+            H.T @ np.linalg.solve(R, H)
+            for H, R in {
                 (H.tobytes(), R.tobytes()): (H, R)
                 for H, R in (self.observation(node) for node in self.sensing)
             }.values()
@@ -182,12 +179,11 @@ class Scenario(Part):
 
     def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
         """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together; p may be 0. With
-        ``believed``, R is what the filter takes it to be."""
+        ``believed``, R is what the filter takes it to be.
+        """
         return self._stacked(self.placed.get(node, ()), believed)
 
-    def _stacked(
-        self, placed: tuple[Placed, ...], believed: bool
-    ) -> tuple[FloatArray, FloatArray]:
+    def _stacked(self, placed: tuple[Placed, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
         H = [self.sensors[place.entry].H for place in placed]
         R = [self._noise(place.entry, believed) for place in placed]
         empty = np.zeros((0, self.plant.n))
@@ -234,8 +230,8 @@ class Scenario(Part):
     def start(self, node: int) -> tuple[FloatArray, FloatArray]:
         """``xhat`` (n,) and ``P`` (n, n) of a node at time 0."""
         index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
-        first = self.truth.mean if mean is None else mean
-        spread = self.truth.cov if cov is None else cov
+        first = self.plant.start_mean if mean is None else mean
+        spread = self.plant.start_cov if cov is None else cov
         return (
             first[index] if isinstance(first, tuple) else first,
             spread[index] if isinstance(spread, tuple) else spread,
@@ -247,13 +243,14 @@ class Scenario(Part):
         return self.filter.algorithm.weight(degrees[receiver], degrees[sender])
 
     def measured(self, link: Link) -> float:
-        """The delivery probability that the graph's table gives a direction, 1 where it has none."""
+        """The delivery probability of a direction in the graph's table, 1 where it has none."""
         delivery = self.topology.delivery
         return 1.0 if delivery is None else delivery.get(link, 0.0)
 
     def effective_rates(self) -> dict[Link, float]:
         """Messages per second that arrive on each direction (sender, receiver) in the long run;
-        nan where that is not known beforehand."""
+        nan where that is not known beforehand.
+        """
         clock, loss = self.network.activation, self.network.channel.loss
         rates: dict[Link, float] = {}
         if clock is None or not self.filter.algorithm.talks:

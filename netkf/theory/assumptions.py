@@ -69,18 +69,34 @@ def _plant(scenario: Scenario) -> list[Row]:
         if unobservable(plant.A, _own_information(scenario, node)) is None
     ]
     A, Q = scenario.belief
-    same = np.array_equal(A, plant.A) and np.array_equal(Q, plant.Q) and (
-        scenario.filter.model.R is None
+    same = (
+        np.array_equal(A, plant.A)
+        and np.array_equal(Q, plant.Q)
+        and (scenario.filter.model.R is None)
     )
     return [
-        ("(A, B) is controllable", "H II-A", lost is None,
-         "every mode is driven by the noise" if lost is None
-         else f"the mode with eigenvalue {lost:.6g} is not driven"),
-        ("(A, H) is observable, all sensors together", "H II-A", hidden is None,
-         f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
-         if hidden is None else f"the mode with eigenvalue {hidden:.6g} is not seen"),
-        ("the filters know the plant and the sensors", "H (4)", same,
-         "same A, B and R" if same else "filter.model differs from the truth"),
+        (
+            "(A, B) is controllable",
+            "H II-A",
+            lost is None,
+            "every mode is driven by the noise"
+            if lost is None
+            else f"the mode with eigenvalue {lost:.6g} is not driven",
+        ),
+        (
+            "(A, H) is observable, all sensors together",
+            "H II-A",
+            hidden is None,
+            f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
+            if hidden is None
+            else f"the mode with eigenvalue {hidden:.6g} is not seen",
+        ),
+        (
+            "the filters know the plant and the sensors",
+            "H (4)",
+            same,
+            "same A, B and R" if same else "filter.model differs from the truth",
+        ),
     ]
 
 
@@ -98,13 +114,20 @@ def _clocks(scenario: Scenario) -> list[Row]:
     spread = f"{known.min():g} .. {known.max():g} per second" if known.size else "no rate known"
     return [
         ("the rates of all links are positive", "H II-B b", positive, spread),
-        ("the link clocks are independent Poisson processes", "H II-B b, Theorem 2",
-         clock.memoryless,
-         "exponential gaps" if clock.memoryless
-         else f"the gaps of {type(clock).__name__} are not exponential: H(12) is not promised"),
-        ("all links have one rate", "H Theorem 3", positive and np.ptp(rates) == 0.0
-         if rates.size else True,
-         "the limit S does not need it when the rates grow together"),
+        (
+            "the link clocks are independent Poisson processes",
+            "H II-B b, Theorem 2",
+            clock.memoryless,
+            "exponential gaps"
+            if clock.memoryless
+            else f"the gaps of {type(clock).__name__} are not exponential: H(12) is not promised",
+        ),
+        (
+            "all links have one rate",
+            "H Theorem 3",
+            positive and np.ptp(rates) == 0.0 if rates.size else True,
+            "the limit S does not need it when the rates grow together",
+        ),
     ]
 
 
@@ -115,16 +138,32 @@ def _channel(scenario: Scenario) -> list[Row]:
     fixed = channel.delay.fixed
     symmetric = c is not None and bool(np.allclose(c, c.T, rtol=1e-12))
     return [
-        ("losses are independent of each other and of the past", "H Theorem 2, derived",
-         channel.loss.independent,
-         "arrivals are Poisson processes of lower rates" if channel.loss.independent
-         else "arrivals come in bursts: H(12) is not promised"),
-        ("messages take no time, or one fixed time", "H (7), derived", fixed is not None,
-         "random delay: H(12) is not promised" if fixed is None
-         else "no delay" if fixed == 0.0
-         else f"{fixed:g} s; covariances are predicted to their arrival"),
-        ("both directions of a link arrive at one rate", "H (12), (13)", symmetric,
-         "the limit is S" if symmetric else "the limit is not S but weighs the nodes differently"),
+        (
+            "losses are independent of each other and of the past",
+            "H Theorem 2, derived",
+            channel.loss.independent,
+            "arrivals are Poisson processes of lower rates"
+            if channel.loss.independent
+            else "arrivals come in bursts: H(12) is not promised",
+        ),
+        (
+            "messages take no time, or one fixed time",
+            "H (7), derived",
+            fixed is not None,
+            "random delay: H(12) is not promised"
+            if fixed is None
+            else "no delay"
+            if fixed == 0.0
+            else f"{fixed:g} s; covariances are predicted to their arrival",
+        ),
+        (
+            "both directions of a link arrive at one rate",
+            "H (12), (13)",
+            symmetric,
+            "the limit is S"
+            if symmetric
+            else "the limit is not S but weighs the nodes differently",
+        ),
     ]
 
 
@@ -132,10 +171,14 @@ def _start(scenario: Scenario) -> list[Row]:
     plant, worst = scenario.truth, np.inf
     for node in scenario.nodes:
         mean, cov = scenario.start(node)
-        offset = plant.mean - mean
-        gap = cov - plant.cov - np.outer(offset, offset)
+        offset = plant.start_mean - mean
+        gap = cov - plant.start_cov - np.outer(offset, offset)
         worst = min(worst, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
     return [
-        ("P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']", "H (9), (10)", worst >= -1e-12,
-         f"least eigenvalue of the difference {worst:.3g}")
+        (
+            "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
+            "H (9), (10)",
+            worst >= -1e-12,
+            f"least eigenvalue of the difference {worst:.3g}",
+        )
     ]

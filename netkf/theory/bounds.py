@@ -86,11 +86,17 @@ class _Pieces:
         scale = max(float(np.abs(y).max()), float(np.abs(self._equations.Q).max()), 1e-300)
         with np.errstate(over="ignore", invalid="ignore"):
             solved = scipy.integrate.solve_ivp(
-                f, (begin, end), y, method="DOP853", dense_output=True,
-                rtol=TOLERANCE, atol=1e-3 * TOLERANCE * scale,
+                f,
+                (begin, end),
+                y,
+                method="DOP853",
+                dense_output=True,
+                rtol=TOLERANCE,
+                atol=1e-3 * TOLERANCE * scale,
             )
         if not solved.success:
             raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
+        assert solved.sol is not None
         _check_defect(f, solved.sol)
         self._outputs.append(solved.sol)
 
@@ -130,8 +136,11 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
         if change <= 1e-13 * np.abs(P).max():
             break
     residual = np.abs(slope(equations, P, P)).max()
-    size = np.abs(equations.Q).max() + np.abs(P @ equations.G @ P).max() + np.abs(
-        equations.A @ P).max()
+    size = (
+        np.abs(equations.Q).max()
+        + np.abs(P @ equations.G @ P).max()
+        + np.abs(equations.A @ P).max()
+    )
     if not residual <= 1e-9 * size:
         raise TheoryError(f"the steady state of H(12) was solved to {residual:.1e} only")
     return P

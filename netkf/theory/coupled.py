@@ -24,7 +24,8 @@ from netkf.scenario.scenario import Scenario
 
 class Coupled(NamedTuple):
     """A (n, n), Q (n, n), G (N, n, n), coupling (N, N) sparse, T (n, n), q (n, n), delay (s),
-    start (N, n, n)."""
+    start (N, n, n).
+    """
 
     A: FloatArray
     Q: FloatArray
@@ -64,22 +65,20 @@ def promised(scenario: Scenario) -> None:
 
 
 def informations(scenario: Scenario) -> FloatArray:
-    """(N, n, n): ``G_i`` as the filters believe it; every node has all where one filter reads all."""
+    """(N, n, n): ``G_i`` as the filters believe it; a pooled filter's is the same at all nodes."""
     if scenario.filter.algorithm.pooled:
         return np.stack([scenario.pooled_model.information] * len(scenario.nodes))
     return np.stack([model.information for model in scenario.models])
 
 
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
-    """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times their weight."""
+    """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times weight."""
     index, size = scenario.topology.index, len(scenario.nodes)
-    entries = [
-        (index[receiver], index[sender], rate * scenario.weight(receiver, sender))
-        for (sender, receiver), rate in scenario.effective_rates().items()
-        if rate > 0.0
-    ]
-    rows, columns, values = zip(*entries, strict=True) if entries else ((), (), ())
-    return scipy.sparse.csr_array((values, (rows, columns)), shape=(size, size), dtype=np.float64)
+    matrix = scipy.sparse.lil_array((size, size), dtype=np.float64)
+    for (sender, receiver), rate in scenario.effective_rates().items():
+        if rate > 0.0:
+            matrix[index[receiver], index[sender]] = rate * scenario.weight(receiver, sender)
+    return scipy.sparse.csr_array(matrix)
 
 
 def coupled(scenario: Scenario) -> Coupled:
@@ -112,7 +111,8 @@ def slope(equations: Coupled, P: FloatArray, sent: FloatArray) -> FloatArray:
 
 def linear_operator(equations: Coupled, gains: FloatArray) -> scipy.sparse.csr_array:
     """(N n n, N n n): ``X_i -> (A - K_i) X_i + X_i (A - K_i)' + sum_j c_ij (T X_j T' - X_i)`` on
-    row-major vec(X), where ``K_i = gains[i]`` stands for L_i H_i."""
+    row-major vec(X), where ``K_i = gains[i]`` stands for L_i H_i.
+    """
     n, eye = len(equations.A), np.eye(len(equations.A))
     leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)
     blocks = [

@@ -62,7 +62,8 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
 
 class _Instant(NamedTuple):
     """What happens at one time: snapshots to keep, as (sender, key), and for each receiver the
-    senders' weights with the key of the snapshot, None where the message took no time."""
+    senders' weights with the key of the snapshot, None where the message took no time.
+    """
 
     time: float
     snapshots: list[tuple[int, tuple[int, int, int]]]
@@ -100,7 +101,8 @@ def _instants(scenario: Scenario, run: Run) -> Iterator[_Instant]:
 
 class _Errors:
     """Stacked errors with their covariance, moved through time. Block 0 is the state itself where
-    the filters' A differs from the plant's, since the errors then follow it."""
+    the filters' A differs from the plant's, since the errors then follow it.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self._n, self._plant = scenario.plant.n, scenario.truth
@@ -108,8 +110,9 @@ class _Errors:
         self._models = [scenario.pooled_model] if pooled else list(scenario.models)
         first = scenario.models[0]
         empty = np.zeros((0, self._n))
-        self._blind = FlowModel(first.A, first.Q, empty, np.zeros((0, 0)), first.horizon,
-                                first.interval)
+        self._blind = FlowModel(
+            first.A, first.Q, empty, np.zeros((0, 0)), first.horizon, first.interval
+        )
         self.hosts = len(self._models)
         starts = [scenario.start(node)[1] for node in scenario.nodes][: self.hosts]
         self._P = np.stack(starts)
@@ -117,7 +120,7 @@ class _Errors:
         self._follows = bool(self._difference.any())
         self._noise = [self._true_noise(scenario, k, pooled) for k in range(self.hosts)]
         blocks = self.hosts + self._follows
-        self._sigma = np.kron(np.ones((blocks, blocks)), self._plant.cov)
+        self._sigma: FloatArray = np.kron(np.ones((blocks, blocks)), self._plant.start_cov)
         self._time = 0.0
         self._messages: list[tuple[int, int, int]] = []
 
@@ -126,8 +129,10 @@ class _Errors:
         nodes = scenario.sensing if pooled else (scenario.nodes[host],)
         roots = [np.linalg.cholesky(scenario.observation(node)[1]) for node in nodes]
         parts = [
-            np.linalg.solve(scenario.observation(node, believed=True)[1],
-                            scenario.observation(node)[0]).T @ root
+            np.linalg.solve(
+                scenario.observation(node, believed=True)[1], scenario.observation(node)[0]
+            ).T
+            @ root
             for node, root in zip(nodes, roots, strict=True)
         ]
         return np.concatenate([np.zeros((self._n, 0)), *parts], axis=1)
@@ -136,7 +141,7 @@ class _Errors:
         """The covariance of the errors of the nodes."""
         first = self._n * self._follows
         last = first + self.hosts * self._n
-        return self._sigma[first:last, first:last]
+        return np.asarray(self._sigma[first:last, first:last])
 
     def happen(self, instant: _Instant) -> None:
         """Advance to an instant, keep what is sent, reset what receives."""
@@ -159,7 +164,7 @@ class _Errors:
             self._P = np.tensordot(weights, self._P, 1)
             whole = np.eye(len(weights) + first)
             whole[first:, first:] = weights
-            self._mix(np.kron(whole, np.eye(n)))
+            self._mix(np.asarray(np.kron(whole, np.eye(n)), dtype=np.float64))
         self._drop([s for inbox in instant.resets.values() for _, s in inbox.values() if s])
 
     def _mix(self, matrix: FloatArray) -> None:
@@ -208,8 +213,11 @@ class _Errors:
             P = self._P[members]
             X_end, Y_end = _flow(model, P, gap)
             inverse = np.swapaxes(np.linalg.inv(X_end), 1, 2)
-            self._P[members] = symmetric(np.swapaxes(np.linalg.solve(
-                np.swapaxes(X_end, 1, 2), np.swapaxes(Y_end, 1, 2)), 1, 2))
+            self._P[members] = symmetric(
+                np.swapaxes(
+                    np.linalg.solve(np.swapaxes(X_end, 1, 2), np.swapaxes(Y_end, 1, 2)), 1, 2
+                )
+            )
             transition[members] = inverse
             for k, (s, w) in enumerate(zip(times, _WEIGHTS * gap, strict=True)):
                 X, Y = _flow(model, P, s)
@@ -240,8 +248,9 @@ class _Errors:
             r = s + z * (gap - s)
             X, _ = _flow(model, P, r)
             phi = inverse @ np.swapaxes(X, 1, 2)
-            total += w * (gap - s) * phi @ self._difference @ _expm(
-                self._plant.A, r - s) @ self._plant.B
+            total += (
+                w * (gap - s) * phi @ self._difference @ _expm(self._plant.A, r - s) @ self._plant.B
+            )
         return total
 
     def _move(

@@ -45,7 +45,8 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
 
 def central_covariance(scenario: Scenario) -> FloatArray:
     """(n, n): steady covariance of the Kalman-Bucy filter that reads all sensors and knows the
-    true model. Raises TheoryError where it does not exist."""
+    true model. Raises TheoryError where it does not exist.
+    """
     G = np.zeros((scenario.plant.n, scenario.plant.n))
     for node in scenario.sensing:
         H, R = scenario.observation(node)

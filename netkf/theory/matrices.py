@@ -16,13 +16,13 @@ RESIDUAL = 1e-9
 
 def as_square(name: str, value: Any, n: int | None = None) -> FloatArray:
     """A finite (n, n) float array; raises TheoryError otherwise."""
-    array = np.asarray(value, dtype=np.float64)
+    array: FloatArray = np.asarray(value, dtype=np.float64)
     wanted = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
         raise TheoryError(f"{name} must be a {wanted} matrix, its shape is {array.shape}")
     if not np.isfinite(array).all():
         raise TheoryError(f"{name} must be finite")
-    return array
+    return np.asarray(array)
 
 
 def as_covariance(name: str, value: Any, n: int) -> FloatArray:
@@ -74,7 +74,7 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
         raise TheoryError(f"no stabilising solution of the Riccati equation: {error}") from None
     # One step of Newton's method takes what is left of the residual away.
     closed = A - S @ G
-    S = symmetric(scipy.linalg.solve_continuous_lyapunov(closed, -(Q + S @ G @ S)))
+    S = _solve_lyapunov(closed, Q + S @ G @ S)
     residual = A @ S + S @ A.T + Q - S @ G @ S
     size = np.abs(A @ S).max() + np.abs(Q).max() + np.abs(S @ G @ S).max()
     if not np.abs(residual).max() <= RESIDUAL * size:
@@ -88,11 +88,15 @@ def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     """The solution of 0 = A X + X A' + Q for a stable A; raises TheoryError otherwise."""
     if not np.linalg.eigvals(A).real.max() < 0.0:
         raise TheoryError("the error dynamics are not stable, their covariance has no limit")
-    X = symmetric(scipy.linalg.solve_continuous_lyapunov(A, -Q))
+    X = _solve_lyapunov(A, Q)
     residual = np.abs(A @ X + X @ A.T + Q).max()
     if not residual <= RESIDUAL * (np.abs(A @ X).max() + np.abs(Q).max()):
         raise TheoryError(f"the Lyapunov equation was solved to {residual:.1e} only")
     return X
+
+
+def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
+    return symmetric(np.asarray(scipy.linalg.solve_continuous_lyapunov(A, -Q), dtype=np.float64))
 
 
 def undetectable(A: FloatArray, G: FloatArray) -> complex | None:

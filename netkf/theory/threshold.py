@@ -53,7 +53,8 @@ def _hidden(A: FloatArray, G: FloatArray) -> _Hidden:
 
 def growth(equations: Coupled, factor: float) -> float:
     """The least growth rate (1/s) of H(12)'s linear part when all rates are ``factor`` times what
-    they are; a steady state exists where it is negative. Minus infinity: no node needs help."""
+    they are; a steady state exists where it is negative. Minus infinity: no node needs help.
+    """
     hidden = [_hidden(equations.A, G) for G in equations.G]
     gains = [np.zeros((len(h.A), len(h.O))) for h in hidden]
     coupling = factor * equations.coupling
@@ -84,10 +85,10 @@ def _perron(
     for i, j, c in zip(entries.row, entries.col, entries.data, strict=True):
         E = (hidden[i].U - gains[i] @ hidden[i].O) @ equations.T @ hidden[j].N
         blocks[i][j] = scipy.sparse.coo_array(c * np.kron(E, E))
-    for i, h in enumerate(hidden):
+    for k, h in enumerate(hidden):
         eye = np.eye(len(h.A))
-        own = np.kron(h.A, eye) + np.kron(eye, h.A) - leaving[i] * np.eye(len(h.A) ** 2)
-        blocks[i][i] = scipy.sparse.coo_array(own)
+        own = np.kron(h.A, eye) + np.kron(eye, h.A) - leaving[k] * np.eye(len(h.A) ** 2)
+        blocks[k][k] = scipy.sparse.coo_array(own)
     kept = [i for i, size in enumerate(sizes) if size]
     matrix = scipy.sparse.block_array([[blocks[i][j] for j in kept] for i in kept], format="csc")
     rate, vector = _rightmost(matrix)
@@ -130,7 +131,8 @@ def _improved(
 
 def threshold_factor(equations: Coupled) -> float | None:
     """The factor on all link rates from which on H(12) has a steady state, to 1e-6; None where no
-    factor up to 1e9 helps."""
+    factor up to 1e9 helps.
+    """
     low, high = 1.0, 2.0
     while growth(equations, high) >= 0.0:
         low, high = high, 2.0 * high

@@ -1,0 +1,1 @@
+"""What is recorded: schema, recorder, tables, fingerprint, first difference."""

@@ -59,17 +59,16 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
     """EVENT rows as named columns; ``first`` is the sequence number of the first row."""
     import pandas as pd
 
-    kinds = pd.Categorical.from_codes(rows["kind"].astype(np.int8), categories=list(KINDS))
+    kinds = pd.Categorical.from_codes(rows["kind"].astype(np.int8), categories=pd.Index(KINDS))
     run = np.full(len(rows), replica, dtype=np.int64)
     columns = {"run": run, "seq": np.arange(first, first + len(rows)), "kind": kinds}
-    return {
-        name: columns[name] if name in columns else rows[name] for name in EVENT_COLUMNS
-    }
+    return {name: columns[name] if name in columns else rows[name] for name in EVENT_COLUMNS}
 
 
 def errors(x: FloatArray, xhat: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Squared error and NEES ``e' P^-1 e``, (T, N) each, of x (T, n), xhat (T, N, n) and
-    P (T, N, n, n); NEES is nan where P is singular."""
+    P (T, N, n, n); NEES is nan where P is singular.
+    """
     e = x[:, None, :] - xhat
     with np.errstate(all="ignore"):
         try:

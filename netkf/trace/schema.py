@@ -49,7 +49,7 @@ EVENT_COLUMNS = ("run", "seq", "t", "kind", "node", "peer", "message", "phase", 
 
 
 def state_columns(n: int) -> list[str]:
-    """Columns of the table of states for an n-dimensional plant, P by rows of its upper triangle."""
+    """Columns of the table of states for an n-dimensional plant; P by rows of its upper half."""
     join = "" if n <= 10 else "_"
     upper = [f"P{i}{join}{j}" for i in range(n) for j in range(i, n)]
     states = [f"{name}{i}" for name in ("x", "xhat") for i in range(n)]

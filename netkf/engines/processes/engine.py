@@ -23,14 +23,15 @@ SENSE, DIVERGED = CODES["sense"], CODES["diverged"]
 Processes = list[Generator[simpy.Event, Any, None]]
 
 
-class Diverged(Exception):
+class DivergedError(Exception):
     """A covariance is no longer finite."""
 
 
 @dataclass
 class ProcessesEngine(Engine):
     """Runs every scenario. ``arrange`` may reorder the processes before they start; nothing that
-    happens depends on it."""
+    happens depends on it.
+    """
 
     arrange: Callable[[Processes], Processes] = list
     name = "processes"
@@ -60,7 +61,7 @@ class ProcessesEngine(Engine):
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             try:
                 timeline.run()
-            except Diverged:
+            except DivergedError:
                 return "diverged"
             finally:
                 recorder.flush()
@@ -106,4 +107,4 @@ def _sampling(
         if broken.size:
             for k in broken:
                 recorder.append((time, DIVERGED, scenario.nodes[k], -1, -1, -1, NAN))
-            raise Diverged
+            raise DivergedError

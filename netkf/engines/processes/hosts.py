@@ -106,12 +106,30 @@ def make_hosts(
 
     if algorithm.pooled:
         every = [path for node in scenario.sensing for path in sensors(node)]
-        shared = Host(timeline, recorder, truth, algorithm, -1, 0, scenario.pooled_model,
-                      scenario.start(nodes[0]), every)
+        shared = Host(
+            timeline,
+            recorder,
+            truth,
+            algorithm,
+            -1,
+            0,
+            scenario.pooled_model,
+            scenario.start(nodes[0]),
+            every,
+        )
         return dict.fromkeys(nodes, shared)
     return {
-        node: Host(timeline, recorder, truth, algorithm, node, entity, scenario.models[entity],
-                   scenario.start(node), sensors(node))
+        node: Host(
+            timeline,
+            recorder,
+            truth,
+            algorithm,
+            node,
+            entity,
+            scenario.models[entity],
+            scenario.start(node),
+            sensors(node),
+        )
         for entity, node in enumerate(nodes)
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from heapq import heappush
+from typing import Any
 
 import simpy
 
@@ -21,5 +22,6 @@ class Timeline(simpy.Environment):
         """
         event = simpy.Event(self)
         event._ok, event._value = True, None
-        heappush(self._queue, (time, rank << 48 | entity, next(self._eid), event))
+        queue: list[Any] = self._queue  # simpy annotates its priorities as two constants
+        heappush(queue, (time, rank << 48 | entity, next(self._eid), event))
         return event
