@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 from netkf.core.arrays import FloatArray, symmetric
 
@@ -119,7 +120,7 @@ def riccati_step(
     while whole >> level:
         if whole >> level & 1:
             F = table.F[level]
-            middle = np.linalg.solve(np.eye(n) + P @ table.G[level], P)
+            middle = _solve(np.eye(n) + P @ table.G[level], P)
             P = table.Q[level] + F @ middle @ F.T
             P = 0.5 * (P + P.T)
             x = table.jump[level] @ x
@@ -130,5 +131,11 @@ def riccati_step(
     E, transition = evaluate_hamiltonian(table, rest)
     X = E[:n, :n] + E[:n, n:] @ P
     Y = E[n:, :n] + E[n:, n:] @ P
-    moved = np.linalg.solve(X.T, Y.T)
-    return np.asarray(0.5 * (moved + moved.T)), transition @ x
+    P = _solve(X.T, Y.T)
+    return 0.5 * (P + P.T), transition @ x
+
+
+def _solve(left: FloatArray, right: FloatArray) -> FloatArray:
+    # LAPACK itself: numpy's wrapper takes longer than the arithmetic. Overflow gives nan.
+    _, _, solution, info = dgesv(left, right)
+    return np.full_like(right, np.nan) if info else np.asarray(solution)

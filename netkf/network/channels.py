@@ -49,6 +49,11 @@ class Loss(Part):
         """Whether every chance is 0 or 1 and nothing is drawn."""
         return False
 
+    @property
+    def changing(self) -> bool:
+        """Whether ``weather`` draws."""
+        return False
+
     def mean_delivery(self, link: Link, measured: float) -> float:
         """Delivered fraction in the long run; nan where it is not known beforehand."""
         return self.chance(link, 0, False, measured)
@@ -157,6 +162,11 @@ class GilbertElliott(Loss):
         assert self.to_bad is not None
         assert self.to_good is not None
         return self.to_bad, self.to_good
+
+    @property
+    def changing(self) -> bool:
+        """True."""
+        return True
 
     def weather(self, bad: bool | None, random: np.random.Generator) -> bool:
         """One step of the chain; the first state is stationary."""
@@ -360,15 +370,18 @@ class Fates:
         self._bad: bool | None = None
         self._luck = self._sky = self._post = None
         if not self._loss.certain:
-            self._luck, self._sky = generator("loss"), generator("weather")
+            self._luck = generator("loss")
+        if self._loss.changing:
+            self._sky = generator("weather")
         if self._fixed is None:
             self._post = generator("delay")
 
     def draw(self) -> tuple[float, bool, float]:
         """A uniform number, whether the link is in its bad state, and a delay in seconds."""
         luck, bad, delay = 0.0, False, self._fixed
-        if self._luck is not None and self._sky is not None:
+        if self._luck is not None:
             luck = float(self._luck.random())
+        if self._sky is not None:
             self._bad = bad = self._loss.weather(self._bad, self._sky)
         if delay is None:
             assert self._post is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -50,8 +51,8 @@ class LinkClock(Part):
         ``now`` (0.0 before the first). Empty when the clock has stopped for good.
         """
 
-    def origin(self, link: Link, random: np.random.Generator) -> float:
-        """What is drawn once for a link at its start, such as a phase."""
+    def origin(self, link: Link, random: Callable[[], np.random.Generator]) -> float:
+        """What is drawn once for a link at its start, such as a phase, from ``random()``."""
         return 0.0
 
     def mean_rate(self, link: Link) -> float:
@@ -240,10 +241,10 @@ class Periodic(LinkClock):
             if isinstance(value, float) and value >= self.period:
                 raise ScenarioError(name, "must be below the period", value, "give less")
 
-    def origin(self, link: Link, random: np.random.Generator) -> float:
+    def origin(self, link: Link, random: Callable[[], np.random.Generator]) -> float:
         """The phase."""
         if isinstance(self.phase, str):
-            return self.period * float(random.random())
+            return self.period * float(random().random())
         return self.phase
 
     def mean_rate(self, link: Link) -> float:

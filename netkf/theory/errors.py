@@ -120,7 +120,7 @@ class _Errors:
         self._follows = bool(self._difference.any())
         self._noise = [self._true_noise(scenario, k, pooled) for k in range(self.hosts)]
         blocks = self.hosts + self._follows
-        self._sigma: FloatArray = np.kron(np.ones((blocks, blocks)), self._plant.start_cov)
+        self._sigma: FloatArray = np.tile(self._plant.start_cov, (blocks, blocks))
         self._time = 0.0
         self._messages: list[tuple[int, int, int]] = []
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.riccati import riccati_step, riccati_table
-from netkf.core.arrays import FloatArray, is_semidefinite, square_root, symmetric
+from netkf.core.arrays import ArrayLike, FloatArray, is_semidefinite, square_root, symmetric
 from netkf.core.errors import TheoryError
 
 RESIDUAL = 1e-9
 
 
-def as_square(name: str, value: Any, n: int | None = None) -> FloatArray:
+def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
     """A finite (n, n) float array; raises TheoryError otherwise."""
     array: FloatArray = np.asarray(value, dtype=np.float64)
     wanted = "square" if n is None else f"{n} x {n}"
@@ -25,7 +23,7 @@ def as_square(name: str, value: Any, n: int | None = None) -> FloatArray:
     return np.asarray(array)
 
 
-def as_covariance(name: str, value: Any, n: int) -> FloatArray:
+def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
     """A symmetric positive semidefinite (n, n) array; raises TheoryError otherwise."""
     array = as_square(name, value, n)
     if not np.allclose(array, array.T, rtol=1e-9, atol=1e-12 * np.abs(array).max()):
@@ -35,26 +33,28 @@ def as_covariance(name: str, value: Any, n: int) -> FloatArray:
     return symmetric(array)
 
 
-def riccati_flow(P: Any, A: Any, Q: Any, G: Any, gap: float) -> FloatArray:
+def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: float) -> FloatArray:
     """The solution at time ``gap`` >= 0 (seconds) of dP = A P + P A' + Q - P G P from ``P``.
 
     All matrices are (n, n); ``G = H' R^-1 H``, H (4b). Relative error about 1e-15 whatever the gap.
     Raises TheoryError for wrong shapes, a P, Q or G that is not positive semidefinite, a negative
     or infinite gap, and where the solution overflows.
     """
-    A = as_square("A", A)
-    n = len(A)
-    P, Q, G = (as_covariance(name, v, n) for name, v in (("P", P), ("Q", Q), ("G", G)))
+    drift = as_square("A", A)
+    n = len(drift)
+    start, noise, information = (
+        as_covariance(name, value, n) for name, value in (("P", P), ("Q", Q), ("G", G))
+    )
     if not (np.isfinite(gap) and gap >= 0.0):
         raise TheoryError(f"gap must be finite and not negative, got {gap!r}")
     if gap == 0.0:
-        return P
+        return start
     with np.errstate(over="ignore", invalid="ignore"):
-        table = riccati_table(A, Q, G, float(gap))
-        P, _ = riccati_step(table, P, np.zeros(n), float(gap))
-    if not np.isfinite(P).all():
+        table = riccati_table(drift, noise, information, float(gap))
+        end, _ = riccati_step(table, start, np.zeros(n), float(gap))
+    if not np.isfinite(end).all():
         raise TheoryError(f"the solution overflows before {gap:g} s: an undetectable mode grows")
-    return P
+    return end
 
 
 def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:

@@ -54,7 +54,7 @@ class LinkProcess:
         self._timeline, self._recorder = timeline, recorder
         self._link, self._entity, self._horizon = link, entity, scenario.horizon
         self._random = streams.generator("clock", i, j)
-        self._origin = self._clock.origin(link, streams.generator("phase", i, j))
+        self._origin = self._clock.origin(link, partial(_stream, streams, link, "phase"))
         self._shared = network.channel.symmetric
         fates = [
             Fates(network.channel, partial(_stream, streams, ends)) for ends in ((i, j), (j, i))
