@@ -55,6 +55,19 @@ def _lines(axes: Any, times: FloatArray, values: FloatArray, scenario: Scenario)
     axes.autoscale()
 
 
+def _legend(axes: Any) -> None:
+    axes.legend(
+        frameon=False,
+        fontsize=7.5,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 0.98),
+        ncols=4,
+        columnspacing=1.2,
+        handlelength=1.6,
+        borderaxespad=0.2,
+    )
+
+
 def _scale(axes: Any, values: FloatArray) -> None:
     """Logarithmic where the values span more than a factor of 100."""
     positive = values[np.isfinite(values) & (values > 0.0)]
@@ -74,14 +87,14 @@ def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
         np.sqrt((error**2).mean(axis=1)),
         color=PROMISE,
         lw=1.6,
-        label="root mean square of all nodes",
+        label="root mean square of all",
         zorder=3,
     )
     axes.plot([], [], color=SENSING, label="nodes with a sensor")
     axes.plot([], [], color=RELAY, label="nodes without")
     _scale(axes, error)
     axes.set(ylabel="error |x - xhat|", xlabel="simulated seconds")
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
+    _legend(axes)
 
 
 def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
@@ -96,7 +109,7 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
             color=PROMISE,
             ls="--",
             lw=1.3,
-            label="bound on E[P], H(12): largest",
+            label="bound H(12): largest",
             zorder=3,
         )
         axes.plot(
@@ -105,11 +118,11 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
             color=PROMISE,
             ls=":",
             lw=1.3,
-            label="and smallest over nodes",
+            label="and smallest",
             zorder=3,
         )
     for value, words, style in (
-        (promised.limit, "its limit S, H(13)", "-."),
+        (promised.limit, "limit S, H(13)", "-."),
         (promised.central, "centralised filter", "-"),
     ):
         if math.isfinite(value):
@@ -117,14 +130,14 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
     shown = root if promised.bound is None else np.concatenate([root, np.sqrt(promised.bound)])
     _scale(axes, shown)
     axes.set(ylabel="square root of trace P", xlabel="simulated seconds")
-    axes.legend(frameon=False, fontsize=8, loc="best", ncols=2)
+    _legend(axes)
 
 
 def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) -> None:
     topology = scenario.topology
     places = topology.positions or _layout(scenario)
-    ticks = finished.samples.ticks
-    counts = np.array([ticks.get(link, 0) for link in topology.links], dtype=float)
+    delivered = finished.samples.delivered
+    counts = np.array([delivered.get(link, 0) for link in topology.links], dtype=float)
     if len(counts):
         share = counts / max(float(counts.max()), 1.0)
         axes.add_collection(
@@ -174,7 +187,7 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
     axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))
     total = finished.summary["messages"]
     axes.set_title(
-        f"links as wide as they ticked; {total['sent']:,} messages, {total['lost']:,} lost",
+        f"links as wide as they delivered; {total['sent']:,} messages, {total['lost']:,} lost",
         fontsize=9,
     )
     figure.colorbar(dots, ax=axes, shrink=0.5, label="RMS error", pad=0.01)

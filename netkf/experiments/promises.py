@@ -88,9 +88,11 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
     if any(column["trace"] for column in columns):
         lines.append(textwrap.indent(_by_node(scenario, columns), "  "))
     lines += ["", "traces to compare"]
+    delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
     for name, words, _ in LIMITS:
         value = found[name]
-        lines.append(f"  {words}: {value['reason'] or number(value['trace'])}")
+        note = ", if messages took no time" if delayed and name != "central_covariance" else ""
+        lines.append(f"  {words}{note}: {value['reason'] or number(value['trace'])}")
     return "\n".join(lines)
 
 

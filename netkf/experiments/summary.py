@@ -19,7 +19,7 @@ from netkf.trace.schema import CODES
 
 class SummarySink(Sink):
     """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES; and
-    how often each link ticked.
+    how many messages each link delivered.
     """
 
     def __init__(self) -> None:
@@ -27,16 +27,15 @@ class SummarySink(Sink):
         self.sq_error: list[FloatArray] = []
         self.trace: list[FloatArray] = []
         self.nees: list[FloatArray] = []
-        self.ticks: dict[tuple[int, int], int] = {}
+        self.delivered: dict[tuple[int, int], int] = {}
 
     def events(self, rows: np.ndarray) -> None:
-        """Ticks of each link are counted."""
-        ticks = rows[rows["kind"] == CODES["tick"]]
-        pairs, counts = np.unique(
-            np.column_stack([ticks["node"], ticks["peer"]]), axis=0, return_counts=True
-        )
-        for (node, peer), count in zip(pairs.tolist(), counts.tolist(), strict=True):
-            self.ticks[node, peer] = self.ticks.get((node, peer), 0) + count
+        """Deliveries of each link are counted, both directions together."""
+        arrived = rows[rows["kind"] == CODES["deliver"]]
+        ends = np.sort(np.column_stack([arrived["node"], arrived["peer"]]), axis=1)
+        pairs, counts = np.unique(ends, axis=0, return_counts=True)
+        for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+            self.delivered[i, j] = self.delivered.get((i, j), 0) + count
 
     def states(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         """Reduced at once."""

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.integrate
 import scipy.sparse.linalg
 
+from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
@@ -18,6 +19,8 @@ from netkf.theory.threshold import growth, threshold_factor
 TOLERANCE = 1e-10
 DEFECT = 1e-7
 CHECKED_STEPS = 200
+EXPLICIT_EVALUATIONS = 20_000
+OVERFLOW = 1e150
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
@@ -33,12 +36,31 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     if moments.ndim != 1 or (np.diff(moments) < 0.0).any() or (moments < 0.0).any():
         raise TheoryError("times must be increasing and not negative")
     equations = coupled(scenario)
-    P = np.empty((len(moments), *equations.start.shape))
-    last, pieces = float(moments[-1]), _Pieces(equations)
-    pieces.extend(last)
-    for k, t in enumerate(moments):
-        P[k] = pieces(float(t))
-    return symmetric(P)
+    if equations.coupling.nnz == 0:
+        P = _uncoupled(equations, moments)
+    else:
+        pieces = _Pieces(equations)
+        pieces.extend(float(moments[-1]))
+        P = symmetric(np.stack([pieces(float(t)) for t in moments]))
+    if not np.abs(P).max() < OVERFLOW:
+        raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {moments[-1]:g} s")
+    return P
+
+
+def _uncoupled(equations: Coupled, times: FloatArray) -> FloatArray:
+    """The Riccati flow of each node by itself."""
+    P = np.empty((len(times), *equations.start.shape))
+    tables: dict[bytes, RiccatiTable] = {}
+    nothing = np.zeros(len(equations.A))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i, (G, start) in enumerate(zip(equations.G, equations.start, strict=True)):
+            key = G.tobytes()
+            if key not in tables:
+                longest = max(float(times[-1]), 1e-9)
+                tables[key] = riccati_table(equations.A, equations.Q, G, longest)
+            for k, t in enumerate(times):
+                P[k, i] = riccati_step(tables[key], start, nothing, float(t))[0] if t else start
+    return P
 
 
 class _Pieces:
@@ -53,7 +75,8 @@ class _Pieces:
         start = self._equations.start
         if t <= 0.0:
             return start
-        piece = int(np.searchsorted(self._ends, t)) - 1
+        # t may lie a rounding error beyond what is known so far.
+        piece = min(int(np.searchsorted(self._ends, t)), len(self._outputs)) - 1
         return self._outputs[piece](t).reshape(start.shape)
 
     def extend(self, last: float) -> None:
@@ -71,6 +94,8 @@ class _Pieces:
 
         def f(t: float, y: FloatArray) -> FloatArray:
             P = y.reshape(shape)
+            if not np.abs(y).max() < OVERFLOW:
+                raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {t:g} s")
             if equations.delay == 0.0:
                 return slope(equations, P, P).reshape(-1)
             if begin < equations.delay * (1.0 - 1e-12):  # nothing has arrived yet
@@ -82,23 +107,60 @@ class _Pieces:
     def _integrate(
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray]
     ) -> None:
-        y = self(begin).reshape(-1)
-        scale = max(float(np.abs(y).max()), float(np.abs(self._equations.Q).max()), 1e-300)
         with np.errstate(over="ignore", invalid="ignore"):
-            solved = scipy.integrate.solve_ivp(
-                f,
-                (begin, end),
-                y,
-                method="DOP853",
-                dense_output=True,
-                rtol=TOLERANCE,
-                atol=1e-3 * TOLERANCE * scale,
-            )
+            try:
+                solved = self._solve(begin, end, _limited(f), method="DOP853")
+            except _StiffError:
+                # A blind node's large covariance reaches precise sensors: P G is a large rate.
+                solved = self._solve(begin, end, f, method="Radau", jac=self._jacobian)
         if not solved.success:
             raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
         assert solved.sol is not None
         _check_defect(f, solved.sol)
         self._outputs.append(solved.sol)
+
+    def _solve(
+        self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], **method: Any
+    ) -> Any:
+        y = self(begin).reshape(-1)
+        scale = max(float(np.abs(y).max()), float(np.abs(self._equations.Q).max()), 1e-300)
+        return scipy.integrate.solve_ivp(
+            f,
+            (begin, end),
+            y,
+            dense_output=True,
+            rtol=TOLERANCE,
+            atol=1e-3 * TOLERANCE * scale,
+            **method,
+        )
+
+    def _jacobian(self, t: float, y: FloatArray) -> Any:
+        equations = self._equations
+        if equations.delay > 0.0:  # what arrives is known, only what leaves depends on P
+            return linear_operator(equations, self._gains(y), arriving=False).tocsc()
+        return linear_operator(equations, self._gains(y)).tocsc()
+
+    def _gains(self, y: FloatArray) -> FloatArray:
+        return y.reshape(self._equations.start.shape) @ self._equations.G
+
+
+class _StiffError(Exception):
+    pass
+
+
+def _limited(
+    f: Callable[[float, FloatArray], FloatArray],
+) -> Callable[[float, FloatArray], FloatArray]:
+    left = EXPLICIT_EVALUATIONS
+
+    def counted(t: float, y: FloatArray) -> FloatArray:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise _StiffError
+        return f(t, y)
+
+    return counted
 
 
 def _check_defect(f: Callable[[float, FloatArray], FloatArray], output: Any) -> None:
@@ -128,7 +190,7 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     equations = coupled(scenario)
     P = _stabilising(equations)
     if P is None:
-        raise TheoryError(_below_threshold(scenario, equations))
+        raise TheoryError(_no_steady_state(scenario, equations))
     for _ in range(60):
         following = _newton(equations, P)
         change = np.abs(following - P).max()
@@ -170,27 +232,36 @@ def _stable(equations: Coupled, P: FloatArray) -> bool:
 
 
 def _stabilising(equations: Coupled) -> FloatArray | None:
-    """Covariances whose gains stabilise H(12), found on its own path; None where none exist."""
-    without_delay = equations._replace(delay=0.0)
-    P = equations.start + equations.Q + 1e-3 * np.eye(len(equations.A))
+    """Covariances whose gains stabilise H(12); None where none exist.
+
+    Implicit steps along H(12), each a steady problem with A shifted by 1/(2 step), that grow until
+    no shift is needed.
+    """
+    n = len(equations.A)
+    P = equations.start + equations.Q + 1e-3 * np.eye(n)
+    if _stable(equations, P):
+        return P
+    if growth(equations, 1.0) >= 0.0:
+        return None
     fastest = float(np.abs(equations.A).max() + equations.coupling.sum(axis=1).max() + 1e-3)
-    stretch, decided = 1.0 / fastest, False
-    for _ in range(40):
+    step = 0.1 / fastest
+    for _ in range(400):
+        shift = equations.A - 0.5 / step * np.eye(n)
+        implicit = equations._replace(A=shift, Q=equations.Q + P / step)
+        if not _stable(implicit, P):
+            step *= 0.5
+            continue
+        for _ in range(3):
+            P = _newton(implicit, P)
         if _stable(equations, P):
             return P
-        if not decided and stretch * fastest > 16.0:
-            if growth(equations, 1.0) >= 0.0:
-                return None
-            decided = True
-        pieces = _Pieces(without_delay._replace(start=P))
-        pieces.extend(stretch)
-        P, stretch = symmetric(pieces(stretch)), 1.5 * stretch
-        if not np.abs(P).max() < 1e100:
-            return None
+        step *= 1.5
     return None
 
 
-def _below_threshold(scenario: Scenario, equations: Coupled) -> str:
+def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
+    if growth(equations, 1.0) < 0.0:
+        return "H(12) has a steady state, but it was not found: too near the threshold"
     factor = threshold_factor(equations)
     if factor is None:
         return "H(12) has no steady state at any rate: the sensors together miss a growing mode"

@@ -109,9 +109,12 @@ def slope(equations: Coupled, P: FloatArray, sent: FloatArray) -> FloatArray:
     return np.asarray(change + mixed - leaving * P)
 
 
-def linear_operator(equations: Coupled, gains: FloatArray) -> scipy.sparse.csr_array:
+def linear_operator(
+    equations: Coupled, gains: FloatArray, arriving: bool = True
+) -> scipy.sparse.csr_array:
     """(N n n, N n n): ``X_i -> (A - K_i) X_i + X_i (A - K_i)' + sum_j c_ij (T X_j T' - X_i)`` on
-    row-major vec(X), where ``K_i = gains[i]`` stands for L_i H_i.
+    row-major vec(X), where ``K_i = gains[i]`` stands for L_i H_i; without the T X_j T' where they
+    are not ``arriving`` from the present.
     """
     n, eye = len(equations.A), np.eye(len(equations.A))
     leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)
@@ -119,6 +122,8 @@ def linear_operator(equations: Coupled, gains: FloatArray) -> scipy.sparse.csr_a
         np.kron(equations.A - K, eye) + np.kron(eye, equations.A - K) - out * np.eye(n * n)
         for K, out in zip(gains, leaving, strict=True)
     ]
+    if not arriving:
+        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
     between = scipy.sparse.kron(equations.coupling, np.kron(equations.T, equations.T))
     return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks) + between)
 

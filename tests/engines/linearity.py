@@ -52,7 +52,7 @@ def run(scenario, streams):
 
 
 def engine_covariance(scenario):
-    """(T, N, n, n): Cov(x - xhat_i) of what the engine computes, for plants that start at mean 0."""
+    """(T, N, n, n): Cov(x - xhat_i) of what the engine computes, for plants starting at mean 0."""
     silent = OneDraw(scenario.seed)
     assert not run(scenario, silent).any()
     total = 0.0

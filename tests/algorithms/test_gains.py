@@ -1,0 +1,118 @@
+"""The gains that use the moments of a reading, against the integrals that define them."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from netkf.algorithms.flow import FlowModel, FlowState, Payload, Reading
+from netkf.algorithms.gains import gain_table, longest_interval
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.riccati import riccati_step, riccati_table
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
+
+
+def system(seed, n=3, p=2):
+    random = np.random.default_rng(seed)
+    A, B, S = (random.normal(size=(n, n)) for _ in range(3))
+    H, V = random.normal(size=(p, n)), random.normal(size=(p, p))
+    return A, B @ B.T, H, V @ V.T + 0.1 * np.eye(p), S @ S.T
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gains_are_the_projections_of_the_exact_weight(seed):
+    """K_j = (2j+1)/g int P_j(s) Phi(g, s) P(s) H' R^-1 ds, with Phi from the closed loop's ODE."""
+    A, Q, H, R, P0 = system(seed)
+    g, G = 0.05, H.T @ np.linalg.solve(R, H)
+    table = riccati_table(A, Q, G, g)
+    model = FlowModel(A, Q, H, R, 1.0, g)
+    flow = lambda s: riccati_step(table, P0, np.zeros(3), s)[0]  # noqa: E731
+    steps = 2000
+
+    def transition(s):  # product of midpoint exponentials from s to g
+        h, Phi = (g - s) / steps, np.eye(3)
+        for k in range(steps):
+            Phi = scipy.linalg.expm((A - flow(s + (k + 0.5) * h) @ G) * h) @ Phi
+        return Phi
+
+    places, weights = np.polynomial.legendre.leggauss(4)
+    K = np.zeros((2, 3, 2))
+    for z, w in zip(places, weights, strict=True):
+        s = 0.5 * g * (1 + z)
+        k = transition(s) @ flow(s) @ H.T @ np.linalg.inv(R)
+        K[0] += 0.5 * w * k
+        K[1] += 1.5 * w * z * k
+    P, x = flow(g), np.array([1.0, -2.0, 0.5])
+    predicted = np.concatenate(
+        [
+            sum(
+                0.5 * g * w * z**j * H @ scipy.linalg.expm(-A * 0.5 * g * (1 - z)) @ x
+                for z, w in zip(NODES, WEIGHTS, strict=True)
+            )
+            for j in range(2)
+        ]
+    )
+    moments = np.array([0.3, -0.2, 0.02, 0.05])
+    expected = x + np.concatenate([K[0], K[1]], axis=1) @ (moments - predicted)
+    state = Hybrid(epsilon=0.5).measure(FlowState(x, P, model), Reading(moments, g))
+    np.testing.assert_allclose(state.xhat, expected, rtol=0, atol=2e-7)
+
+
+def test_the_innovation_does_not_see_the_state():
+    """A noise-free reading of a noise-free state leaves the error what the closed loop makes it."""
+    A, Q, H, R, P = system(1)
+    model, g = FlowModel(A, Q, H, R, 1.0, 0.1), 0.1
+
+    def update(x):
+        moments = np.concatenate(
+            [
+                sum(
+                    0.5 * g * w * z**j * H @ scipy.linalg.expm(A * 0.5 * g * (1 + z)) @ x
+                    for z, w in zip(NODES, WEIGHTS, strict=True)
+                )
+                for j in range(2)
+            ]
+        )
+        hybrid = Hybrid(epsilon=0.5)
+        start = FlowState(x + np.array([1.0, 0.0, 0.0]), P, model)
+        return (
+            scipy.linalg.expm(A * g) @ x
+            - hybrid.measure(hybrid.flow(start, g), Reading(moments, g)).xhat
+        )
+
+    np.testing.assert_allclose(update(np.zeros(3)), update(1e6 * np.ones(3)), atol=1e-7)
+
+
+def test_an_interval_that_is_too_long_is_refused():
+    A, Q, H, R, _ = system(2)
+    longest = longest_interval(A, Q, H, R)
+    gain_table(A, Q, H, R, longest)
+    with pytest.raises(ValueError, match="too long"):
+        gain_table(A, Q, H, R, 1.01 * longest)
+
+
+def test_reset_is_the_convex_combination_of_values_before_it():
+    """H (7), (9) written plainly; the self weight is 1 - sum of the active ones."""
+    A, Q, H, R, _ = system(3)
+    model, random = FlowModel(A, Q, H, R, 1.0, 0.1), np.random.default_rng(0)
+    own, one, two = (Payload(random.normal(size=3), np.diag(random.random(3))) for _ in range(3))
+    state = Hybrid(epsilon=0.3).absorb(
+        FlowState(own.xhat, own.P, model), [(0.3, one, 0.0), (0.3, two, 0.0)]
+    )
+    np.testing.assert_allclose(state.xhat, 0.4 * own.xhat + 0.3 * one.xhat + 0.3 * two.xhat)
+    np.testing.assert_allclose(state.P, 0.4 * own.P + 0.3 * one.P + 0.3 * two.P)
+
+
+def test_an_old_message_is_predicted_to_its_arrival():
+    A, Q, H, R, _ = system(4)
+    model, age = FlowModel(A, Q, H, R, 1.0, 0.1), 0.4
+    sent = Payload(np.array([1.0, 2.0, 3.0]), np.eye(3))
+    state = Hybrid(epsilon=1.0).absorb(FlowState(np.zeros(3), np.eye(3), model), [(1.0, sent, age)])
+    E = scipy.linalg.expm(A * age)
+    noise = sum(
+        0.5 * age * w * (F := scipy.linalg.expm(A * 0.5 * age * (1 + z))) @ Q @ F.T
+        for z, w in zip(NODES, WEIGHTS, strict=True)
+    )
+    np.testing.assert_allclose(state.xhat, E @ sent.xhat, rtol=1e-12)
+    np.testing.assert_allclose(state.P, E @ E.T + noise, rtol=1e-11)
+    np.testing.assert_array_equal(sent.P, np.eye(3))

@@ -1,0 +1,76 @@
+"""The Riccati flow against arbitrary-precision arithmetic and against itself."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import netkf
+from netkf.algorithms.riccati import riccati_step, riccati_table
+
+WALK = np.array([[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
+PUSH = np.diag([0.0, 0.25, 0.0, 0.25])
+LEAN = np.array([[0.1, 1.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, -1.0]])
+DRIVE = np.array([[1.0, 0.5, 0.0], [0.5, 1.25, 2.0], [0.0, 2.0, 4.0]])
+SYSTEMS = {  # A, Q, G; the constant-velocity Hamiltonians are defective, R = 0.01 is stiff
+    "walk": (WALK, PUSH, np.diag([2.5, 0, 0, 0])),
+    "walk, precise": (WALK, PUSH, np.diag([100.0, 0, 0, 0])),
+    "walk, blind": (WALK, PUSH, np.zeros((4, 4))),
+    "unstable, precise": (LEAN, DRIVE, np.diag([100.0, 0, 0])),
+    "unstable, other": (LEAN, DRIVE, np.diag([0, 0, 20.0])),
+    "oscillator": (np.array([[0.0, 1], [-1, 0.1]]), np.diag([0.0, 1]), np.diag([4.0, 0])),
+    "no noise": (np.array([[0.0, 1], [-1, -0.1]]), np.zeros((2, 2)), np.diag([4.0, 0])),
+}
+
+
+def exact(P, A, Q, G, gap):
+    n = len(A)
+    with mpmath.workdps(40 + int(25 * gap)):
+        M = mpmath.matrix(np.block([[-A.T, G], [Q, A]]).tolist())
+        E = mpmath.expm(M * mpmath.mpf(gap), method="taylor")
+        start = mpmath.matrix(P.tolist())
+        X = E[:n, :n] + E[:n, n:] * start
+        Y = E[n:, :n] + E[n:, n:] * start
+        return np.array((Y * X**-1).tolist(), dtype=float)
+
+
+@pytest.mark.parametrize("gap", [1e-6, 1e-3, 0.7, 13.0, 100.0])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_flow_agrees_with_arbitrary_precision(name, gap):
+    A, Q, G = SYSTEMS[name]
+    for P in (np.zeros_like(A), 1.5 * np.eye(len(A)), 1e4 * np.eye(len(A))):
+        truth = exact(P, A, Q, G, gap)
+        got = netkf.theory.riccati_flow(P, A, Q, G, gap)
+        assert np.abs(got - truth).max() <= 1e-12 * np.abs(truth).max()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 5), st.floats(1e-4, 3.0), st.floats(1e-4, 3.0))
+def test_flow_composes_over_gaps_and_keeps_covariances(seed, n, first, second):
+    random = np.random.default_rng(seed)
+    A = random.normal(size=(n, n))
+    B, C, S = (random.normal(size=(n, 2)) for _ in range(3))
+    Q, G, P = B @ B.T, C @ C.T, S @ S.T
+    table = riccati_table(A, Q, G, 10.0)
+    x = random.normal(size=n)
+    once, moved = riccati_step(table, P, x, first + second)
+    part, halfway = riccati_step(table, P, x, first)
+    twice, moved_twice = riccati_step(table, part, halfway, second)
+    scale = np.abs(once).max() + 1e-12
+    assert np.abs(once - twice).max() <= 1e-10 * scale
+    assert np.abs(moved - moved_twice).max() <= 1e-10 * (np.abs(moved).max() + 1e-12)
+    assert np.array_equal(once, once.T)
+    assert np.linalg.eigvalsh(once)[0] >= -1e-12 * scale
+
+
+def test_flow_refuses_what_is_no_riccati_equation():
+    eye = np.eye(2)
+    with pytest.raises(netkf.TheoryError, match="P must be a 2 x 2 matrix"):
+        netkf.theory.riccati_flow(np.eye(3), eye, eye, eye, 1.0)
+    with pytest.raises(netkf.TheoryError, match="Q must be positive semidefinite"):
+        netkf.theory.riccati_flow(eye, eye, -eye, eye, 1.0)
+    with pytest.raises(netkf.TheoryError, match="gap must be finite and not negative, got -1"):
+        netkf.theory.riccati_flow(eye, eye, eye, eye, -1.0)
+    with pytest.raises(netkf.TheoryError, match="overflows"):
+        netkf.theory.riccati_flow(eye, 10 * eye, eye, 0 * eye, 100.0)

@@ -1,0 +1,43 @@
+"""Shared by all tests: where the scenarios are and how to build one from plain values."""
+
+from pathlib import Path
+
+import pytest
+
+import netkf
+from netkf.scenario.reading import from_table
+
+ROOT = Path(__file__).parent.parent
+SCENARIOS = ROOT / "scenarios"
+
+
+def scenario_files():
+    return sorted(SCENARIOS.glob("*.toml"))
+
+
+@pytest.fixture
+def ring():
+    return netkf.load(SCENARIOS / "poisson_ring.toml")
+
+
+@pytest.fixture
+def build(tmp_path):
+    """A scenario from tables; tables that are missing get small defaults."""
+
+    def make(**tables):
+        table = {
+            "format": 1,
+            "name": "test",
+            "horizon": 3.0,
+            "probe": 0.5,
+            "plant": {"kind": "diffusion", "A": [[-0.5]], "B": [[1.0]], "cov": [[1.0]]},
+            "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[0.5]]}],
+            "network": {
+                "graph": {"kind": "path", "nodes": 2},
+                "activation": {"kind": "poisson", "rate": 2.0},
+            },
+            "filter": {"kind": "hybrid", "epsilon": 0.5},
+        }
+        return from_table({**table, **tables}, tmp_path)
+
+    return make

@@ -1,0 +1,87 @@
+"""Cov(x - xhat) of what the engine computes against the exact Sigma, without Monte Carlo."""
+
+import numpy as np
+import pytest
+
+from netkf.plants import diffusion, sensors
+from netkf.theory import error_covariance
+
+from .linearity import engine_covariance
+
+STATED = 1e-3  # the docs promise this much at the default sensing period
+
+
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch):
+    monkeypatch.setattr(diffusion, "BLOCK", 1)
+    monkeypatch.setattr(sensors, "BLOCK", 1)
+
+
+def deviation(scenario):
+    """Largest relative deviation (Frobenius) over sample times and nodes."""
+    mine, run = engine_covariance(scenario)
+    exact = error_covariance(scenario, run)
+    size = np.maximum(np.linalg.norm(exact, axis=(-1, -2)), 1e-12)
+    return (np.linalg.norm(mine - exact, axis=(-1, -2)) / size).max()
+
+
+def test_default_sensing_period_keeps_what_the_docs_state(ring):
+    assert deviation(ring.replace({"horizon": 3.0})) < STATED / 50
+
+
+def test_the_error_has_fourth_order_in_the_sensing_period(ring):
+    short = ring.replace({"horizon": 2.0, "probe": 1.0})
+    coarse, fine = (deviation(short.replace({"plant.sensing_period": h})) for h in (0.5, 0.25))
+    assert 10.0 < coarse / fine < 25.0
+
+
+def test_first_transient_needs_no_shorter_period(ring):
+    wide = [[1e4, 0.0], [0.0, 1e4]]
+    changes = {"horizon": 1.0, "probe": 0.2, "plant.cov": wide, "filter.cov": wide}
+    assert deviation(ring.replace(changes)) < STATED / 50
+
+
+def test_precise_sensors(ring):
+    changes = {"horizon": 1.0, "probe": 0.1, "sensors.0.R": [[0.01]]}
+    assert deviation(ring.replace(changes)) < STATED / 50
+
+
+def test_samples_off_the_sensing_grid(ring):
+    changes = {"horizon": 2.0, "probe": [0.33, 0.7, 1.1, 1.95], "plant.sensing_period": 0.25}
+    assert deviation(ring.replace(changes)) < STATED / 20
+
+
+@pytest.mark.parametrize(
+    "delay", [{"kind": "constant", "seconds": 0.3}, {"kind": "exponential", "mean": 0.2}]
+)
+def test_delays(ring, delay):
+    changes = {
+        "horizon": 2.0,
+        "network.channel.delay": delay,
+        "network.channel.symmetric": False,
+        "network.activation.rate": 4.0,
+    }
+    assert deviation(ring.replace(changes)) < STATED / 20
+
+
+@pytest.mark.parametrize(
+    "model",
+    [{"A": [[0.0, 1.0], [-1.2, 0.0]]}, {"B": [[0.3], [0.7]]}, {"R": [[1.0]]}],
+    ids=["A", "B", "R"],
+)
+def test_filters_that_believe_another_model(ring, model):
+    assert deviation(ring.replace({"horizon": 2.0, "filter.model": model})) < STATED / 20
+
+
+@pytest.mark.parametrize("kind", ["local", "central"])
+def test_baselines(ring, kind):
+    short = ring.replace({"horizon": 2.0, "filter": {"kind": kind}})
+    assert deviation(short) < STATED / 20
+
+
+def test_several_sensors_on_a_node_and_rows_of_zeros(ring):
+    more = [
+        {"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[0.25]]},
+        {"nodes": [0, 1], "H": [[0.0, 1.0], [0.0, 0.0]], "R": [[0.5, 0.1], [0.1, 0.3]]},
+    ]
+    assert deviation(ring.replace({"horizon": 1.5, "sensors": more})) < STATED / 20

@@ -1,0 +1,127 @@
+"""The plant's path and the sensors' noise against the laws that they are drawn from."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from netkf.plants import diffusion, sensors
+from netkf.plants.diffusion import Diffusion, default_sensing_period
+from netkf.plants.sensors import LinearSensor
+from tests.engines.linearity import Unit
+
+A = np.array([[0.0, 1.0], [-2.0, 0.3]])
+B = np.array([[0.0], [1.5]])
+COV = np.array([[2.0, 0.5], [0.5, 1.0]])
+
+
+@pytest.fixture(autouse=True)
+def few_draws(monkeypatch):
+    monkeypatch.setattr(diffusion, "BLOCK", 1)
+    monkeypatch.setattr(sensors, "BLOCK", 1)
+
+
+def plant(**changes):
+    given = {"A": A, "B": B, "mean": [0.0, 0.0], "cov": COV, "sensing_period": 0.2}
+    return Diffusion(**{**given, **changes})
+
+
+def covariance_of(compute, streams):
+    """Exact covariance of a linear map of normal draws, column by column."""
+    units = [Unit() for _ in range(streams)]
+    compute(*units)
+    columns = []
+    for k, unit in enumerate(units):
+        for place in range(unit.count):
+            chosen = [Unit(place if j == k else None) for j in range(streams)]
+            columns.append(compute(*chosen))
+    L = np.array(columns).T
+    return L @ L.T
+
+
+def exact_joint(times):
+    """Covariance of x at several times: e^At COV e^A't and the integral of the noise (Van Loan)."""
+    expm = scipy.linalg.expm
+
+    def at(t):
+        E = expm(np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]]) * t)
+        return expm(A * t) @ COV @ expm(A * t).T + E[2:, 2:].T @ E[:2, 2:]
+
+    return np.block(
+        [
+            [expm(A * max(t - s, 0.0)) @ at(min(s, t)) @ expm(A * max(s - t, 0.0)).T for s in times]
+            for t in times
+        ]
+    )
+
+
+@pytest.mark.parametrize("times", [[0.0, 0.2, 0.4, 1.0], [0.13, 0.17, 0.2, 0.55, 0.81]])
+def test_states_have_their_exact_joint_law_on_and_off_the_grid(times):
+    def compute(random, probing):
+        path = plant().path(random, probing, np.array(times))
+        return np.concatenate([path.state(t) for t in times])
+
+    np.testing.assert_allclose(covariance_of(compute, 2), exact_joint(times), rtol=0, atol=2e-9)
+
+
+def test_the_grid_does_not_depend_on_what_is_shown():
+    seeds = lambda: (np.random.default_rng(1), np.random.default_rng(2))  # noqa: E731
+    one = plant().path(*seeds(), np.array([0.4, 0.8]))
+    other = plant().path(*seeds(), np.array([0.05, 0.31, 0.4, 0.47, 0.8]))
+    for t in (0.4, 0.8):
+        np.testing.assert_array_equal(one.state(t), other.state(t))
+
+
+def test_moments_of_the_parts_of_a_step_add_up():
+    path = plant().path(np.random.default_rng(0), np.random.default_rng(1), np.array([]))
+    path.state(0.2)
+    whole = path.moments(0.2, 0.4)
+    cuts = [0.2, 0.23, 0.31, 0.4]
+    parts = [path.moments(a, b) for a, b in pairwise(cuts)]
+    np.testing.assert_allclose(sum(p[0] for p in parts), whole[0], rtol=1e-12)
+    # P_1 of the whole on a part [a, b] is middle + share P_1 of the part
+    tilted = sum(
+        (a + b - 0.6) / 0.2 * p[0] + (b - a) / 0.2 * p[1]
+        for a, b, p in zip(cuts[:-1], cuts[1:], parts, strict=True)
+    )
+    np.testing.assert_allclose(tilted, whole[1], rtol=0, atol=1e-14)
+
+
+def test_a_plant_without_noise_follows_its_equation():
+    quiet = plant(B=[[0.0], [0.0]], cov=np.zeros((2, 2)), mean=[1.0, -1.0])
+    path = quiet.path(np.random.default_rng(0), np.random.default_rng(1), np.array([0.77, 3.0]))
+    for t in (0.77, 3.0):
+        np.testing.assert_allclose(path.state(t), scipy.linalg.expm(A * t) @ [1.0, -1.0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("cuts", [[0.2], [0.05, 0.2], [0.01, 0.06, 0.19, 0.2]])
+def test_cuts_of_a_reading_are_independent_white_noise(cuts):
+    """Moments of the parts of a step: independent, variances g R and g R / 3 (derived)."""
+    R = np.array([[0.5, 0.2], [0.2, 0.4]])
+    sensor = LinearSensor((0,), np.zeros((2, 2)), R)
+
+    def compute(random, cutting):
+        truth = plant().path(np.random.default_rng(0), np.random.default_rng(1), np.array([]))
+        path, start, parts = sensor.path(random, cutting), 0.0, []
+        for end in cuts:
+            seen = truth.moments(start, end)
+            parts.append(path.moments(truth, seen, start, end).reshape(-1))
+            start = end
+        return np.concatenate(parts)
+
+    gaps = np.diff([0.0, *cuts])
+    blocks = [scipy.linalg.block_diag(g * R, g / 3.0 * R) for g in gaps]
+    expected = scipy.linalg.block_diag(*blocks)
+    np.testing.assert_allclose(covariance_of(compute, 2), expected, rtol=0, atol=1e-12)
+
+
+def test_default_period_follows_the_fastest_time_constant():
+    G = [np.diag([4.0, 0.0])]
+    slow, fast = (
+        default_sensing_period(plant(A=A * s, B=B * np.sqrt(s)), [g * s for g in G])
+        for s in (1.0, 10.0)
+    )
+    assert slow == pytest.approx(10.0 * fast)
+    # 1, 2 or 5 times a power of ten
+    assert f"{slow:e}"[0] in "125"

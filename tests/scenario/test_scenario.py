@@ -1,0 +1,120 @@
+"""Scenario files: read, change, write, read again."""
+
+import sys
+import textwrap
+import tomllib
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.scenario.reading import from_table, load
+from netkf.scenario.writing import as_table, resolved, to_toml
+from tests.conftest import scenario_files
+
+
+@pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
+def test_written_scenarios_read_back_the_same(file):
+    scenario = netkf.load(file)
+    for table in (as_table(scenario), resolved(scenario)):
+        again = from_table(tomllib.loads(to_toml(table)), file.parent)
+        assert resolved(again) == resolved(scenario)
+    assert resolved(scenario)["plant"]["sensing_period"] > 0.0
+
+
+@pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
+def test_resolved_scenarios_give_the_same_run(file, tmp_path):
+    scenario = netkf.load(file).replace({"horizon": 1.0, "probe": 0.5})
+    again = from_table(tomllib.loads(to_toml(resolved(scenario))), file.parent)
+    one, other = netkf.simulate(scenario), netkf.simulate(again)
+    assert one.fingerprint == other.fingerprint
+    np.testing.assert_array_equal(one.xhat, other.xhat)
+
+
+def test_random_graphs_are_resolved_with_their_seed(build):
+    network = {
+        "graph": {"kind": "geometric", "nodes": 8, "radius": 0.6, "connected": True},
+        "activation": {"kind": "poisson", "rate": 1.0},
+    }
+    scenario = build(network=network, seed=5, filter={"kind": "hybrid", "epsilon": 0.1})
+    assert resolved(scenario)["network"]["graph"]["seed"] == 5
+    assert scenario.replace({"seed": 6}).topology.links != scenario.topology.links
+
+
+def test_defaults_come_from_the_plant(build):
+    scenario = build(
+        plant={"kind": "diffusion", "A": [[-1.0]], "B": [[1.0]], "mean": [3.0], "cov": [[2.0]]}
+    )
+    run = netkf.simulate(scenario)
+    assert run.xhat[0].tolist() == [[3.0], [3.0]]
+    assert run.P[0].tolist() == [[[2.0]], [[2.0]]]
+
+
+def test_one_start_per_node(build):
+    filters = {"kind": "hybrid", "epsilon": 0.5, "mean": [[1.0], [2.0]], "cov": [[[3.0]], [[4.0]]]}
+    run = netkf.simulate(build(filter=filters))
+    assert run.xhat[0].tolist() == [[1.0], [2.0]]
+    assert run.P[0].tolist() == [[[3.0]], [[4.0]]]
+
+
+def test_replace_takes_paths_as_in_a_file(ring):
+    changed = ring.replace(
+        {
+            "network.activation.rate": 5.0,
+            "sensors.0.R": [[1.0]],
+            "sensors[0].nodes": [1],
+            "filter.kind": "hybrid",
+        }
+    )
+    assert changed.network.activation.rate == 5.0
+    assert changed.sensors[0].nodes == (1,)
+    assert ring.network.activation.rate == 2.0
+    assert ring.replace({}) == ring != changed
+    # derived defaults are derived again
+    assert ring.replace({"sensors.0.R": [[0.01]]}).truth.sensing_period < ring.truth.sensing_period
+
+
+def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
+    (tmp_path / "fusion.py").write_text(
+        textwrap.dedent(
+            """
+            from dataclasses import dataclass
+
+            from netkf.algorithms.hybrid import Hybrid
+            from netkf.core.fields import number, setting
+            from netkf.network.clocks import LinkClock
+
+
+            @dataclass(frozen=True, eq=False)
+            class Timid(Hybrid):
+                share: float = setting(number(above=0.0, high=1.0), default=0.5)
+
+                def weight(self, degree, peer_degree):
+                    return self.share * self.epsilon
+
+
+            @dataclass(frozen=True, eq=False)
+            class Doubling(LinkClock):
+                first: float
+
+                def ticks(self, link, origin, index, now, random, count):
+                    return self.first * 2.0 ** __import__("numpy").arange(index, index + count)
+            """
+        )
+    )
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    table = as_table(ring)
+    table["filter"] = {"kind": "fusion:Timid", "epsilon": 0.4, "cov": [[1.0, 0.0], [0.0, 1.0]]}
+    table["network"]["activation"] = {"kind": "fusion:Doubling", "first": 0.3}
+    file = tmp_path / "mine.toml"
+    file.write_text(to_toml(table))
+    scenario = load(file)
+    assert scenario.filter.algorithm.share == 0.5
+    run = netkf.simulate(scenario)
+    ticks = run.events[run.events.kind == "tick"]
+    assert sorted(set(ticks.t)) == [0.3, 0.6, 1.2, 2.4, 4.8, 9.6, 19.2]
+    assert resolved(scenario)["filter"]["kind"] == "fusion:Timid"
+    plain = scenario.replace({"filter.kind": "hybrid", "filter.epsilon": 0.2})
+    np.testing.assert_array_equal(netkf.simulate(plain).P, run.P)
+    with pytest.raises(netkf.ScenarioError, match=r"filter\.share: must be a finite number"):
+        scenario.replace({"filter.share": 2.0})

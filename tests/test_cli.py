@@ -1,0 +1,83 @@
+"""The command line as a user meets it."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import netkf
+from netkf.cli import main, parse_changes
+from tests.conftest import SCENARIOS
+
+RING = str(SCENARIOS / "poisson_ring.toml")
+
+
+def test_run_ends_with_a_table_and_a_picture(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["run", RING, "--out", str(out), "--set", "horizon=5.0"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for words in (
+        "node  RMS error  mean trace P  bound   ratio",
+        "messages: ",
+        "per second",
+        "limit S of H(13)",
+        str(out),
+    ):
+        assert words in printed.out
+    assert (out / "run.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_no_bound_is_shown_where_none_is_promised(tmp_path, capsys):
+    changes = ["--set", 'network.channel.delay={kind="exponential", mean=0.1}', "--no-plot"]
+    assert main(["run", RING, "--out", str(tmp_path / "o"), "--set", "horizon=3.0", *changes]) == 0
+    assert "bound: not promised: " in capsys.readouterr().out
+
+
+def test_theory_says_what_holds_before_anything_runs(capsys):
+    assert main(["theory", str(SCENARIOS / "threshold.toml")]) == 0
+    printed = capsys.readouterr().out
+    assert "the rate 1.7 is below the threshold 2" in printed
+    assert "FAILS" not in printed
+
+
+def test_theory_as_json_is_one_document(capsys):
+    assert main(["theory", RING, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert all(row["holds"] for row in found["assumptions"])
+    assert len(found["steady_bound"]["value"]) == 6
+    assert found["limit_covariance"]["trace"] == pytest.approx(2.194, rel=1e-3)
+
+
+def test_settings_are_toml_or_bare_words():
+    changes = parse_changes(["a.b=1.5", "c=[1, 2]", 'd="x y"', "e=word", "f=true", "g={ k = 1 }"])
+    assert changes == {"a.b": 1.5, "c": [1, 2], "d": "x y", "e": "word", "f": True, "g": {"k": 1}}
+
+
+def test_seed_makes_another_run(tmp_path, capsys):
+    for name, seed in (("a", "1"), ("b", "2")):
+        arguments = ["--set", "horizon=2.0", "--no-plot", "--trace", "none"]
+        main(["run", RING, "--seed", seed, "--out", str(tmp_path / name), *arguments])
+    one, other = (json.loads((tmp_path / n / "manifest.json").read_text()) for n in "ab")
+    assert one["fingerprint"] != other["fingerprint"]
+    assert other["seed"] == 2
+    assert not (tmp_path / "a" / "events.parquet").exists()
+
+
+def test_import_is_quick_and_light():
+    code = (
+        "import sys, netkf;"
+        "heavy = {'pandas', 'matplotlib', 'numba', 'scipy', 'networkx', 'simpy', 'pyarrow'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_public_names_exist():
+    for name in netkf.__all__:
+        assert getattr(netkf, name) is not None
+    assert set(netkf.__all__) <= set(dir(netkf))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = netkf.nothing

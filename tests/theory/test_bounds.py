@@ -1,0 +1,280 @@
+"""H(12) and its steady state against closed forms and plain integrations."""
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+
+import netkf
+from netkf import theory
+from netkf.theory.coupled import coupled
+from netkf.theory.threshold import growth
+
+
+def plain_bound(A, Q, G, c, P0, times):
+    """H(12) written plainly, with c[i][j] the effective rate times weight of messages j -> i."""
+    N, n = len(G), len(A)
+
+    def f(t, y):
+        P = y.reshape(N, n, n)
+        return np.concatenate(
+            [
+                (
+                    A @ P[i]
+                    + P[i] @ A.T
+                    - P[i] @ G[i] @ P[i]
+                    + Q
+                    + sum(c[i][j] * (P[j] - P[i]) for j in range(N))
+                ).ravel()
+                for i in range(N)
+            ]
+        )
+
+    solved = scipy.integrate.solve_ivp(
+        f, (0, times[-1]), np.concatenate([P0.ravel()] * N), "Radau", times, rtol=1e-10, atol=1e-12
+    )
+    return solved.y.T.reshape(len(times), N, n, n)
+
+
+def test_directions_that_lose_differently_enter_as_directed_rates(build, tmp_path):
+    rows = ["0,1,0.9", "1,0,0.4", "1,2,0.6", "2,1,1.0"]
+    (tmp_path / "links.csv").write_text("sender,receiver,delivery_probability\n" + "\n".join(rows))
+    scenario = build(
+        network={
+            "graph": {"kind": "csv", "path": "links.csv"},
+            "activation": {"kind": "poisson", "rate": 2.0, "rates": [[1, 2, 3.0]]},
+            "channel": {"loss": {"kind": "per-link"}, "symmetric": False},
+        },
+        filter={"kind": "hybrid", "epsilon": 0.4},
+    )
+    c = np.zeros((3, 3))
+    c[1, 0], c[0, 1], c[2, 1], c[1, 2] = 0.9 * 0.8, 0.4 * 0.8, 0.6 * 1.2, 1.0 * 1.2
+    G = [np.array([[2.0]]), np.zeros((1, 1)), np.zeros((1, 1))]
+    times = [0.5, 2.0, 7.0]
+    expected = plain_bound(np.array([[-0.5]]), np.eye(1), G, c, np.eye(1), times)
+    np.testing.assert_allclose(theory.covariance_bound(scenario, times), expected, rtol=1e-7)
+    # the limit weighs the nodes by the left null vector of the coupling
+    fast = scenario.replace(
+        {"network.activation": {"kind": "poisson", "rate": 4e4, "rates": [[1, 2, 6e4]]}}
+    )
+    np.testing.assert_allclose(
+        theory.steady_covariance_bound(fast),
+        np.broadcast_to(theory.limit_covariance(scenario), (3, 1, 1)),
+        rtol=3e-4,
+    )
+    w = scipy.linalg.null_space((np.diag(c.sum(1)) - c).T)[:, 0]
+    g = (w / w.sum())[0] * 2.0
+    S = (-1.0 + np.sqrt(1.0 + 4.0 * g)) / (2.0 * g)
+    np.testing.assert_allclose(theory.limit_covariance(scenario), [[S]], rtol=1e-12)
+
+
+def test_a_fixed_delay_enters_as_the_predicted_past(build):
+    """Against a fine explicit integration of the delay differential equation."""
+    d, rate, eps, a = 0.3, 2.0, 0.5, -0.5
+    delay = {"kind": "constant", "seconds": d}
+    network = {
+        "graph": {"kind": "path", "nodes": 2},
+        "activation": {"kind": "poisson", "rate": rate},
+        "channel": {"delay": delay},
+    }
+    scenario = build(network=network)
+    h = 1e-4
+    lag, steps = round(d / h), round(2.0 / h)
+    P = np.ones((steps + 1, 2))
+    G, T = np.array([2.0, 0.0]), np.exp(2 * a * d)
+    q = (T - 1.0) / (2 * a)
+
+    def slope(k, value, half):
+        if k + half < lag:
+            return 2 * a * value - G * value**2 + 1.0
+        past = P[k - lag] if not half else 0.5 * (P[k - lag] + P[k - lag + 1])
+        return 2 * a * value - G * value**2 + 1.0 + rate * eps * (T * past[::-1] + q - value)
+
+    for k in range(steps):
+        middle = P[k] + 0.5 * h * slope(k, P[k], 0)
+        P[k + 1] = P[k] + h * slope(k, middle, 0.5)
+    times = [0.2, 0.3, 0.6, 1.0, 2.0]
+    bound = theory.covariance_bound(scenario, times)[:, :, 0, 0]
+    np.testing.assert_allclose(bound, P[[round(t / h) for t in times]], rtol=2e-4)
+    steady = theory.steady_covariance_bound(scenario)
+    far = theory.covariance_bound(scenario, [40.0])[0]
+    np.testing.assert_allclose(steady, far, rtol=1e-8)
+
+
+def test_filters_that_do_not_talk_have_their_own_covariance_as_bound(build):
+    local = build(filter={"kind": "local"})
+    bound = theory.covariance_bound(local, local.times)
+    np.testing.assert_allclose(netkf.simulate(local).P, bound, rtol=1e-8)
+    central = build(filter={"kind": "central"})
+    run = netkf.simulate(central)
+    np.testing.assert_allclose(run.P, theory.covariance_bound(central, run.times), rtol=1e-8)
+    np.testing.assert_allclose(run.P[:, 0], run.P[:, 1], rtol=0)
+
+
+@pytest.mark.parametrize(("a", "eps"), [(0.5, 0.5), (0.3, 0.2), (1.0, 1.0)])
+def test_threshold_of_one_blind_node(build, a, eps):
+    """lambda > 2 a / eps, whatever the noises."""
+    plant = {"kind": "diffusion", "A": [[a]], "B": [[1.0]], "cov": [[1.0]]}
+
+    def scenario(rate):
+        return build(
+            plant=plant,
+            filter={"kind": "hybrid", "epsilon": eps},
+            network={
+                "graph": {"kind": "path", "nodes": 2},
+                "activation": {"kind": "poisson", "rate": rate},
+            },
+        )
+
+    critical = 2.0 * a / eps
+    assert np.isfinite(theory.steady_covariance_bound(scenario(1.01 * critical))).all()
+    with pytest.raises(netkf.TheoryError, match="is below the threshold") as caught:
+        theory.steady_covariance_bound(scenario(0.99 * critical))
+    assert float(str(caught.value).split()[-1]) == pytest.approx(critical, rel=1e-5)
+
+
+def test_threshold_where_every_node_sees_a_part(build):
+    """Two growing modes, each seen by one node: the claim is decided by integrating for long."""
+    plant = {
+        "kind": "diffusion",
+        "A": [[0.4, 0.1], [0.0, 0.2]],
+        "B": [[1.0, 0.0], [0.0, 1.0]],
+        "cov": [[1.0, 0.0], [0.0, 1.0]],
+    }
+    sensors = [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.5]]},
+        {"nodes": [1], "H": [[0.0, 1.0]], "R": [[0.5]]},
+    ]
+
+    def scenario(rate):
+        return build(
+            plant=plant,
+            sensors=sensors,
+            network={
+                "graph": {"kind": "path", "nodes": 3},
+                "activation": {"kind": "poisson", "rate": rate},
+            },
+        )
+
+    with pytest.raises(netkf.TheoryError, match="below the threshold") as caught:
+        theory.steady_covariance_bound(scenario(0.5))
+    critical = float(str(caught.value).split()[-1])
+    assert growth(coupled(scenario(critical * 1.001)), 1.0) < 0.0
+    steady = theory.steady_covariance_bound(scenario(1.02 * critical))
+    assert np.linalg.eigvalsh(steady).min() > 0.0
+    below = theory.covariance_bound(scenario(0.98 * critical), [200.0, 400.0, 800.0])
+    size = below.max(axis=(1, 2, 3))
+    assert size[2] / size[1] > 2.0
+    assert size[1] / size[0] > 1.4
+
+
+def test_no_rate_helps_where_a_growing_mode_is_missed(build):
+    plant = {"kind": "diffusion", "A": [[0.1, 0.0], [0.0, 0.3]], "B": [[1.0], [1.0]]}
+    sensors = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[1.0]]}]
+    scenario = build(
+        plant=plant,
+        sensors=sensors,
+        filter={"kind": "hybrid", "epsilon": 0.5, "cov": [[1.0, 0.0], [0.0, 1.0]]},
+    )
+    with pytest.raises(netkf.TheoryError, match="at any rate"):
+        theory.steady_covariance_bound(scenario)
+    with pytest.raises(netkf.TheoryError, match=r"eigenvalue 0\.3"):
+        theory.limit_covariance(scenario)
+
+
+@pytest.mark.parametrize(
+    ("network", "words"),
+    [
+        ({"activation": {"kind": "periodic", "period": 0.5}}, "not Poisson"),
+        ({"channel": {"delay": {"kind": "exponential", "mean": 0.1}}}, "delay is random"),
+        (
+            {"channel": {"loss": {"kind": "gilbert-elliott", "mean_loss": 0.2, "mean_burst": 3.0}}},
+            "losses depend on earlier ones",
+        ),
+    ],
+)
+def test_what_is_not_promised_is_said_in_words(build, network, words):
+    base = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "poisson", "rate": 1.0}}
+    scenario = build(network={**base, **network})
+    with pytest.raises(netkf.TheoryError, match=f"not promised: .*{words}"):
+        theory.covariance_bound(scenario, [1.0])
+    table = theory.assumptions(scenario)
+    assert table[~table.holds].evidence.str.contains("not promised").any()
+
+
+def test_convergence_to_the_limit_has_slope_minus_one(ring):
+    """H Theorem 3, measured."""
+    S = theory.limit_covariance(ring)
+    distance = []
+    for rate in (100.0, 300.0, 1000.0):
+        P = theory.steady_covariance_bound(ring.replace({"network.activation.rate": rate}))
+        distance.append(np.linalg.norm(P - S, axis=(1, 2)).max())
+    slopes = np.diff(np.log(distance)) / np.diff(np.log([100.0, 300.0, 1000.0]))
+    np.testing.assert_allclose(slopes, -1.0, atol=0.03)
+
+
+def test_the_true_errors_come_to_their_own_limit(build):
+    """Fast links: the exact covariance of a run comes to true_limit_covariance, far below S."""
+    network = {
+        "graph": {"kind": "path", "nodes": 2},
+        "activation": {"kind": "poisson", "rate": 400.0},
+    }
+    scenario = build(
+        network=network,
+        horizon=6.0,
+        probe=[5.0, 5.5, 6.0],
+        sensors=[{"nodes": [0, 1], "H": [[1.0]], "R": [[0.5]]}],
+    )
+    run = netkf.simulate(scenario)
+    limit = theory.true_limit_covariance(scenario)[0, 0]
+    assert theory.error_covariance(scenario, run)[..., 0, 0] == pytest.approx(limit, rel=0.02)
+    assert limit < 0.95 * theory.limit_covariance(scenario)[0, 0]
+
+
+def test_limit_of_sensors_all_alike_is_the_centralised_filter_with_more_noise(build):
+    """S is a single sensor's covariance; the centralised one has N times less noise."""
+    three = {
+        "graph": {"kind": "complete", "nodes": 3},
+        "activation": {"kind": "poisson", "rate": 1.0},
+    }
+    sensors = [{"nodes": [0, 1, 2], "H": [[1.0]], "R": [[0.5]]}]
+    scenario = build(network=three, sensors=sensors, filter={"kind": "hybrid", "epsilon": 0.3})
+    scalar = lambda g: (-1.0 + np.sqrt(1.0 + 4.0 * g)) / (2.0 * g)  # noqa: E731
+    assert theory.limit_covariance(scenario)[0, 0] == pytest.approx(scalar(2.0), rel=1e-12)
+    assert theory.central_covariance(scenario)[0, 0] == pytest.approx(scalar(6.0), rel=1e-12)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_theorem_2_by_simulation(ring, symmetric):
+    """E[P_i(t)] <= bound: no mean of 300 runs lies above by 4 standard errors (72 comparisons)."""
+    scenario = ring.replace({"horizon": 6.0, "probe": 1.0, "network.channel.symmetric": symmetric})
+    bound = theory.covariance_bound(scenario, scenario.times)
+    P = np.array([netkf.simulate(scenario, replica=r).P for r in range(300)])
+    traces = np.trace(P, axis1=-2, axis2=-1)
+    mean, error = traces.mean(axis=0), traces.std(axis=0, ddof=1) / np.sqrt(len(traces))
+    allowed = np.trace(bound, axis1=-2, axis2=-1)
+    assert (mean[1:] <= allowed[1:] + 4.0 * error[1:]).all()
+    # and the bound is not idle: it lies within a fifth of the mean
+    assert (mean[1:] >= 0.8 * allowed[1:]).all()
+
+
+def test_assumptions_name_what_fails(build):
+    scenario = build(
+        plant={
+            "kind": "diffusion",
+            "A": [[-0.5, 0.0], [0.0, -1.0]],
+            "B": [[1.0], [0.0]],
+            "cov": [[1.0, 0.0], [0.0, 1.0]],
+        },
+        sensors=[{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.5]]}],
+        filter={"kind": "hybrid", "epsilon": 0.5, "cov": [[0.5, 0.0], [0.0, 1.0]]},
+    )
+    table = theory.assumptions(scenario).set_index("assumption")
+    assert list(table.columns) == ["source", "holds", "evidence"]
+    failing = set(table.index[~table.holds])
+    assert failing == {
+        "(A, B) is controllable",
+        "(A, H) is observable, all sensors together",
+        "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
+    }
+    assert "eigenvalue -1" in table.evidence["(A, B) is controllable"]

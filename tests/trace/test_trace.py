@@ -1,0 +1,80 @@
+"""Tables, fingerprints, differences."""
+
+import hashlib
+
+import numpy as np
+
+import netkf
+from netkf.trace import recorder
+from netkf.trace.schema import EVENT_COLUMNS, state_columns
+
+
+def test_tables_have_their_columns(ring):
+    run = netkf.simulate(ring)
+    events, states = run.events, run.states
+    assert tuple(events.columns) == EVENT_COLUMNS
+    assert events.seq.tolist() == list(range(len(events)))
+    assert (events.run == 0).all()
+    assert events.t.is_monotonic_increasing
+    assert list(states.columns) == [
+        "run",
+        "t",
+        "node",
+        "x0",
+        "x1",
+        "xhat0",
+        "xhat1",
+        "P00",
+        "P01",
+        "P11",
+        "sq_error",
+        "nees",
+    ]
+    assert len(states) == len(run.times) * len(run.nodes)
+    row = states[(states.t == 3.5) & (states.node == 4)].iloc[0]
+    e = run.x[7] - run.xhat[7, 4]
+    assert row.sq_error == e @ e
+    np.testing.assert_allclose(row.nees, e @ np.linalg.inv(run.P[7, 4]) @ e)
+    assert run.P[7, 4, 0, 1] == row.P01
+    assert "P0_11" in state_columns(12)
+
+
+def test_columns_that_mean_nothing_say_so(ring):
+    events = netkf.simulate(ring).events
+    sense = events[events.kind == "sense"]
+    assert set(sense.node) == {0, 3}
+    assert (sense[["peer", "message", "phase"]] == -1).all(axis=None)
+    assert sense.age.isna().all()
+    assert (events[events.kind == "absorb"].age == 0.0).all()
+
+
+def test_nees_of_a_certain_state_is_nan(build):
+    run = netkf.simulate(build(plant={"kind": "diffusion", "A": [[-1.0]], "B": [[1.0]]}))
+    states = run.states
+    assert states[states.t == 0.0].nees.isna().all()
+    assert states[states.t > 0.0].nees.notna().all()
+
+
+def test_fingerprint_does_not_depend_on_blocks(ring, monkeypatch):
+    whole = netkf.simulate(ring)
+    monkeypatch.setattr(recorder, "BLOCK", 10)
+    pieces = netkf.simulate(ring)
+    assert pieces.fingerprint == whole.fingerprint
+    assert whole.fingerprint == hashlib.sha256(whole.log.tobytes()).hexdigest()
+    assert netkf.first_difference(whole, pieces) is None
+
+
+def test_first_difference_names_the_event(ring):
+    one = netkf.simulate(ring)
+    other = netkf.simulate(ring.replace({"network.channel.loss.delivery": 0.3}))
+    words = netkf.first_difference(one, other)
+    row = int(words.split()[1].rstrip(":"))
+    assert (
+        one.events.drop(columns="run")
+        .iloc[:row]
+        .equals(other.events.drop(columns="run").iloc[:row])
+    )
+    assert "kind=deliver" in words
+    assert "kind=lost" in words
+    short = netkf.simulate(ring.replace({"horizon": 10.0}))
+    assert "no event" in netkf.first_difference(one, short)
