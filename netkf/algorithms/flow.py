@@ -104,12 +104,12 @@ class FlowFilter(Part):
         already, its estimate does not yet.
         """
         P, xhat = riccati_step(state.model.riccati, state.P, state.xhat, gap)
-        return state._replace(xhat=xhat, P=P)
+        return FlowState(xhat, P, state.model)
 
     def measure(self, state: Any, reading: Reading) -> Any:
         """The state once the readings of the gap that just passed are used."""
         xhat = gain_update(state.model.gains, state.P, state.xhat, reading.moments, reading.gap)
-        return state._replace(xhat=xhat)
+        return FlowState(xhat, state.P, state.model)
 
     def emit(self, state: Any) -> Any:
         """What the node sends now."""

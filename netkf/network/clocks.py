@@ -131,58 +131,59 @@ class Poisson(LinkClock):
             )
 
 
+PARAMETERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "gamma": (("shape",), ("mean", "rate", "scale")),
+    "weibull": (("shape",), ("mean", "rate", "scale")),
+    "uniform": (("low", "high"), ()),
+    "constant": ((), ("mean", "rate")),
+}
+"""What each distribution of gaps needs, and of what it takes exactly one."""
+
+
 @dataclass(frozen=True, eq=False)
 class Renewal(LinkClock):
     """Independent gaps from one ``distribution``.
 
-    gamma and weibull take ``shape`` and either ``mean`` (seconds) or ``rate``; uniform takes
-    ``low`` and ``high``; constant takes ``mean`` or ``rate``. Shape 1 is the Poisson clock.
+    gamma and weibull take ``shape`` and one of ``mean`` (seconds), ``rate`` (one over the mean) or
+    ``scale``; uniform takes ``low`` and ``high``; constant takes ``mean`` or ``rate``. Gamma or
+    weibull gaps of shape 1 are the Poisson clock.
     """
 
-    distribution: str = setting(choice("gamma", "weibull", "uniform", "constant"))
+    distribution: str = setting(choice(*PARAMETERS))
     mean: float | None = setting(positive, default=None)
     rate: float | None = setting(positive, default=None)
+    scale: float | None = setting(positive, default=None)
     shape: float | None = setting(positive, default=None)
     low: float | None = setting(number(low=0.0), default=None)
     high: float | None = setting(positive, default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        uniform = self.distribution == "uniform"
-        shaped = self.distribution in ("gamma", "weibull")
-        for name, used in (("shape", shaped), ("low", uniform), ("high", uniform)):
-            self._demand(name, used)
-        if uniform:
-            self._demand("mean", False)
-            self._demand("rate", False)
-            assert self.low is not None
-            assert self.high is not None
-            if self.high < self.low:
-                raise ScenarioError("high", "must be at least low", self.high, "swap the two")
-        elif (self.mean is None) == (self.rate is None):
-            raise ScenarioError(
-                "mean",
-                "either mean or rate must be given, and not both",
-                self.mean,
-                "keep one of them",
-            )
-
-    def _demand(self, name: str, used: bool) -> None:
-        value = getattr(self, name)
-        if used and value is None:
-            raise ScenarioError(name, f"is missing for {self.distribution} gaps", None, "add it")
-        if not used and value is not None:
-            raise ScenarioError(
-                name, f"means nothing for {self.distribution} gaps", value, "remove it"
-            )
+        needed, one_of = PARAMETERS[self.distribution]
+        for name in ("shape", "low", "high", "mean", "rate", "scale"):
+            value = getattr(self, name)
+            if value is None and name in needed:
+                words = f"is missing for {self.distribution} gaps"
+                raise ScenarioError(name, words, None, f"add {name} = ...")
+            if value is not None and name not in needed + one_of:
+                words = f"means nothing for {self.distribution} gaps"
+                raise ScenarioError(name, words, value, "remove it")
+        given = [name for name in one_of if getattr(self, name) is not None]
+        if one_of and len(given) != 1:
+            words = f"exactly one of {', '.join(one_of)} must be given"
+            raise ScenarioError("mean", words, given, "keep or add one")
+        if self.low is not None and self.high is not None and self.high < self.low:
+            raise ScenarioError("high", "must be at least low", self.high, "swap the two")
 
     @property
     def _mean(self) -> float:
-        if self.distribution == "uniform":
-            assert self.low is not None
-            assert self.high is not None
+        if self.low is not None and self.high is not None:
             return 0.5 * (self.low + self.high)
-        return self.mean if self.mean is not None else 1.0 / float(self.rate or math.nan)
+        if self.scale is not None and self.shape is not None:
+            weibull = self.distribution == "weibull"
+            unit = math.gamma(1.0 + 1.0 / self.shape) if weibull else self.shape
+            return self.scale * unit
+        return self.mean if self.mean is not None else 1.0 / (self.rate or math.nan)
 
     def mean_rate(self, link: Link) -> float:
         """One over the mean gap."""

@@ -359,6 +359,7 @@ GRAPHS = [
     ("csv-outside", listed("../outside.csv"), f"{G}.path", "got '../outside.csv'"),
     ("csv-absolute", listed("/etc/passwd"), f"{G}.path", "must stay inside the folder"),
     ("csv-around", listed("folder/../../outside.csv"), f"{G}.path", "must stay inside the folder"),
+    ("csv-back", listed("../scenarios/ring.csv"), f"{G}.path", "must stay inside the folder"),
     ("csv-link", listed("link.csv"), f"{G}.path", "must stay inside the folder"),
     ("csv-circle", listed("circle.csv"), f"{G}.path", "got 'circle.csv'"),
     ("csv-nul-path", listed(r"a\u0000b"), f"{G}.path", r"got 'a\x00b'"),
@@ -384,7 +385,7 @@ GRAPHS = [
     ("csv-text", listed("measured.csv", 'minimum = "a"'), f"{G}.minimum", "at most 1; got 'a'"),
     ("csv-high", listed("measured.csv", "minimum = 1.5"), f"{G}.minimum", "at most 1; got 1.5"),
     ("csv-none", listed("measured.csv", "minimum = 0.95"), f"{G}.path", "no link of the table"),
-    ("csv-unmeasured", listed("ring.csv", "minimum = 0.5"), f"{G}.minimum", "column; got 0.5"),
+    ("csv-unmeasured", listed("ring.csv", "minimum = 0.5"), f"{G}.minimum", "table; got 0.5"),
     (
         "csv-left-out",
         listed("island.csv", "minimum = 0.5") | {"sensors.nodes": "[7]"},
@@ -828,7 +829,15 @@ def test_a_wrong_setting_is_refused_in_one_line(setting, key, fragment, write, r
 
 
 @pytest.mark.parametrize("command", ["run", "theory"])
-@pytest.mark.parametrize("name", ["absent.toml", "absent/absent.toml", "a" * 300, "", "folder"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("absent.toml", id="absent"),
+        pytest.param("absent/absent.toml", id="absent-folder"),
+        pytest.param("a" * 300, id="long"),
+        pytest.param("folder", id="folder"),
+    ],
+)
 def test_a_file_that_cannot_be_read_is_named(command, name, tmp_path, refusal):
     (tmp_path / "folder").mkdir()
     line = refusal(command, tmp_path / name)
@@ -873,7 +882,16 @@ def test_a_wrong_command_line_is_refused_in_one_line(arguments, fragment, write,
     assert says_what_to_do(line)
 
 
-@pytest.mark.parametrize("out", ["full", "file", "file/below", "a" * 300, "a\0b"])
+@pytest.mark.parametrize(
+    "out",
+    [
+        pytest.param("full", id="not-empty"),
+        pytest.param("file", id="file"),
+        pytest.param("file/below", id="below-a-file"),
+        pytest.param("a" * 300, id="long"),
+        pytest.param("a\0b", id="nul"),
+    ],
+)
 def test_a_directory_that_cannot_be_used_is_refused(out, write, refusal, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "kept.txt").write_text("kept")
@@ -946,6 +964,21 @@ RIGHT = [
 @pytest.mark.parametrize("change", rows(RIGHT))
 def test_what_is_right_is_not_refused(change, write):
     assert netkf.load(write(change)).plant.n == 2
+
+
+def test_two_folders_may_use_one_name_for_their_modules(tmp_path):
+    for nodes in (4, 5):
+        folder = tmp_path / str(nodes)
+        folder.mkdir()
+        (folder / "refusal_twin.py").write_text(
+            "from netkf.network.graphs import Cycle\n\n\n"
+            f"class Ring(Cycle):\n    origin = {nodes}\n"
+        )
+        path = folder / "twin.toml"
+        path.write_bytes(changed(graph("refusal_twin:Ring", f"nodes = {nodes}")))
+        scenario = netkf.load(path)
+        assert scenario.network.graph.origin == nodes
+        assert scenario.replace({"horizon": 1.0}).network.graph.origin == nodes
 
 
 def test_load_raises_an_error_with_its_parts(write):

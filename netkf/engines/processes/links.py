@@ -56,12 +56,12 @@ class LinkProcess:
         self._random = streams.generator("clock", i, j)
         self._origin = self._clock.origin(link, partial(_stream, streams, link, "phase"))
         self._shared = network.channel.symmetric
-        fates = [
-            Fates(network.channel, partial(_stream, streams, ends)) for ends in ((i, j), (j, i))
-        ]
-        self._ways = tuple(
-            Direction(scenario, ends, 2 * entity + k, hosts, fates[0 if self._shared else k])
-            for k, ends in enumerate(((i, j), (j, i)))
+        forth = Fates(network.channel, partial(_stream, streams, (i, j)))
+        # Symmetric: the messages of one activation share one draw.
+        back = forth if self._shared else Fates(network.channel, partial(_stream, streams, (j, i)))
+        self._ways = (
+            Direction(scenario, (i, j), 2 * entity, hosts, forth),
+            Direction(scenario, (j, i), 2 * entity + 1, hosts, back),
         )
 
     def ticking(self) -> Generator[simpy.Event, Any, None]:
