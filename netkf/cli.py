@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import netkf
-from netkf.core.errors import NetkfError, ScenarioError
+from netkf.core.errors import NetkfError, ScenarioError, quote
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
 BAD_USAGE, INTERRUPTED = 2, 130
+LONGEST_WORD = 1000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,8 +84,9 @@ def _command(
 
 
 def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be a non-negative integer, got {text!r}")
+    if not text.isdecimal() or len(text) > 30:
+        words = f"must be a non-negative integer of at most 30 digits, got {quote(text)}"
+        raise argparse.ArgumentTypeError(words)
     return int(text)
 
 
@@ -97,9 +99,12 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
         if not equals or not key or not text:
             raise ScenarioError("--set", "must be KEY.PATH=VALUE", setting, "write it that way")
         try:
-            changes[key] = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            if text[0] in "[{\"'":
+            value = tomllib.loads(f"value = {text}")
+            if list(value) != ["value"]:
+                raise ValueError
+            changes[key] = value["value"]
+        except (ValueError, RecursionError):
+            if text[0] in "[{\"'" or not text.isprintable() or len(text) > LONGEST_WORD:
                 raise ScenarioError(
                     "--set",
                     f"value of {key} is not valid TOML",
@@ -113,10 +118,15 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
 def _load(options: argparse.Namespace) -> Scenario:
     from netkf.scenario.reading import load
 
-    scenario = load(options.scenario, parse_changes(options.set))
+    changes = parse_changes(options.set)
+    if getattr(options, "seed", None) is not None:
+        changes["seed"] = options.seed
+    return load(options.scenario, changes)
+
+
+def _notes(scenario: Scenario) -> None:
     for note in scenario.topology.notes:
         print(f"note: {note}", file=sys.stderr)
-    return scenario
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -124,11 +134,10 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.experiments.tables import summary_table
 
     scenario = _load(options)
-    if options.seed is not None:
-        scenario = scenario.replace({"seed": options.seed})
     meter = _Meter(scenario.horizon)
     finished = run_to_directory(scenario, options.out, options.engine, options.trace, meter)
     meter.close()
+    _notes(scenario)
     print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
     print()
     print(summary_table(finished.summary))
@@ -179,6 +188,7 @@ def _theory(options: argparse.Namespace) -> int:
 
     scenario = _load(options)
     found = promises(scenario)
+    _notes(scenario)
     if options.json:
         print(json.dumps(found, indent=2))
     else:

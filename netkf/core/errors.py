@@ -41,8 +41,14 @@ class ScenarioError(NetkfError, ValueError):
     def __str__(self) -> str:
         got = "" if self.value is None else f"; got {quote(self.value)}"
         remedy = f"; {self.remedy}" if self.remedy else ""
-        where = ": ".join(part for part in (self.file, self.key) if part)
+        key = _printable(self.key)
+        where = ": ".join(part for part in (self.file, key) if part)
         return f"{where}: {self.rule}{got}{remedy}" if where else f"{self.rule}{got}{remedy}"
+
+
+def _printable(key: str, longest: int = 120) -> str:
+    shown = key if key.isprintable() else key.encode("unicode_escape").decode()
+    return shown if len(shown) <= longest else f"{shown[: longest // 2]} ... {shown[-20:]}"
 
 
 def quote(value: object, longest: int = 80) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
@@ -125,18 +126,23 @@ positive = number(above=0.0)
 probability = number(low=0.0, high=1.0)
 
 
-def integer(low: int | None = None) -> Rule:
-    """A whole number, at least ``low`` where that is given."""
+def integer(low: int | None = None, high: int | None = None) -> Rule:
+    """A whole number, at least ``low`` and at most ``high`` where they are given."""
 
     def convert(value: Any) -> int:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise TypeError
-        if low is not None and value < low:
+        if (low is not None and value < low) or (high is not None and value > high):
             raise ValueError
         return int(value)
 
     bound = "" if low is None else f" of at least {low}"
+    bound += "" if high is None else f" and at most {high:,}"
     return Rule(f"must be an integer{bound}", convert, f"give an integer{bound}")
+
+
+LARGEST = 1e30
+"""Numbers of larger size, or variances below its inverse, overflow when they meet."""
 
 
 def _is(kind: type) -> Callable[[Any], Any]:
@@ -149,7 +155,22 @@ def _is(kind: type) -> Callable[[Any], Any]:
 
 
 boolean = Rule("must be true or false", _is(bool), "write true or false without quotes")
-text = Rule("must be a string that is not empty", _is(str), 'write it as "text"')
+
+
+def _line(value: Any) -> str:
+    if not isinstance(value, str) or not value.isprintable():
+        raise TypeError
+    return value
+
+
+def _line_or_more(value: Any) -> str:
+    if not _line(value):
+        raise TypeError
+    return str(value)
+
+
+line = Rule("must be one line of text", _line, 'write it as "text" without line breaks')
+text = Rule("must be one line of text that is not empty", _line_or_more, 'write it as "text"')
 
 
 def instance(kind: type) -> Rule:
@@ -171,17 +192,33 @@ def choice(*names: str) -> Rule:
     return Rule(f"must be one of {listed}", convert, "choose one of them")
 
 
-def either(first: Rule, second: Rule) -> Rule:
-    """What obeys one of two rules."""
+def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
+    """What obeys the second rule where it looks like it, else the first."""
 
     def convert(value: Any) -> Any:
+        rule = second if is_second(value) else first
         try:
-            return first.convert(value)
-        except (TypeError, ValueError):
-            return second.convert(value)
+            return rule.convert(value)
+        except (_BecauseError, ScenarioError):
+            raise
+        except (TypeError, ValueError, OverflowError):
+            raise _BecauseError(words) from None
 
     words = f"{first.words}, or {second.words.removeprefix('must be ')}"
     return Rule(words, convert, first.remedy)
+
+
+def nested(depth: int) -> Callable[[Any], bool]:
+    """Whether lists are nested that deep."""
+
+    def measure(value: Any) -> int:
+        if isinstance(value, np.ndarray):
+            return value.ndim
+        if isinstance(value, (list, tuple)):
+            return 1 + max(map(measure, value), default=0)
+        return 0
+
+    return lambda value: measure(value) >= depth
 
 
 def array(dimensions: int, kind: str) -> Rule:
@@ -194,11 +231,13 @@ def array(dimensions: int, kind: str) -> Rule:
         if result.ndim != dimensions or result.size == 0:
             raise _BecauseError(f"must be a {kind}")
         if not np.isfinite(result).all():
-            raise _BecauseError(f"must be a {kind} of finite numbers")
+            raise _BecauseError(f"must be a {kind} with finite numbers")
+        if np.abs(result).max() > LARGEST:
+            raise _BecauseError(f"must be a {kind} with numbers of at most {LARGEST:g} in size")
         return result
 
     remedy = "write rows of equal length, [[a, b], [c, d]]" if dimensions == 2 else "write [a, b]"
-    return Rule(f"must be a {kind} of finite numbers", convert, remedy)
+    return Rule(f"must be a {kind} with finite numbers", convert, remedy)
 
 
 def _has_bool(value: Any) -> bool:
@@ -239,7 +278,7 @@ def _covariance(value: Any) -> FloatArray:
 def _definite(value: Any) -> FloatArray:
     result = _symmetric(value)
     values = np.linalg.eigvalsh(result)
-    if not values[0] > 1e-14 * abs(values[-1]):
+    if not values[0] > max(1e-14 * abs(values[-1]), 1.0 / LARGEST):
         raise _BecauseError(f"must be positive definite (least eigenvalue {values[0]:.3g})")
     return result
 
@@ -266,7 +305,8 @@ def several(rule: Rule, what: str, least: int = 1) -> Rule:
             raise ValueError
         return tuple(rule(f"[{k}]", item) for k, item in enumerate(value))
 
-    return Rule(f"must be a list of {what}", convert, f"write a list of {what}")
+    some = "" if least == 0 else " that is not empty"
+    return Rule(f"must be a list of {what}{some}", convert, f"write a list of {what}")
 
 
 def row(*rules: Rule, what: str) -> Rule:
@@ -282,12 +322,15 @@ def row(*rules: Rule, what: str) -> Rule:
     return Rule(f"must be {what}", convert, f"write {what}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SourceFile:
     """A file that a scenario names: its path as written, and the folder that it is relative to."""
 
     name: str
     folder: Path
+
+    def __repr__(self) -> str:
+        return repr(self.name)
 
     @property
     def full(self) -> Path:
@@ -304,12 +347,18 @@ def _source(value: Any) -> SourceFile:
             source = SourceFile(Path(value).name, Path(value).parent)
     else:
         raise TypeError
-    folder = source.folder.resolve()
-    if Path(source.name).is_absolute() or not source.full.resolve().is_relative_to(folder):
+    name = os.path.normpath(source.name)
+    if not source.name or os.path.isabs(name) or name == ".." or name.startswith("../"):
         raise _BecauseError("must stay inside the folder of the scenario file")
-    if not source.full.is_file():
-        raise _BecauseError(f"no such file in {source.folder}")
-    return source
+    try:
+        folder = source.folder.resolve()
+        if not source.full.resolve().is_relative_to(folder):
+            raise _BecauseError("must stay inside the folder of the scenario file")
+        if not source.full.is_file():
+            raise _BecauseError(f"no such file in {source.folder}")
+    except (OSError, RuntimeError) as error:  # a loop of links, a name that is too long
+        raise _BecauseError("must be the path of a file that can be read") from error
+    return SourceFile(name, source.folder)
 
 
 source_file = Rule(

@@ -11,6 +11,8 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 
+LARGEST_ID = 2**53
+
 
 def read_columns(
     source: SourceFile, required: tuple[str, ...], optional: tuple[str, ...] = ()
@@ -20,22 +22,32 @@ def read_columns(
     Raises ScenarioError, with the file and the line, for a missing column, a row of another
     length, or an entry that is not a finite number.
     """
-    with source.full.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file)
-        header = [name.strip() for name in next(reader, [])]
-        missing = [name for name in required if name not in header]
-        if missing:
-            raise ScenarioError(
-                "path",
-                f"{source.name} must have the columns {', '.join(required)}",
-                header,
-                f"add the column {missing[0]}",
-            )
-        names = [name for name in (*required, *optional) if name in header]
-        places = [header.index(name) for name in names]
-        rows = [_numbers(source, reader.line_num, header, r, places) for r in reader if r]
-    columns = np.array(rows, dtype=np.float64).reshape(len(rows), len(names)).T
+    header, rows = _read(source)
+    missing = [name for name in required if name not in header]
+    if missing:
+        words = f"{source.name} must have the columns {', '.join(required)}"
+        raise ScenarioError("path", words, header, f"add the column {missing[0]}")
+    names = [name for name in (*required, *optional) if name in header]
+    places = [header.index(name) for name in names]
+    numbers = [_numbers(source, line, header, row, places) for line, row in rows]
+    columns = np.array(numbers, dtype=np.float64).reshape(len(rows), len(names)).T
     return dict(zip(names, columns, strict=True))
+
+
+def read_header(source: SourceFile) -> list[str]:
+    """The names of the columns; raises ScenarioError where the file is no table."""
+    return _read(source)[0]
+
+
+def _read(source: SourceFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    try:
+        with source.full.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            header = [name.strip() for name in next(reader, [])]
+            return header, [(reader.line_num, row) for row in reader if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        words = f"{source.name} cannot be read as a UTF-8 table of comma-separated values"
+        raise ScenarioError("path", words, str(error), "mend the file") from None
 
 
 def _numbers(
@@ -64,12 +76,12 @@ def _numbers(
 
 
 def whole(source: SourceFile, name: str, column: FloatArray) -> list[int]:
-    """A column of node ids or counts as Python integers; raises ScenarioError for fractions."""
-    wrong = np.flatnonzero(column != np.round(column))
+    """A column of node ids or counts as Python integers; raises ScenarioError for others."""
+    wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > LARGEST_ID))
     if wrong.size:
         raise ScenarioError(
             "path",
-            f"{source.name}: {name} must hold integers",
+            f"{source.name}: {name} must hold integers from 0 to 2^53",
             float(column[wrong[0]]),
             "mend the row",
         )

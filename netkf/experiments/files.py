@@ -50,20 +50,45 @@ def finite(value: Any) -> Any:
 
 
 def new_directory(wanted: Path | None, name: str) -> Path:
-    """Where a run goes: ``wanted``, which must be new or empty, or the first free runs/NAME-k."""
-    if wanted is not None:
-        if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
-            raise ScenarioError(
-                "--out",
-                "must be a new or empty directory",
-                str(wanted),
-                "choose another, or remove it first",
-            )
-        return wanted
-    safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip(".") or "run"
-    return next(
-        path for k in range(1, 1_000_000) if not (path := Path("runs") / f"{safe}-{k}").exists()
-    )
+    """Make the directory of a run: ``wanted``, new or empty, or the first free runs/NAME-k."""
+    if wanted is None:
+        safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)[:100].strip(".")
+        tries = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
+        wanted = next(path for path in tries if not path.exists())
+    try:
+        wanted.mkdir(parents=True, exist_ok=True)
+        taken = any(wanted.iterdir())
+    except (OSError, ValueError) as error:
+        words = f"cannot be made ({getattr(error, 'strerror', None) or error})"
+        raise ScenarioError("--out", words, str(wanted), "choose another") from None
+    if taken:
+        raise ScenarioError(
+            "--out",
+            "must be a new or empty directory",
+            str(wanted),
+            "choose another, or remove it first",
+        )
+    return wanted
+
+
+OWN = (
+    "scenario.toml",
+    "manifest.json",
+    "events.parquet",
+    "states.parquet",
+    "ensemble.parquet",
+    "summary.json",
+    "run.png",
+)
+"""What a run directory holds."""
+
+
+def check_sources(scenario: Scenario) -> None:
+    """Raise ScenarioError for a file whose copy would stand in the way of the run's own."""
+    for source in source_files(scenario):
+        if source.name in OWN:
+            words = "is a name that run directories use themselves"
+            raise ScenarioError("path", words, source.name, "rename the file")
 
 
 def write_scenario(directory: Path, scenario: Scenario) -> None:

@@ -13,7 +13,13 @@ import numpy as np
 import netkf
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress, silent
-from netkf.experiments.files import ParquetSink, new_directory, write_json, write_scenario
+from netkf.experiments.files import (
+    ParquetSink,
+    check_sources,
+    new_directory,
+    write_json,
+    write_scenario,
+)
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, SummarySink, promise, summarise
 from netkf.scenario.scenario import Scenario
@@ -47,8 +53,8 @@ def run_to_directory(
     KeyboardInterrupt goes on. Raises ScenarioError and EngineError before anything is written.
     """
     chosen = choose_engine(engine, scenario)
+    check_sources(scenario)
     directory = new_directory(out, scenario.name)
-    directory.mkdir(parents=True, exist_ok=True)
     write_scenario(directory, scenario)
     samples, tables = SummarySink(), ParquetSink(directory, scenario, 0, trace != "none")
     recorder = Recorder([samples, tables])

@@ -213,12 +213,14 @@ class RecordedLoss(Loss):
         names = ("sender", "receiver", "message", "delivered")
         table = read_columns(self.path, names)
         rows = zip(*(whole(self.path, name, table[name]) for name in names), strict=True)
+        known: dict[tuple[int, int, int], int] = {}
         lost: dict[Link, set[int]] = {}
         for sender, receiver, message, delivered in rows:
-            if message < 0 or delivered not in (0, 1):
+            key = (sender, receiver, message)
+            if delivered not in (0, 1) or known.setdefault(key, delivered) != delivered:
                 raise ScenarioError(
                     "path",
-                    f"{self.path.name}: message counts from 0 and delivered is 0 or 1",
+                    f"{self.path.name}: delivered must be 0 or 1, one value a message",
                     [sender, receiver, message, delivered],
                     "mend the row",
                 )

@@ -73,7 +73,8 @@ def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
     return np.asarray(np.add.accumulate(np.concatenate([[now], gaps]))[1:])
 
 
-_link_rate = row(integer(), integer(), positive, what="a triple [i, j, rate]")
+_rate = number(above=0.0, high=1e9)
+_link_rate = row(integer(), integer(), _rate, what="a triple [i, j, rate]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Poisson(LinkClock):
     sets single links over that default.
     """
 
-    rate: float | None = setting(positive, default=None)
+    rate: float | None = setting(_rate, default=None)
     rates: tuple[tuple[int, int, float], ...] = setting(
         several(_link_rate, "triples [i, j, rate]", least=0), default=()
     )
@@ -114,13 +115,14 @@ class Poisson(LinkClock):
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(link))
 
     def check(self, topology: Topology) -> None:
-        """Every link has a rate, and every rate a link."""
-        links = set(topology.links)
+        """Every link has a rate, and every rate a link, once."""
+        links, named = set(topology.links), set()
         for k, (i, j, _) in enumerate(self.rates):
-            if (min(i, j), max(i, j)) not in links:
-                raise ScenarioError(
-                    f"rates[{k}]", "must name a link of the graph", [i, j], "remove or mend it"
-                )
+            link = (min(i, j), max(i, j))
+            if link not in links or link in named:
+                words = "names a link again" if link in named else "must name a link of the graph"
+                raise ScenarioError(f"rates[{k}]", words, [i, j], "remove or mend it")
+            named.add(link)
         bare = sorted(links - self._by_link.keys())
         if self.rate is None and bare:
             raise ScenarioError(
@@ -130,6 +132,9 @@ class Poisson(LinkClock):
                 "add rate = ... as the default of all links",
             )
 
+
+SHORTEST = 1e-9
+"""Seconds; gaps below it are not told apart from rounding."""
 
 PARAMETERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "gamma": (("shape",), ("mean", "rate", "scale")),
@@ -151,9 +156,9 @@ class Renewal(LinkClock):
 
     distribution: str = setting(choice(*PARAMETERS))
     mean: float | None = setting(positive, default=None)
-    rate: float | None = setting(positive, default=None)
+    rate: float | None = setting(_rate, default=None)
     scale: float | None = setting(positive, default=None)
-    shape: float | None = setting(positive, default=None)
+    shape: float | None = setting(number(low=0.1, high=1e6), default=None)
     low: float | None = setting(number(low=0.0), default=None)
     high: float | None = setting(positive, default=None)
 
@@ -174,6 +179,9 @@ class Renewal(LinkClock):
             raise ScenarioError("mean", words, given, "keep or add one")
         if self.low is not None and self.high is not None and self.high < self.low:
             raise ScenarioError("high", "must be at least low", self.high, "swap the two")
+        if self._mean < SHORTEST:
+            words = f"gaps must be at least {SHORTEST:g} s on average"
+            raise ScenarioError("high" if not one_of else given[0], words, self._mean, "lengthen")
 
     @property
     def _mean(self) -> float:
@@ -231,8 +239,10 @@ class Periodic(LinkClock):
     ``phase`` is a time in [0, period) or "random", one draw a link; nothing ticks at time 0.
     """
 
-    period: float = setting(positive)
-    phase: float | str = setting(either(number(low=0.0), choice("random")), default=0.0)
+    period: float = setting(number(low=SHORTEST))
+    phase: float | str = setting(
+        either(number(low=0.0), choice("random"), lambda value: isinstance(value, str)), default=0.0
+    )
     jitter: float = setting(number(low=0.0), default=0.0)
 
     def __post_init__(self) -> None:

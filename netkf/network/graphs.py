@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,13 +25,14 @@ from netkf.core.fields import (
     several,
     source_file,
 )
-from netkf.core.tables import read_columns, whole
+from netkf.core.tables import read_columns, read_header, whole
 
 if TYPE_CHECKING:
     import networkx
 
 Link = tuple[int, int]
 MOST_TRIES = 1000
+MOST_NODES, MOST_LINKS = 1_000_000, 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +96,21 @@ def _from_networkx(graph: networkx.Graph[Any], **more: Any) -> Topology:
     return _topology(graph.nodes, graph.edges, **more)
 
 
-_count = integer(low=1)
+_count = integer(low=1, high=MOST_NODES)
+_node = integer(low=0, high=2**53)
+
+
+def _bounded(nodes: int, links: int) -> None:
+    if nodes > MOST_NODES or links > MOST_LINKS:
+        words = f"must have at most {MOST_NODES:,} nodes and {MOST_LINKS:,} links"
+        raise ScenarioError("", words, f"{nodes:,} nodes, {links:,} links", "make it smaller")
 
 
 @dataclass(frozen=True, eq=False)
 class Cycle(Graph):
     """``nodes`` in a ring."""
 
-    nodes: int = setting(integer(low=3))
+    nodes: int = setting(integer(low=3, high=MOST_NODES))
 
     def build(self, seed: int) -> Topology:
         """Links (k, k + 1) and (0, nodes - 1)."""
@@ -127,6 +136,7 @@ class Complete(Graph):
 
     def build(self, seed: int) -> Topology:
         """All pairs."""
+        _bounded(self.nodes, self.nodes * (self.nodes - 1) // 2)
         pairs = [(i, j) for i in range(self.nodes) for j in range(i + 1, self.nodes)]
         return _topology(range(self.nodes), pairs)
 
@@ -151,6 +161,7 @@ class Grid(Graph):
 
     def build(self, seed: int) -> Topology:
         """Links to the right and below; positions on the lattice."""
+        _bounded(self.rows * self.columns, 2 * self.rows * self.columns)
         ids = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
         right = zip(ids[:, :-1].ravel().tolist(), ids[:, 1:].ravel().tolist(), strict=True)
         below = zip(ids[:-1].ravel().tolist(), ids[1:].ravel().tolist(), strict=True)
@@ -176,10 +187,7 @@ class RandomGraph(Graph):
         for attempt in range(MOST_TRIES if self.connected else 1):
             # networkx takes legacy generators only for its older functions.
             state = np.random.RandomState((first + attempt) % 2**32)
-            try:
-                graph = make(state)
-            except networkx.NetworkXError as error:
-                raise ScenarioError("", f"must be a graph that exists: {error}") from None
+            graph = make(state)
             if not self.connected or networkx.is_connected(graph):
                 return graph
         raise ScenarioError(
@@ -198,12 +206,28 @@ class Regular(RandomGraph):
     degree: int = setting(integer(low=0))
 
     def build(self, seed: int) -> Topology:
-        """networkx.random_regular_graph."""
+        """networkx.random_regular_graph; above half the nodes, the complement of one."""
         import networkx
 
-        return _from_networkx(
-            self._draw(seed, lambda s: networkx.random_regular_graph(self.degree, self.nodes, s))
-        )
+        N, degree = self.nodes, self.degree
+        if degree >= N or degree * N % 2:
+            raise ScenarioError(
+                "",
+                "a regular graph needs degree below nodes and degree * nodes even",
+                f"degree {degree}, nodes {N}",
+                "change one of them",
+            )
+        _bounded(N, degree * N // 2)
+
+        def make(state: np.random.RandomState) -> networkx.Graph[Any]:
+            if 2 * degree < N:
+                sparse: networkx.Graph[Any] = networkx.random_regular_graph(degree, N, state)
+                return sparse
+            rest = networkx.random_regular_graph(N - 1 - degree, N, state)
+            drawn: networkx.Graph[Any] = networkx.complement(rest)
+            return drawn
+
+        return _from_networkx(self._draw(seed, make))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +241,7 @@ class ErdosRenyi(RandomGraph):
         """networkx.fast_gnp_random_graph."""
         import networkx
 
+        _bounded(self.nodes, int(0.5 * self.p * self.nodes * (self.nodes - 1)))
         return _from_networkx(
             self._draw(seed, lambda s: networkx.fast_gnp_random_graph(self.nodes, self.p, s))
         )
@@ -247,7 +272,7 @@ class Edges(Graph):
     """Links written out; ``nodes = N`` names the nodes 0 .. N - 1, else the links do."""
 
     edges: tuple[Link, ...] = setting(
-        several(row(integer(), integer(), what="a pair of node ids"), "pairs of node ids", least=0)
+        several(row(_node, _node, what="a pair of node ids"), "pairs of node ids", least=0)
     )
     nodes: int | None = setting(_count, default=None)
     directed: bool = setting(boolean, default=False)
@@ -314,7 +339,10 @@ class CsvGraph(Graph):
         }
         if not links:
             raise ScenarioError(
-                "path", "no link of the table is left", self.path.name, "lower minimum or add rows"
+                "path" if self.minimum is None else "minimum",
+                "no link of the table is left",
+                self.minimum,
+                "lower minimum or add rows",
             )
         kept = {node for link in links for node in link}
         notes = _left_out(nodes - kept)
@@ -340,32 +368,28 @@ class CsvGraph(Graph):
                     [i, j, p],
                     "mend the row",
                 )
-        return dict(zip(zip(senders, receivers, strict=True), values, strict=True)), measured
+        pairs = list(zip(senders, receivers, strict=True))
+        twice = next((pair for pair, count in Counter(pairs).items() if count > 1), None)
+        if twice is not None:
+            words = f"{self.path.name}: each direction must be listed once"
+            raise ScenarioError("path", words, list(twice), "remove the other rows")
+        return dict(zip(pairs, values, strict=True)), measured
 
     def _positions(self, nodes: set[int]) -> dict[int, tuple[float, float]] | None:
         if self.positions is None:
             return None
-        header = self.positions.full.read_text(encoding="utf-8-sig").partition("\n")[0]
-        names = tuple(name.strip() for name in header.split(","))[:3]
+        source = self.positions
         try:
+            names = tuple(read_header(source)[:3])
             if len(names) < 3:
-                raise ScenarioError(
-                    "path",
-                    f"{self.positions.name} must have the columns node, x, y",
-                    header,
-                    "add what is missing",
-                )
-            table = read_columns(self.positions, names)
-            ids = whole(self.positions, names[0], table[names[0]])
+                words = f"{source.name} must have the columns node, x, y"
+                raise ScenarioError("", words, list(names), "add what is missing")
+            table = read_columns(source, names)
+            ids = whole(source, names[0], table[names[0]])
         except ScenarioError as error:
             raise ScenarioError("positions", error.rule, error.value, error.remedy) from None
-        places = dict(
-            zip(
-                ids,
-                zip(table[names[1]].tolist(), table[names[2]].tolist(), strict=True),
-                strict=True,
-            )
-        )
+        x, y = table[names[1]].tolist(), table[names[2]].tolist()
+        places = dict(zip(ids, zip(x, y, strict=True), strict=True))
         missing = sorted(nodes - places.keys())
         if missing:
             raise ScenarioError(

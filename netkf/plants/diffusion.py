@@ -70,10 +70,13 @@ class Diffusion(Part):
         return DiffusionPath(self, random, probing, shown)
 
 
-def default_sensing_period(plant: Diffusion, informations: list[FloatArray]) -> float:
+def default_sensing_period(
+    plant: Diffusion, informations: list[FloatArray], longest: float
+) -> float:
     """The sensing period for which the errors' covariance is within 1e-3 of the exact one.
 
-    ``informations`` are the matrices H' R^-1 H of the nodes that sense. The period is a fraction
+    ``informations`` are the matrices H' R^-1 H of the nodes that sense, ``longest`` what their
+    filters can use at once (algorithms/gains). The period is a fraction
     of the fastest time constant of the plant and of a node's own filter (a large first
     covariance asks for nothing shorter, see algorithms/gains), rounded down to 1, 2 or 5 times a
     power of ten. It depends on nothing else, so that filters and networks meet the same truth.
@@ -82,9 +85,7 @@ def default_sensing_period(plant: Diffusion, informations: list[FloatArray]) -> 
     for G in informations:
         M = np.block([[-plant.A.T, G], [plant.Q, plant.A]])
         fastest = max(fastest, float(np.abs(np.linalg.eigvals(M)).max()))
-    if fastest == 0.0:
-        return 1.0
-    wanted = 0.5 / fastest
+    wanted = min(0.5 / fastest if fastest > 0.0 else 1.0, longest)
     power = 10.0 ** math.floor(math.log10(wanted))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= wanted * (1.0 + 1e-9))
     return float(f"{digit * power:.12g}")

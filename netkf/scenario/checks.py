@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import longest_interval
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
 MOST_SAMPLES = 10_000_000
+MOST_STEPS = 100_000_000
+MOST_TICKS = 1e9
 
 
 def check(scenario: Scenario) -> None:
@@ -125,6 +128,7 @@ def _network(scenario: Scenario) -> None:
             None,
             'add activation = { kind = "poisson", rate = ... }',
         )
+    _ticks(scenario)
     if topology.directed:
         raise ScenarioError(
             "network.graph.directed",
@@ -140,6 +144,20 @@ def _network(scenario: Scenario) -> None:
             f"{len(topology.components)} parts, one of them {smallest}",
             "add links, or connected = true for a random graph",
         )
+
+
+def _ticks(scenario: Scenario) -> None:
+    clock = scenario.network.activation
+    assert clock is not None
+    for link in scenario.topology.links:
+        ticks = clock.mean_rate(link) * scenario.horizon
+        if ticks > MOST_TICKS:
+            raise ScenarioError(
+                "network.activation",
+                f"must make at most {MOST_TICKS:g} ticks of a link up to the horizon",
+                f"{ticks:.3g} ticks of link {link}",
+                "lower the rate or shorten the horizon",
+            )
 
 
 def _filter(scenario: Scenario) -> None:
@@ -211,19 +229,35 @@ def _degrees(scenario: Scenario) -> None:
 
 
 def _sensing_period(scenario: Scenario) -> None:
-    period = scenario.truth.sensing_period
+    period, horizon = scenario.truth.sensing_period, scenario.horizon
     assert period is not None
-    A, Q = scenario.belief
+    if horizon / period > MOST_STEPS:
+        raise ScenarioError(
+            "plant.sensing_period",
+            f"must make at most {MOST_STEPS:,} steps to the horizon",
+            period,
+            "lengthen it, shorten the horizon, or use less precise sensors",
+        )
     pooled = scenario.filter.algorithm.pooled
-    models = (
-        [scenario.pooled_model] if pooled else list({id(m): m for m in scenario.models}.values())
+    models = [scenario.pooled_model] if pooled else scenario.models
+    longest = min((_longest(scenario, model) for model in models if len(model.H)), default=period)
+    if min(period, horizon) <= longest * (1.0 + 1e-9):
+        return
+    if scenario.plant.sensing_period is not None:
+        raise ScenarioError(
+            "plant.sensing_period",
+            "is too long for the readings of the most precise node",
+            period,
+            f"give at most {longest:.3g}, or leave it out",
+        )
+    raise ScenarioError(
+        "filter.model",
+        f"is too far from the truth: it needs readings every {longest:.3g} s, the sensors give "
+        f"one every {period:.3g} s",
+        None,
+        f"set plant.sensing_period to at most {longest:.3g}",
     )
-    for model in models:
-        longest = longest_interval(A, Q, model.H, model.R)
-        if len(model.H) and min(period, scenario.horizon) > longest:
-            raise ScenarioError(
-                "plant.sensing_period",
-                "is too long for the readings of the most precise node",
-                period,
-                f"give at most {longest:.3g}, or leave it out",
-            )
+
+
+def _longest(scenario: Scenario, model: FlowModel) -> float:
+    return longest_interval(*scenario.belief, model.H, model.R)

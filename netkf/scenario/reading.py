@@ -17,31 +17,39 @@ from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
 from netkf.scenario.writing import as_table
 
 FORMAT = 1
+TABLES = ("plant", "network", "filter")
 
 
 def load(path: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
     """The scenario of a file, with some keys changed. Raises ScenarioError with one line."""
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-        return from_table(with_changes(table, changes or {}), path.parent)
-    except OSError as error:
-        raise ScenarioError(
-            "", f"cannot be read ({error.strerror})", None, "check the path", str(path)
-        ) from None
-    except UnicodeDecodeError:
-        raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8", str(path)) from None
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(
-            "", f"is not valid TOML: {error}", None, "mend that line", str(path)
-        ) from None
+        return from_table(with_changes(_parsed(path), changes or {}), path.parent)
     except ScenarioError as error:
         raise error.in_file(str(path)) from None
 
 
+def _parsed(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError:
+        raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8") from None
+    except OSError as error:
+        words = f"cannot be read ({error.strerror})"
+        raise ScenarioError("", words, None, "check the path") from None
+    except RecursionError:
+        words = "is not valid TOML: nested too deep"
+        raise ScenarioError("", words, None, "mend the brackets") from None
+    except ValueError as error:  # TOMLDecodeError among them
+        words = f"is not valid TOML: {' '.join(str(error).split())[:120]}"
+        raise ScenarioError("", words, None, "mend that line") from None
+
+
 def changed(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
     """The scenario with some keys changed, see Scenario.replace."""
-    folder = next((s.folder for s in source_files(scenario)), Path.cwd())
+    folder = getattr(scenario, "_folder", None)
+    if folder is None:  # built in Python
+        folder = next((s.folder for s in source_files(scenario)), Path.cwd())
     return from_table(with_changes(as_table(scenario), changes), folder)
 
 
@@ -70,7 +78,7 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
         return value
     key, rest = keys[0], keys[1:]
     if isinstance(node, (list, tuple)):
-        if not key.isdigit() or int(key) >= len(node):
+        if not key.isdecimal() or int(key) >= len(node):
             raise ScenarioError(
                 path, f"has no entry {key!r} in a list of {len(node)}", None, "count from 0"
             )
@@ -101,7 +109,8 @@ def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
     for key, reader in readers.items():
         if key in table:
             table[key] = _under(key, reader, table[key])
-    scenario: Scenario = _part(Scenario, table, folder)
+    scenario: Scenario = _part(Scenario, table, folder, ("format",))
+    object.__setattr__(scenario, "_folder", folder)  # where replace looks files and modules up
     return scenario
 
 
@@ -112,20 +121,17 @@ def _under(key: str, reader: Any, value: Any) -> Any:
         raise error.under(key) from None
 
 
-def _part(cls: type[Any], table: dict[str, Any], folder: Path) -> Any:
+def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str, ...] = ()) -> Any:
+    """``others`` are keys that stand in the same table and are read elsewhere."""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for key, value in table.items():
         if key not in fields:
-            raise ScenarioError(
-                key, "is not a key here", value, f"keys are {', '.join(_written(fields))}"
-            )
+            known = ", ".join([*others, *fields])
+            raise ScenarioError(key, "is not a key here", value, f"keys are {known}")
     for name, field in fields.items():
-        if (
-            field.default is dataclasses.MISSING
-            and name not in table
-            and field.default_factory is dataclasses.MISSING
-        ):
-            raise ScenarioError(name, "is missing", None, f"add {name} = ...")
+        if field.default is dataclasses.MISSING and name not in table:
+            remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
+            raise ScenarioError(name, "is missing", None, remedy)
     values = {
         name: SourceFile(value, folder)
         if fields[name].metadata.get("rule") is source_file and isinstance(value, str)
@@ -135,16 +141,13 @@ def _part(cls: type[Any], table: dict[str, Any], folder: Path) -> Any:
     return cls(**values)
 
 
-def _written(fields: Mapping[str, Any]) -> list[str]:
-    return [name for name in fields if not name.startswith("_")] or ["kind only"]
-
-
 def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:
     table = _table(value)
     kind = table.pop("kind", default)
     if kind is None:
         raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
-    return _part(find(family, kind, folder), table, folder)
+    others = ("kind", "mean", "cov", "model") if family == "filter" else ("kind",)
+    return _part(find(family, kind, folder), table, folder, others)
 
 
 def _table(value: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import Part
 from netkf.network import channels, clocks, graphs
 from netkf.plants.diffusion import Diffusion
@@ -83,19 +83,19 @@ def find(family: str, kind: object, folder: Path) -> type[Part]:
 def _imported(family: str, kind: str, folder: Path) -> type[Part]:
     module_name, _, class_name = kind.partition(":")
     places = [place for place in (str(folder), str(Path.cwd())) if place not in sys.path]
-    sys.path.extend(places)
+    sys.path[:0] = places
     try:
+        _forget_other(module_name, folder)
         found = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (Exception, SystemExit) as error:
         raise ScenarioError(
             "kind",
-            f"could not be imported ({error})",
+            f"could not be imported ({type(error).__name__}: {quote(str(error))})",
             kind,
             "put the module beside the scenario file or on the Python path",
         ) from None
     finally:
-        for place in places:
-            sys.path.remove(place)
+        sys.path[: len(places)] = []
     contract = FAMILIES[family]
     if not (isinstance(found, type) and issubclass(found, contract)):
         raise ScenarioError(
@@ -104,7 +104,25 @@ def _imported(family: str, kind: str, folder: Path) -> type[Part]:
             kind,
             f"derive the class from {contract.__module__}.{contract.__name__}",
         )
+    missing = sorted(name for name in dir(found) if _is_abstract(getattr(found, name, None)))
+    if missing:
+        raise ScenarioError(
+            "kind", f"must define {', '.join(missing)}", kind, "write what the contract asks for"
+        )
     return found
+
+
+def _forget_other(module_name: str, folder: Path) -> None:
+    """A module beside the scenario wins over one of that name imported from elsewhere."""
+    beside, loaded = folder / f"{module_name}.py", sys.modules.get(module_name)
+    other = getattr(loaded, "__file__", None)
+    if loaded is not None and beside.exists() and (other is None or not beside.samefile(other)):
+        del sys.modules[module_name]
+        importlib.invalidate_caches()
+
+
+def _is_abstract(attribute: object) -> bool:
+    return bool(getattr(attribute, "__isabstractmethod__", False))
 
 
 def name_of(family: str, part: Part) -> str:

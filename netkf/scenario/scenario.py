@@ -11,17 +11,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.flow import FlowFilter, FlowModel
+from netkf.algorithms.gains import longest_interval
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.fields import (
     Part,
-    Rule,
     array,
     covariance,
     definite_covariance,
     either,
     instance,
     integer,
+    line,
     matrix,
+    nested,
     positive,
     setting,
     several,
@@ -54,7 +56,7 @@ class Belief(Part):
     A: FloatArray | None = setting(square, default=None)
     B: FloatArray | None = setting(matrix, default=None)
     R: FloatArray | tuple[FloatArray, ...] | None = setting(
-        either(definite_covariance, several(definite_covariance, "covariance matrices")),
+        either(definite_covariance, several(definite_covariance, "covariance matrices"), nested(3)),
         default=None,
     )
 
@@ -69,10 +71,11 @@ class Filtering(Part):
 
     algorithm: FlowFilter = setting(instance(FlowFilter))
     mean: FloatArray | tuple[FloatArray, ...] | None = setting(
-        either(vector, several(vector, "vectors, one per node")), default=None
+        either(vector, several(vector, "vectors, one per node"), nested(2)), default=None
     )
     cov: FloatArray | tuple[FloatArray, ...] | None = setting(
-        either(covariance, several(covariance, "covariance matrices, one per node")), default=None
+        either(covariance, several(covariance, "covariance matrices, one per node"), nested(3)),
+        default=None,
     )
     model: Belief = setting(instance(Belief), default=Belief())
 
@@ -99,8 +102,8 @@ class Scenario(Part):
     sensors: tuple[LinearSensor, ...] = setting(several(instance(LinearSensor), "sensors", least=0))
     network: Network = setting(instance(Network))
     filter: Filtering = setting(instance(Filtering))
-    probe: float | FloatArray = setting(either(positive, array(1, "list of times")))
-    claim: str = setting(Rule("must be a string", str), default="")
+    probe: float | FloatArray = setting(either(positive, array(1, "list of times"), nested(1)))
+    claim: str = setting(line, default="")
     seed: int = setting(integer(low=0), default=0)
 
     def __post_init__(self) -> None:
@@ -142,7 +145,8 @@ class Scenario(Part):
         if isinstance(self.probe, np.ndarray):
             return self.probe
         count = int(np.floor(self.horizon / self.probe * (1.0 + 1e-12)))
-        return np.minimum(np.round(self.probe * np.arange(count + 1), 12), self.horizon)
+        digits = 12 - min(0, int(np.floor(np.log10(self.probe))))
+        return np.minimum(np.round(self.probe * np.arange(count + 1), digits), self.horizon)
 
     @cached_property
     def truth(self) -> Diffusion:
@@ -151,16 +155,13 @@ class Scenario(Part):
         filled = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
         if filled.sensing_period is not None:
             return filled
-        informations = [
-            H.T @ np.linalg.solve(R, H)
-            for H, R in {
-                (H.tobytes(), R.tobytes()): (H, R)
-                for H, R in (self.observation(node) for node in self.sensing)
-            }.values()
-        ]
-        return dataclasses.replace(
-            filled, sensing_period=default_sensing_period(filled, informations)
-        )
+        seen = (self.observation(node) for node in self.sensing)
+        distinct = {(H.tobytes(), R.tobytes()): (H, R) for H, R in seen}.values()
+        informations = [H.T @ np.linalg.solve(R, H) for H, R in distinct]
+        everything = self._stacked(self._everywhere, believed=False)
+        longest = longest_interval(plant.A, plant.Q, *everything)
+        period = default_sensing_period(filled, informations, longest)
+        return dataclasses.replace(filled, sensing_period=period)
 
     @cached_property
     def placed(self) -> dict[int, tuple[Placed, ...]]:
@@ -214,8 +215,11 @@ class Scenario(Part):
     @cached_property
     def pooled_model(self) -> FlowModel:
         """The model of a filter that reads the sensors of all nodes at once."""
-        everywhere = tuple(place for node in self.placed for place in self.placed[node])
-        return self._model(self._stacked(everywhere, believed=True), {})
+        return self._model(self._stacked(self._everywhere, believed=True), {})
+
+    @property
+    def _everywhere(self) -> tuple[Placed, ...]:
+        return tuple(place for node in self.placed for place in self.placed[node])
 
     def _model(
         self, observation: tuple[FloatArray, FloatArray], made: dict[bytes, FlowModel]

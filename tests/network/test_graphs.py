@@ -48,9 +48,9 @@ def test_connected_draws_until_it_is():
 
 
 def test_edges_keep_their_ids():
-    topology = graphs.Edges(edges=[[7, 3], [3, -2], [3, 7]]).build(0)
-    assert topology.nodes == (-2, 3, 7)
-    assert topology.links == ((-2, 3), (3, 7))
+    topology = graphs.Edges(edges=[[7, 3], [3, 2], [3, 7]]).build(0)
+    assert topology.nodes == (2, 3, 7)
+    assert topology.links == ((2, 3), (3, 7))
     lonely = graphs.Edges(edges=[[0, 1]], nodes=3).build(0)
     assert [len(part) for part in lonely.components] == [2, 1]
 

@@ -131,9 +131,9 @@ TOP = [
     ("name-missing", {"name": None}, "name", "is missing"),
     ("name-number", {"name": "5"}, "name", "got 5"),
     ("name-empty", {"name": '""'}, "name", "not empty; got ''"),
-    ("claim-number", {"claim": "5"}, "claim", "must be a string; got 5"),
-    ("claim-list", {"claim": '["a", "b"]'}, "claim", "must be a string; got ['a', 'b']"),
-    ("claim-lines", {"claim": r'"one\ntwo"'}, "claim", r"one line; got 'one\ntwo'"),
+    ("claim-number", {"claim": "5"}, "claim", "one line of text; got 5"),
+    ("claim-list", {"claim": '["a", "b"]'}, "claim", "one line of text; got ['a', 'b']"),
+    ("claim-lines", {"claim": r'"one\ntwo"'}, "claim", r"one line of text; got 'one\ntwo'"),
     ("horizon-missing", {"horizon": None}, "horizon", "is missing"),
     ("horizon-zero", {"horizon": "0"}, "horizon", "above 0; got 0"),
     ("horizon-negative", {"horizon": "-2.0"}, "horizon", "above 0; got -2.0"),
@@ -153,7 +153,6 @@ TOP = [
     ("probe-true", {"probe": "true"}, "probe", "got True"),
     ("probe-long", {"probe": "2.5"}, "probe", "at most the horizon 2; got 2.5"),
     ("probe-fine", {"probe": "1e-9"}, "probe", "samples; got 1e-09"),
-    ("probe-rounds", {"horizon": "1e-12", "probe": "1e-13"}, "probe", "got 1e-13"),
     ("probe-empty", {"probe": "[]"}, "probe", "list of times; got []"),
     ("probe-beyond", {"probe": "[0.5, 2.5]"}, "probe", "times must lie in [0, 2]; got 2.5"),
     ("probe-early", {"probe": "[-0.5, 1.0]"}, "probe", "times must lie in [0, 2]; got -0.5"),
@@ -250,9 +249,24 @@ SENSORS = [
     ("node-unknown", {"sensors.nodes": "[0, 6]"}, "sensors[0].nodes[1]", "of the graph; got 6"),
     ("node-negative", {"sensors.nodes": "[-1]"}, "sensors[0].nodes[0]", "of the graph; got -1"),
     ("node-twice", {"sensors.nodes": "[3, 3]"}, "sensors[0].nodes", "node once; got [3, 3]"),
-    ("nodes-number", {"sensors.nodes": "0"}, "sensors[0].nodes", "list of node ids; got 0"),
-    ("nodes-text", {"sensors.nodes": '"all"'}, "sensors[0].nodes", "of node ids; got 'all'"),
-    ("nodes-empty", {"sensors.nodes": "[]"}, "sensors[0].nodes", "list of node ids; got []"),
+    (
+        "nodes-number",
+        {"sensors.nodes": "0"},
+        "sensors[0].nodes",
+        "not empty; got 0",
+    ),
+    (
+        "nodes-text",
+        {"sensors.nodes": '"all"'},
+        "sensors[0].nodes",
+        "not empty; got 'all'",
+    ),
+    (
+        "nodes-empty",
+        {"sensors.nodes": "[]"},
+        "sensors[0].nodes",
+        "not empty; got []",
+    ),
     ("nodes-fraction", {"sensors.nodes": "[0, 3.0]"}, "sensors[0].nodes[1]", "integer; got 3.0"),
     ("nodes-true", {"sensors.nodes": "[true]"}, "sensors[0].nodes[0]", "integer; got True"),
     ("nodes-texts", {"sensors.nodes": '["0"]'}, "sensors[0].nodes[0]", "integer; got '0'"),
@@ -292,16 +306,21 @@ GRAPHS = [
     ("graph-kind", graph("ring", "nodes = 6"), f"{G}.kind", "got 'ring'"),
     ("graph-unknown", {f"{G}.n": "6"}, f"{G}.n", "is not a key here; got 6"),
     ("cycle-missing", graph("cycle"), f"{G}.nodes", "is missing"),
-    ("cycle-two", graph("cycle", "nodes = 2"), f"{G}.nodes", "at least 3; got 2"),
-    ("cycle-float", graph("cycle", "nodes = 6.0"), f"{G}.nodes", "integer of at least 3; got 6.0"),
-    ("cycle-true", graph("cycle", "nodes = true"), f"{G}.nodes", "at least 3; got True"),
-    ("cycle-text", graph("cycle", 'nodes = "6"'), f"{G}.nodes", "at least 3; got '6'"),
-    ("path-none", graph("path", "nodes = 0"), f"{G}.nodes", "at least 1; got 0"),
+    ("cycle-two", graph("cycle", "nodes = 2"), f"{G}.nodes", "at most 1,000,000; got 2"),
+    (
+        "cycle-float",
+        graph("cycle", "nodes = 6.0"),
+        f"{G}.nodes",
+        "at most 1,000,000; got 6.0",
+    ),
+    ("cycle-true", graph("cycle", "nodes = true"), f"{G}.nodes", "at most 1,000,000; got True"),
+    ("cycle-text", graph("cycle", 'nodes = "6"'), f"{G}.nodes", "at most 1,000,000; got '6'"),
+    ("path-none", graph("path", "nodes = 0"), f"{G}.nodes", "at most 1,000,000; got 0"),
     ("star-huge", graph("star", f"nodes = 1{'0' * 30}"), f"{G}.nodes", "got 1000"),
-    ("complete-huge", graph("complete", "nodes = 100000"), f"{G}.nodes", "got 100000"),
-    ("grid-rows", graph("grid", "rows = 0, columns = 3"), f"{G}.rows", "at least 1; got 0"),
+    ("complete-huge", graph("complete", "nodes = 100000"), G, "got '100,000 nodes"),
+    ("grid-rows", graph("grid", "rows = 0, columns = 3"), f"{G}.rows", "at most 1,000,000; got 0"),
     ("grid-columns", graph("grid", "rows = 2"), f"{G}.columns", "is missing"),
-    ("grid-huge", graph("grid", "rows = 1000000000, columns = 1000000000"), G, "got"),
+    ("grid-huge", graph("grid", "rows = 10000, columns = 10000"), G, "got"),
     ("regular-odd", graph("regular", "nodes = 5, degree = 3"), G, "got"),
     ("regular-full", graph("regular", "nodes = 6, degree = 6"), G, "got"),
     ("regular-minus", graph("regular", "nodes = 6, degree = -2"), f"{G}.degree", "0; got -2"),
@@ -371,7 +390,12 @@ GRAPHS = [
     ("csv-word", listed("word.csv"), f"{G}.path", "word.csv line 3: sender must be a finite"),
     ("csv-hole", listed("hole.csv"), f"{G}.path", "hole.csv line 2: delivery_probability must"),
     ("csv-nan", listed("nan.csv"), f"{G}.path", "finite number; got 'nan'"),
-    ("csv-half", listed("half.csv"), f"{G}.path", "half.csv: receiver must hold integers; got 1.5"),
+    (
+        "csv-half",
+        listed("half.csv"),
+        f"{G}.path",
+        "from 0 to 2^53; got 1.5",
+    ),
     ("csv-loop", listed("loop.csv"), f"{G}.path", "join two nodes with a probability; got [2, 2"),
     ("csv-sure", listed("sure.csv"), f"{G}.path", "with a probability; got [0, 1, 1.5]"),
     ("csv-twice", listed("twice.csv"), f"{G}.path", "twice.csv"),
@@ -384,7 +408,7 @@ GRAPHS = [
     ("csv-directed", listed("measured.csv", "directed = true"), f"{G}.directed", "must be false"),
     ("csv-text", listed("measured.csv", 'minimum = "a"'), f"{G}.minimum", "at most 1; got 'a'"),
     ("csv-high", listed("measured.csv", "minimum = 1.5"), f"{G}.minimum", "at most 1; got 1.5"),
-    ("csv-none", listed("measured.csv", "minimum = 0.95"), f"{G}.path", "no link of the table"),
+    ("csv-none", listed("measured.csv", "minimum = 0.95"), f"{G}.minimum", "no link of the table"),
     ("csv-unmeasured", listed("ring.csv", "minimum = 0.5"), f"{G}.minimum", "table; got 0.5"),
     (
         "csv-left-out",
@@ -446,7 +470,7 @@ CLOCKS = [
         "gaps-both",
         clock("renewal", f"{GAMMA}, shape = 2.0, mean = 1.0, rate = 1.0"),
         f"{C}.mean",
-        "not both; got 1.0",
+        "must be given; got ['mean', 'rate']",
     ),
     ("gaps-neither", clock("renewal", CONSTANT), f"{C}.mean", "must be given"),
     (
@@ -470,7 +494,7 @@ CLOCKS = [
         "got 0.001",
     ),
     ("period-missing", clock("periodic"), f"{C}.period", "is missing"),
-    ("period-negative", clock("periodic", "period = -1.0"), f"{C}.period", "above 0; got -1.0"),
+    ("period-negative", clock("periodic", "period = -1.0"), f"{C}.period", "1e-09; got -1.0"),
     ("period-tiny", clock("periodic", "period = 1e-13"), f"{C}.period", "got 1e-13"),
     ("phase-late", clock("periodic", "period = 1.0, phase = 1.0"), f"{C}.phase", "got 1.0"),
     ("phase-text", clock("periodic", 'period = 1.0, phase = "any"'), f"{C}.phase", "got 'any'"),
@@ -483,7 +507,7 @@ CLOCKS = [
     ("ticks-early", clock("recorded", 'path = "before.csv"'), f"{C}.path", "got -0.5"),
     ("ticks-inf", clock("recorded", 'path = "never.csv"'), f"{C}.path", "never.csv line 2: t must"),
     ("ticks-columns", clock("recorded", 'path = "no_time.csv"'), f"{C}.path", "columns t, node"),
-    ("ticks-node", clock("recorded", 'path = "half_node.csv"'), f"{C}.path", "integers; got 0.5"),
+    ("ticks-node", clock("recorded", 'path = "half_node.csv"'), f"{C}.path", "2^53; got 0.5"),
     ("ticks-latin", clock("recorded", 'path = "latin_clock.csv"'), f"{C}.path", "latin_clock.csv"),
 ]
 
@@ -538,7 +562,7 @@ CHANNELS = [
     ("lost-absent", loss("recorded", 'path = "no.csv"'), f"{L}.path", "got 'no.csv'"),
     ("lost-outside", loss("recorded", 'path = "../outside.csv"'), f"{L}.path", "stay inside"),
     ("lost-flag", loss("recorded", 'path = "flag.csv"'), f"{L}.path", "got [0, 1, 1, 2]"),
-    ("lost-minus", loss("recorded", 'path = "minus_message.csv"'), f"{L}.path", "got [0, 1, -1, 0"),
+    ("lost-minus", loss("recorded", 'path = "minus_message.csv"'), f"{L}.path", "got -1.0"),
     ("lost-half", loss("recorded", 'path = "half_message.csv"'), f"{L}.path", "got 0.5"),
     (
         "lost-columns",
@@ -857,10 +881,10 @@ USAGE = [
     ("option", ["run", "{file}", "--speed", "5"], "--speed"),
     ("no-file", ["run"], "scenario"),
     ("two-files", ["run", "{file}", "more.toml"], "more.toml"),
-    ("seed-negative", ["run", "{file}", "--seed", "-1"], "non-negative integer, got '-1'"),
-    ("seed-word", ["run", "{file}", "--seed", "x"], "non-negative integer, got 'x'"),
-    ("seed-float", ["run", "{file}", "--seed", "1.0"], "non-negative integer, got '1.0'"),
-    ("seed-empty", ["run", "{file}", "--seed", ""], "non-negative integer, got ''"),
+    ("seed-negative", ["run", "{file}", "--seed", "-1"], "integer of at most 30 digits, got '-1'"),
+    ("seed-word", ["run", "{file}", "--seed", "x"], "integer of at most 30 digits, got 'x'"),
+    ("seed-float", ["run", "{file}", "--seed", "1.0"], "integer of at most 30 digits, got '1.0'"),
+    ("seed-empty", ["run", "{file}", "--seed", ""], "integer of at most 30 digits, got ''"),
     ("seed-long", ["run", "{file}", "--seed", "1" * 5000], "--seed"),
     ("seed-nothing", ["run", "{file}", "--seed"], "--seed"),
     ("engine", ["run", "{file}", "--engine", "foo"], "invalid choice: 'foo'"),
@@ -967,6 +991,7 @@ def test_what_is_right_is_not_refused(change, write):
 
 
 def test_two_folders_may_use_one_name_for_their_modules(tmp_path):
+    loaded = {}
     for nodes in (4, 5):
         folder = tmp_path / str(nodes)
         folder.mkdir()
@@ -976,7 +1001,8 @@ def test_two_folders_may_use_one_name_for_their_modules(tmp_path):
         )
         path = folder / "twin.toml"
         path.write_bytes(changed(graph("refusal_twin:Ring", f"nodes = {nodes}")))
-        scenario = netkf.load(path)
+        loaded[nodes] = netkf.load(path)
+    for nodes, scenario in loaded.items():
         assert scenario.network.graph.origin == nodes
         assert scenario.replace({"horizon": 1.0}).network.graph.origin == nodes
 
