@@ -7,6 +7,7 @@ has sensors, ``measure`` for the interval that just passed, and ``emit``/``absor
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from netkf.algorithms.gains import GainTable, gain_table, gain_update
 from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
 from netkf.core.arrays import FloatArray
 from netkf.core.fields import Part
+
+STRETCH = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,12 +107,21 @@ class FlowFilter(Part):
         already, its estimate does not yet.
         """
         P, xhat = riccati_step(state.model.riccati, state.P, state.xhat, gap)
-        return FlowState(xhat, P, state.model)
+        return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
         """The state once the readings of the gap that just passed are used."""
         xhat = gain_update(state.model.gains, state.P, state.xhat, reading.moments, reading.gap)
-        return FlowState(xhat, state.P, state.model)
+        return state._replace(xhat=xhat)
+
+    def stretch(self, state: Any) -> float:
+        """Seconds of readings that ``measure`` may use at once from this state on.
+
+        A large covariance shrinks fast, and the weights of readings change as fast: on the time
+        scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
+        """
+        rate = float((state.P * state.model.information).sum())
+        return STRETCH / rate if rate > 0.0 else math.inf
 
     def emit(self, state: Any) -> Any:
         """What the node sends now."""

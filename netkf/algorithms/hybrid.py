@@ -29,7 +29,7 @@ class Hybrid(FlowFilter):
             arrived = predict(state.model, payload, age)
             xhat = xhat + weight * arrived.xhat
             P = P + weight * arrived.P
-        return FlowState(xhat, P, state.model)
+        return state._replace(xhat=xhat, P=P)
 
     def weight(self, degree: int, peer_degree: int) -> float:
         """``epsilon`` on every link."""

@@ -49,8 +49,14 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
 
 def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray, float]:
     """The Hamiltonian of ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``."""
-    size_Q, size_G = float(np.abs(Q).max()), float(np.abs(G).max())
-    scale = (size_Q / size_G) ** 0.5 if size_Q > 0.0 and size_G > 0.0 else 1.0
+    size_A, size_Q, size_G = (float(np.abs(matrix).max()) for matrix in (A, Q, G))
+    size_A = max(size_A, 1e-6)
+    if size_Q > 0.0 and size_G > 0.0:
+        scale = (size_Q / size_G) ** 0.5
+    elif size_Q > 0.0 or size_G > 0.0:  # one of them may be made as small as A
+        scale = size_Q / size_A if size_Q > 0.0 else size_A / size_G
+    else:
+        scale = 1.0
     return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
 
 

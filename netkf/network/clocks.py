@@ -214,7 +214,8 @@ class Renewal(LinkClock):
         """Gaps of the distribution, added up."""
         shape = self.shape or 1.0
         if self.distribution == "gamma":
-            gaps = random.standard_gamma(shape, count) * (self._mean / shape)
+            gaps = random.standard_gamma(shape, count)
+            gaps = gaps / (shape * self.rate) if self.rate else gaps * (self._mean / shape)
         elif self.distribution == "weibull":
             scale = self._mean / math.gamma(1.0 + 1.0 / shape)
             gaps = random.standard_exponential(count) ** (1.0 / shape) * scale

@@ -23,6 +23,7 @@ from netkf.core.fields import Part, covariance, matrix, positive, setting, squar
 from netkf.core.legendre import forward_coefficients
 
 BLOCK = 64  # steps drawn at once
+LONGEST_STEP = 8.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -61,6 +62,12 @@ class Diffusion(Part):
         """``B B'`` (n, n)."""
         return np.asarray(self.B @ self.B.T)
 
+    @property
+    def longest_period(self) -> float:
+        """Seconds; the longest sensing period for which the path is exact."""
+        norm = float(np.abs(self.A).sum(axis=0).max())
+        return LONGEST_STEP / norm if norm > 0.0 else math.inf
+
     def path(
         self, random: np.random.Generator, probing: np.random.Generator, shown: FloatArray
     ) -> DiffusionPath:
@@ -77,15 +84,15 @@ def default_sensing_period(
 
     ``informations`` are the matrices H' R^-1 H of the nodes that sense, ``longest`` what their
     filters can use at once (algorithms/gains). The period is a fraction
-    of the fastest time constant of the plant and of a node's own filter (a large first
-    covariance asks for nothing shorter, see algorithms/gains), rounded down to 1, 2 or 5 times a
+    of the fastest time constant of the plant and of a node's own filter (a large
+    covariance asks for nothing shorter, see FlowFilter.stretch), rounded down to 1, 2 or 5 times a
     power of ten. It depends on nothing else, so that filters and networks meet the same truth.
     """
     fastest = float(np.abs(np.linalg.eigvals(plant.A)).max())
     for G in informations:
         M = np.block([[-plant.A.T, G], [plant.Q, plant.A]])
         fastest = max(fastest, float(np.abs(np.linalg.eigvals(M)).max()))
-    wanted = min(0.5 / fastest if fastest > 0.0 else 1.0, longest)
+    wanted = min(0.5 / fastest if fastest > 0.0 else 1.0, longest, plant.longest_period)
     power = 10.0 ** math.floor(math.log10(wanted))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= wanted * (1.0 + 1e-9))
     return float(f"{digit * power:.12g}")
@@ -118,7 +125,7 @@ class DiffusionPath:
         self.period = plant.sensing_period
         self._A, self._B, self._n = plant.A, plant.B, plant.n
         self._random, self._probing, self._shown = random, probing, shown
-        terms = 30
+        terms = 64  # enough for |A| h <= LONGEST_STEP
         powers = [np.eye(self._n)]
         for k in range(1, terms):
             powers.append(powers[-1] @ plant.A / k)

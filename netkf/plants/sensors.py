@@ -86,20 +86,15 @@ class SensorPath:
         """Moments of the first share u of an interval and of the rest, given those of the whole."""
         whole, tilted = self._rest
         normals = self._cutting.standard_normal(self._rest.shape)
-        # Exact conditional law of four independent moments given two linear sums of them.
-        variance = u * (1.0 - u) * (1.0 - 3.0 * u * (1.0 - u)) * length
-        covariance = u**3 * (1.0 - u) * length
-        other = u * (1.0 - u**3) / 3.0 * length
-        deviation = math.sqrt(max(variance, 0.0))
-        slope = covariance / deviation if deviation > 0.0 else 0.0
-        left = u * whole + 3.0 * u * (u - 1.0) * tilted + deviation * normals[0]
-        left_tilted = (
-            u * u * tilted
-            + slope * normals[0]
-            + math.sqrt(max(other - slope * slope, 0.0)) * normals[1]
-        )
-        right = whole - left
-        right_tilted = np.zeros_like(right)
-        if 1.0 - u > 1e-9:  # else the difference below is rounding, and its variance nothing
-            right_tilted = (tilted - (u - 1.0) * left - u * left_tilted - u * right) / (1.0 - u)
+        # Exact conditional law of four independent moments (variances g, g/3 on each part) given
+        # their two sums; written so that nothing cancels when a part is short.
+        w = 1.0 - u
+        spread = 1.0 - 3.0 * u * w
+        first = math.sqrt(u * w * spread * length) * normals[0]
+        slope = math.sqrt(u * w / spread * length) * normals[0]
+        other = math.sqrt(u * w / (3.0 * spread) * length) * normals[1]
+        left = u * whole - 3.0 * u * w * tilted + first
+        left_tilted = u * u * (tilted + slope) + w * other
+        right = w * whole + 3.0 * u * w * tilted - first
+        right_tilted = w * w * (tilted + slope) - u * other
         return np.stack([left, left_tilted]), np.stack([right, right_tilted])

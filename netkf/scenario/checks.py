@@ -238,6 +238,13 @@ def _sensing_period(scenario: Scenario) -> None:
             period,
             "lengthen it, shorten the horizon, or use less precise sensors",
         )
+    if period > scenario.plant.longest_period * (1.0 + 1e-9):
+        raise ScenarioError(
+            "plant.sensing_period",
+            "is too long for the plant",
+            period,
+            f"give at most {scenario.plant.longest_period:.3g}, or leave it out",
+        )
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_model] if pooled else scenario.models
     longest = min((_longest(scenario, model) for model in models if len(model.H)), default=period)

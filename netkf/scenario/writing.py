@@ -83,8 +83,6 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
-    if isinstance(value, SourceFile):
-        return value.name
     return value
 
 
@@ -112,6 +110,8 @@ def _value(value: Any) -> str:
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, SourceFile):
+        return json.dumps(value.name, ensure_ascii=False)
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     return repr(value)

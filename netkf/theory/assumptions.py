@@ -72,7 +72,10 @@ def _plant(scenario: Scenario) -> list[Row]:
     same = (
         np.array_equal(A, plant.A)
         and np.array_equal(Q, plant.Q)
-        and (scenario.filter.model.R is None)
+        and all(
+            np.array_equal(scenario.observation(node)[1], scenario.observation(node, True)[1])
+            for node in scenario.sensing
+        )
     )
     return [
         (

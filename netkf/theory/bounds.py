@@ -1,4 +1,4 @@
-"""The bound H(12) over time and in its steady state."""
+"""The bound H(12) over time."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import scipy.integrate
-import scipy.sparse.linalg
 
 from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import Coupled, coupled, linear_operator, slope
-from netkf.theory.threshold import growth, threshold_factor
 
 TOLERANCE = 1e-10
 DEFECT = 1e-7
@@ -33,7 +31,9 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     does not apply, and says why.
     """
     moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    if moments.ndim != 1 or (np.diff(moments) < 0.0).any() or (moments < 0.0).any():
+    if moments.ndim != 1 or not moments.size or not np.isfinite(moments).all():
+        raise TheoryError("times must be a list of finite numbers that is not empty")
+    if (np.diff(moments) < 0.0).any() or moments[0] < 0.0:
         raise TheoryError("times must be increasing and not negative")
     equations = coupled(scenario)
     if equations.coupling.nnz == 0:
@@ -178,96 +178,3 @@ def _check_defect(f: Callable[[float, FloatArray], FloatArray], output: Any) -> 
         defect = np.abs(change - integral).max()
         if not defect <= DEFECT * (np.abs(output(b)).max() + np.abs(change).max()):
             raise TheoryError(f"H(12) was integrated with a defect of {defect:.1e} at {a:g} s")
-
-
-def steady_covariance_bound(scenario: Scenario) -> FloatArray:
-    """(N, n, n): the steady state of H(12).
-
-    Newton's method from gains that a linear equation has proved stabilising; returned with a
-    relative residual below 1e-9. Raises TheoryError where there is none, with the factor by
-    which all link rates would have to grow for one to exist.
-    """
-    equations = coupled(scenario)
-    P = _stabilising(equations)
-    if P is None:
-        raise TheoryError(_no_steady_state(scenario, equations))
-    for _ in range(60):
-        following = _newton(equations, P)
-        change = np.abs(following - P).max()
-        P = following
-        if change <= 1e-13 * np.abs(P).max():
-            break
-    residual = np.abs(slope(equations, P, P)).max()
-    size = (
-        np.abs(equations.Q).max()
-        + np.abs(P @ equations.G @ P).max()
-        + np.abs(equations.A @ P).max()
-    )
-    if not residual <= 1e-9 * size:
-        raise TheoryError(f"the steady state of H(12) was solved to {residual:.1e} only")
-    return P
-
-
-def _solve(equations: Coupled, P: FloatArray, right: FloatArray) -> FloatArray:
-    operator = linear_operator(equations, P @ equations.G)
-    solution = scipy.sparse.linalg.spsolve(operator.tocsc(), -right.reshape(-1))
-    return symmetric(np.asarray(solution).reshape(P.shape))
-
-
-def _newton(equations: Coupled, P: FloatArray) -> FloatArray:
-    inflow = np.asarray(equations.coupling.sum(axis=1)).reshape(-1, 1, 1) * equations.q
-    return _solve(equations, P, equations.Q + P @ equations.G @ P + inflow)
-
-
-def _stable(equations: Coupled, P: FloatArray) -> bool:
-    """Whether the gains of P stabilise H(12) made linear.
-
-    That map X -> op(X) is a generator of positive maps, so it is stable if and only if
-    op(X) = -I has a positive definite solution.
-    """
-    eye = np.broadcast_to(np.eye(P.shape[-1]), P.shape)
-    with np.errstate(all="ignore"):
-        X = _solve(equations, P, eye)
-    return bool(np.isfinite(X).all() and np.linalg.eigvalsh(X)[:, 0].min() > 0.0)
-
-
-def _stabilising(equations: Coupled) -> FloatArray | None:
-    """Covariances whose gains stabilise H(12); None where none exist.
-
-    Implicit steps along H(12), each a steady problem with A shifted by 1/(2 step), that grow until
-    no shift is needed.
-    """
-    n = len(equations.A)
-    P = equations.start + equations.Q + 1e-3 * np.eye(n)
-    if _stable(equations, P):
-        return P
-    if growth(equations, 1.0) >= 0.0:
-        return None
-    fastest = float(np.abs(equations.A).max() + equations.coupling.sum(axis=1).max() + 1e-3)
-    step = 0.1 / fastest
-    for _ in range(400):
-        shift = equations.A - 0.5 / step * np.eye(n)
-        implicit = equations._replace(A=shift, Q=equations.Q + P / step)
-        if not _stable(implicit, P):
-            step *= 0.5
-            continue
-        for _ in range(3):
-            P = _newton(implicit, P)
-        if _stable(equations, P):
-            return P
-        step *= 1.5
-    return None
-
-
-def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
-    if growth(equations, 1.0) < 0.0:
-        return "H(12) has a steady state, but it was not found: too near the threshold"
-    factor = threshold_factor(equations)
-    if factor is None:
-        return "H(12) has no steady state at any rate: the sensors together miss a growing mode"
-    activation = scenario.network.activation
-    rate = getattr(activation, "rate", None)
-    words = f"every link rate must be at least {factor:.6g} times what it is"
-    if rate is not None and not getattr(activation, "rates", ()):
-        words = f"the rate {rate:g} is below the threshold {factor * rate:.6g}"
-    return f"H(12) has no steady state: {words}"

@@ -68,6 +68,7 @@ class _Instant(NamedTuple):
     time: float
     snapshots: list[tuple[int, tuple[int, int, int]]]
     resets: dict[int, dict[int, tuple[float, tuple[int, int, int] | None]]]
+    arrived: list[tuple[int, int, int]]
 
 
 def _instants(scenario: Scenario, run: Run) -> Iterator[_Instant]:
@@ -84,6 +85,7 @@ def _instants(scenario: Scenario, run: Run) -> Iterator[_Instant]:
         snapshots: list[tuple[int, tuple[int, int, int]]] = []
         resets: dict[int, dict[int, tuple[float, tuple[int, int, int] | None]]] = {}
         ages: dict[tuple[int, int], float] = {}
+        arrived: list[tuple[int, int, int]] = []
         for row in rows:
             node, peer, message = int(row["node"]), int(row["peer"]), int(row["message"])
             if row["kind"] == CODES["send"]:
@@ -91,12 +93,14 @@ def _instants(scenario: Scenario, run: Run) -> Iterator[_Instant]:
                     snapshots.append((index[node], (node, peer, message)))
                 continue
             key, age = (peer, node, message), float(row["age"])
+            if key in late:
+                arrived.append(key)
             if age <= ages.get((node, peer), np.inf):
                 ages[node, peer] = age
                 weight = scenario.weight(node, peer)
                 inbox = resets.setdefault(index[node], {})
                 inbox[index[peer]] = (weight, key if key in late else None)
-        yield _Instant(float(rows["t"][0]), snapshots, resets)
+        yield _Instant(float(rows["t"][0]), snapshots, resets, arrived)
 
 
 class _Errors:
@@ -165,7 +169,7 @@ class _Errors:
             whole = np.eye(len(weights) + first)
             whole[first:, first:] = weights
             self._mix(np.asarray(np.kron(whole, np.eye(n)), dtype=np.float64))
-        self._drop([s for inbox in instant.resets.values() for _, s in inbox.values() if s])
+        self._drop(instant.arrived)
 
     def _mix(self, matrix: FloatArray) -> None:
         self._sigma = matrix @ self._sigma @ matrix.T
@@ -188,6 +192,8 @@ class _Errors:
             return
         models = {id(m): m for m in (*self._models, self._blind)}.values()
         unit = min(model.riccati.unit for model in models)
+        if self._follows:
+            unit = min(unit, 1.0 / max(float(np.abs(self._plant.A).sum(axis=0).max()), 1e-300))
         steps = int(np.ceil(gap / unit))
         for _ in range(steps):
             self._step(gap / steps)

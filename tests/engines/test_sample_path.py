@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from netkf.algorithms import flow
 from netkf.plants import diffusion, sensors
 from netkf.theory import error_covariance
 
@@ -29,7 +30,8 @@ def test_default_sensing_period_keeps_what_the_docs_state(ring):
     assert deviation(ring.replace({"horizon": 3.0})) < STATED / 50
 
 
-def test_the_error_has_fourth_order_in_the_sensing_period(ring):
+def test_the_error_has_fourth_order_in_the_sensing_period(ring, monkeypatch):
+    monkeypatch.setattr(flow, "STRETCH", np.inf)  # no shorter stretches where P is large
     short = ring.replace({"horizon": 2.0, "probe": 1.0})
     coarse, fine = (deviation(short.replace({"plant.sensing_period": h})) for h in (0.5, 0.25))
     assert 10.0 < coarse / fine < 25.0
@@ -85,3 +87,27 @@ def test_several_sensors_on_a_node_and_rows_of_zeros(ring):
         {"nodes": [0, 1], "H": [[0.0, 1.0], [0.0, 0.0]], "R": [[0.5, 0.1], [0.1, 0.3]]},
     ]
     assert deviation(ring.replace({"horizon": 1.5, "sensors": more})) < STATED / 20
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_systems_with_large_first_covariances(build, seed):
+    random = np.random.default_rng(seed)
+    n = int(random.integers(2, 4))
+    A = random.normal(size=(n, n))
+    A -= max(0.0, np.linalg.eigvals(A).real.max() - 0.3) * np.eye(n)
+    eye, first = np.eye(n), 10.0 ** random.uniform(2, 4)
+    sensors = [
+        {"nodes": [k], "H": random.normal(size=(1, n)), "R": [[10.0 ** random.uniform(-3, 1)]]}
+        for k in range(2)
+    ]
+    scenario = build(
+        plant={"kind": "diffusion", "A": A, "B": random.normal(size=(n, 1)), "cov": eye},
+        sensors=sensors,
+        network={
+            "graph": {"kind": "path", "nodes": 3},
+            "activation": {"kind": "poisson", "rate": 2.0},
+        },
+        filter={"kind": "hybrid", "epsilon": 0.3, "cov": first * eye},
+    )
+    end = min(1.0, 12.0 * scenario.truth.sensing_period)
+    assert deviation(scenario.replace({"horizon": end, "probe": end / 4.0})) < STATED

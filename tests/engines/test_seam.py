@@ -142,18 +142,17 @@ def test_erlang_of_shape_one_is_the_poisson_clock(ring):
     same(netkf.simulate(ring), netkf.simulate(ring.replace({"network.activation": erlang})))
 
 
-def test_recorded_ticks_and_losses_replay_a_run(ring, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_recorded_ticks_and_losses_replay_a_run(ring, tmp_path):
     run = netkf.simulate(ring)
     events = run.events
-    events[events.kind == "tick"][["t", "node", "peer"]].to_csv("ticks.csv", index=False)
+    events[events.kind == "tick"][["t", "node", "peer"]].to_csv(tmp_path / "ticks.csv", index=False)
     lost = events[events.kind == "lost"][["node", "peer", "message"]].assign(delivered=0)
     lost.columns = ["sender", "receiver", "message", "delivered"]
-    lost.to_csv("lost.csv", index=False)
+    lost.to_csv(tmp_path / "lost.csv", index=False)
     replay = ring.replace(
         {
-            "network.activation": {"kind": "recorded", "path": "ticks.csv"},
-            "network.channel.loss": {"kind": "recorded", "path": "lost.csv"},
+            "network.activation": {"kind": "recorded", "path": tmp_path / "ticks.csv"},
+            "network.channel.loss": {"kind": "recorded", "path": tmp_path / "lost.csv"},
         }
     )
     same(run, netkf.simulate(replay))

@@ -119,7 +119,7 @@ def test_cuts_of_a_reading_are_independent_white_noise(cuts):
 def test_default_period_follows_the_fastest_time_constant():
     G = [np.diag([4.0, 0.0])]
     slow, fast = (
-        default_sensing_period(plant(A=A * s, B=B * np.sqrt(s)), [g * s for g in G])
+        default_sensing_period(plant(A=A * s, B=B * np.sqrt(s)), [g * s for g in G], np.inf)
         for s in (1.0, 10.0)
     )
     assert slow == pytest.approx(10.0 * fast)

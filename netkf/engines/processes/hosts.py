@@ -18,6 +18,7 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.schema import CODES
 
 ABSORB = CODES["absorb"]
+SHORTEST_SHARE = 1e-9
 
 
 class Host:
@@ -44,19 +45,24 @@ class Host:
 
     def advance(self, time: float) -> None:
         """Bring the filter to ``time``, with the readings of the stretch in between."""
-        gap = time - self._now
-        if gap <= 0.0:
-            return
-        algorithm = self._algorithm
-        state = algorithm.flow(self._state, gap)
-        if self._sensors:
-            state = algorithm.measure(state, Reading(self._read(time), gap))
-        self._state, self._now = state, time
+        algorithm, state, now = self._algorithm, self._state, self._now
+        while now < time:
+            end = time
+            if self._sensors:
+                stretch = algorithm.stretch(state)
+                if stretch < time - now:
+                    end = now + max(stretch, SHORTEST_SHARE * (time - now))
+            state = algorithm.flow(state, end - now)
+            if self._sensors:
+                moments = self._read(now, end)
+                state = algorithm.measure(state, Reading(moments, end - now))
+            now = end
+        self._state, self._now = state, now
 
-    def _read(self, time: float) -> FloatArray:
-        truth, start = self._truth, self._now
-        seen = truth.moments(start, time)
-        parts = [sensor.moments(truth, seen, start, time) for sensor in self._sensors]
+    def _read(self, start: float, end: float) -> FloatArray:
+        truth = self._truth
+        seen = truth.moments(start, end)
+        parts = [sensor.moments(truth, seen, start, end) for sensor in self._sensors]
         whole = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return whole.reshape(-1)
 

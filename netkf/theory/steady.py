@@ -1,0 +1,133 @@
+"""The steady state of H(12), and how fast links must tick for it to exist.
+
+A steady state exists if and only if some gains make the linear part of H(12) stable (for a
+controllable plant). Gains are looked for along H(12) itself, by implicit steps whose length grows
+while gains keep stabilising the shifted problem: where a steady state exists they come to gains
+that need no shift, which one linear equation proves; where none exists the steps stay shorter than
+the time in which H(12) grows, and P grows past every bound.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import scipy.sparse.linalg
+
+from netkf.core.arrays import FloatArray, symmetric
+from netkf.core.errors import TheoryError
+from netkf.scenario.scenario import Scenario
+from netkf.theory.coupled import Coupled, coupled, linear_operator, slope
+
+GROWN = 1e9  # a covariance that many times the first is taken to grow for ever
+RESIDUAL = 1e-9
+MOST_STEPS = 400
+LARGEST_FACTOR = 1e6
+FEW_UNKNOWNS = 400
+
+
+def steady_covariance_bound(scenario: Scenario) -> FloatArray:
+    """(N, n, n): the steady state of H(12).
+
+    Newton's method from gains that a linear equation has proved stabilising; returned with a
+    relative residual below 1e-9. Raises TheoryError where there is none, with the threshold that
+    the link rates would have to reach for one to exist.
+    """
+    equations = coupled(scenario)
+    P = _stabilising(equations)
+    if P is None:
+        raise TheoryError(_no_steady_state(scenario, equations))
+    for _ in range(60):
+        following = _newton(equations, P)
+        change = np.abs(following - P).max()
+        P = following
+        if change <= 1e-13 * np.abs(P).max():
+            break
+    residual = np.abs(slope(equations, P, P)).max()
+    sizes = [np.abs(x).max() for x in (equations.Q, P @ equations.G @ P, equations.A @ P)]
+    if not residual <= RESIDUAL * sum(sizes):
+        raise TheoryError(
+            f"the steady state of H(12) was solved to {residual:.1e} only: "
+            "some mode is neither driven by noise nor damped"
+        )
+    return P
+
+
+def _solve(equations: Coupled, P: FloatArray, right: FloatArray) -> FloatArray:
+    operator = linear_operator(equations, P @ equations.G)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
+        solution = scipy.sparse.linalg.spsolve(operator.tocsc(), -right.reshape(-1))
+    return symmetric(np.asarray(solution).reshape(P.shape))
+
+
+def _newton(equations: Coupled, P: FloatArray) -> FloatArray:
+    inflow = np.asarray(equations.coupling.sum(axis=1)).reshape(-1, 1, 1) * equations.q
+    return _solve(equations, P, equations.Q + P @ equations.G @ P + inflow)
+
+
+def _stable(equations: Coupled, P: FloatArray) -> bool:
+    """Whether the gains of P stabilise H(12) made linear.
+
+    That map X -> op(X) is a generator of positive maps, so it is stable if and only if
+    op(X) = -I has a positive definite solution.
+    """
+    X = _solve(equations, P, np.broadcast_to(np.eye(P.shape[-1]), P.shape))
+    return bool(np.isfinite(X).all() and np.linalg.eigvalsh(X)[:, 0].min() > 0.0)
+
+
+def _stabilising(equations: Coupled) -> FloatArray | None:
+    """Covariances whose gains stabilise H(12); None where none were found."""
+    n = len(equations.A)
+    size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
+    P = equations.start + equations.Q + 1e-3 * size * np.eye(n)
+    leaving = float(equations.coupling.sum(axis=1).max())
+    step = 0.1 / (float(np.abs(equations.A).max()) + leaving + 1e-9)
+    for _ in range(MOST_STEPS):
+        if _stable(equations, P):
+            return P
+        shift = equations.A - 0.5 / step * np.eye(n)
+        implicit = equations._replace(A=shift, Q=equations.Q + P / step)
+        if not _stable(implicit, P):
+            step *= 0.5
+            continue
+        for _ in range(3):
+            P = _newton(implicit, P)
+        if not np.abs(P).max() < GROWN * size:
+            return None
+        step *= 1.5
+    return None
+
+
+def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
+    factor = threshold_factor(equations)
+    if factor is None:
+        return "H(12) has no steady state, and faster links do not give it one"
+    activation = scenario.network.activation
+    rate = getattr(activation, "rate", None)
+    words = f"every link rate must be at least {factor:.5g} times what it is"
+    if rate is not None and not getattr(activation, "rates", ()):
+        words = f"the rate {rate:g} is below the threshold {factor * rate:.5g}"
+    return f"H(12) has no steady state: {words}"
+
+
+def threshold_factor(equations: Coupled) -> float | None:
+    """The factor on all link rates from which on H(12) has a steady state, by bisection between a
+    factor that has none and one that has (to 1e-6, or 1e-3 for large networks); None where no
+    factor up to 1e6 helps.
+    """
+
+    def exists(factor: float) -> bool:
+        faster = equations._replace(coupling=factor * equations.coupling)
+        return _stabilising(faster) is not None
+
+    low, high = 1.0, 2.0
+    while not exists(high):
+        low, high = high, 2.0 * high
+        if high > LARGEST_FACTOR or equations.coupling.nnz == 0:
+            return None
+    fine = 1e-6 if equations.start.size <= FEW_UNKNOWNS else 1e-3
+    while high / low > 1.0 + fine:
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if exists(middle) else (middle, high)
+    return high
