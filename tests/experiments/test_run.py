@@ -110,8 +110,9 @@ def test_a_diverged_run_says_so(build, tmp_path):
 def test_directories_are_never_overwritten(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = new_directory(None, "a/b name")
-    first.mkdir(parents=True)
+    assert first == Path("runs/a-b-name-1")
     assert new_directory(None, "a/b name") == Path("runs/a-b-name-2")
+    assert new_directory(first, "x") == first  # still empty
     (first / "file").touch()
     with pytest.raises(netkf.ScenarioError, match="new or empty directory"):
         new_directory(first, "x")

@@ -136,7 +136,7 @@ TOP = [
     ("claim-lines", {"claim": r'"one\ntwo"'}, "claim", r"one line of text; got 'one\ntwo'"),
     ("horizon-missing", {"horizon": None}, "horizon", "is missing"),
     ("horizon-zero", {"horizon": "0"}, "horizon", "above 0; got 0"),
-    ("horizon-negative", {"horizon": "-2.0"}, "horizon", "1e+09; got -2.0"),
+    ("horizon-negative", {"horizon": "-2.0"}, "horizon", "above 0; got -2.0"),
     ("horizon-inf", {"horizon": "inf"}, "horizon", "finite number above 0; got inf"),
     ("horizon-nan", {"horizon": "nan"}, "horizon", "finite number above 0; got nan"),
     ("horizon-text", {"horizon": '"2"'}, "horizon", "above 0; got '2'"),
