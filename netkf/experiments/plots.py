@@ -181,7 +181,7 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
                 color=DARK,
                 zorder=3,
             )
-    axes.set_aspect("equal")
+    axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.axis("off")
     axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))

@@ -23,7 +23,7 @@ from netkf.core.fields import (
     source_file,
 )
 from netkf.core.tables import read_columns, whole
-from netkf.network.graphs import Link, Topology
+from netkf.network.graphs import Link, Topology, demand_links
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,17 +249,7 @@ class RecordedLoss(Loss):
 
     def check(self, topology: Topology) -> None:
         """Every recorded pair is a link."""
-        links = set(topology.links)
-        if not topology.directed:
-            links |= {(j, i) for i, j in links}
-        strange = sorted(self._lost.keys() - links)
-        if strange:
-            raise ScenarioError(
-                "path",
-                f"{self.path.name}: every pair must be a link of the graph",
-                list(strange[0]),
-                "add the link or remove the rows",
-            )
+        demand_links(self.path, self._lost, topology)
 
 
 @dataclass(frozen=True, eq=False)

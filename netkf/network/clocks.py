@@ -26,7 +26,7 @@ from netkf.core.fields import (
     source_file,
 )
 from netkf.core.tables import read_columns, whole
-from netkf.network.graphs import Link, Topology
+from netkf.network.graphs import Link, Topology, demand_links
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,11 +318,4 @@ class RecordedClock(LinkClock):
 
     def check(self, topology: Topology) -> None:
         """Every recorded pair is a link."""
-        strange = sorted(self._times.keys() - set(topology.links))
-        if strange:
-            raise ScenarioError(
-                "path",
-                f"{self.path.name}: every pair must be a link of the graph",
-                list(strange[0]),
-                "add the link or remove the rows",
-            )
+        demand_links(self.path, self._times, topology)

@@ -78,6 +78,17 @@ class Topology:
         return sorted(networkx.connected_components(graph), key=len, reverse=True)
 
 
+def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) -> None:
+    """Raise ScenarioError where a file names a pair that is no link of the graph."""
+    links = set(topology.links)
+    if not topology.directed:
+        links |= {(j, i) for i, j in links}
+    strange = sorted(set(pairs) - links)
+    if strange:
+        words = f"{source.name}: every pair must be a link of the graph"
+        raise ScenarioError("path", words, list(strange[0]), "add the link or remove the rows")
+
+
 @dataclass(frozen=True, eq=False)
 class Graph(Part):
     """The contract of a graph kind; ``seed`` is the root seed for the random ones."""

@@ -99,6 +99,24 @@ def test_a_fixed_delay_enters_as_the_predicted_past(build):
     np.testing.assert_allclose(steady, far, rtol=1e-8)
 
 
+def test_a_short_delay_is_integrated_in_longer_stretches(build):
+    """The same equation cut into stretches of one delay, and the limit of no delay."""
+
+    def bound(seconds):
+        delay = {"kind": "constant", "seconds": seconds}
+        network = {
+            "graph": {"kind": "path", "nodes": 2},
+            "activation": {"kind": "poisson", "rate": 2.0},
+            "channel": {"delay": delay},
+        }
+        return theory.covariance_bound(build(network=network), [0.5, 1.0, 2.5])
+
+    none, tiny, short = bound(0.0), bound(1e-6), bound(1e-3)
+    assert np.abs(tiny - none).max() < 1e-5
+    # first order in the delay
+    np.testing.assert_allclose((short - none) / 1e-3, (bound(2e-3) - none) / 2e-3, rtol=0.01)
+
+
 def test_filters_that_do_not_talk_have_their_own_covariance_as_bound(build):
     local = build(filter={"kind": "local"})
     bound = theory.covariance_bound(local, local.times)
