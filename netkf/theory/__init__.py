@@ -3,6 +3,15 @@
 from netkf.theory.assumptions import assumptions
 from netkf.theory.bounds import covariance_bound
 from netkf.theory.errors import error_covariance
+from netkf.theory.intermittent import (
+    critical_certificate,
+    critical_probability,
+    invariant_samples,
+    lyapunov_step,
+    riccati_step,
+    steady_covariance,
+    support,
+)
 from netkf.theory.limits import central_covariance, limit_covariance, true_limit_covariance
 from netkf.theory.matrices import riccati_flow
 from netkf.theory.steady import steady_covariance_bound
@@ -11,9 +20,16 @@ __all__ = [
     "assumptions",
     "central_covariance",
     "covariance_bound",
+    "critical_certificate",
+    "critical_probability",
     "error_covariance",
+    "invariant_samples",
     "limit_covariance",
+    "lyapunov_step",
     "riccati_flow",
+    "riccati_step",
+    "steady_covariance",
     "steady_covariance_bound",
+    "support",
     "true_limit_covariance",
 ]

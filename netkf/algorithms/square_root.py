@@ -1,0 +1,49 @@
+"""Covariance recursions in square-root form, which survive covariances of 1e14 and far beyond.
+
+For ``P = S S'`` one orthogonal triangularisation of ``[[H S, root(R), 0], [F S, 0, root(Q)]]``
+gives the innovation's root, the gain and the root of the next covariance: nothing is subtracted, so
+nothing cancels after an outage, where covariance forms lose eps * P (Kailath, Sayed and Hassibi,
+Linear Estimation, section 12.3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+
+
+def lower_triangular(array: FloatArray) -> FloatArray:
+    """L (..., r, r), lower triangular with ``L L' = array array'`` for stacks of (r, c), c >= r."""
+    return np.asarray(np.swapaxes(np.linalg.qr(np.swapaxes(array, -1, -2), mode="r"), -1, -2))
+
+
+def predict_root(S: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
+    """Root of ``F P F' + Q`` (..., n, n)."""
+    moved = F @ S
+    noise = np.broadcast_to(root_Q, moved.shape[:-2] + root_Q.shape)
+    return lower_triangular(np.concatenate([moved, noise], axis=-1))
+
+
+def update_root(
+    S: FloatArray, F: FloatArray, root_Q: FloatArray, H: FloatArray, root_R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Roots and gains of a measurement update followed by a prediction, for a stack of S.
+
+    Returns the root of ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (..., n, n) and the
+    predictor's gain ``F P H' (H P H' + R)^-1`` (..., n, p), R (15)-(18).
+    """
+    p, n = H.shape
+    seen, moved = H @ S, F @ S
+    lead = moved.shape[:-2]
+    # Large columns first: Householder's reflections then keep the small ones to full precision.
+    noise_R, noise_Q = (
+        np.broadcast_to(root_R, (*lead, p, p)),
+        np.broadcast_to(root_Q, (*lead, n, n)),
+    )
+    top = np.concatenate([seen, noise_R, np.zeros((*lead, p, n))], axis=-1)
+    bottom = np.concatenate([moved, np.zeros((*lead, n, p)), noise_Q], axis=-1)
+    L = lower_triangular(np.concatenate([top, bottom], axis=-2))
+    innovation, cross, root = L[..., :p, :p], L[..., p:, :p], L[..., p:, p:]
+    gain = np.linalg.solve(np.swapaxes(innovation, -1, -2), np.swapaxes(cross, -1, -2))
+    return root, np.swapaxes(gain, -1, -2)

@@ -1,0 +1,281 @@
+"""Intermittent observations: the random Riccati equation P_{t+1} = f_gamma(P_t) of R.
+
+``f_0(P) = F P F' + Q`` without the reading, ``f_1`` with it, R (15)-(18). P is the one-step
+prediction covariance and ``delivery`` the probability that a reading arrives.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from netkf.algorithms.square_root import predict_root, update_root
+from netkf.core.arrays import ArrayLike, FloatArray, square_root, symmetric
+from netkf.core.errors import TheoryError
+from netkf.core.streams import Streams
+from netkf.theory.matrices import RESIDUAL, as_covariance, as_square
+
+DEEPEST = 22
+COALESCED = 1e-9
+MOST_STEPS = 100_000
+
+
+class System(NamedTuple):
+    """Checked F (n, n), Q (n, n), H (p, n), R (p, p)."""
+
+    F: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+
+
+def _system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> System:
+    F_ = as_square("F", F)
+    n = len(F_)
+    H_ = _observation(H, n)
+    R_ = as_covariance("R", R, len(H_))
+    if len(R_) and not np.linalg.eigvalsh(R_)[0] > 0.0:
+        raise TheoryError("R must be positive definite")
+    return System(F_, as_covariance("Q", Q, n), H_, R_)
+
+
+def _observation(H: ArrayLike, n: int) -> FloatArray:
+    array: FloatArray = np.asarray(H, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != n or not np.isfinite(array).all():
+        raise TheoryError(f"H must be a finite matrix of {n} columns, its shape is {array.shape}")
+    return array
+
+
+def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
+    """``f_0(P) = F P F' + Q`` (n, n), R (15): a slot without a reading."""
+    transition = as_square("F", F)
+    n = len(transition)
+    return symmetric(
+        transition @ as_covariance("P", P, n) @ transition.T + as_covariance("Q", Q, n)
+    )
+
+
+def riccati_step(
+    P: ArrayLike, F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike
+) -> FloatArray:
+    """``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), R (16): a slot with one.
+
+    Computed from square roots by an orthogonal triangularisation, without a subtraction.
+    """
+    system = _system(F, Q, H, R)
+    start = as_covariance("P", P, len(system.F))
+    root, _ = update_root(_root(start), system.F, square_root(system.Q), system.H, _root(system.R))
+    return symmetric(root @ root.T)
+
+
+def _root(P: FloatArray) -> FloatArray:
+    try:
+        return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
+    except np.linalg.LinAlgError:  # singular
+        return square_root(P)
+
+
+def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
+    """P* (n, n), the stabilising fixed point of f_1.
+
+    Raises TheoryError, naming the mode, where (F, H) is not detectable, and where what was found
+    does not solve the equation or does not stabilise the filter.
+    """
+    F, Q, H, R = _system(F, Q, H, R)
+    hidden = _unseen(F, H)
+    if hidden is not None:
+        raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
+    try:
+        P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise TheoryError(f"no stabilising fixed point of f_1: {error}") from None
+    # One step of Newton's method takes what is left of the residual away.
+    K = _gain(P, F, H, R)
+    P = symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(F - K @ H, Q + K @ R @ K.T)))
+    residual = np.abs(riccati_step(P, F, Q, H, R) - P).max()
+    if not residual <= RESIDUAL * np.abs(P).max():
+        raise TheoryError(f"P* was solved to {residual:.1e} only")
+    if not np.abs(np.linalg.eigvals(F - _gain(P, F, H, R) @ H)).max() < 1.0:
+        raise TheoryError("the fixed point found does not stabilise the filter")
+    return P
+
+
+def _gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
+
+
+def _unseen(F: FloatArray, H: FloatArray) -> complex | None:
+    """An eigenvalue of F on or outside the unit circle whose mode H does not see, or None."""
+    size = max(float(np.linalg.norm(F, 2)), 1e-300)
+    seen = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
+    for value in np.linalg.eigvals(F):
+        if abs(value) < 1.0 - 1e-12:
+            continue
+        pencil = np.concatenate([F - value * np.eye(len(F)), seen])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9 * size:
+            return complex(value)
+    return None
+
+
+class Critical(NamedTuple):
+    """Bounds on the delivery probability above which the mean covariance stays bounded.
+
+    lower : R (31), necessary, not sufficient
+    upper : R (32), from there on sufficient
+    gain  : (n, p) K with spectral radius below 1 of ``(1-g) F x F + g (F+KH) x (F+KH)`` at
+            ``g = upper + 1e-6``: proves the upper bound
+    perron: (n, n) X >= 0 with ``min over K of (1-g) F X F' + g (F+KH) X (F+KH)' >= X`` at
+            ``g = upper - 1e-6``: proves that no gain will do there
+    """
+
+    lower: float
+    upper: float
+    gain: FloatArray
+    perron: FloatArray
+
+
+def critical_probability(F: ArrayLike, H: ArrayLike) -> tuple[float, float]:
+    """(lower, upper) bounds on the critical delivery probability, R (31) and (32).
+
+    The upper one is the smallest g for which some K makes the mean of the Kronecker squares
+    contract; it is found by policy iteration over K inside a root search over g, to about 1e-12.
+    Raises TheoryError where (F, H) is not detectable: then no probability will do.
+    """
+    found = critical_certificate(F, H)
+    return found.lower, found.upper
+
+
+def critical_certificate(F: ArrayLike, H: ArrayLike) -> Critical:
+    """The bounds of critical_probability with what proves the upper one from both sides."""
+    transition = as_square("F", F)
+    n = len(transition)
+    observation = _observation(H, n)
+    hidden = _unseen(transition, observation)
+    if hidden is not None:
+        raise TheoryError(
+            f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g} is never seen"
+        )
+    alpha = float(np.abs(np.linalg.eigvals(transition)).max())
+    lower = max(0.0, 1.0 - 1.0 / alpha**2) if alpha > 0.0 else 0.0
+    search = _Contraction(transition, observation)
+    if search.radius(0.0) <= 1.0 or search.radius(lower) <= 1.0 + 1e-13:
+        upper = lower
+    else:
+        upper = float(
+            scipy.optimize.brentq(lambda g: np.log(search.radius(g)), lower, 1.0, xtol=1e-14)
+        )
+    above, below = min(1.0, upper + 1e-6), max(0.0, upper - 1e-6)
+    _, gain, _ = search.best(above)
+    _, _, perron = search.best(below)
+    return Critical(lower, upper, gain, perron)
+
+
+class _Contraction:
+    """min over K of the spectral radius of ``X -> (1-g) F X F' + g (F+KH) X (F+KH)'``."""
+
+    def __init__(self, F: FloatArray, H: FloatArray) -> None:
+        self._F, self._H = F, H
+        n = len(F)
+        rows, columns = np.triu_indices(n)
+        # vec of a symmetric matrix from its upper triangle, and the triangle of a vec
+        self._expand = np.zeros((n * n, len(rows)))
+        self._expand[rows * n + columns, np.arange(len(rows))] = 1.0
+        self._expand[columns * n + rows, np.arange(len(rows))] = 1.0
+        self._pick = rows * n + columns
+
+    def radius(self, g: float) -> float:
+        """The least spectral radius at g."""
+        return self.best(g)[0]
+
+    def best(self, g: float) -> tuple[float, FloatArray, FloatArray]:
+        """The least spectral radius, the gain that reaches it and the Perron matrix."""
+        n = len(self._F)
+        K = self._improved(np.zeros((n, len(self._H))), np.eye(n))
+        best, X = self._perron(g, K)
+        gain = K
+        for _ in range(500):
+            K = self._improved(K, X)
+            rho, X_new = self._perron(g, K)
+            if not rho < best * (1.0 - 1e-15):
+                break
+            best, X, gain = rho, X_new, K
+        return best, gain, X
+
+    def _improved(self, K: FloatArray, X: FloatArray) -> FloatArray:
+        # Where X says nothing about a direction, what is known of it is kept.
+        S = self._H @ X @ self._H.T
+        wanted = -(self._F @ X @ self._H.T) - K @ S
+        return np.asarray(K + wanted @ np.linalg.pinv(S, rcond=1e-13, hermitian=True))
+
+    def _perron(self, g: float, K: FloatArray) -> tuple[float, FloatArray]:
+        closed = self._F + K @ self._H
+        whole = (1.0 - g) * np.kron(self._F, self._F) + g * np.kron(closed, closed)
+        values, vectors = np.linalg.eig(whole[self._pick] @ self._expand)
+        k = int(np.argmax(values.real))
+        vector = (self._expand @ vectors[:, k]).real
+        X = symmetric(vector.reshape(self._F.shape))
+        return float(np.abs(values).max()), X * np.sign(np.trace(X))
+
+
+def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) -> FloatArray:
+    """(2^depth, n, n): all words of ``depth`` letters over {f_0, f_1} applied to P*, right to left.
+
+    Entry k belongs to the word whose letters are the binary digits of k, the first (applied last)
+    leading. R Theorem 10: the closure of these points over all depths is the support of the
+    invariant law; f_1(P*) = P*, so each depth holds the ones before. Raises TheoryError for a depth
+    outside 0 .. 22 and where P* does not exist.
+    """
+    if int(depth) != depth or not 0 <= depth <= DEEPEST:
+        raise TheoryError(f"depth must be an integer from 0 to {DEEPEST}, got {depth!r}")
+    F, Q, H, R = _system(F, Q, H, R)
+    roots = _root(steady_covariance(F, Q, H, R))[None]
+    root_Q, root_R = square_root(Q), _root(R)
+    for _ in range(depth):
+        without = predict_root(roots, F, root_Q)
+        with_reading, _gain = update_root(roots, F, root_Q, H, root_R)
+        roots = np.concatenate([without, with_reading])
+    return symmetric(roots @ np.swapaxes(roots, -1, -2))
+
+
+def invariant_samples(
+    F: ArrayLike,
+    Q: ArrayLike,
+    H: ArrayLike,
+    R: ArrayLike,
+    delivery: float,
+    samples: int,
+    seed: int,
+) -> FloatArray:
+    """(samples, n, n): independent draws from the invariant law of the random Riccati equation.
+
+    One chain a draw, all side by side. Each runs from P* and, on the same arrivals, from a
+    covariance a million times larger, until the two agree to 1e-9: then neither remembers its
+    start. Raises TheoryError where no invariant law exists or that does not happen.
+    """
+    F, Q, H, R = _system(F, Q, H, R)
+    if not 0.0 < delivery <= 1.0:
+        raise TheoryError(f"delivery must lie in (0, 1], got {delivery!r}")
+    if int(samples) != samples or samples < 1:
+        raise TheoryError(f"samples must be a positive integer, got {samples!r}")
+    n, P = len(F), steady_covariance(F, Q, H, R)
+    random = Streams(seed).generator("arrivals")
+    first = np.stack([_root(P), 1e3 * _root(P + np.trace(P) * np.eye(n))])
+    roots = np.repeat(first[:, None], samples, axis=1)
+    root_Q, root_R = square_root(Q), _root(R)
+    for step in range(1, MOST_STEPS):
+        arrived = random.random(samples) < delivery
+        following = np.empty_like(roots)
+        following[:, ~arrived] = predict_root(roots[:, ~arrived], F, root_Q)
+        following[:, arrived] = update_root(roots[:, arrived], F, root_Q, H, root_R)[0]
+        roots = following
+        if step % 8 == 0:
+            pair = roots @ np.swapaxes(roots, -1, -2)
+            apart = np.abs(pair[0] - pair[1]).max(axis=(-1, -2))
+            if (apart <= COALESCED * np.abs(pair[0]).max(axis=(-1, -2))).all():
+                return symmetric(pair[0])
+            if not np.isfinite(pair).all():
+                break
+    raise TheoryError("the equation does not forget its start: no invariant law was reached")

@@ -1,0 +1,125 @@
+"""The random Riccati equation against independent values in 60-digit arithmetic."""
+
+import json
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf import theory
+from tests.cases import FOLDER
+
+CASES = json.loads((FOLDER / "intermittent.json").read_text())
+SCALAR = ([[2.0**0.5]], [[1.0]], [[1.0]], [[1.0]])
+
+
+@pytest.mark.parametrize("case", CASES["cases"], ids=lambda c: c["id"])
+def test_recorded_arrivals(case):
+    F, Q, H, R = (case[name] for name in "AQCR")
+    P = np.array(case["P0"])
+    for gamma, expected in zip(case["gammas"], case["P"][1:], strict=True):
+        step = theory.riccati_step(P, F, Q, H, R) if gamma else theory.lyapunov_step(P, F, Q)
+        np.testing.assert_allclose(step, expected, rtol=1e-10, atol=1e-12 * np.abs(expected).max())
+        P = step
+
+
+@pytest.mark.parametrize("name", CASES["steady"])
+def test_steady_covariance(name):
+    case = CASES["steady"][name]
+    P = theory.steady_covariance(*(case[k] for k in "AQCR"))
+    np.testing.assert_allclose(P, case["Pstar"], rtol=0, atol=1e-11 * np.abs(case["Pstar"]).max())
+
+
+@pytest.mark.parametrize("name", CASES["critical"])
+def test_critical_probability_with_its_certificates(name):
+    case, system = CASES["critical"][name], CASES["steady"][name]
+    F, H = np.array(system["A"]), np.array(system["C"])
+    found = theory.critical_certificate(F, H)
+    assert theory.critical_probability(F, H) == (found.lower, found.upper)
+    assert found.lower == pytest.approx(case["lower_31"], abs=1e-12)
+    assert found.upper == pytest.approx(case["upper_closed_form"] or case["upper_32"], abs=1e-10)
+    # the gain proves the bound from above
+    g, closed = min(1.0, found.upper + 1e-6), F + found.gain @ H
+    mean = (1 - g) * np.kron(F, F) + g * np.kron(closed, closed)
+    assert np.abs(np.linalg.eigvals(mean)).max() < 1.0
+    # the Perron matrix proves it from below: even the best gain for it does not shrink it
+    g, X = found.upper - 1e-6, found.perron
+    best = F @ X @ F.T - g * F @ X @ H.T @ np.linalg.pinv(H @ X @ H.T) @ H @ X @ F.T
+    assert np.linalg.eigvalsh(X).min() >= -1e-9 * np.abs(X).max()
+    assert np.linalg.eigvalsh(best - X).min() >= -1e-7 * np.abs(X).max()
+
+
+def test_two_decoupled_plants_are_as_critical_as_the_worse():
+    """A Perron matrix that lives on one block must not spoil the gain of the other."""
+    one, other = [[1.25, 0.0], [1.0, 1.1]], [[2.0**0.5]]
+    F = np.zeros((3, 3))
+    F[:2, :2], F[2:, 2:] = one, other
+    H = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    alone = [
+        theory.critical_probability(one, [[1.0, 1.0]]),
+        theory.critical_probability(other, [[1.0]]),
+    ]
+    both = theory.critical_probability(F, H)
+    # the readings arrive together, so the bound is the larger of the two
+    assert both[1] == pytest.approx(max(upper for _, upper in alone), abs=1e-9)
+
+
+def test_lower_bound_is_not_sufficient():
+    lower, upper = theory.critical_probability(np.diag([2.0**0.5, -(2.0**0.5)]), [[1.0, 1.0]])
+    assert lower == pytest.approx(0.5, abs=1e-12)
+    assert upper == pytest.approx(0.75, abs=1e-9)
+
+
+def test_a_step_survives_covariances_beyond_double_rounding():
+    """f_1 of 1e14 and 1e20 times a full matrix, against the limit that forgets P."""
+    F = np.array([[1.2, 0.4], [0.0, 1.1]])
+    Q, H, R = np.eye(2), np.eye(2), np.eye(2)
+    limit = F @ F.T + Q  # f_1(P) -> F (H^-1 R H^-T) F' + Q as P grows
+    shape = np.array([[2.0, 1.0], [1.0, 1.0]])
+    for size in (1e14, 1e20):
+        np.testing.assert_allclose(theory.riccati_step(size * shape, F, Q, H, R), limit, rtol=1e-12)
+
+
+def test_support_of_the_scalar_example():
+    """R Proposition 24 with the holes: no point between what f_1 and f_0 can reach."""
+    points = theory.support(*SCALAR, depth=12)[:, 0, 0]
+    assert points.shape == (4096,)
+    listed = {row["word"]: row["value"] for row in CASES["scalar_support_first_64"]}
+    for word, value in listed.items():
+        if len(word) <= 12:
+            k = int((word + "1" * (12 - len(word))) or "0", 2)
+            assert points[k] == pytest.approx(value, rel=1e-12)
+    star = 1.0 + 2.0**0.5
+    assert points.min() == pytest.approx(star, rel=1e-12)
+    inside = (points > 3.0 + 1e-9) & (points < 2.0 * star + 1.0 - 1e-9)
+    assert not inside.any()
+    deeper = theory.support(*SCALAR, depth=13)[:, 0, 0]
+    assert np.isclose(points[:, None], deeper[None, :], rtol=1e-12).any(axis=1).all()
+
+
+@pytest.mark.parametrize("delivery", [0.6, 0.9])
+def test_invariant_samples_have_the_exact_law_of_the_scalar_example(delivery):
+    """Derived: P(P > 2^(n+2) - 1) = (1 - g)^(n+1); five binomial tests at level 1e-4 each."""
+    scipy_stats = pytest.importorskip("scipy.stats")
+    P = theory.invariant_samples(*SCALAR, delivery=delivery, samples=20000, seed=3)[:, 0, 0]
+    for n in range(5):
+        above, chance = int((2.0 ** (n + 2) - 1.0 < P).sum()), (1.0 - delivery) ** (n + 1)
+        assert scipy_stats.binomtest(above, len(P), chance).pvalue > 1e-4
+    wrong = (1.0 - delivery + 0.03) ** 2
+    above = int((P > 7.0).sum())
+    assert scipy_stats.binomtest(above, len(P), wrong).pvalue < 1e-4
+    again = theory.invariant_samples(*SCALAR, delivery=delivery, samples=20000, seed=3)
+    np.testing.assert_array_equal(P, again[:, 0, 0])
+
+
+def test_what_does_not_exist_is_refused():
+    with pytest.raises(netkf.TheoryError, match=r"not detectable: the mode with eigenvalue 2"):
+        theory.steady_covariance([[2.0]], [[1.0]], [[0.0]], [[1.0]])
+    with pytest.raises(netkf.TheoryError, match="is never seen"):
+        theory.critical_probability([[2.0]], [[0.0]])
+    with pytest.raises(netkf.TheoryError, match="depth must be"):
+        theory.support(*SCALAR, depth=-1)
+    with pytest.raises(netkf.TheoryError, match="delivery must lie"):
+        theory.invariant_samples(*SCALAR, delivery=0.0, samples=1, seed=0)
+    with pytest.raises(netkf.TheoryError, match="H must be a finite matrix of 1 columns"):
+        theory.riccati_step([[1.0]], [[1.0]], [[1.0]], [[1.0, 0.0]], [[1.0]])
