@@ -173,11 +173,16 @@ line = Rule("must be one line of text", _line, 'write it as "text" without line 
 text = Rule("must be one line of text that is not empty", _line_or_more, 'write it as "text"')
 
 
-def instance(kind: type) -> Rule:
-    """An object of a class (a part of a scenario)."""
-    return Rule(
-        f"must be a {kind.__name__.lower()}", _is(kind), 'write a table { kind = "...", ... }'
-    )
+def instance(*kinds: type) -> Rule:
+    """An object of one of some classes (a part of a scenario)."""
+
+    def convert(value: Any) -> Any:
+        if not isinstance(value, kinds):
+            raise TypeError
+        return value
+
+    names = " or ".join(f"a {kind.__name__.lower()}" for kind in kinds)
+    return Rule(f"must be {names}", convert, 'write a table { kind = "...", ... }')
 
 
 def choice(*names: str) -> Rule:

@@ -56,6 +56,8 @@ def _lines(axes: Any, times: FloatArray, values: FloatArray, scenario: Scenario)
 
 
 def _legend(axes: Any) -> None:
+    if not axes.get_legend_handles_labels()[0]:
+        return
     axes.legend(
         frameon=False,
         fontsize=7.5,

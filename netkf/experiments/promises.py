@@ -18,6 +18,7 @@ from netkf.theory import (
     central_covariance,
     covariance_bound,
     limit_covariance,
+    steady_covariance,
     steady_covariance_bound,
     true_limit_covariance,
 )
@@ -38,7 +39,6 @@ def promises(scenario: Scenario) -> dict[str, Any]:
     number does not exist. Plain JSON values.
     """
     rows = assumptions(scenario)
-    ends = np.array([scenario.horizon])
     found: dict[str, Any] = {
         "scenario": scenario.name,
         "filter": type(scenario.filter.algorithm).__name__.lower(),
@@ -47,13 +47,24 @@ def promises(scenario: Scenario) -> dict[str, Any]:
             {"assumption": a, "source": s, "holds": bool(h), "evidence": e}
             for a, s, h, e in rows.itertuples(index=False)
         ],
-        "bound_at_horizon": _value(lambda: covariance_bound(scenario, ends)[0]),
-        "steady_bound": _value(lambda: steady_covariance_bound(scenario)),
     }
+    if scenario.slotted:
+        found["slot_central_covariance"] = _value(lambda: _slot_central(scenario))
+        plain: dict[str, Any] = finite(found)
+        return plain
+    ends = np.array([scenario.horizon])
+    found["bound_at_horizon"] = _value(lambda: covariance_bound(scenario, ends)[0])
+    found["steady_bound"] = _value(lambda: steady_covariance_bound(scenario))
     for name, _, function in LIMITS:
         found[name] = _value(lambda function=function: function(scenario))  # type: ignore[misc]
-    plain: dict[str, Any] = finite(found)
-    return plain
+    whole: dict[str, Any] = finite(found)
+    return whole
+
+
+def _slot_central(scenario: Scenario) -> FloatArray:
+    """P*: the prediction covariance of a filter that gets every reading in every slot."""
+    model = scenario.pooled_slot_model
+    return steady_covariance(model.F, model.Q, model.H, model.R)
 
 
 def _value(function: Callable[[], FloatArray]) -> dict[str, Any]:
@@ -78,6 +89,11 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
         lines += textwrap.wrap(
             row["evidence"], 92, initial_indent=" " * 9, subsequent_indent=" " * 9
         )
+    if scenario.slotted:
+        value = found["slot_central_covariance"]
+        words = value["reason"] or number(value["trace"])
+        lines += ["", f"trace of P*, the prediction covariance with all readings: {words}"]
+        return "\n".join(lines)
     lines += ["", "trace of the bound on E[P_i]"]
     columns = [found["bound_at_horizon"], found["steady_bound"]]
     for words, column in zip((f"at {scenario.horizon:g} s", "steady state"), columns, strict=True):

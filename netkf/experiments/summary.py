@@ -16,10 +16,13 @@ from netkf.trace.recorder import Sink
 from netkf.trace.run import errors
 from netkf.trace.schema import CODES
 
+ROUNDING = 4.0 * np.finfo(float).eps
+
 
 class SummarySink(Sink):
     """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES; and
-    how many messages each link delivered.
+    how many messages each link delivered. ``rounding_from`` is the first sample at which the state
+    is so large that rounding blurs the errors (unstable plants over long horizons).
     """
 
     def __init__(self) -> None:
@@ -28,6 +31,7 @@ class SummarySink(Sink):
         self.trace: list[FloatArray] = []
         self.nees: list[FloatArray] = []
         self.delivered: dict[tuple[int, int], int] = {}
+        self.rounding_from: float | None = None
 
     def events(self, rows: np.ndarray) -> None:
         """Deliveries of each link are counted, both directions together."""
@@ -44,6 +48,10 @@ class SummarySink(Sink):
         self.sq_error.append(sq_error[0])
         self.nees.append(nees[0])
         self.trace.append(np.trace(P, axis1=1, axis2=2))
+        deviation = np.sqrt(max(float(np.diagonal(P, axis1=1, axis2=2).min()), 0.0))
+        blurred = ROUNDING * float(np.abs(x).max()) > 0.01 * deviation > 0.0
+        if blurred and self.rounding_from is None:
+            self.rounding_from = t
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +122,7 @@ def summarise(
         "limit": promised.limit,
         "central": promised.central,
         "bound": promised.words or "H(12), promised by H Theorem 2",
+        "rounding_from": sink.rounding_from,
         "messages": {
             **messages,
             "in_flight": messages["sent"] - messages["delivered"] - messages["lost"],

@@ -55,6 +55,11 @@ def summary_table(summary: dict[str, Any]) -> str:
         )
     if all(row["bound"] is None for row in nodes):
         lines.append(f"bound: {summary['bound']}")
+    if summary["rounding_from"] is not None:
+        lines.append(
+            f"note: from {summary['rounding_from']:g} s on the state is so large that rounding "
+            "blurs the errors; shorten the horizon"
+        )
     references = [
         f"{words} {number(value)}"
         for words, value in (

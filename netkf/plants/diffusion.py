@@ -19,8 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray, square_root
-from netkf.core.fields import Part, covariance, matrix, positive, setting, square, vector
+from netkf.core.fields import matrix, positive, setting, square
 from netkf.core.legendre import forward_coefficients
+from netkf.plants.plant import Plant
 
 BLOCK = 64  # steps drawn at once
 LONGEST_STEP = 8.0
@@ -30,7 +31,7 @@ _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 @dataclass(frozen=True, eq=False)
-class Diffusion(Part):
+class Diffusion(Plant):
     """``dx = A x dt + B dw``, H (1), with x(0) Gaussian of ``mean`` and ``cov``.
 
     ``A`` (n, n), ``B`` (n, m); ``sensing_period`` is the step h of the sensors in seconds.
@@ -38,24 +39,12 @@ class Diffusion(Part):
 
     A: FloatArray = setting(square)
     B: FloatArray = setting(matrix)
-    mean: FloatArray | None = setting(vector, default=None)
-    cov: FloatArray | None = setting(covariance, default=None)
     sensing_period: float | None = setting(positive, default=None)
 
     @property
     def n(self) -> int:
         """Dimension of the state."""
         return len(self.A)
-
-    @property
-    def start_mean(self) -> FloatArray:
-        """(n,) mean of x(0), zeros by default."""
-        return np.zeros(self.n) if self.mean is None else self.mean
-
-    @property
-    def start_cov(self) -> FloatArray:
-        """(n, n) covariance of x(0), zeros by default."""
-        return np.zeros((self.n, self.n)) if self.cov is None else self.cov
 
     @cached_property
     def Q(self) -> FloatArray:

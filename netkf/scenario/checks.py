@@ -8,8 +8,12 @@ import numpy as np
 
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import longest_interval
+from netkf.algorithms.slot import Intermittent, SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
+from netkf.network.clocks import LinkClock
+from netkf.network.matchings import Matching, RecordedSlots
+from netkf.plants.diffusion import Diffusion
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -26,7 +30,10 @@ def check(scenario: Scenario) -> None:
     _sensors(scenario)
     _network(scenario)
     _filter(scenario)
-    _sensing_period(scenario)
+    if scenario.slotted:
+        _slots(scenario)
+    else:
+        _sensing_period(scenario)
 
 
 def _times(scenario: Scenario) -> None:
@@ -70,8 +77,12 @@ def _shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str)
 
 def _plant(scenario: Scenario) -> None:
     plant, n = scenario.plant, scenario.plant.n
-    why = f"plant.A has {n} rows"
-    _shape("plant.B", plant.B, (n, None), why)
+    if isinstance(plant, Diffusion):
+        why = f"plant.A has {n} rows"
+        _shape("plant.B", plant.B, (n, None), why)
+    else:
+        why = f"plant.F has {n} rows"
+        _shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
     if plant.mean is not None:
         _shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
@@ -122,13 +133,15 @@ def _network(scenario: Scenario) -> None:
         return
     name = type(algorithm).__name__.lower()
     if network.activation is None:
+        example = "broadcast" if scenario.slotted else "poisson"
         raise ScenarioError(
             "network.activation",
             f"is missing, and the {name} filter talks",
             None,
-            'add activation = { kind = "poisson", rate = ... }',
+            f'add activation = {{ kind = "{example}", ... }}',
         )
-    _ticks(scenario)
+    if not scenario.slotted:
+        _ticks(scenario)
     if topology.directed:
         raise ScenarioError(
             "network.graph.directed",
@@ -136,7 +149,7 @@ def _network(scenario: Scenario) -> None:
             True,
             "give an undirected graph",
         )
-    if len(topology.components) > 1:
+    if len(topology.components) > 1 and not isinstance(algorithm, Intermittent):
         smallest = sorted(topology.components[-1])
         raise ScenarioError(
             "network.graph",
@@ -148,7 +161,7 @@ def _network(scenario: Scenario) -> None:
 
 def _ticks(scenario: Scenario) -> None:
     clock = scenario.network.activation
-    assert clock is not None
+    assert isinstance(clock, LinkClock)
     for link in scenario.topology.links:
         ticks = clock.mean_rate(link) * scenario.horizon
         if ticks > MOST_TICKS:
@@ -187,10 +200,18 @@ def _filter(scenario: Scenario) -> None:
         elif value is not None:
             _shape(key, value, shape, why)
     model = filtering.model
-    if model.A is not None:
-        _shape("filter.model.A", model.A, (n, n), why)
-    if model.B is not None:
-        _shape("filter.model.B", model.B, (n, None), why)
+    for name in "ABFQ":
+        value = getattr(model, name)
+        if value is None:
+            continue
+        if (name in "FQ") != scenario.slotted:
+            raise ScenarioError(
+                f"filter.model.{name}",
+                "belongs to plants of the other kind of time",
+                value,
+                "use F and Q for linear plants, A and B for diffusions",
+            )
+        _shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     _believed_noise(scenario)
     _degrees(scenario)
 
@@ -238,19 +259,19 @@ def _sensing_period(scenario: Scenario) -> None:
             period,
             "lengthen it, shorten the horizon, or use less precise sensors",
         )
-    if period > scenario.plant.longest_period * (1.0 + 1e-9):
+    if period > scenario.truth.longest_period * (1.0 + 1e-9):
         raise ScenarioError(
             "plant.sensing_period",
             "is too long for the plant",
             period,
-            f"give at most {scenario.plant.longest_period:.3g}, or leave it out",
+            f"give at most {scenario.truth.longest_period:.3g}, or leave it out",
         )
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_model] if pooled else scenario.models
     longest = min((_longest(scenario, model) for model in models if len(model.H)), default=period)
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return
-    if scenario.plant.sensing_period is not None:
+    if getattr(scenario.plant, "sensing_period", None) is not None:
         raise ScenarioError(
             "plant.sensing_period",
             "is too long for the readings of the most precise node",
@@ -268,3 +289,42 @@ def _sensing_period(scenario: Scenario) -> None:
 
 def _longest(scenario: Scenario, model: FlowModel) -> float:
     return longest_interval(*scenario.belief, model.H, model.R)
+
+
+def _slots(scenario: Scenario) -> None:
+    plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
+    assert isinstance(algorithm, SlotFilter)
+    off = [
+        t
+        for t, k in zip(scenario.times.tolist(), scenario.slots, strict=True)
+        if abs(t - k * plant.period) > 1e-9 * max(plant.period, t)
+    ]
+    if off:
+        raise ScenarioError(
+            "probe",
+            f"times must be multiples of the plant's period {plant.period:g}",
+            off[0],
+            "sample at slots only",
+        )
+    activation = scenario.network.activation
+    if not algorithm.talks:
+        return
+    name = type(algorithm).__name__.lower()
+    pairs = isinstance(activation, Matching) or (
+        isinstance(activation, RecordedSlots) and activation.matching
+    )
+    if pairs != algorithm.pairwise:
+        raise ScenarioError(
+            "network.activation.kind",
+            f"must be a {'matching' if algorithm.pairwise else 'broadcast'} for the {name} filter",
+            type(activation).__name__.lower(),
+            "choose another activation or another filter",
+        )
+    exchanges = algorithm.programme.count("exchange")
+    if exchanges * scenario.phase_length >= plant.period * (1.0 - 1e-9):
+        raise ScenarioError(
+            "network.activation.phase",
+            f"must leave {exchanges} exchange(s) room within the period {plant.period:g}",
+            scenario.phase_length,
+            "shorten it",
+        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Part, SourceFile, integer, source_file
 from netkf.network.channels import Channel
-from netkf.scenario.registry import find
+from netkf.scenario.registry import SLOTTED, find
 from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
 from netkf.scenario.writing import as_table
 
@@ -99,13 +99,16 @@ def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
         raise ScenarioError("format", "is missing", None, f"write format = {FORMAT} first")
     if integer()("format", version) != FORMAT:
         raise ScenarioError("format", f"must be {FORMAT}", version, "this netkf reads no other")
-    readers = {
-        "plant": lambda value: _kind("plant", folder, value),
-        "sensors": lambda value: _list(value, folder),
-        "network": lambda value: _network(value, folder),
-        "filter": lambda value: _filtering(value, folder),
-    }
     table.setdefault("sensors", [])
+    time = ""
+    if "plant" in table:
+        table["plant"] = _under("plant", partial(_kind, "plant", folder), table["plant"])
+        time = "slot " if isinstance(table["plant"], SLOTTED) else ""
+    readers: dict[str, Callable[[Any], Any]] = {
+        "sensors": lambda value: _list(value, folder),
+        "network": lambda value: _network(value, folder, time),
+        "filter": lambda value: _filtering(value, folder, time),
+    }
     for key, reader in readers.items():
         if key in table:
             table[key] = _under(key, reader, table[key])
@@ -146,7 +149,7 @@ def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> 
     kind = table.pop("kind", default)
     if kind is None:
         raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
-    others = ("kind", "mean", "cov", "model") if family == "filter" else ("kind",)
+    others = ("kind", "mean", "cov", "model") if family.endswith("filter") else ("kind",)
     return _part(find(family, kind, folder), table, folder, others)
 
 
@@ -165,11 +168,11 @@ def _list(value: Any, folder: Path) -> tuple[Any, ...]:
     )
 
 
-def _network(value: Any, folder: Path) -> Network:
+def _network(value: Any, folder: Path, time: str) -> Network:
     table = _table(value)
-    for family in ("graph", "activation"):
-        if family in table:
-            table[family] = _under(family, partial(_kind, family, folder), table[family])
+    for key, family in (("graph", "graph"), ("activation", f"{time}activation")):
+        if key in table:
+            table[key] = _under(key, partial(_kind, family, folder), table[key])
     if "channel" in table:
         table["channel"] = _under("channel", lambda v: _channel(v, folder), table["channel"])
     network: Network = _part(Network, table, folder)
@@ -185,7 +188,7 @@ def _channel(value: Any, folder: Path) -> Channel:
     return channel
 
 
-def _filtering(value: Any, folder: Path) -> Filtering:
+def _filtering(value: Any, folder: Path, time: str) -> Filtering:
     table = _table(value)
     shared: dict[str, Any] = {
         key: table.pop(key) for key in ("mean", "cov", "model") if key in table
@@ -194,6 +197,6 @@ def _filtering(value: Any, folder: Path) -> Filtering:
         shared["model"] = _under(
             "model", lambda v: _part(Belief, _table(v), folder), shared["model"]
         )
-    algorithm = _kind("filter", folder, table)
+    algorithm = _kind(f"{time}filter", folder, table)
     filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, folder)
     return filtering

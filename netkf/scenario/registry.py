@@ -9,25 +9,30 @@ from pathlib import Path
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import Part
-from netkf.network import channels, clocks, graphs
+from netkf.network import channels, clocks, graphs, matchings
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.linear import LinearPlant
+from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor
 
 FAMILIES: dict[str, type[Part]] = {
-    "plant": Diffusion,
+    "plant": Plant,
     "sensor": LinearSensor,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
     "loss": channels.Loss,
     "delay": channels.Delay,
     "filter": FlowFilter,
+    "slot activation": matchings.SlotActivation,
+    "slot filter": SlotFilter,
 }
 """The contract that the classes of each family keep."""
 
 KINDS: dict[str, dict[str, type[Part]]] = {
-    "plant": {"diffusion": Diffusion},
+    "plant": {"diffusion": Diffusion, "linear": LinearPlant},
     "sensor": {"linear": LinearSensor},
     "graph": {
         "cycle": graphs.Cycle,
@@ -62,7 +67,32 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "lognormal": channels.LognormalDelay,
     },
     "filter": {"hybrid": Hybrid, "local": Local, "central": Central},
+    "slot activation": {
+        "matching": matchings.Matching,
+        "broadcast": matchings.Broadcast,
+        "recorded": matchings.RecordedSlots,
+    },
+    "slot filter": {
+        "gossip": Gossip,
+        "intermittent": Intermittent,
+        "local": SlotLocal,
+        "central": SlotCentral,
+    },
 }
+"""Plants that live in slots take the slot activations and slot filters."""
+
+SLOTTED = (LinearPlant,)
+
+
+def other_time(family: str, kind: object) -> str | None:
+    """Words about a kind that exists in the other kind of time only."""
+    other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
+    if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
+        return None
+    slots = "in slots (linear)"
+    flow = "in continuous time (diffusion)"
+    needs, has = (flow, slots) if family.startswith("slot ") else (slots, flow)
+    return f"belongs to plants {needs}, and this plant is {has}"
 
 
 def find(family: str, kind: object, folder: Path) -> type[Part]:
@@ -74,6 +104,9 @@ def find(family: str, kind: object, folder: Path) -> type[Part]:
         return names[kind]
     if isinstance(kind, str) and ":" in kind:
         return _imported(family, kind, folder)
+    words = other_time(family, kind)
+    if words is not None:
+        raise ScenarioError("kind", words, kind, "change the plant or choose another kind")
     listed = ", ".join(f'"{name}"' for name in names)
     raise ScenarioError(
         "kind", f"must be one of {listed}", kind, 'choose one, or write "package.module:Class"'
@@ -127,7 +160,8 @@ def _is_abstract(attribute: object) -> bool:
 
 def name_of(family: str, part: Part) -> str:
     """The ``kind`` that :func:`find` would turn into the class of ``part``."""
-    for name, candidate in KINDS[family].items():
-        if type(part) is candidate:
-            return name
+    for table in (KINDS[family], KINDS.get(f"slot {family}", {})):
+        for name, candidate in table.items():
+            if type(part) is candidate:
+                return name
     return f"{type(part).__module__}:{type(part).__qualname__}"

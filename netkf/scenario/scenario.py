@@ -12,7 +12,9 @@ import numpy as np
 
 from netkf.algorithms.flow import FlowFilter, FlowModel
 from netkf.algorithms.gains import longest_interval
+from netkf.algorithms.slot import SlotFilter, SlotModel
 from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.core.errors import TheoryError
 from netkf.core.fields import (
     Part,
     array,
@@ -34,7 +36,10 @@ from netkf.core.fields import (
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Graph, Link, Topology
+from netkf.network.matchings import SlotActivation
 from netkf.plants.diffusion import Diffusion, default_sensing_period
+from netkf.plants.linear import LinearPlant
+from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor
 
 
@@ -43,18 +48,24 @@ class Network(Part):
     """Who can talk to whom, when, and what becomes of a message."""
 
     graph: Graph = setting(instance(Graph))
-    activation: LinkClock | None = setting(instance(LinkClock), default=None)
+    activation: LinkClock | SlotActivation | None = setting(
+        instance(LinkClock, SlotActivation), default=None
+    )
     channel: Channel = setting(instance(Channel), default=Channel())
 
 
 @dataclass(frozen=True, eq=False)
 class Belief(Part):
-    """What the filters believe where it differs from the truth: ``A`` (n, n), ``B`` (n, m) of the
-    plant, ``R`` of the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry.
+    """What the filters believe where it differs from the truth.
+
+    ``A`` (n, n) and ``B`` (n, m) of a diffusion, ``F`` and ``Q`` (n, n) of a linear plant, ``R`` of
+    the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry.
     """
 
     A: FloatArray | None = setting(square, default=None)
     B: FloatArray | None = setting(matrix, default=None)
+    F: FloatArray | None = setting(square, default=None)
+    Q: FloatArray | None = setting(covariance, default=None)
     R: FloatArray | tuple[FloatArray, ...] | None = setting(
         either(definite_covariance, several(definite_covariance, "covariance matrices"), nested(3)),
         default=None,
@@ -69,7 +80,7 @@ class Filtering(Part):
     order of node ids; both default to the plant's.
     """
 
-    algorithm: FlowFilter = setting(instance(FlowFilter))
+    algorithm: FlowFilter | SlotFilter = setting(instance(FlowFilter, SlotFilter))
     mean: FloatArray | tuple[FloatArray, ...] | None = setting(
         either(vector, several(vector, "vectors, one per node"), nested(2)), default=None
     )
@@ -98,7 +109,7 @@ class Scenario(Part):
 
     name: str = setting(text)
     horizon: float = setting(positive)
-    plant: Diffusion = setting(instance(Diffusion))
+    plant: Plant = setting(instance(Plant))
     sensors: tuple[LinearSensor, ...] = setting(several(instance(LinearSensor), "sensors", least=0))
     network: Network = setting(instance(Network))
     filter: Filtering = setting(instance(Filtering))
@@ -148,10 +159,62 @@ class Scenario(Part):
         digits = 12 - min(0, int(np.floor(np.log10(self.probe))))
         return np.minimum(np.round(self.probe * np.arange(count + 1), digits), self.horizon)
 
+    @property
+    def slotted(self) -> bool:
+        """Whether the scenario runs in slots, else in continuous time."""
+        return isinstance(self.plant, LinearPlant)
+
+    @property
+    def slot_plant(self) -> LinearPlant:
+        """The plant of a scenario in slots; raises TheoryError for one in continuous time."""
+        if not isinstance(self.plant, LinearPlant):
+            raise TheoryError("this is about scenarios in slots, and the plant is a diffusion")
+        return self.plant
+
+    @cached_property
+    def slots(self) -> tuple[int, ...]:
+        """Numbers of the slots that are sampled."""
+        period = self.slot_plant.period
+        return tuple(round(t / period) for t in self.times.tolist())
+
+    @property
+    def phase_length(self) -> float:
+        """Seconds that an exchange of a slot lasts."""
+        activation, algorithm = self.network.activation, self.filter.algorithm
+        assert isinstance(activation, SlotActivation)
+        assert isinstance(algorithm, SlotFilter)
+        if activation.phase is not None:
+            return activation.phase
+        return 0.5 * self.slot_plant.period / max(1, algorithm.programme.count("exchange"))
+
+    @cached_property
+    def slot_belief(self) -> tuple[FloatArray, FloatArray]:
+        """``F`` and ``Q`` (n, n) as the filters have them."""
+        plant, model = self.slot_plant, self.filter.model
+        return (
+            plant.F if model.F is None else model.F,
+            plant.Q if model.Q is None else model.Q,
+        )
+
+    @cached_property
+    def slot_models(self) -> tuple[SlotModel, ...]:
+        """What each node believes, in the order of ``nodes``."""
+        return tuple(
+            SlotModel(*self.slot_belief, *self.observation(node, believed=True))
+            for node in self.nodes
+        )
+
+    @cached_property
+    def pooled_slot_model(self) -> SlotModel:
+        """The model of a filter that reads the sensors of all nodes at once."""
+        return SlotModel(*self.slot_belief, *self._stacked(self._everywhere, believed=True))
+
     @cached_property
     def truth(self) -> Diffusion:
-        """The plant with every default filled in."""
+        """The diffusion with every default filled in; raises TheoryError for a plant in slots."""
         plant = self.plant
+        if not isinstance(plant, Diffusion):
+            raise TheoryError("this is about scenarios in continuous time, and this one has slots")
         filled = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
         if filled.sensing_period is not None:
             return filled
@@ -200,8 +263,9 @@ class Scenario(Part):
     def belief(self) -> tuple[FloatArray, FloatArray]:
         """``A`` and ``Q = B B'`` (n, n) as the filters have them."""
         model = self.filter.model
-        A = self.plant.A if model.A is None else model.A
-        B = self.plant.B if model.B is None else model.B
+        plant = self.truth
+        A = plant.A if model.A is None else model.A
+        B = plant.B if model.B is None else model.B
         return A, np.asarray(B @ B.T)
 
     @cached_property
@@ -257,7 +321,7 @@ class Scenario(Part):
         """
         clock, loss = self.network.activation, self.network.channel.loss
         rates: dict[Link, float] = {}
-        if clock is None or not self.filter.algorithm.talks:
+        if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
             return rates
         for i, j in self.topology.links:
             for link in ((i, j), (j, i)):

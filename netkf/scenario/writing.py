@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.core.fields import Part, SourceFile
 from netkf.network.graphs import RandomGraph
+from netkf.plants.plant import Plant
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Filtering, Scenario
 
@@ -27,15 +28,22 @@ def resolved(scenario: Scenario) -> dict[str, Any]:
         network = dataclasses.replace(network, graph=graph)
     filled = dataclasses.replace(
         scenario,
-        plant=scenario.truth,
+        plant=_filled(scenario),
         network=network,
         filter=dataclasses.replace(
             scenario.filter,
-            mean=scenario.truth.mean if scenario.filter.mean is None else scenario.filter.mean,
-            cov=scenario.truth.cov if scenario.filter.cov is None else scenario.filter.cov,
+            mean=scenario.plant.start_mean
+            if scenario.filter.mean is None
+            else scenario.filter.mean,
+            cov=scenario.plant.start_cov if scenario.filter.cov is None else scenario.filter.cov,
         ),
     )
     return _scenario(filled, defaults=True)
+
+
+def _filled(scenario: Scenario) -> Plant:
+    plant = scenario.plant if scenario.slotted else scenario.truth
+    return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
 
 
 def _scenario(scenario: Scenario, defaults: bool) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from netkf.theory.assumptions import assumptions
 from netkf.theory.bounds import covariance_bound
 from netkf.theory.errors import error_covariance
+from netkf.theory.gossip import detecting_walk, mean_matching
 from netkf.theory.intermittent import (
     critical_certificate,
     critical_probability,
@@ -22,10 +23,12 @@ __all__ = [
     "covariance_bound",
     "critical_certificate",
     "critical_probability",
+    "detecting_walk",
     "error_covariance",
     "invariant_samples",
     "limit_covariance",
     "lyapunov_step",
+    "mean_matching",
     "riccati_flow",
     "riccati_step",
     "steady_covariance",

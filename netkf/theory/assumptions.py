@@ -1,4 +1,4 @@
-"""The assumptions of H Theorems 2 and 3, checked one by one with evidence."""
+"""The assumptions of the theorems about a scenario, checked one by one with evidence."""
 
 from __future__ import annotations
 
@@ -7,23 +7,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from netkf.algorithms.hybrid import Hybrid
+from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import coupling
 from netkf.theory.matrices import unobservable
+from netkf.theory.slot_assumptions import Row, slot_rows
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Row = tuple[str, str, bool, str]
 
 
 def assumptions(scenario: Scenario) -> pd.DataFrame:
     """A table with a row for each assumption: assumption, source, holds, evidence."""
     import pandas as pd
 
-    rows = _plant(scenario)
-    if scenario.filter.algorithm.talks:
-        rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
+    if scenario.slotted:
+        rows = slot_rows(scenario)
+    else:
+        rows = _plant(scenario)
+        if scenario.filter.algorithm.talks:
+            rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
     rows += _start(scenario)
     return pd.DataFrame(rows, columns=["assumption", "source", "holds", "evidence"])
 
@@ -110,7 +113,7 @@ def _own_information(scenario: Scenario, node: int) -> np.ndarray:
 
 def _clocks(scenario: Scenario) -> list[Row]:
     clock = scenario.network.activation
-    assert clock is not None
+    assert isinstance(clock, LinkClock)
     rates = np.array([clock.mean_rate(link) for link in scenario.topology.links])
     known = rates[np.isfinite(rates)]
     positive = len(known) == len(rates) and bool((known > 0.0).all())
@@ -171,7 +174,7 @@ def _channel(scenario: Scenario) -> list[Row]:
 
 
 def _start(scenario: Scenario) -> list[Row]:
-    plant, worst = scenario.truth, np.inf
+    plant, worst = scenario.plant, np.inf
     for node in scenario.nodes:
         mean, cov = scenario.start(node)
         offset = plant.start_mean - mean
@@ -180,7 +183,7 @@ def _start(scenario: Scenario) -> list[Row]:
     return [
         (
             "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
-            "H (9), (10)",
+            "G (10)" if scenario.slotted else "H (9), (10)",
             worst >= -1e-12,
             f"least eigenvalue of the difference {worst:.3g}",
         )

@@ -19,6 +19,7 @@ from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.riccati import riccati_step, riccati_table
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
+from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
 
 
@@ -40,11 +41,12 @@ class Coupled(NamedTuple):
 def not_promised(scenario: Scenario) -> str | None:
     """Why H Theorem 2 does not speak about the scenario, in words; None where it does."""
     algorithm, network = scenario.filter.algorithm, scenario.network
-    if not algorithm.talks:
+    if not scenario.slotted and not algorithm.talks:
         return None
     if not isinstance(algorithm, Hybrid):
-        return f"H(12) is about the hybrid filter, not {type(algorithm).__name__}"
-    assert network.activation is not None
+        name = type(algorithm).__name__.lower()
+        return f"H(12) is about the hybrid filter in continuous time, not about {name}"
+    assert isinstance(network.activation, LinkClock)
     if not network.activation.memoryless:
         return (
             "not promised: the link clocks are not Poisson processes, and for other clocks of the "

@@ -85,7 +85,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     does not solve the equation or does not stabilise the filter.
     """
     F, Q, H, R = _system(F, Q, H, R)
-    hidden = _unseen(F, H)
+    hidden = unseen(F, H)
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
     try:
@@ -107,7 +107,7 @@ def _gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatAr
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
 
 
-def _unseen(F: FloatArray, H: FloatArray) -> complex | None:
+def unseen(F: FloatArray, H: FloatArray) -> complex | None:
     """An eigenvalue of F on or outside the unit circle whose mode H does not see, or None."""
     size = max(float(np.linalg.norm(F, 2)), 1e-300)
     seen = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
@@ -153,7 +153,7 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> Critical:
     transition = as_square("F", F)
     n = len(transition)
     observation = _observation(H, n)
-    hidden = _unseen(transition, observation)
+    hidden = unseen(transition, observation)
     if hidden is not None:
         raise TheoryError(
             f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g} is never seen"

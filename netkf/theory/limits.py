@@ -31,7 +31,7 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
     Q may differ from the truth, its A may not. Raises TheoryError where the limit does not exist.
     """
     A, _ = scenario.belief
-    if not np.array_equal(A, scenario.plant.A):
+    if not np.array_equal(A, scenario.truth.A):
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
     S, w = limit_covariance(scenario), left_weights(scenario)
     closed = A - S @ np.tensordot(w, informations(scenario), 1)

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import simpy
 
+from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, Rank
 from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
+from netkf.engines.processes.slots import SlotProcess
 from netkf.engines.processes.timeline import Timeline
 from netkf.plants.diffusion import DiffusionPath
 from netkf.scenario.scenario import Scenario
@@ -45,17 +47,8 @@ class ProcessesEngine(Engine):
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
         timeline = Timeline()
-        truth = scenario.truth.path(
-            streams.generator("plant"), streams.generator("probe"), scenario.times
-        )
-        hosts = make_hosts(scenario, streams, timeline, recorder, truth)
-        processes: Processes = [_sampling(timeline, scenario, truth, hosts, recorder, progress)]
-        processes += _sensing(timeline, scenario, truth, hosts, recorder)
-        if scenario.filter.algorithm.talks:
-            processes += [
-                LinkProcess(scenario, streams, timeline, recorder, hosts, link, k).ticking()
-                for k, link in enumerate(scenario.topology.links)
-            ]
+        make = _in_slots if scenario.slotted else _in_continuous_time
+        processes = make(scenario, streams, timeline, recorder, progress)
         for process in self.arrange(processes):
             timeline.process(process)
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
@@ -66,6 +59,40 @@ class ProcessesEngine(Engine):
             finally:
                 recorder.flush()
         return "complete"
+
+
+def _in_continuous_time(
+    scenario: Scenario,
+    streams: Streams,
+    timeline: Timeline,
+    recorder: Recorder,
+    progress: Progress,
+) -> Processes:
+    truth = scenario.truth.path(
+        streams.generator("plant"), streams.generator("probe"), scenario.times
+    )
+    hosts = make_hosts(scenario, streams, timeline, recorder, truth)
+    processes: Processes = [_sampling(timeline, scenario, truth, hosts, recorder, progress)]
+    processes += _sensing(timeline, scenario, truth, hosts, recorder)
+    if scenario.filter.algorithm.talks:
+        processes += [
+            LinkProcess(scenario, streams, timeline, recorder, hosts, link, k).ticking()
+            for k, link in enumerate(scenario.topology.links)
+        ]
+    return processes
+
+
+def _in_slots(
+    scenario: Scenario,
+    streams: Streams,
+    timeline: Timeline,
+    recorder: Recorder,
+    progress: Progress,
+) -> Processes:
+    def sampled(time: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+        _record(scenario, recorder, progress, time, x, xhat, P)
+
+    return [SlotProcess(scenario, streams, timeline, recorder, sampled).running()]
 
 
 def _sensing(
@@ -100,11 +127,23 @@ def _sampling(
         estimates = [hosts[node].estimate(time) for node in scenario.nodes]
         xhat = np.array([estimate for estimate, _ in estimates])
         P = np.array([cov for _, cov in estimates])
-        recorder.sample(time, x, xhat, P)
-        recorder.flush_if_full()
-        progress(time)
-        broken = np.flatnonzero(~np.isfinite(P).all(axis=(1, 2)))
-        if broken.size:
-            for k in broken:
-                recorder.append((time, DIVERGED, scenario.nodes[k], -1, -1, -1, NAN))
-            raise DivergedError
+        _record(scenario, recorder, progress, time, x, xhat, P)
+
+
+def _record(
+    scenario: Scenario,
+    recorder: Recorder,
+    progress: Progress,
+    time: float,
+    x: FloatArray,
+    xhat: FloatArray,
+    P: FloatArray,
+) -> None:
+    recorder.sample(time, x, xhat, P)
+    recorder.flush_if_full()
+    progress(time)
+    broken = np.flatnonzero(~np.isfinite(P).all(axis=(1, 2)))
+    if broken.size:
+        for k in broken:
+            recorder.append((time, DIVERGED, scenario.nodes[k], -1, -1, -1, NAN))
+        raise DivergedError

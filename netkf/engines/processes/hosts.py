@@ -71,7 +71,13 @@ class Host:
         self.advance(time)
         return self._algorithm.emit(self._state)
 
-    def receive(self, time: float, peer: int, weight: float, payload: Any, age: float) -> None:
+    def accepts(self, payload: Any) -> bool:
+        """True: in continuous time nothing is too late."""
+        return True
+
+    def receive(
+        self, time: float, peer: int, number: int, weight: float, payload: Any, age: float
+    ) -> None:
         """Put a message into the inbox; the newest of several from one peer counts."""
         if not self._inbox:
             event = self._timeline.at(time, Rank.ABSORB, self.entity)
@@ -106,6 +112,7 @@ def make_hosts(
 ) -> dict[int, Host]:
     """The host of every node; where the filter is pooled, all nodes share one."""
     algorithm, nodes = scenario.filter.algorithm, scenario.nodes
+    assert isinstance(algorithm, FlowFilter)
 
     def sensors(node: int) -> list[SensorPath]:
         return [_sensor(scenario, streams, node, p) for p in scenario.placed.get(node, ())]

@@ -1,0 +1,213 @@
+"""Slot filters: node algorithms in discrete time.
+
+Each slot is a short programme of phases that the filter declares, such as ``("exchange",
+"sense")``. In an exchange every node may send once and then absorbs all that arrived before the
+inbox closed; in a sense phase it is handed the reading of the slot. States are NamedTuples of
+arrays that nothing changes in place. Covariances are carried as square roots, ``P = root root'``.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
+from netkf.core.arrays import FloatArray, block_diagonal, square_root
+from netkf.core.fields import Part
+
+Messages = Sequence[tuple[float, Any, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class SlotModel:
+    """What one node believes: ``x[k+1] = F x[k] + w``, cov(w) = Q; ``y = H x + v``, cov(v) = R.
+
+    ``F, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0.
+    """
+
+    F: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+
+    @cached_property
+    def root_Q(self) -> FloatArray:
+        """``root_Q root_Q' = Q``."""
+        return square_root(self.Q)
+
+
+class SlotState(NamedTuple):
+    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, a ``kept`` reading."""
+
+    xhat: FloatArray
+    root: FloatArray
+    model: SlotModel
+    kept: Any = None
+
+
+class Reading(NamedTuple):
+    """One reading: ``y`` (p,), with the ``H`` (p, n) and ``R`` (p, p) that its sender believes."""
+
+    y: FloatArray
+    H: FloatArray
+    R: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SlotFilter(Part):
+    """The contract of every filter in slots.
+
+    ``programme`` lists the phases of a slot, "exchange" or "sense"; ``first_slot`` is the first in
+    which nodes exchange; ``predicts`` says that a sample shows the prediction with which a slot
+    begins, else what is known after its reading; ``pairwise`` that nodes exchange in pairs (a
+    matching), else all with all neighbours. ``talks``, ``pooled``: as for flow filters.
+    """
+
+    programme: ClassVar[tuple[str, ...]] = ("exchange", "sense")
+    first_slot: ClassVar[int] = 0
+    predicts: ClassVar[bool] = True
+    pairwise: ClassVar[bool] = False
+    talks: ClassVar[bool] = True
+    pooled: ClassVar[bool] = False
+
+    def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> Any:
+        """The state at slot 0."""
+        return SlotState(mean, square_root(cov), model)
+
+    @abstractmethod
+    def sense(self, state: Any, y: FloatArray) -> Any:
+        """The state once the node's reading ``y`` (p,) of this slot is known."""
+
+    def emit(self, state: Any, phase: int) -> Any:
+        """What the node sends in exchange number ``phase`` of the slot; None for nothing."""
+        return None
+
+    def absorb(self, state: Any, phase: int, messages: Messages) -> Any:
+        """The state when the inbox of that exchange closes; called for every node, with all
+        ``(weight, payload, age)`` that arrived in time in the order of their senders.
+        """
+        return state
+
+    def weight(self, degree: int, peer_degree: int) -> float:
+        """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
+        return 1.0 / (1.0 + max(degree, peer_degree))
+
+    def largest_degree(self) -> float:
+        """The largest number of links a node may have."""
+        return np.inf
+
+    def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:
+        """``xhat`` (n,) and ``P`` (n, n)."""
+        return state.xhat, state.root @ state.root.T
+
+
+def update_and_predict(
+    xhat: FloatArray, root: FloatArray, model: SlotModel, reading: Reading
+) -> tuple[FloatArray, FloatArray]:
+    """The next prediction and the root of its covariance from a prediction and a reading."""
+    if not len(reading.y):
+        return model.F @ xhat, predict_root(root, model.F, model.root_Q)
+    noise = np.asarray(np.linalg.cholesky(reading.R), dtype=np.float64)
+    following, gain = update_root(root, model.F, model.root_Q, reading.H, noise)
+    return model.F @ xhat + gain @ (reading.y - reading.H @ xhat), following
+
+
+class Pair(NamedTuple):
+    """What gossip swaps."""
+
+    xhat: FloatArray
+    root: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Gossip(SlotFilter):
+    """The gossip interactive Kalman filter of Kar and Moura, G (10).
+
+    Paired nodes first swap the pair (xhat, P), then each updates with its own reading and predicts.
+    Nothing is swapped in slot 0. A node whose partner's message is lost keeps its own pair: if only
+    one direction fails, one pair is copied and the other is gone.
+    """
+
+    first_slot: ClassVar[int] = 1
+    pairwise: ClassVar[bool] = True
+
+    def emit(self, state: SlotState, phase: int) -> Pair:
+        """The pair."""
+        return Pair(state.xhat, state.root)
+
+    def absorb(self, state: SlotState, phase: int, messages: Messages) -> SlotState:
+        """The partner's pair in place of the own one."""
+        for _, pair, _ in messages:
+            state = state._replace(xhat=pair.xhat, root=pair.root)
+        return state
+
+    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+        """Update with the own reading and predict."""
+        reading = Reading(y, state.model.H, state.model.R)
+        xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
+        return state._replace(xhat=xhat, root=root)
+
+
+@dataclass(frozen=True, eq=False)
+class Intermittent(SlotFilter):
+    """The Kalman filter with intermittent observations, R (15)-(18).
+
+    Every node sends its reading to its neighbours and updates with its own and with those that
+    arrive in time.
+    """
+
+    programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
+
+    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+        """Keep the reading."""
+        return state._replace(kept=Reading(y, state.model.H, state.model.R))
+
+    def emit(self, state: SlotState, phase: int) -> Reading | None:
+        """The reading, from nodes that have sensors."""
+        return state.kept if len(state.kept.y) else None
+
+    def absorb(self, state: SlotState, phase: int, messages: Messages) -> SlotState:
+        """Update with all readings together and predict."""
+        readings = [state.kept, *(payload for _, payload, _ in messages)]
+        every = Reading(
+            np.concatenate([r.y for r in readings]),
+            np.concatenate([r.H for r in readings]),
+            block_diagonal([r.R for r in readings]),
+        )
+        xhat, root = update_and_predict(state.xhat, state.root, state.model, every)
+        return state._replace(xhat=xhat, root=root, kept=None)
+
+
+@dataclass(frozen=True, eq=False)
+class SlotLocal(SlotFilter):
+    """Every node runs a Kalman filter on its own readings and never talks; samples are filtered."""
+
+    programme: ClassVar[tuple[str, ...]] = ("sense",)
+    predicts: ClassVar[bool] = False
+    talks: ClassVar[bool] = False
+
+    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+        """Predict from the slot before, then update; called from slot 1 on."""
+        model = state.model
+        xhat, root = model.F @ state.xhat, predict_root(state.root, model.F, model.root_Q)
+        if not len(y):
+            return state._replace(xhat=xhat, root=root)
+        p, n = model.H.shape
+        top = np.concatenate([model.H @ root, np.linalg.cholesky(model.R)], axis=1)
+        L = lower_triangular(
+            np.concatenate([top, np.concatenate([root, np.zeros((n, p))], axis=1)])
+        )
+        gain = np.linalg.solve(L[:p, :p].T, L[p:, :p].T).T
+        return state._replace(xhat=xhat + gain @ (y - model.H @ xhat), root=L[p:, p:])
+
+
+@dataclass(frozen=True, eq=False)
+class SlotCentral(SlotLocal):
+    """One Kalman filter reads all sensors; every node shows it."""
+
+    pooled: ClassVar[bool] = True

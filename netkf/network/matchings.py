@@ -1,0 +1,271 @@
+"""Matchings: which pairs of nodes exchange in a slot, and what they are in the mean.
+
+The mean matching ``Abar`` has the probability that i and j are paired in a slot as entry (i, j) and
+that of staying alone on the diagonal, G section II. It is exact: a formula or a recursion.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import Counter
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import (
+    Part,
+    SourceFile,
+    choice,
+    number,
+    positive,
+    setting,
+    source_file,
+)
+from netkf.core.tables import read_columns, read_header, whole
+from netkf.network.graphs import Link, Topology, demand_links
+
+MOST_EDGES = 20  # beyond it the recursions over sets of edges take too long
+
+
+@dataclass(frozen=True, eq=False)
+class SlotActivation(Part):
+    """Who exchanges in the slots of a slot filter.
+
+    ``phase`` is the length of one exchange in seconds, after which its inbox closes; by default
+    half of the period is shared evenly among the exchanges of a slot.
+    """
+
+    phase: float | None = setting(positive, default=None)
+
+    @abstractmethod
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError where the settings do not fit the graph."""
+
+
+PROTOCOLS = ("one-edge", "node-wakeup", "maximal", "uniform-maximal", "independent")
+
+
+@dataclass(frozen=True, eq=False)
+class Matching(SlotActivation):
+    """A random matching a slot, by ``protocol``.
+
+    one-edge        one link, uniformly; with probability ``lazy`` none
+    node-wakeup     one node, uniformly, and one of its neighbours, uniformly
+    maximal         links in random order, each taken if both ends are free (greedy)
+    uniform-maximal one of all maximal matchings, uniformly
+    independent     each link with probability ``p`` by itself; links that meet are all dropped
+    """
+
+    protocol: str = setting(choice(*PROTOCOLS))
+    lazy: float | None = setting(number(low=0.0, below=1.0), default=None)
+    p: float | None = setting(number(above=0.0, high=1.0), default=None)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, owner in (("lazy", "one-edge"), ("p", "independent")):
+            if getattr(self, name) is not None and self.protocol != owner:
+                raise ScenarioError(
+                    name, f"means nothing for {self.protocol}", getattr(self, name), "remove it"
+                )
+        if self.protocol == "independent" and self.p is None:
+            raise ScenarioError("p", "is missing for independent", None, "add p = ...")
+
+    def check(self, topology: Topology) -> None:
+        """Uniform maximal matchings are enumerated, so there may not be too many links."""
+        if self.protocol == "uniform-maximal" and len(topology.links) > MOST_EDGES:
+            raise ScenarioError(
+                "protocol",
+                f"uniform-maximal needs a graph of at most {MOST_EDGES} links",
+                f"{len(topology.links)} links",
+                'use "maximal"',
+            )
+
+    def draw(self, topology: Topology, random: np.random.Generator) -> list[Link]:
+        """The pairs of one slot."""
+        links = topology.links
+        if not links:
+            return []
+        draws = {
+            "one-edge": self._one_edge,
+            "node-wakeup": _node_wakeup,
+            "maximal": _random_greedy,
+            "uniform-maximal": _uniform_maximal,
+            "independent": self._independent,
+        }
+        return draws[self.protocol](topology, random)
+
+    def _one_edge(self, topology: Topology, random: np.random.Generator) -> list[Link]:
+        lazy = random.random() < (self.lazy or 0.0)
+        edge = topology.links[int(random.integers(len(topology.links)))]
+        return [] if lazy else [edge]
+
+    def _independent(self, topology: Topology, random: np.random.Generator) -> list[Link]:
+        luck = random.random(len(topology.links))
+        up = [link for link, u in zip(topology.links, luck, strict=True) if u < (self.p or 0.0)]
+        busy = Counter(node for link in up for node in link)
+        return [link for link in up if busy[link[0]] == busy[link[1]] == 1]
+
+    def mean(self, topology: Topology) -> FloatArray:
+        """(N, N) the exact mean matching; raises ScenarioError where that is out of reach."""
+        chance = self._chances(topology)
+        mean = np.zeros((len(topology.nodes),) * 2)
+        for (i, j), value in chance.items():
+            a, b = topology.index[i], topology.index[j]
+            mean[a, b] = mean[b, a] = value
+        mean[np.diag_indices(len(mean))] = 1.0 - mean.sum(axis=1)
+        return mean
+
+    def _chances(self, topology: Topology) -> dict[Link, float]:
+        links, degrees = topology.links, topology.degrees
+        if self.protocol == "one-edge":
+            return dict.fromkeys(links, (1.0 - (self.lazy or 0.0)) / max(len(links), 1))
+        if self.protocol == "node-wakeup":
+            size = len(topology.nodes)
+            return {(i, j): (1.0 / degrees[i] + 1.0 / degrees[j]) / size for i, j in links}
+        if self.protocol == "independent":
+            p = self.p or 0.0
+            return {(i, j): p * (1.0 - p) ** (degrees[i] + degrees[j] - 2) for i, j in links}
+        if len(links) > MOST_EDGES:
+            raise ScenarioError(
+                "network.activation.protocol",
+                f"has an exact mean for at most {MOST_EDGES} links only",
+                f"{len(links)} links",
+                "use one-edge, node-wakeup or independent",
+            )
+        if self.protocol == "uniform-maximal":
+            every = maximal_matchings(links)
+            return {link: sum(link in m for m in every) / len(every) for link in links}
+        shares = _greedy_shares(links)
+        return dict(zip(links, shares, strict=True))
+
+
+def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
+    node = topology.nodes[int(random.integers(len(topology.nodes)))]
+    share = random.random()
+    peers = sorted({j if i == node else i for i, j in topology.links if node in (i, j)})
+    if not peers:
+        return []
+    peer = peers[int(share * len(peers))]
+    return [(min(node, peer), max(node, peer))]
+
+
+def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link]:
+    return _greedy([topology.links[k] for k in random.permutation(len(topology.links))])
+
+
+def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
+    every = maximal_matchings(topology.links)
+    return list(every[int(random.integers(len(every)))])
+
+
+def _greedy(links: list[Link]) -> list[Link]:
+    taken: set[int] = set()
+    chosen = []
+    for i, j in links:
+        if i not in taken and j not in taken:
+            taken |= {i, j}
+            chosen.append((i, j))
+    return chosen
+
+
+@lru_cache(maxsize=8)
+def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
+    """All matchings to which no link can be added, each sorted, in sorted order."""
+    found: set[tuple[Link, ...]] = set()
+
+    def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:
+        if not free:
+            found.add(tuple(sorted(chosen)))
+            return
+        first = free[0]
+        # A maximal matching holds the first free link or one that meets it.
+        for link in free:
+            if set(link) & set(first):
+                extend((*chosen, link), tuple(o for o in free if not set(o) & set(link)))
+
+    extend((), links)
+    return tuple(sorted(found))
+
+
+def _greedy_shares(links: tuple[Link, ...]) -> tuple[float, ...]:
+    """Probability of each link in the greedy matching in random order.
+
+    The first link of a random order is uniform; what is left after it is a random order of the
+    links that do not meet it. Recursion over the sets of links that are left, as bit masks.
+    """
+    count = len(links)
+    meets = [
+        sum(1 << b for b in range(count) if set(links[a]) & set(links[b])) for a in range(count)
+    ]
+
+    @cache
+    def shares(free: int) -> tuple[float, ...]:
+        left = [a for a in range(count) if free >> a & 1]
+        total = [0.0] * count
+        for a in left:
+            rest = shares(free & ~meets[a])
+            total[a] += 1.0
+            for b, value in enumerate(rest):
+                total[b] += value
+        return tuple(value / max(len(left), 1) for value in total)
+
+    return shares((1 << count) - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Broadcast(SlotActivation):
+    """In each exchange every node sends to every neighbour."""
+
+    def check(self, topology: Topology) -> None:
+        """Any graph will do."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSlots(SlotActivation):
+    """Exchanges read from a table: ``slot,node,peer`` for matchings (the pairs of each slot), or
+    ``slot,phase,step,node,peer`` for broadcasts (the links that were up).
+    """
+
+    path: SourceFile = setting(source_file)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self._pairs  # a bad file is refused now
+
+    @property
+    def matching(self) -> bool:
+        """Whether the table lists pairs of a matching."""
+        return "phase" not in read_header(self.path)
+
+    @cached_property
+    def _pairs(self) -> dict[tuple[int, int], list[Link]]:
+        names: tuple[str, ...] = ("slot", "node", "peer")
+        if not self.matching:
+            names = ("slot", "phase", "step", "node", "peer")
+        table = read_columns(self.path, names)
+        columns = {name: whole(self.path, name, table[name]) for name in names}
+        pairs: dict[tuple[int, int], list[Link]] = {}
+        for row, (slot, i, j) in enumerate(
+            zip(columns["slot"], columns["node"], columns["peer"], strict=True)
+        ):
+            phase = 0 if self.matching else columns["phase"][row]
+            listed = pairs.setdefault((slot, phase), [])
+            link = (min(i, j), max(i, j))
+            busy = {node for pair in listed for node in pair}
+            if self.matching and link not in listed and (i == j or busy & {i, j}):
+                words = f"{self.path.name}: a node may be paired once a slot"
+                raise ScenarioError("path", words, [slot, i, j], "mend the row")
+            if link not in listed:
+                listed.append(link)
+        return {key: sorted(listed) for key, listed in pairs.items()}
+
+    def pairs(self, slot: int, phase: int) -> list[Link]:
+        """The pairs of one exchange, sorted."""
+        return self._pairs.get((slot, phase), [])
+
+    def check(self, topology: Topology) -> None:
+        """Every recorded pair is a link."""
+        demand_links(self.path, {p for listed in self._pairs.values() for p in listed}, topology)

@@ -1,0 +1,90 @@
+"""The linear plant in slots, x[k+1] = F x[k] + w[k], and its readings.
+
+The path and the noise of every sensor are drawn slot by slot from streams of their own, whatever
+the network does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray, square_root
+from netkf.core.fields import covariance, positive, setting, square
+from netkf.plants.plant import Plant
+
+BLOCK = 64  # slots drawn at once
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPlant(Plant):
+    """``x[k+1] = F x[k] + w[k]``, cov(w) = Q; slot k is at time ``k * period`` seconds.
+
+    ``F`` (n, n), ``Q`` (n, n).
+    """
+
+    F: FloatArray = setting(square)
+    Q: FloatArray = setting(covariance)
+    period: float = setting(positive)
+
+    @property
+    def n(self) -> int:
+        """Dimension of the state."""
+        return len(self.F)
+
+    def slot_time(self, k: int) -> float:
+        """Seconds; rounded so that lattices of other periods meet it."""
+        return float(round(k * self.period, 12))
+
+    def path(self, random: np.random.Generator) -> LinearPath:
+        """A path of its own."""
+        return LinearPath(self, random)
+
+
+class LinearPath:
+    """The path of one run, slot by slot."""
+
+    def __init__(self, plant: LinearPlant, random: np.random.Generator) -> None:
+        self._F, self._root = plant.F, square_root(plant.Q)
+        self._noise = Blocks(random, plant.n)
+        self._x = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(plant.n)
+        self._slot = 0
+
+    def state(self, slot: int) -> FloatArray:
+        """X at a slot not before the last one asked for."""
+        while self._slot < slot:
+            self._x = self._F @ self._x + self._root @ self._noise.draw()
+            self._slot += 1
+        return self._x
+
+
+class SlotReadings:
+    """The readings of one sensor on one node, ``y = H x + v``, one a slot."""
+
+    def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
+        self._H, self._root = H, np.linalg.cholesky(R)
+        self._noise = Blocks(random, len(R))
+        self._slot, self._v = -1, np.zeros(len(R))
+
+    def reading(self, slot: int, x: FloatArray) -> FloatArray:
+        """(p,) the reading of a slot not before the last one asked for; each has its own noise."""
+        while self._slot < slot:
+            self._v = self._root @ self._noise.draw()
+            self._slot += 1
+        return np.asarray(self._H @ x + self._v)
+
+
+class Blocks:
+    """Standard normal vectors, drawn many at a time."""
+
+    def __init__(self, random: np.random.Generator, size: int) -> None:
+        self._random, self._size, self._used = random, size, 0
+        self._drawn = np.empty((0, size))
+
+    def draw(self) -> FloatArray:
+        """(size,) the next vector."""
+        if self._used == len(self._drawn):
+            self._drawn, self._used = self._random.standard_normal((BLOCK, self._size)), 0
+        self._used += 1
+        return np.asarray(self._drawn[self._used - 1])

@@ -1,0 +1,34 @@
+"""What every plant is: a state of some dimension that starts somewhere."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.fields import Part, covariance, setting, vector
+
+
+@dataclass(frozen=True, eq=False)
+class Plant(Part):
+    """x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n), both zero by default."""
+
+    mean: FloatArray | None = setting(vector, default=None)
+    cov: FloatArray | None = setting(covariance, default=None)
+
+    @property
+    @abstractmethod
+    def n(self) -> int:
+        """Dimension of the state."""
+
+    @property
+    def start_mean(self) -> FloatArray:
+        """(n,) mean of x(0)."""
+        return np.zeros(self.n) if self.mean is None else self.mean
+
+    @property
+    def start_cov(self) -> FloatArray:
+        """(n, n) covariance of x(0)."""
+        return np.zeros((self.n, self.n)) if self.cov is None else self.cov

@@ -1,0 +1,176 @@
+"""The assumptions of G (C.1, S.1, D.1) and of R about scenarios in slots."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.algorithms.slot import Gossip, Intermittent
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import TheoryError
+from netkf.scenario.scenario import Scenario
+from netkf.theory.gossip import detecting_walk, mean_matching, primitive
+from netkf.theory.intermittent import critical_probability, unseen
+
+Row = tuple[str, str, bool, str]
+SHOWN = 12
+
+
+def slot_rows(scenario: Scenario) -> list[Row]:
+    """(assumption, source, holds, evidence) of each."""
+    algorithm = scenario.filter.algorithm
+    rows = _plant(scenario)
+    if isinstance(algorithm, Gossip):
+        return [*_matching(scenario), *rows, *_walk(scenario), *_swaps(scenario)]
+    if isinstance(algorithm, Intermittent):
+        return [*rows, *_readings(scenario), *_arrivals(scenario)]
+    return rows
+
+
+def _plant(scenario: Scenario) -> list[Row]:
+    plant, (F, Q) = scenario.slot_plant, scenario.slot_belief
+    least = float(np.linalg.eigvalsh(plant.Q)[0])
+    idle = unseen(plant.F.T, plant.Q)
+    same = (
+        np.array_equal(F, plant.F)
+        and np.array_equal(Q, plant.Q)
+        and all(
+            np.array_equal(scenario.observation(n)[1], scenario.observation(n, True)[1])
+            for n in scenario.sensing
+        )
+    )
+    return [
+        (
+            "(F, Q^1/2) is stabilisable",
+            "G S.1, R Theorem 9",
+            idle is None,
+            "every mode that does not decay is driven by the noise"
+            if idle is None
+            else f"the mode with eigenvalue {idle:.6g} is not driven",
+        ),
+        (
+            "Q is positive definite",
+            "G II-A, R Theorem 9",
+            least > 0.0,
+            f"least eigenvalue {least:.3g}; sufficient for the uniqueness of the limit law",
+        ),
+        (
+            "the filters know the plant and the sensors",
+            "G (10), R (15)",
+            same,
+            "same F, Q and R" if same else "filter.model differs from the truth",
+        ),
+    ]
+
+
+def _matching(scenario: Scenario) -> list[Row]:
+    name = "the mean matching is irreducible and aperiodic"
+    try:
+        mean = mean_matching(scenario)
+    except TheoryError as error:
+        return [(name, "G C.1", False, f"not decided: {error}")]
+    irreducible, aperiodic, period = primitive(mean)
+    if not irreducible:
+        words = "some nodes are never reached from others"
+    elif not aperiodic:
+        words = (
+            f"it has period {period}: tokens visit the two halves of the network in turn, and "
+            "filters can blow up though every sensor is observable"
+        )
+    else:
+        words = f"least positive entry {mean[mean > 0.0].min():.3g}"
+    return [(name, "G C.1", irreducible and aperiodic, words)]
+
+
+def _walk(scenario: Scenario) -> list[Row]:
+    name = "some walk on the network detects the state (weak detectability)"
+    try:
+        walk = detecting_walk(scenario)
+    except TheoryError as error:
+        return [(name, "G D.1", False, f"not decided: {error}")]
+    if walk is None:
+        return [
+            (
+                name,
+                "G D.1",
+                False,
+                "no walk of up to 40 steps has an invertible Gramian; D.1 is "
+                "sufficient, not necessary: a mode that decays by itself need not be seen",
+            )
+        ]
+    shown = ", ".join(map(str, walk[:SHOWN])) + (", ..." if len(walk) > SHOWN else "")
+    return [(name, "G D.1", True, f"the Gramian of the walk ({shown}) is invertible")]
+
+
+def _swaps(scenario: Scenario) -> list[Row]:
+    channel = scenario.network.channel
+    certain = type(channel.loss).__name__ == "NoLoss"
+    holds = certain or channel.symmetric
+    words = (
+        "nothing is lost"
+        if certain
+        else "both messages of a pair are lost together: a swap or none"
+        if holds
+        else "one of two messages may be lost: a pair is then copied and the other one is gone, so "
+        "tokens are no permutation any more"
+    )
+    return [("every exchange is a swap", "G (10)", holds, words)]
+
+
+def _sight(scenario: Scenario) -> dict[int, FloatArray]:
+    """For each node, H of all readings that can reach it."""
+    near: dict[int, set[int]] = {node: {node} for node in scenario.nodes}
+    for i, j in scenario.topology.links:
+        near[i].add(j)
+        near[j].add(i)
+    return {
+        node: np.concatenate([scenario.observation(peer)[0] for peer in sorted(peers)])
+        for node, peers in near.items()
+    }
+
+
+def _readings(scenario: Scenario) -> list[Row]:
+    F = scenario.slot_plant.F
+    blind = [node for node, H in _sight(scenario).items() if unseen(F, H) is not None]
+    words = "its own readings and its neighbours' see every mode that does not decay"
+    if blind:
+        words = f"not at node{'s' if len(blind) > 1 else ''} {', '.join(map(str, blind[:SHOWN]))}"
+    return [("(F, H) is detectable at every node", "R Theorem 9", not blind, words)]
+
+
+def _arrivals(scenario: Scenario) -> list[Row]:
+    loss, F = scenario.network.channel.loss, scenario.slot_plant.F
+    rates = [
+        loss.mean_delivery(link, scenario.measured(link))
+        for pair in scenario.topology.links
+        for link in (pair, pair[::-1])
+    ]
+    known = [rate for rate in rates if np.isfinite(rate)]
+    least = min(known, default=1.0)
+    rows: list[Row] = [
+        (
+            "arrivals are independent of each other and of the past, and not impossible",
+            "R (12), Theorem 9",
+            loss.independent and len(known) == len(rates) and least > 0.0,
+            f"delivery from {least:g}" if loss.independent else "losses come in bursts or recorded",
+        )
+    ]
+    worst, words = 0.0, "every node sees enough by itself"
+    for node, H in _sight(scenario).items():
+        if unseen(F, scenario.observation(node)[0]) is None or unseen(F, H) is not None:
+            continue
+        lower, upper = critical_probability(F, H)
+        if upper >= worst:
+            worst = upper
+            words = (
+                f"node {node}: if all readings arrived together, the critical probability would "
+                f"lie in [{lower:.6g}, {upper:.6g}], R (31), (32); delivery from {least:g}"
+            )
+    rows.append(
+        (
+            "readings arrive often enough for a bounded mean (sufficient)",
+            "R (32)",
+            worst == 0.0 or least > worst,
+            words + "; below it P is still stochastically bounded, its mean may not be",
+        )
+    )
+    return rows
