@@ -15,6 +15,7 @@ from netkf.theory.intermittent import (
 )
 from netkf.theory.limits import central_covariance, limit_covariance, true_limit_covariance
 from netkf.theory.matrices import riccati_flow
+from netkf.theory.scalar_law import scalar_law
 from netkf.theory.steady import steady_covariance_bound
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "mean_matching",
     "riccati_flow",
     "riccati_step",
+    "scalar_law",
     "steady_covariance",
     "steady_covariance_bound",
     "support",

@@ -32,7 +32,8 @@ class System(NamedTuple):
     R: FloatArray
 
 
-def _system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> System:
+def checked_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> System:
+    """The matrices as checked arrays; raises TheoryError."""
     F_ = as_square("F", F)
     n = len(F_)
     H_ = _observation(H, n)
@@ -65,7 +66,7 @@ def riccati_step(
 
     Computed from square roots by an orthogonal triangularisation, without a subtraction.
     """
-    system = _system(F, Q, H, R)
+    system = checked_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
     root, _ = update_root(_root(start), system.F, square_root(system.Q), system.H, _root(system.R))
     return symmetric(root @ root.T)
@@ -84,7 +85,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     Raises TheoryError, naming the mode, where (F, H) is not detectable, and where what was found
     does not solve the equation or does not stabilise the filter.
     """
-    F, Q, H, R = _system(F, Q, H, R)
+    F, Q, H, R = checked_system(F, Q, H, R)
     hidden = unseen(F, H)
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
@@ -230,7 +231,7 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     """
     if int(depth) != depth or not 0 <= depth <= DEEPEST:
         raise TheoryError(f"depth must be an integer from 0 to {DEEPEST}, got {depth!r}")
-    F, Q, H, R = _system(F, Q, H, R)
+    F, Q, H, R = checked_system(F, Q, H, R)
     roots = _root(steady_covariance(F, Q, H, R))[None]
     root_Q, root_R = square_root(Q), _root(R)
     for _ in range(depth):
@@ -255,7 +256,7 @@ def invariant_samples(
     covariance a million times larger, until the two agree to 1e-9: then neither remembers its
     start. Raises TheoryError where no invariant law exists or that does not happen.
     """
-    F, Q, H, R = _system(F, Q, H, R)
+    F, Q, H, R = checked_system(F, Q, H, R)
     if not 0.0 < delivery <= 1.0:
         raise TheoryError(f"delivery must lie in (0, 1], got {delivery!r}")
     if int(samples) != samples or samples < 1:

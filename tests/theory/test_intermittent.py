@@ -123,3 +123,42 @@ def test_what_does_not_exist_is_refused():
         theory.invariant_samples(*SCALAR, delivery=0.0, samples=1, seed=0)
     with pytest.raises(netkf.TheoryError, match="H must be a finite matrix of 1 columns"):
         theory.riccati_step([[1.0]], [[1.0]], [[1.0]], [[1.0, 0.0]], [[1.0]])
+
+
+@pytest.mark.parametrize("delivery", [0.5, 0.6, 0.75, 0.9])
+def test_exact_scalar_law(delivery):
+    law = theory.scalar_law(*SCALAR, delivery)
+    holes = 2.0 ** np.arange(2, 8) - 1.0
+    above = (1.0 - delivery) ** np.arange(1, 7)
+    np.testing.assert_allclose(1.0 - law.cdf(holes), above, rtol=0, atol=1e-15)
+    # backwards in x: near P* a rounding error of x holds much of the mass, so not in u
+    points = theory.support(*SCALAR, depth=6)[:, 0, 0]
+    levels = law.cdf(points * (1.0 + 1e-12))
+    kept = levels < 1.0 - 1e-6
+    np.testing.assert_allclose(law.quantile(levels[kept]), points[kept], rtol=1e-4)
+    assert law.cdf(law.least - 1e-9) == 0.0
+    low, high = law.hole
+    assert law.cdf((low + high) / 2) == pytest.approx(delivery)
+    means = {0.5: np.inf, 0.6: 9.739843, 0.75: 4.266367, 0.9: 2.881815}
+    assert law.mean() == pytest.approx(means[delivery], rel=1e-6)
+
+
+@pytest.mark.parametrize("level", CASES["scalar_law"])
+def test_quantiles_of_the_scalar_law(level):
+    law = theory.scalar_law(*SCALAR, float(level))
+    for row in CASES["scalar_law"][level]["quantiles"]:
+        got = float(law.quantile(row["u"]))
+        sides = row["exact_left"], row["exact_right"]
+        assert min(sides) * (1 - 1e-9) <= got <= max(sides) * (1 + 1e-9), row
+
+
+def test_samples_and_exact_law_agree():
+    """Kolmogorov-Smirnov at level 1e-4; a law of the wrong delivery is told apart."""
+    scipy_stats = pytest.importorskip("scipy.stats")
+    P = theory.invariant_samples(*SCALAR, delivery=0.75, samples=4000, seed=8)[:, 0, 0]
+    P = np.round(P, 9)
+    right, wrong = (theory.scalar_law(*SCALAR, g) for g in (0.75, 0.72))
+    assert scipy_stats.kstest(P, lambda x: right.cdf(x + 1e-9)).pvalue > 1e-4
+    assert scipy_stats.kstest(P, lambda x: wrong.cdf(x + 1e-9)).pvalue < 1e-4
+    with pytest.raises(netkf.TheoryError, match="images of f_0 and f_1 meet"):
+        theory.scalar_law(1.05, 1.0, 1.0, 100.0, 0.5)
