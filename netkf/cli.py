@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
+import threading
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -134,6 +136,8 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.experiments.tables import summary_table
 
     scenario = _load(options)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
     meter = _Meter(scenario.horizon)
     finished = run_to_directory(scenario, options.out, options.engine, options.trace, meter)
     meter.close()

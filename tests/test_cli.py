@@ -1,9 +1,12 @@
 """The command line as a user meets it."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 
+import pandas as pd
 import pytest
 
 import netkf
@@ -81,3 +84,25 @@ def test_public_names_exist():
     assert set(netkf.__all__) <= set(dir(netkf))
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = netkf.nothing
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_an_interrupted_run_leaves_what_was_finished(tmp_path, name):
+    out = tmp_path / "out"
+    arguments = ["run", RING, "--set", "horizon=100000.0", "--set", "probe=1.0", "--out", str(out)]
+    code = f"import sys; from netkf.cli import main; sys.exit(main({arguments!r}))"
+    run = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+    for _ in range(600):
+        time.sleep(0.1)
+        if (out / "events.parquet.part").exists():
+            break
+    run.send_signal(getattr(signal, name))
+    _, printed = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert printed == "netkf: interrupted; what was finished is kept\n"
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["status"] == "interrupted"
+    events = pd.read_parquet(out / "events.parquet")
+    assert len(events) == manifest["events"] > 0
+    assert pd.read_parquet(out / "states.parquet").t.max() > 0.0
+    assert not list(out.glob("*.part"))

@@ -69,7 +69,9 @@ def run_to_directory(
         "runs": {"wanted": 1, "done": 0},
         "engine": chosen.name,
     }
+    # Written at once, so that a run that is killed outright says that it did not finish.
     status, began = "interrupted", time.perf_counter()
+    write_json(directory / "manifest.json", {**manifest, "status": status})
     try:
         status = chosen.run(scenario, Streams(scenario.seed, 0), recorder, progress)
     finally:
