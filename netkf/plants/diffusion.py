@@ -25,6 +25,7 @@ from netkf.plants.plant import Plant
 
 BLOCK = 64  # steps drawn at once
 LONGEST_STEP = 8.0
+MOST_SPLITS = 256  # kept laws of a state shown inside a step
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -114,12 +115,8 @@ class DiffusionPath:
         self.period = plant.sensing_period
         self._A, self._B, self._n = plant.A, plant.B, plant.n
         self._random, self._probing, self._shown = random, probing, shown
-        terms = 64  # enough for |A| h <= LONGEST_STEP
-        powers = [np.eye(self._n)]
-        for k in range(1, terms):
-            powers.append(powers[-1] @ plant.A / k)
-        self._exp = np.stack(powers)
-        self._integrals = np.einsum("jk,kab->kjab", forward_coefficients(terms), self._exp)
+        self._series = _response_series(plant.A, self.period)
+        self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
         self._response = self.responses(self.period)
         self._spread = _factor(self._noise(self.period))
         self._normals = np.empty((0, 3 * self._n))
@@ -138,10 +135,11 @@ class DiffusionPath:
 
     def responses(self, gap: float) -> FloatArray:
         """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""
-        powers = gap ** np.arange(len(self._exp))
-        transition = np.tensordot(powers, self._exp, 1)
-        integrals = np.tensordot(powers * gap, self._integrals, 1)
-        return np.concatenate([transition[None], integrals])
+        powers = np.empty(len(self._series))
+        powers[0] = 1.0
+        powers[1:] = gap
+        values = np.multiply.accumulate(powers) @ self._series
+        return np.asarray(values.reshape(3, self._n, self._n))
 
     def _noise(self, gap: float) -> FloatArray:
         """(3 n, 20 m): responses of the end and the moments to noise at the quadrature nodes."""
@@ -158,11 +156,13 @@ class DiffusionPath:
         if s >= end:
             return np.zeros((3 * self._n, self._B.shape[1]))
         since = max(s, start)
-        entry = np.tensordot((since - s) ** np.arange(len(self._exp)), self._exp, 1) @ self._B
+        entry = self.responses(since - s)[0] @ self._B
         rest = end - since
         to_end, plain, tilted = self.responses(rest)
         share = rest / gap  # P_1 of the whole interval is (1 - share) + share P_1 of the rest
-        return np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted]) @ entry
+        return np.asarray(
+            np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted]) @ entry
+        )
 
     def _next_step(self) -> None:
         n = self._n
@@ -203,7 +203,7 @@ class DiffusionPath:
         from_noise = 0.5 * gap * (np.stack([_THREE_WEIGHTS, _THREE_WEIGHTS * _THREE]) @ noise)
         x = step.x_start
         if start > step.start:
-            x = np.tensordot((start - step.start) ** np.arange(len(self._exp)), self._exp, 1) @ x
+            x = self.responses(start - step.start)[0] @ x
         return np.asarray(self.responses(gap)[1:] @ x + from_noise)
 
     def state(self, time: float) -> FloatArray:
@@ -212,9 +212,11 @@ class DiffusionPath:
         assert time == step.end, f"{time} is neither on the sensing grid nor among the times shown"
         return step.x_end
 
-    def _split(self, step: _Step, time: float) -> None:
-        """Draw the path at ``time`` given the whole step, and put two steps in its place."""
-        n, length, left = self._n, step.end - step.start, time - step.start
+    def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
+        """Gain (3 n, 3 n) and root of the law of state and moments at ``left`` given those of a
+        whole step of ``length``.
+        """
+        n = self._n
         places = np.concatenate([_NODES * left, left + _NODES * (length - left)])
         weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])
         columns = [
@@ -224,15 +226,23 @@ class DiffusionPath:
         ]
         factor = np.concatenate(columns, axis=1)
         C = factor @ factor.T
-        known, asked = C[: 3 * n, : 3 * n], C[3 * n :, 3 * n :]
-        cross = C[3 * n :, : 3 * n]
+        known, asked, cross = C[: 3 * n, : 3 * n], C[3 * n :, 3 * n :], C[3 * n :, : 3 * n]
         gain = cross @ np.linalg.pinv(known, rcond=1e-13, hermitian=True)
+        return gain, square_root(asked - gain @ cross.T)
+
+    def _split(self, step: _Step, time: float) -> None:
+        """Draw the path at ``time`` given the whole step, and put two steps in its place."""
+        n, length, left = self._n, step.end - step.start, time - step.start
+        key = round(length, 12), round(left, 12)
+        if key not in self._splits:
+            if len(self._splits) >= MOST_SPLITS:
+                self._splits.clear()
+            self._splits[key] = self._conditional(length, left)
+        gain, spread = self._splits[key]
         residual = np.concatenate([step.x_end, *step.moments]) - (
             self.responses(length) @ step.x_start
         ).reshape(-1)
-        noise = gain @ residual + square_root(asked - gain @ cross.T) @ (
-            self._probing.standard_normal(3 * n)
-        )
+        noise = gain @ residual + spread @ self._probing.standard_normal(3 * n)
         values = (self.responses(left) @ step.x_start).reshape(-1) + noise
         x, first = values[:n], values[n:].reshape(2, n)
         share = left / length
@@ -250,6 +260,23 @@ class DiffusionPath:
                 time, step.end, x, step.x_end, second, _cubic(length - left, later[0], later[1:])
             ),
         ]
+
+
+def _response_series(A: FloatArray, longest: float) -> FloatArray:
+    """(terms, 3 n n): power series in the gap of ``exp(A g)`` and of its two moments."""
+    n, size = len(A), float(np.abs(A).sum(axis=0).max()) * longest
+    terms, last = 1, 1.0
+    while last > 1e-18 or terms < 8:
+        last *= size / terms
+        terms += 1
+    exponential = [np.eye(n)]
+    for k in range(1, terms):
+        exponential.append(exponential[-1] @ A / k)
+    powers = np.stack(exponential)
+    series = np.zeros((terms + 1, 3, n, n))
+    series[:-1, 0] = powers
+    series[1:, 1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), powers)
+    return series.reshape(terms + 1, -1)
 
 
 def _factor(noise: FloatArray) -> FloatArray:
