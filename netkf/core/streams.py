@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -23,13 +24,14 @@ class Streams:
     replica: int = 0
 
     def generator(self, purpose: str, *entity: int) -> np.random.Generator:
-        """The generator of ``purpose`` for ``entity`` (node ids, a link's two ends, ...)."""
-        code = int.from_bytes(hashlib.sha256(purpose.encode()).digest()[:4], "little")
-        key = (self.replica, code, *entity)
-        return np.random.Generator(np.random.PCG64DXSM(_sequence(self.seed, key)))
+        """The generator of ``purpose`` for ``entity`` (node ids, a link's two ends,
+        ...: integers that are not negative).
+        """
+        key = (self.replica, _code(purpose), *entity)
+        sequence = np.random.SeedSequence(entropy=self.seed, spawn_key=key)
+        return np.random.Generator(np.random.PCG64DXSM(sequence))
 
 
-def _sequence(seed: int, key: tuple[int, ...]) -> np.random.SeedSequence:
-    # Spawn keys are unsigned; node ids may be negative, so the sign gets a place of its own.
-    spawn = tuple(part for k in key for part in (abs(k), int(k < 0)))
-    return np.random.SeedSequence(entropy=seed, spawn_key=spawn)
+@cache
+def _code(purpose: str) -> int:
+    return int.from_bytes(hashlib.sha256(purpose.encode()).digest()[:4], "little")
