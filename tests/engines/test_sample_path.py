@@ -32,9 +32,11 @@ def test_default_sensing_period_keeps_what_the_docs_state(ring):
 
 def test_the_error_has_fourth_order_in_the_sensing_period(ring, monkeypatch):
     monkeypatch.setattr(flow, "STRETCH", np.inf)  # no shorter stretches where P is large
-    short = ring.replace({"horizon": 2.0, "probe": 1.0})
-    coarse, fine = (deviation(short.replace({"plant.sensing_period": h})) for h in (0.5, 0.25))
-    assert 10.0 < coarse / fine < 25.0
+    clock = {"kind": "periodic", "period": 0.5}  # ticks on the grid: no interval is cut
+    short = ring.replace({"horizon": 2.0, "probe": 1.0, "network.activation": clock})
+    errors = [deviation(short.replace({"plant.sensing_period": h})) for h in (0.5, 0.25, 0.125)]
+    assert 14.0 < errors[0] / errors[1] < 18.0
+    assert 14.0 < errors[1] / errors[2] < 18.0
 
 
 def test_first_transient_needs_no_shorter_period(ring):
