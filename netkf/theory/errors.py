@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from netkf.algorithms.baselines import Local
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.riccati import evaluate_hamiltonian
@@ -35,11 +36,16 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     With ``stacked``, (T, N n, N n): the errors of all nodes together. H (10) says that each block
     stays below P_i, which this shows without Monte Carlo. For the filters hybrid, local and
     central, with delays and with models that differ from the truth. Raises TheoryError for other
-    filters.
+    filters, and for a user's subclass that does more than choose its weights.
     """
-    algorithm = scenario.filter.algorithm
+    algorithm, _ = scenario.filter.algorithm, scenario.truth  # raises for scenarios in slots
     if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
+    known = Hybrid if algorithm.talks else Local
+    for name in ("init", "flow", "measure", "emit", "absorb", "estimate"):
+        if getattr(type(algorithm), name, None) is not getattr(known, name):
+            words = f"{type(algorithm).__name__} defines {name} itself"
+            raise TheoryError(f"the exact error covariance is not known: {words}")
     nodes, n = len(scenario.nodes), scenario.plant.n
     errors = _Errors(scenario)
     hosts = errors.hosts

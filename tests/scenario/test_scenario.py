@@ -98,6 +98,11 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
                     return self.share * self.epsilon
 
 
+            class Loud(Timid):
+                def absorb(self, state, messages):
+                    return state
+
+
             @dataclass(frozen=True, eq=False)
             class Doubling(LinkClock):
                 first: float
@@ -121,5 +126,9 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
     assert resolved(scenario)["filter"]["kind"] == "fusion:Timid"
     plain = scenario.replace({"filter.kind": "hybrid", "filter.epsilon": 0.2})
     np.testing.assert_array_equal(netkf.simulate(plain).P, run.P)
+    exact = netkf.theory.error_covariance(scenario, run)  # other weights are understood
+    assert np.linalg.eigvalsh(run.P - exact).min() > -1e-9
+    with pytest.raises(netkf.TheoryError, match="Loud defines absorb itself"):
+        netkf.theory.error_covariance(scenario.replace({"filter.kind": "fusion:Loud"}), run)
     with pytest.raises(netkf.ScenarioError, match=r"filter\.share: must be a finite number"):
         scenario.replace({"filter.share": 2.0})
