@@ -38,14 +38,29 @@ class Coupled(NamedTuple):
     start: FloatArray
 
 
+STEPS = ("init", "flow", "measure", "emit", "absorb", "estimate")
+
+
+def own_steps(algorithm: object, known: type) -> list[str]:
+    """The steps that a user's subclass defines itself; theorems about ``known`` are not about it.
+
+    Other weights are understood, they enter the equations.
+    """
+    mine = type(algorithm)
+    return [name for name in STEPS if getattr(mine, name, None) is not getattr(known, name)]
+
+
 def not_promised(scenario: Scenario) -> str | None:
     """Why H Theorem 2 does not speak about the scenario, in words; None where it does."""
     algorithm, network = scenario.filter.algorithm, scenario.network
     if not scenario.slotted and not algorithm.talks:
         return None
+    name = type(algorithm).__name__
     if not isinstance(algorithm, Hybrid):
-        name = type(algorithm).__name__.lower()
-        return f"H(12) is about the hybrid filter in continuous time, not about {name}"
+        return f"H(12) is about the hybrid filter in continuous time, not about {name.lower()}"
+    own = own_steps(algorithm, Hybrid)
+    if own:
+        return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
     assert isinstance(network.activation, LinkClock)
     if not network.activation.memoryless:
         return (
@@ -54,9 +69,8 @@ def not_promised(scenario: Scenario) -> str | None:
         )
     if network.channel.delay.fixed is None:
         return "not promised: H(12) holds for no delay or a fixed one, and the delay is random"
-    if not network.channel.loss.independent:
-        return "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
-    return None
+    bursts = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
+    return None if network.channel.loss.independent else bursts
 
 
 def promised(scenario: Scenario) -> None:

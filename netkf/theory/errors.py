@@ -23,6 +23,7 @@ from netkf.algorithms.riccati import evaluate_hamiltonian
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
+from netkf.theory.coupled import own_steps
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -42,10 +43,12 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
     known = Hybrid if algorithm.talks else Local
-    for name in ("init", "flow", "measure", "emit", "absorb", "estimate"):
-        if getattr(type(algorithm), name, None) is not getattr(known, name):
-            words = f"{type(algorithm).__name__} defines {name} itself"
-            raise TheoryError(f"the exact error covariance is not known: {words}")
+    own = own_steps(algorithm, known)
+    if own:
+        words = f"{type(algorithm).__name__} defines {own[0]} itself"
+        raise TheoryError(f"the exact error covariance is not known: {words}")
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        raise TheoryError("the run is of another scenario: its nodes or its state differ")
     nodes, n = len(scenario.nodes), scenario.plant.n
     errors = _Errors(scenario)
     hosts = errors.hosts

@@ -130,5 +130,10 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
     assert np.linalg.eigvalsh(run.P - exact).min() > -1e-9
     with pytest.raises(netkf.TheoryError, match="Loud defines absorb itself"):
         netkf.theory.error_covariance(scenario.replace({"filter.kind": "fusion:Loud"}), run)
+    loud = scenario.replace({"filter.kind": "fusion:Loud", "network": as_table(ring)["network"]})
+    with pytest.raises(netkf.TheoryError, match=r"not promised: .*Loud defines absorb itself"):
+        netkf.theory.covariance_bound(loud, [1.0])
+    with pytest.raises(netkf.TheoryError, match="another scenario"):
+        netkf.theory.error_covariance(ring.replace({"network.graph.nodes": 5}), run)
     with pytest.raises(netkf.ScenarioError, match=r"filter\.share: must be a finite number"):
         scenario.replace({"filter.share": 2.0})
