@@ -268,6 +268,17 @@ class Scenario(Part):
         B = plant.B if model.B is None else model.B
         return A, np.asarray(B @ B.T)
 
+    @property
+    def filters_know_the_truth(self) -> bool:
+        """Whether the filters have the plant's matrices and the sensors' R."""
+        plant = self.plant
+        if isinstance(plant, LinearPlant):
+            pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
+        else:
+            pairs = [*zip(self.belief, (self.truth.A, self.truth.Q), strict=True)]
+        pairs += [(self._noise(k, True), self._noise(k, False)) for k in range(len(self.sensors))]
+        return all(np.array_equal(believed, true) for believed, true in pairs)
+
     @cached_property
     def models(self) -> tuple[FlowModel, ...]:
         """What each node believes, in the order of ``nodes``; equal models are one object."""

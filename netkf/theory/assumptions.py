@@ -71,15 +71,7 @@ def _plant(scenario: Scenario) -> list[Row]:
         for node in scenario.nodes
         if unobservable(plant.A, _own_information(scenario, node)) is None
     ]
-    A, Q = scenario.belief
-    same = (
-        np.array_equal(A, plant.A)
-        and np.array_equal(Q, plant.Q)
-        and all(
-            np.array_equal(scenario.observation(node)[1], scenario.observation(node, True)[1])
-            for node in scenario.sensing
-        )
-    )
+    same = scenario.filters_know_the_truth
     return [
         (
             "(A, B) is controllable",

@@ -27,17 +27,9 @@ def slot_rows(scenario: Scenario) -> list[Row]:
 
 
 def _plant(scenario: Scenario) -> list[Row]:
-    plant, (F, Q) = scenario.slot_plant, scenario.slot_belief
+    plant, same = scenario.slot_plant, scenario.filters_know_the_truth
     least = float(np.linalg.eigvalsh(plant.Q)[0])
     idle = unseen(plant.F.T, plant.Q)
-    same = (
-        np.array_equal(F, plant.F)
-        and np.array_equal(Q, plant.Q)
-        and all(
-            np.array_equal(scenario.observation(n)[1], scenario.observation(n, True)[1])
-            for n in scenario.sensing
-        )
-    )
     return [
         (
             "(F, Q^1/2) is stabilisable",
