@@ -112,6 +112,15 @@ def test_invariant_samples_have_the_exact_law_of_the_scalar_example(delivery):
     np.testing.assert_array_equal(P, again[:, 0, 0])
 
 
+def test_a_single_draw_has_the_invariant_law_too():
+    """Stopping at the first meeting would prefer draws with recent arrivals; 2000 seeds."""
+    scipy_stats = pytest.importorskip("scipy.stats")
+    P = [theory.invariant_samples(*SCALAR, 0.75, samples=1, seed=s)[0, 0, 0] for s in range(2000)]
+    for n in range(4):
+        above = int((2.0 ** (n + 2) - 1.0 < np.array(P)).sum())
+        assert scipy_stats.binomtest(above, len(P), 0.25 ** (n + 1)).pvalue > 1e-4
+
+
 def test_what_does_not_exist_is_refused():
     with pytest.raises(netkf.TheoryError, match=r"not detectable: the mode with eigenvalue 2"):
         theory.steady_covariance([[2.0]], [[1.0]], [[0.0]], [[1.0]])
