@@ -55,13 +55,18 @@ def advance(
     if fast is None:
         return _stack_by_stack(roots, words, F, root_Q, letters)
     moved = np.ascontiguousarray(lower_triangular(roots))
-    workers = 1 if words.size < FEW else min(os.cpu_count() or 1, len(roots))
-    cuts = np.linspace(0, len(roots), workers + 1).astype(int)
-    parts = [slice(a, b) for a, b in itertools.pairwise(cuts)]
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
     spelled = np.ascontiguousarray(words, dtype=np.uint8 if len(letters.rows) < 256 else np.int64)
+    workers = min(os.cpu_count() or 1, len(roots))
+    if words.size < FEW or workers < 2:
+        fast(moved, spelled, F, low_Q, *letters)
+        return moved
+    cuts = np.linspace(0, len(roots), workers + 1).astype(int)
     with ThreadPoolExecutor(workers) as pool:
-        jobs = [pool.submit(fast, moved[part], spelled[part], F, low_Q, *letters) for part in parts]
+        jobs = [
+            pool.submit(fast, moved[a:b], spelled[a:b], F, low_Q, *letters)
+            for a, b in itertools.pairwise(cuts)
+        ]
         for job in jobs:
             job.result()
     return moved

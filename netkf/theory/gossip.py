@@ -34,6 +34,32 @@ def mean_matching(scenario: Scenario) -> FloatArray:
     raise TheoryError("the scenario has no matching")
 
 
+def effective_matching(scenario: Scenario) -> FloatArray:
+    """(N, N) mean of the swaps that happen: Abar with the losses of the channel.
+
+    Raises TheoryError where slots are not independent of each other, where swaps can become copies,
+    or where messages may be late.
+    """
+    activation, channel = scenario.network.activation, scenario.network.channel
+    if not isinstance(activation, Matching):
+        raise TheoryError("the matching is recorded, not drawn")
+    loss, delay = channel.loss, channel.delay.fixed
+    if not loss.independent:
+        raise TheoryError("losses come in bursts or recorded")
+    if delay is None or delay > scenario.phase_length:
+        raise TheoryError("messages may be late")
+    mean, index = mean_matching(scenario), scenario.topology.index
+    for i, j in scenario.topology.links:
+        forth, back = (loss.mean_delivery(d, scenario.measured(d)) for d in ((i, j), (j, i)))
+        if forth != back or not (channel.symmetric or forth == 1.0):
+            raise TheoryError("a swap may become a copy")
+        a, b = index[i], index[j]
+        mean[a, b] = mean[b, a] = forth * mean[a, b]
+    mean[np.diag_indices(len(mean))] = 0.0
+    mean[np.diag_indices(len(mean))] = 1.0 - mean.sum(axis=1)
+    return mean
+
+
 def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
     period, index = scenario.slot_plant.period, scenario.topology.index
     slots = range(1, max(2, int(np.ceil(scenario.horizon / period - 1e-9))))

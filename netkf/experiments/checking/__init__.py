@@ -1,0 +1,1 @@
+"""Theory held against simulation: promises as functions that return evidence."""

@@ -1,0 +1,124 @@
+"""What a promise comes to: a margin with its interval, and a verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not promised"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One promise held against simulation.
+
+    margin, low, high : how far the promise is from being broken, negative where it is, with an
+        interval that covers all comparisons of the row at once
+    tolerance : how far below 0 the interval may reach for the verdict ``holds``
+    verdict   : broken where the whole interval is below 0, holds where it stays above
+        ``-tolerance``, undecided where it is too wide, not promised where an assumption fails
+    needed    : about how many runs an undecided promise takes
+    """
+
+    promise: str
+    source: str
+    assumptions: str
+    margin: float
+    low: float
+    high: float
+    tolerance: float
+    verdict: str
+    needed: int | None
+    evidence: str
+
+
+class Finding(NamedTuple):
+    """A margin (value, low, high), how much below 0 is tolerable, and words about it."""
+
+    margin: tuple[float, float, float]
+    tolerance: float
+    words: str
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Words, source (paper, number), what it needs of the table of assumptions, and its test.
+
+    A test takes what was seen of all runs and a level, and returns a Finding whose interval misses
+    with at most that probability. ``exact`` tests compare paths, not laws, and spend no level.
+    """
+
+    words: str
+    source: str
+    needs: tuple[str, ...]
+    test: Callable[[Any, float], Finding]
+    exact: bool = False
+
+
+class Row(NamedTuple):
+    """A row of the table of assumptions."""
+
+    assumption: str
+    source: str
+    holds: bool
+    evidence: str
+
+
+def judge(
+    promises: Sequence[Promise], seen: Any, assumptions: Sequence[Row], runs: int, level: float
+) -> list[Evidence]:
+    """Evidence for each promise; all intervals together miss with at most ``level``."""
+    failing = [[row for row in assumptions if _needed(p, row) and not row.holds] for p in promises]
+    statistical = sum(not p.exact and not rows for p, rows in zip(promises, failing, strict=True))
+    found = []
+    for promise, rows in zip(promises, failing, strict=True):
+        if rows:
+            why = "; ".join(f"{row.assumption} [{row.source}]: {row.evidence}" for row in rows)
+            found.append(_not_promised(promise, why))
+        else:
+            finding = promise.test(seen, level / max(statistical, 1))
+            found.append(_weighed(promise, finding, runs))
+    return found
+
+
+def _needed(promise: Promise, row: Row) -> bool:
+    return any(need in f"{row.assumption} [{row.source}]" for need in promise.needs)
+
+
+def _weighed(promise: Promise, finding: Finding, runs: int) -> Evidence:
+    (margin, low, high), tolerance, words = finding
+    needed = None
+    if not high >= 0.0:  # also where nothing but nan was seen
+        verdict = BROKEN
+    elif low >= -tolerance:
+        verdict = HOLDS
+    else:
+        verdict = UNDECIDED
+        room = max(tolerance + min(margin, 0.0), 0.1 * tolerance)
+        needed = math.ceil(1.1 * runs * max(1.0, (margin - low) / room) ** 2)
+    return Evidence(
+        promise.words,
+        promise.source,
+        "hold",
+        margin,
+        low,
+        high,
+        tolerance,
+        verdict,
+        needed,
+        words,
+    )
+
+
+def _not_promised(promise: Promise, why: str) -> Evidence:
+    nan = math.nan
+    return Evidence(promise.words, promise.source, why, nan, nan, nan, nan, NOT_PROMISED, None, "")
+
+
+def identity(deviation: float, allowed: float, words: str) -> Finding:
+    """From the largest relative deviation of paths that should be equal but for rounding."""
+    margin = allowed - deviation
+    text = f"largest relative deviation {deviation:.1e}, rounding explains {allowed:.0e}; {words}"
+    return Finding((margin, margin, margin), 0.0, text)

@@ -1,0 +1,222 @@
+"""Promises of filters in slots: intervals, calibration over many seeds, and power."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import netkf
+from netkf.experiments.checking import gossip, intermittent, statistics
+from netkf.experiments.checking.check import check, verdict, watched, witness
+from netkf.experiments.checking.evidence import BROKEN, NOT_PROMISED, Finding, Promise, judge
+from netkf.scenario.reading import from_table
+from tests.conftest import SCENARIOS
+
+GOSSIP = {
+    "format": 1,
+    "name": "three",
+    "horizon": 12.0,
+    "probe": 1.0,
+    "plant": {
+        "kind": "linear",
+        "F": [[1.1, 0.2], [0.0, 0.95]],
+        "Q": [[1.0, 0.0], [0.0, 0.5]],
+        "period": 1.0,
+        "cov": [[1.0, 0.0], [0.0, 1.0]],
+    },
+    "sensors": [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.5]]},
+        {"nodes": [2], "H": [[0.3, 1.0]], "R": [[1.0]]},
+    ],
+    "network": {
+        "graph": {"kind": "cycle", "nodes": 3},
+        "activation": {"kind": "matching", "protocol": "one-edge", "lazy": 0.2},
+    },
+    "filter": {"kind": "gossip"},
+}
+INTERMITTENT = {
+    **GOSSIP,
+    "sensors": [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.5]]},
+        {"nodes": [1], "H": [[0.3, 1.0]], "R": [[1.0]]},
+    ],
+    "network": {
+        "graph": {"kind": "edges", "edges": [[0, 2], [1, 2]]},
+        "activation": {"kind": "broadcast"},
+        "channel": {"loss": {"kind": "bernoulli", "delivery": 0.7}},
+    },
+    "filter": {"kind": "intermittent"},
+}
+SCALAR = {
+    **GOSSIP,
+    "horizon": 20.0,
+    "plant": {"kind": "linear", "F": [[2**0.5]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]},
+    "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}],
+    "network": {
+        "graph": {"kind": "path", "nodes": 2},
+        "activation": {"kind": "broadcast"},
+        "channel": {"loss": {"kind": "bernoulli", "delivery": 0.7}},
+    },
+    "filter": {"kind": "intermittent"},
+}
+
+
+def scenario_of(table, folder, **changes):
+    return from_table(table, folder).replace(changes)
+
+
+def rows_of(found):
+    return {row.source: row for row in found.rows}
+
+
+@pytest.mark.parametrize("table", [GOSSIP, INTERMITTENT, SCALAR], ids=["gossip", "many", "scalar"])
+def test_false_alarms_stay_within_the_level(table, tmp_path):
+    """200 seeds, 40 replicas each, at a level of 20 %: at most as many alarms as 20 % explain."""
+    scenario = watched(scenario_of(table, tmp_path))
+    paper = gossip if table is GOSSIP else intermittent
+    shared = None
+    alarms = dict.fromkeys((0.2, 0.01), 0)
+    for seed in range(200):
+        seen = [witness(scenario, seed, replica) for replica in range(40)]
+        for level in alarms:
+            chosen = paper.Seen(scenario, paper.Witness(*map(np.array, zip(*seen, strict=True))))
+            if shared is None:
+                shared = chosen.reference
+            chosen.__dict__["reference"] = shared
+            found = judge(paper.promises(scenario), chosen, paper.rows(scenario), 40, level)
+            assert not any(row.verdict == NOT_PROMISED for row in found)
+            alarms[level] += any(row.verdict == BROKEN for row in found)
+    for level, count in alarms.items():
+        assert count <= scipy.stats.binom.ppf(0.999, 200, level)
+
+
+@pytest.mark.parametrize(
+    ("kind", "caught", "not_seen"),
+    [
+        # swapping after the update shows at fixed sensors and on paths, not at a random sensor
+        ("UpdateThenSwap", {"G (10), (19), Proposition 7", "derived from G (19)"}, "G (67), "),
+        ("SwapsOnlyP", {"G (9)"}, "G (10), (19)"),
+        ("SwapsOnlyX", {"G (9)", "G (10), (19), Proposition 7"}, "G Proposition 6"),
+    ],
+)
+def test_broken_gossip_is_caught(kind, caught, not_seen, tmp_path):
+    scenario = scenario_of(
+        GOSSIP, tmp_path, filter={"kind": f"tests.experiments.broken:{kind}"}, horizon=16.0
+    )
+    found = check(scenario, runs=300)
+    assert not found
+    broken = {row.source for row in found.rows if row.verdict == BROKEN}
+    assert caught <= broken
+    assert not any(source.startswith(not_seen) for source in broken)
+
+
+def test_a_wrong_mean_matching_is_caught(tmp_path):
+    activation = {"kind": "tests.experiments.broken:Reluctant", "protocol": "one-edge"}
+    scenario = scenario_of(GOSSIP, tmp_path, **{"network.activation": activation})
+    found = rows_of(check(scenario, runs=300))
+    assert found["G Proposition 6"].verdict == BROKEN
+    assert found["G (10), (19), Proposition 7"].verdict == "holds"
+
+
+def test_arrivals_of_the_wrong_probability_are_caught(tmp_path):
+    loss = {"kind": "tests.experiments.broken:Lossier", "delivery": 0.7}
+    many = scenario_of(INTERMITTENT, tmp_path, **{"network.channel.loss": loss})
+    assert rows_of(check(many, runs=300))["R (12)"].verdict == BROKEN
+    scalar = scenario_of(SCALAR, tmp_path, **{"network.channel.loss": loss})
+    found = rows_of(check(scalar, runs=800))
+    assert found["R (12)"].verdict == BROKEN
+    assert found["R Proposition 24, derived"].verdict == BROKEN
+    assert found["R (15)-(18)"].verdict == "holds"
+
+
+@pytest.mark.parametrize(
+    ("kind", "source"), [("Forgetful", "R (15)-(18)"), ("Overconfident", "R (15)")]
+)
+def test_broken_intermittent_filters_are_caught(kind, source, tmp_path):
+    scenario = scenario_of(
+        INTERMITTENT, tmp_path, filter={"kind": f"tests.experiments.broken:{kind}"}
+    )
+    assert rows_of(check(scenario, runs=100))[source].verdict == BROKEN
+
+
+def test_correct_filters_hold_with_enough_runs(tmp_path):
+    found = check(scenario_of(SCALAR, tmp_path), runs=1000)
+    assert found
+    table = found.table
+    assert (table.verdict == "holds").sum() >= 8
+    assert not (table.verdict == BROKEN).any()
+    assert (table.low <= table.margin).all()
+    assert (table.margin <= table.high).all()
+
+
+def test_what_is_not_promised_says_why():
+    scenario = netkf.load(SCENARIOS / "gossip_periodic.toml").replace({"horizon": 20.0})
+    found = rows_of(check(scenario, runs=20))
+    row = found["G Theorem 8"]
+    assert row.verdict == NOT_PROMISED
+    assert "it has period 2" in row.assumptions
+    copies = netkf.load(SCENARIOS / "gossip_copies.toml").replace({"horizon": 20.0})
+    row = rows_of(check(copies, runs=20))["G Proposition 6"]
+    assert "every exchange is a swap" in row.assumptions
+
+
+def test_undecided_says_how_many_runs_would_do(tmp_path):
+    few = rows_of(check(scenario_of(SCALAR, tmp_path), runs=20))["R (15)"]
+    assert few.verdict == "undecided"
+    enough = rows_of(check(scenario_of(SCALAR, tmp_path), runs=few.needed))["R (15)"]
+    assert enough.verdict == "holds"
+
+
+def test_a_verdict_does_not_depend_on_the_order_of_runs(tmp_path):
+    scenario = watched(scenario_of(SCALAR, tmp_path))
+    seen = [witness(scenario, 0, replica) for replica in range(12)]
+    one, other = (verdict(scenario, runs, 0, 0.99) for runs in (seen, seen[::-1]))
+    assert [row.margin for row in one.rows] == pytest.approx([row.margin for row in other.rows])
+
+
+def test_share_covers():
+    """Clopper-Pearson against its definition by scipy."""
+    for successes, trials in ((0, 10), (3, 10), (10, 10), (470, 1000)):
+        low, high = statistics.share(successes, trials, 0.05)[1:]
+        expected = scipy.stats.binomtest(successes, trials).proportion_ci(0.95, "exact")
+        assert (low, high) == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+def test_bands_cover_laws_with_atoms():
+    """The distance to the own law is 0 within the band, also where it has atoms."""
+    random = np.random.default_rng(2)
+    missed = 0
+    for _ in range(400):
+        values = random.integers(1, 4, 60) / 3.0
+        cdf = lambda x: np.floor(3.0 * x).clip(0, 3) / 3.0  # noqa: E731
+        missed += statistics.distance_to(cdf, values, 0.1).low > 0.0
+    assert missed <= scipy.stats.binom.ppf(0.999, 400, 0.1)
+    far = statistics.distance_to(lambda x: np.clip(x, 0, 1) ** 8, random.random(200), 0.01)
+    assert far.low > 0.2
+
+
+def test_mean_ratio_covers():
+    random = np.random.default_rng(3)
+    totals = random.chisquare(30, size=2000)
+    missed = 0
+    for total in totals:
+        low, high = statistics.mean_ratio(float(total), 30, 0.1)[1:]
+        missed += not low <= 1.0 <= high
+    assert 0.07 < missed / 2000 < 0.13
+
+
+def test_chi_square_is_pearsons():
+    counts, chances = np.array([50, 30, 15, 4, 1]), np.array([0.5, 0.25, 0.125, 0.0625, 0.0625])
+    p, cells = statistics.chi_square(counts, chances)
+    pooled = scipy.stats.chisquare([50, 30, 15, 5], [50, 25, 12.5, 12.5])
+    assert cells == 4
+    assert p == pytest.approx(pooled.pvalue)
+
+
+def test_nan_counts_as_broken():
+    nan = float("nan")
+    promise = Promise("words", "source", (), lambda seen, level: Finding((nan,) * 3, 0.1, ""))
+    (row,) = judge([promise], None, [], 10, 0.01)
+    assert row.verdict == BROKEN
+    assert dataclasses.asdict(row)["needed"] is None
