@@ -98,11 +98,14 @@ def _sensors(scenario: Scenario) -> None:
         _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for place, node in enumerate(sensor.nodes):
             if node not in known:
+                left_out = node in scenario.topology.left_out
+                why = ", and this one is left out: none of its links reaches the minimum"
+                remedy = "lower network.graph.minimum or move the sensor; " if left_out else ""
                 raise ScenarioError(
                     f"{key}.nodes[{place}]",
-                    "must be a node of the graph",
+                    f"must be a node of the graph{why if left_out else ''}",
                     node,
-                    f"node ids here are {_ids(scenario.nodes)}",
+                    f"{remedy}node ids here are {_ids(scenario.nodes)}",
                 )
         if len(set(sensor.nodes)) < len(sensor.nodes):
             raise ScenarioError(

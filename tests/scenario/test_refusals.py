@@ -247,6 +247,12 @@ SENSORS = [
     ("sensor-R-missing", {"sensors.R": None}, "sensors[0].R", "is missing"),
     ("second-sensor", {"sensors": SECOND}, "sensors[1].H", "is missing"),
     ("node-unknown", {"sensors.nodes": "[0, 6]"}, "sensors[0].nodes[1]", "of the graph; got 6"),
+    (
+        "node-left-out",
+        listed("island.csv", "minimum = 0.5") | {"sensors.nodes": "[7]"},
+        "sensors[0].nodes[0]",
+        "reaches the minimum; got 7; lower network.graph.minimum",
+    ),
     ("node-negative", {"sensors.nodes": "[-1]"}, "sensors[0].nodes[0]", "of the graph; got -1"),
     ("node-twice", {"sensors.nodes": "[3, 3]"}, "sensors[0].nodes", "node once; got [3, 3]"),
     (
