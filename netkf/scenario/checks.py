@@ -99,13 +99,12 @@ def _sensors(scenario: Scenario) -> None:
         for place, node in enumerate(sensor.nodes):
             if node not in known:
                 left_out = node in scenario.topology.left_out
-                why = ", and this one is left out: none of its links reaches the minimum"
-                remedy = "lower network.graph.minimum or move the sensor; " if left_out else ""
+                why = "none of its links reaches network.graph.minimum, lower that; "
                 raise ScenarioError(
                     f"{key}.nodes[{place}]",
-                    f"must be a node of the graph{why if left_out else ''}",
+                    "must be a node of the graph",
                     node,
-                    f"{remedy}node ids here are {_ids(scenario.nodes)}",
+                    f"{why if left_out else ''}node ids here are {_ids(scenario.nodes)}",
                 )
         if len(set(sensor.nodes)) < len(sensor.nodes):
             raise ScenarioError(
