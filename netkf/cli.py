@@ -144,7 +144,8 @@ def _run(options: argparse.Namespace) -> int:
     _notes(scenario)
     print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
     print()
-    print(summary_table(finished.summary))
+    promised = finished.promised
+    print(summary_table(finished.summary, promised.limit_words, promised.notes))
     rate = finished.events / max(finished.seconds, 1e-9)
     print(f"events: {finished.events:,} in {finished.seconds:.2f} s, {rate:,.0f} per second")
     if finished.status != "complete":

@@ -124,7 +124,7 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
             zorder=3,
         )
     for value, words, style in (
-        (promised.limit, "limit S, H(13)", "-."),
+        (promised.limit, promised.limit_words, "-."),
         (promised.central, "centralised filter", "-"),
     ):
         if math.isfinite(value):

@@ -9,9 +9,11 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
+from netkf.experiments.words import limit_words, mismatch_words
 from netkf.scenario.scenario import Scenario
 from netkf.theory import central_covariance, covariance_bound, limit_covariance
 from netkf.theory.coupled import not_promised
+from netkf.theory.steady import has_steady_state
 from netkf.trace.recorder import Sink
 from netkf.trace.run import errors
 from netkf.trace.schema import CODES
@@ -59,13 +61,15 @@ class Promise:
     """What H(12) and (13) say at the sample times; ``words`` says why where they say nothing.
 
     bound (T, N): trace of H(12); limit, central: traces of S and of the centralised covariance,
-    nan where they do not exist.
+    nan where they do not exist; limit_words names the limit, notes are what to know about both.
     """
 
     bound: FloatArray | None
     limit: float
     central: float
     words: str
+    limit_words: str = "limit S of H(13)"
+    notes: tuple[str, ...] = ()
 
 
 def promise(scenario: Scenario, times: FloatArray) -> Promise:
@@ -81,7 +85,17 @@ def promise(scenario: Scenario, times: FloatArray) -> Promise:
         _trace(limit_covariance, scenario),
         _trace(central_covariance, scenario),
         words or not_promised(scenario) or "",
+        limit_words(scenario),
+        tuple(note for note in (_steady_note(scenario), mismatch_words(scenario)) if note),
     )
+
+
+def _steady_note(scenario: Scenario) -> str:
+    if scenario.slotted or not_promised(scenario) or has_steady_state(scenario):
+        return ""
+    if not scenario.filter.algorithm.talks:
+        return "at some nodes P has no steady state, it grows without end; see netkf theory"
+    return "the bound has no steady state, it grows without end; see netkf theory"
 
 
 def _trace(function: Any, scenario: Scenario) -> float:

@@ -11,7 +11,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.gossip import detecting_walk, mean_matching, primitive
 from netkf.theory.intermittent import critical_probability, unseen
 
-Row = tuple[str, str, bool, str]
+Row = tuple[str, str, bool | None, str]
 SHOWN = 12
 
 
@@ -59,7 +59,7 @@ def _matching(scenario: Scenario) -> list[Row]:
     try:
         mean = mean_matching(scenario)
     except TheoryError as error:
-        return [(name, "G C.1", False, f"not decided: {error}")]
+        return [(name, "G C.1", None, f"not decided: {error}")]
     irreducible, aperiodic, period = primitive(mean)
     if not irreducible:
         words = "some nodes are never reached from others"
@@ -78,7 +78,7 @@ def _walk(scenario: Scenario) -> list[Row]:
     try:
         walk = detecting_walk(scenario)
     except TheoryError as error:
-        return [(name, "G D.1", False, f"not decided: {error}")]
+        return [(name, "G D.1", None, f"not decided: {error}")]
     if walk is None:
         return [
             (
