@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -99,10 +100,35 @@ def test_an_interrupted_run_leaves_what_was_finished(tmp_path, name):
     run.send_signal(getattr(signal, name))
     _, printed = run.communicate(timeout=60)
     assert run.returncode == 130
-    assert printed == "netkf: interrupted; what was finished is kept\n"
+    assert printed == f"netkf: interrupted; what was finished is kept in {out}\n"
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"
     events = pd.read_parquet(out / "events.parquet")
     assert len(events) == manifest["events"] > 0
     assert pd.read_parquet(out / "states.parquet").t.max() > 0.0
     assert not list(out.glob("*.part"))
+
+
+def test_nothing_is_claimed_to_be_kept_where_nothing_was_written(capsys, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("netkf.experiments.promises.promises", stop)
+    assert main(["theory", RING]) == 130
+    assert capsys.readouterr().err == "netkf: interrupted\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_is_told_in_one_line(tmp_path):
+    arguments = ["run", RING, "--set", "horizon=2.0", "--no-plot", "--out", str(tmp_path / "out")]
+    code = f"import sys; from netkf.cli import main; sys.exit(main({arguments!r}))"
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            check=False,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert done.returncode == 2
+    assert done.stderr == "netkf: cannot write: No space left on device\n"

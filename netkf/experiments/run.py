@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import platform
 import time
+import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import numpy as np
 import netkf
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress, silent
+from netkf.experiments.failures import in_words, told
 from netkf.experiments.files import (
     ParquetSink,
     check_sources,
@@ -45,12 +48,16 @@ def run_to_directory(
     engine: str = "auto",
     trace: str = "full",
     progress: Progress = silent,
+    finish: Callable[[Finished], None] | None = None,
 ) -> Finished:
     """Run once and write scenario.toml, manifest.json, the Parquet tables and summary.json.
 
-    ``trace`` is full, first (the same for a single run) or none (no tables). A run that is
-    interrupted keeps what it had: the files are finished, the manifest says ``interrupted``, and
-    KeyboardInterrupt goes on. Raises ScenarioError and EngineError before anything is written.
+    ``trace`` is full, first (the same for a single run) or none (no tables). ``finish`` adds what
+    else belongs to the directory, before the manifest says that it is complete. A run that is
+    interrupted or fails keeps what it had: the files are finished, the manifest says
+    ``interrupted``, or ``failed`` with the error. Raises ScenarioError and EngineError before
+    anything is written, InterruptedRunError (a KeyboardInterrupt) when interrupted, and EngineError
+    where a plugged-in class fails.
     """
     chosen = choose_engine(engine, scenario)
     check_sources(scenario)
@@ -58,33 +65,44 @@ def run_to_directory(
     write_scenario(directory, scenario)
     samples, tables = SummarySink(), ParquetSink(directory, scenario, 0, trace != "none")
     recorder = Recorder([samples, tables])
-    manifest = {
-        "name": scenario.name,
-        "versions": {
-            "netkf": netkf.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
-        "seed": scenario.seed,
-        "runs": {"wanted": 1, "done": 0},
-        "engine": chosen.name,
-    }
+    manifest = Manifest(directory, scenario, scenario.seed, chosen.name)
     # Written at once, so that a run that is killed outright says that it did not finish.
-    status, began = "interrupted", time.perf_counter()
-    write_json(directory / "manifest.json", {**manifest, "status": status})
+    manifest.write("interrupted", None)
+    began, done = time.perf_counter(), False
     try:
         status = chosen.run(scenario, Streams(scenario.seed, 0), recorder, progress)
-    finally:
-        seconds = time.perf_counter() - began
+        seconds, done = time.perf_counter() - began, status == "complete"
         tables.close()
-        manifest["runs"] = {"wanted": 1, "done": int(status == "complete")}
-        manifest |= {
-            "status": status,
-            "events": recorder.total,
-            "fingerprint": recorder.fingerprint,
-        }
-        write_json(directory / "manifest.json", manifest)
-    promised = promise(scenario, np.array(samples.times))
+        promised = promise(scenario, np.array(samples.times))
+        summary = _summary(directory, scenario, samples, promised, recorder)
+        finished = Finished(directory, status, summary, samples, promised, recorder.total, seconds)
+        if finish is not None:
+            finish(finished)
+    except BaseException as error:
+        tables.close()
+        status = "failed" if isinstance(error, Exception) else "interrupted"
+        if not (directory / "summary.json").exists():
+            nothing = Promise(None, np.nan, np.nan, f"not computed: the run {ENDS[status]}")
+            _summary(directory, scenario, samples, nothing, recorder)
+        manifest.write(status, recorder, done, error)
+        reason = told(scenario, error, directory)
+        if reason is error:
+            raise
+        raise reason from error
+    manifest.write(status, recorder, done)
+    return finished
+
+
+ENDS = {"failed": "failed", "interrupted": "was interrupted"}
+
+
+def _summary(
+    directory: Path,
+    scenario: Scenario,
+    samples: SummarySink,
+    promised: Promise,
+    recorder: Recorder,
+) -> dict[str, Any]:
     messages = {
         "sent": recorder.count("send"),
         "delivered": recorder.count("deliver"),
@@ -92,4 +110,41 @@ def run_to_directory(
     }
     summary = summarise(scenario, samples, promised, messages)
     write_json(directory / "summary.json", summary)
-    return Finished(directory, status, summary, samples, promised, recorder.total, seconds)
+    return summary
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """``manifest.json`` of a directory that holds one run."""
+
+    directory: Path
+    scenario: Scenario
+    seed: int
+    engine: str
+
+    def write(
+        self,
+        status: str,
+        recorder: Recorder | None,
+        done: bool = False,
+        error: BaseException | None = None,
+    ) -> None:
+        """Say how the run stands."""
+        manifest: dict[str, Any] = {
+            "name": self.scenario.name,
+            "versions": {
+                "netkf": netkf.__version__,
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
+            "seed": self.seed,
+            "runs": {"wanted": 1, "done": int(done)},
+            "engine": self.engine,
+            "status": status,
+        }
+        if recorder is not None:
+            manifest |= {"events": recorder.total, "fingerprint": recorder.fingerprint}
+        if status == "failed" and error is not None:
+            manifest["error"] = in_words(error)
+            manifest["traceback"] = traceback.format_exception(error)
+        write_json(self.directory / "manifest.json", manifest)

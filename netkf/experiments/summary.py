@@ -24,7 +24,8 @@ ROUNDING = 4.0 * np.finfo(float).eps
 class SummarySink(Sink):
     """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES; and
     how many messages each link delivered. ``rounding_from`` is the first sample at which the state
-    is so large that rounding blurs the errors (unstable plants over long horizons).
+    is so large that rounding blurs the errors (unstable plants over long horizons), ``diverged``
+    are the nodes whose covariance was no longer finite at the last one.
     """
 
     def __init__(self) -> None:
@@ -34,9 +35,11 @@ class SummarySink(Sink):
         self.nees: list[FloatArray] = []
         self.delivered: dict[tuple[int, int], int] = {}
         self.rounding_from: float | None = None
+        self.diverged: list[int] = []
 
     def events(self, rows: np.ndarray) -> None:
         """Deliveries of each link are counted, both directions together."""
+        self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
         arrived = rows[rows["kind"] == CODES["deliver"]]
         ends = np.sort(np.column_stack([arrived["node"], arrived["peer"]]), axis=1)
         pairs, counts = np.unique(ends, axis=0, return_counts=True)
@@ -109,14 +112,17 @@ def summarise(
     scenario: Scenario, sink: SummarySink, promised: Promise, messages: dict[str, int]
 ) -> dict[str, Any]:
     """Per node and overall: time-averaged RMS error, mean trace of P, bound and their ratio, mean
-    NEES over the samples after time 0; messages sent, delivered, lost and still on their way.
+    NEES over the samples after time 0 (of a diverged run without those that rounding blurs);
+    messages sent, delivered, lost and still on their way. Nan where there is no sample.
     """
-    times = np.array(sink.times)
-    used = times > 0.0 if (times > 0.0).any() else times >= 0.0
+    used = _used(np.array(sink.times), sink.rounding_from if sink.diverged else None)
     with np.errstate(all="ignore"):
-        mean_square = np.array(sink.sq_error)[used].mean(axis=0)
-        trace = np.array(sink.trace)[used].mean(axis=0)
-        nees = np.array(sink.nees)[used].mean(axis=0)
+        mean_square, trace, nees = (
+            np.array(values)[used].mean(axis=0)
+            if len(used)
+            else np.full(len(scenario.nodes), np.nan)
+            for values in (sink.sq_error, sink.trace, sink.nees)
+        )
         bound = None if promised.bound is None else promised.bound[used].mean(axis=0)
         nodes = [
             _row(node, mean_square[k], trace[k], None if bound is None else bound[k], nees[k])
@@ -142,6 +148,14 @@ def summarise(
             "in_flight": messages["sent"] - messages["delivered"] - messages["lost"],
         },
     }
+
+
+def _used(times: FloatArray, rounding_from: float | None) -> FloatArray:
+    """Places of the samples that the averages are over."""
+    for wanted in ((times > 0.0) & (times < (rounding_from or np.inf)), times > 0.0):
+        if wanted.any():
+            return np.flatnonzero(wanted)
+    return np.arange(len(times))
 
 
 def _row(node: int, mean_square: Any, trace: Any, bound: Any, nees: Any) -> dict[str, Any]:

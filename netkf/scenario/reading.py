@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import Part, SourceFile, integer, source_file
 from netkf.network.channels import Channel
 from netkf.scenario.registry import SLOTTED, find
@@ -63,6 +63,30 @@ def source_files(part: Any) -> list[SourceFile]:
         values = [getattr(part, field.name) for field in dataclasses.fields(part)]
         return [source for value in values for source in source_files(value)]
     return []
+
+
+def plugged_in(part: Any) -> list[Part]:
+    """The parts of a scenario whose classes are not netkf's own."""
+    if isinstance(part, tuple):
+        return [found for item in part for found in plugged_in(item)]
+    if not isinstance(part, Part):
+        return []
+    inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
+    own = type(part).__module__.partition(".")[0] != "netkf"
+    return [*([part] if own else []), *(found for item in inside for found in plugged_in(item))]
+
+
+def module_files(scenario: Scenario) -> dict[str, Path | None]:
+    """The modules that a scenario's classes come from: the file where it is one file beside the
+    scenario, else None.
+    """
+    folder = getattr(scenario, "_folder", None)
+    found: dict[str, Path | None] = {}
+    for part in plugged_in(scenario):
+        name = type(part).__module__
+        beside = None if folder is None or "." in name else folder / f"{name}.py"
+        found[name] = beside if beside is not None and beside.is_file() else None
+    return found
 
 
 def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,7 +165,19 @@ def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str
         else value
         for name, value in table.items()
     }
-    return cls(**values)
+    return _made(cls, values)
+
+
+def _made(cls: type[Any], values: dict[str, Any]) -> Any:
+    try:
+        return cls(**values)
+    except ScenarioError:
+        raise
+    except Exception as error:
+        if cls.__module__.partition(".")[0] == "netkf":
+            raise
+        words = f"{cls.__name__} could not be made ({type(error).__name__}: {quote(str(error))})"
+        raise ScenarioError("", words, None, "mend the class or its settings") from error
 
 
 def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:
