@@ -150,7 +150,7 @@ def summarise(
     }
 
 
-def _used(times: FloatArray, rounding_from: float | None) -> FloatArray:
+def _used(times: FloatArray, rounding_from: float | None) -> np.ndarray:
     """Places of the samples that the averages are over."""
     for wanted in ((times > 0.0) & (times < (rounding_from or np.inf)), times > 0.0):
         if wanted.any():

@@ -149,7 +149,9 @@ def _forget_other(module_name: str, folder: Path) -> None:
     """A module beside the scenario wins over one of that name imported from elsewhere."""
     beside, loaded = folder / f"{module_name}.py", sys.modules.get(module_name)
     other = getattr(loaded, "__file__", None)
-    if loaded is not None and beside.exists() and (other is None or not beside.samefile(other)):
+    if loaded is None or not beside.exists():
+        return
+    if other is None or not Path(other).exists() or not beside.samefile(other):
         del sys.modules[module_name]
         importlib.invalidate_caches()
 
