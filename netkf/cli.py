@@ -117,7 +117,10 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
         key, equals, text = setting.partition("=")
         key, text = key.strip(), text.strip()
         if not equals or not key or not text:
-            raise ScenarioError("--set", "must be KEY.PATH=VALUE", setting, "write it that way")
+            remedy = "write it that way"
+            if equals and key:
+                remedy = f"give a value; an empty text is written {key}='\"\"'"
+            raise ScenarioError("--set", "must be KEY.PATH=VALUE", setting, remedy)
         try:
             value = tomllib.loads(f"value = {text}")
             if list(value) != ["value"]:

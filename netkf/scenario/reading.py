@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netkf.core.errors import ScenarioError, quote
+from netkf.core.errors import ScenarioError, nearest, quote
 from netkf.core.fields import Part, SourceFile, integer, source_file
 from netkf.network.channels import Channel
 from netkf.scenario.registry import SLOTTED, find
@@ -17,6 +17,7 @@ from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
 from netkf.scenario.writing import as_table
 
 FORMAT = 1
+UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 
 
@@ -26,7 +27,17 @@ def load(path: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario
     try:
         return from_table(with_changes(_parsed(path), changes or {}), path.parent)
     except ScenarioError as error:
-        raise error.in_file(str(path)) from None
+        raise _left_over(error, changes or {}).in_file(str(path)) from None
+
+
+def _left_over(error: ScenarioError, changes: Mapping[str, Any]) -> ScenarioError:
+    """The mistake in other words where a change of kind left keys of the former kind behind."""
+    table = error.key.rpartition(".")[0]
+    if error.rule != UNKNOWN or f"{table}.kind" not in changes or error.key in changes:
+        return error
+    rule = f"is left over from the former kind of {table}"
+    remedy = f"set the whole table, --set '{table}={{ kind = \"...\", ... }}'"
+    return ScenarioError(error.key, rule, error.value, remedy, error.file)
 
 
 def _parsed(path: Path) -> dict[str, Any]:
@@ -50,7 +61,10 @@ def changed(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
     folder = getattr(scenario, "_folder", None)
     if folder is None:  # built in Python
         folder = next((s.folder for s in source_files(scenario)), Path.cwd())
-    return from_table(with_changes(as_table(scenario), changes), folder)
+    try:
+        return from_table(with_changes(as_table(scenario), changes), folder)
+    except ScenarioError as error:
+        raise _left_over(error, changes) from None
 
 
 def source_files(part: Any) -> list[SourceFile]:
@@ -154,7 +168,8 @@ def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str
     for key, value in table.items():
         if key not in fields:
             known = ", ".join([*others, *fields])
-            raise ScenarioError(key, "is not a key here", value, f"keys are {known}")
+            hint = nearest(key, [*others, *fields])
+            raise ScenarioError(key, UNKNOWN, value, f"{hint}keys are {known}")
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in table:
             remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
