@@ -91,9 +91,9 @@ def check_sources(scenario: Scenario) -> None:
             raise ScenarioError("path", words, source.name, "rename the file")
 
 
-def write_scenario(directory: Path, scenario: Scenario) -> None:
-    """The scenario as resolved, with the files it names beside it and the modules that lie beside
-    the scenario; it gives the same run again.
+def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None) -> None:
+    """The scenario as resolved, with the files it names and the modules that lie beside it, and
+    another root ``seed`` where one is given; it gives the same run again.
     """
     for source in source_files(scenario):
         target = directory / source.name
@@ -102,7 +102,9 @@ def write_scenario(directory: Path, scenario: Scenario) -> None:
     for module in module_files(scenario).values():
         if module is not None:
             shutil.copyfile(module, directory / module.name)
-    write_text(directory / "scenario.toml", to_toml(resolved(scenario)))
+    table = resolved(scenario)
+    table["seed"] = scenario.seed if seed is None else seed
+    write_text(directory / "scenario.toml", to_toml(table))
 
 
 def missing_modules(scenario: Scenario) -> list[str]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import netkf
+from netkf.core.errors import ScenarioError
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress, silent
 from netkf.experiments.failures import in_words, told
@@ -27,6 +28,7 @@ from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, SummarySink, promise, summarise
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
+from netkf.trace.run import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +67,16 @@ def run_to_directory(
     write_scenario(directory, scenario)
     samples, tables = SummarySink(), ParquetSink(directory, scenario, 0, trace != "none")
     recorder = Recorder([samples, tables])
-    manifest = Manifest(directory, scenario, scenario.seed, chosen.name)
+    manifest = Manifest(directory, scenario.name, scenario.seed, 0, chosen.name)
     # Written at once, so that a run that is killed outright says that it did not finish.
-    manifest.write("interrupted", None)
+    manifest.write("interrupted", {})
     began, done = time.perf_counter(), False
     try:
         status = chosen.run(scenario, Streams(scenario.seed, 0), recorder, progress)
         seconds, done = time.perf_counter() - began, status == "complete"
         tables.close()
         promised = promise(scenario, np.array(samples.times))
-        summary = _summary(directory, scenario, samples, promised, recorder)
+        summary = _summary(directory, scenario, samples, promised, recorder.count)
         finished = Finished(directory, status, summary, samples, promised, recorder.total, seconds)
         if finish is not None:
             finish(finished)
@@ -83,14 +85,45 @@ def run_to_directory(
         status = "failed" if isinstance(error, Exception) else "interrupted"
         if not (directory / "summary.json").exists():
             nothing = Promise(None, np.nan, np.nan, f"not computed: the run {ENDS[status]}")
-            _summary(directory, scenario, samples, nothing, recorder)
-        manifest.write(status, recorder, done, error)
+            _summary(directory, scenario, samples, nothing, recorder.count)
+        manifest.write(status, _totals(recorder), done, error)
         reason = told(scenario, error, directory)
         if reason is error:
             raise
         raise reason from error
-    manifest.write(status, recorder, done)
+    manifest.write(status, _totals(recorder), done)
     return finished
+
+
+def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
+    """Write a run that is in memory as ``netkf run`` would have: scenario.toml, manifest.json, the
+    Parquet tables and summary.json; returns the directory, which must be new or empty.
+
+    The scenario.toml carries the run's seed; running it again gives the same files for replica 0.
+    Raises ScenarioError where the run is of another scenario.
+    """
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        rule = "must be a run of this scenario: its nodes or its state differ"
+        raise ScenarioError("run", rule, run, "save it with the scenario it was simulated from")
+    check_sources(scenario)
+    folder = new_directory(Path(directory), scenario.name)
+    write_scenario(folder, scenario, run.seed)
+    manifest = Manifest(folder, scenario.name, run.seed, run.replica, run.engine)
+    manifest.write("interrupted", {})
+    samples, tables = SummarySink(), ParquetSink(folder, scenario, run.replica, True)
+    for sink in (samples, tables):
+        sink.events(run.log)
+        for sample in zip(run.times.tolist(), run.x, run.xhat, run.P, strict=True):
+            sink.states(*sample)
+    tables.close()
+    _summary(folder, scenario, samples, promise(scenario, run.times), run.count)
+    totals = {"events": len(run.log), "fingerprint": run.fingerprint}
+    manifest.write(run.status, totals, run.status == "complete")
+    return folder
+
+
+def _totals(recorder: Recorder) -> dict[str, Any]:
+    return {"events": recorder.total, "fingerprint": recorder.fingerprint}
 
 
 ENDS = {"failed": "failed", "interrupted": "was interrupted"}
@@ -101,12 +134,12 @@ def _summary(
     scenario: Scenario,
     samples: SummarySink,
     promised: Promise,
-    recorder: Recorder,
+    count: Callable[[str], int],
 ) -> dict[str, Any]:
     messages = {
-        "sent": recorder.count("send"),
-        "delivered": recorder.count("deliver"),
-        "lost": recorder.count("lost"),
+        "sent": count("send"),
+        "delivered": count("deliver"),
+        "lost": count("lost"),
     }
     summary = summarise(scenario, samples, promised, messages)
     write_json(directory / "summary.json", summary)
@@ -118,32 +151,33 @@ class Manifest:
     """``manifest.json`` of a directory that holds one run."""
 
     directory: Path
-    scenario: Scenario
+    name: str
     seed: int
+    replica: int
     engine: str
 
     def write(
         self,
         status: str,
-        recorder: Recorder | None,
+        totals: dict[str, Any],
         done: bool = False,
         error: BaseException | None = None,
     ) -> None:
         """Say how the run stands."""
         manifest: dict[str, Any] = {
-            "name": self.scenario.name,
+            "name": self.name,
             "versions": {
                 "netkf": netkf.__version__,
                 "numpy": np.__version__,
                 "python": platform.python_version(),
             },
             "seed": self.seed,
+            "replica": self.replica,
             "runs": {"wanted": 1, "done": int(done)},
             "engine": self.engine,
             "status": status,
+            **totals,
         }
-        if recorder is not None:
-            manifest |= {"events": recorder.total, "fingerprint": recorder.fingerprint}
         if status == "failed" and error is not None:
             manifest["error"] = in_words(error)
             manifest["traceback"] = traceback.format_exception(error)
