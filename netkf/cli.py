@@ -230,10 +230,17 @@ class _Meter:
 
 
 def _theory(options: argparse.Namespace) -> int:
+    from netkf.experiments.failures import told
     from netkf.experiments.promises import promises, promises_text
 
     scenario = _load(options)
-    found = promises(scenario)
+    try:
+        found = promises(scenario)
+    except Exception as error:
+        reason = told(scenario, error)
+        if reason is error:
+            raise
+        raise reason from error
     _notes(scenario)
     if options.json:
         print(json.dumps(found, indent=2))

@@ -16,7 +16,8 @@ import pyarrow.parquet as pq
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
-from netkf.scenario.reading import module_files, source_files
+from netkf.scenario.plugins import module_files
+from netkf.scenario.reading import source_files
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import resolved, to_toml
 from netkf.trace.recorder import Sink

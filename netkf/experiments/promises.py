@@ -13,6 +13,7 @@ from netkf.core.errors import TheoryError
 from netkf.experiments.files import finite
 from netkf.experiments.tables import MOST_NODES, number, table
 from netkf.experiments.words import limit_words, mismatch_words, without_delay
+from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
     assumptions,
@@ -40,7 +41,7 @@ def promises(scenario: Scenario) -> dict[str, Any]:
     rows = assumptions(scenario)
     found: dict[str, Any] = {
         "scenario": scenario.name,
-        "filter": type(scenario.filter.algorithm).__name__.lower(),
+        "filter": name_of("filter", scenario.filter.algorithm),
         "nodes": list(scenario.nodes),
         "assumptions": [
             {"assumption": a, "source": s, "holds": None if h is None else bool(h), "evidence": e}

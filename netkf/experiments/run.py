@@ -16,7 +16,7 @@ import netkf
 from netkf.core.errors import ScenarioError
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress, silent
-from netkf.experiments.failures import in_words, told
+from netkf.experiments.failures import told
 from netkf.experiments.files import (
     ParquetSink,
     check_sources,
@@ -26,6 +26,7 @@ from netkf.experiments.files import (
 )
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, SummarySink, promise, summarise
+from netkf.scenario.plugins import in_words
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 from netkf.trace.run import Run

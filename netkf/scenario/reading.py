@@ -9,9 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netkf.core.errors import ScenarioError, nearest, quote
+from netkf.core.errors import ScenarioError, nearest
 from netkf.core.fields import Part, SourceFile, integer, source_file
 from netkf.network.channels import Channel
+from netkf.scenario.plugins import blame, in_words, is_ours
 from netkf.scenario.registry import SLOTTED, find
 from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
 from netkf.scenario.writing import as_table
@@ -77,30 +78,6 @@ def source_files(part: Any) -> list[SourceFile]:
         values = [getattr(part, field.name) for field in dataclasses.fields(part)]
         return [source for value in values for source in source_files(value)]
     return []
-
-
-def plugged_in(part: Any) -> list[Part]:
-    """The parts of a scenario whose classes are not netkf's own."""
-    if isinstance(part, tuple):
-        return [found for item in part for found in plugged_in(item)]
-    if not isinstance(part, Part):
-        return []
-    inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
-    own = type(part).__module__.partition(".")[0] != "netkf"
-    return [*([part] if own else []), *(found for item in inside for found in plugged_in(item))]
-
-
-def module_files(scenario: Scenario) -> dict[str, Path | None]:
-    """The modules that a scenario's classes come from: the file where it is one file beside the
-    scenario, else None.
-    """
-    folder = getattr(scenario, "_folder", None)
-    found: dict[str, Path | None] = {}
-    for part in plugged_in(scenario):
-        name = type(part).__module__
-        beside = None if folder is None or "." in name else folder / f"{name}.py"
-        found[name] = beside if beside is not None and beside.is_file() else None
-    return found
 
 
 def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,9 +166,12 @@ def _made(cls: type[Any], values: dict[str, Any]) -> Any:
     except ScenarioError:
         raise
     except Exception as error:
-        if cls.__module__.partition(".")[0] == "netkf":
+        # A class of the user's failed, this one or one that the scenario asked.
+        words = f"{cls.__name__} could not be made ({in_words(error)})"
+        if is_ours(cls):
+            words = blame(tuple(values.values()), error) or ""
+        if not words:
             raise
-        words = f"{cls.__name__} could not be made ({type(error).__name__}: {quote(str(error))})"
         raise ScenarioError("", words, None, "mend the class or its settings") from error
 
 

@@ -136,6 +136,16 @@ class Nan(Hybrid):
         return state._replace(P=state.P * float("nan"))
 
 
+class Weightless(Hybrid):
+    def weight(self, degree, peer_degree):
+        return 1 / (degree - 2)
+
+
+class Limitless(Hybrid):
+    def largest_degree(self):
+        return self.nothing
+
+
 class Picky(Hybrid):
     def __post_init__(self):
         raise ValueError("not today")
@@ -218,6 +228,19 @@ def test_an_error_in_a_class_of_netkf_is_not_covered_up(ring, tmp_path, monkeypa
 def test_a_class_that_cannot_be_made_is_refused(plugged):
     with pytest.raises(netkf.ScenarioError, match=r"filter: Picky could not .*not today"):
         netkf.load(plugged("Picky"))
+    words = r"toml: failing_filters:Limitless failed in largest_degree: AttributeError.*; mend"
+    with pytest.raises(netkf.ScenarioError, match=words):
+        netkf.load(plugged("Limitless"))
+
+
+@pytest.mark.parametrize("command", ["run", "theory"])
+def test_a_class_that_fails_at_the_start_is_named_in_one_line(plugged, command, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "out")] if command == "run" else []
+    assert main([command, str(plugged("Weightless")), *out]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("netkf: failing_filters:Weightless failed in weight: ZeroDiv")
+    assert len(printed.err.splitlines()) == 1
 
 
 def test_a_covariance_that_is_not_a_number_is_not_called_an_overflow(plugged, tmp_path, capsys):
