@@ -33,6 +33,15 @@ def test_run_ends_with_a_table_and_a_picture(tmp_path, capsys):
     assert (out / "run.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_missing_matplotlib_is_told_and_costs_the_picture_only(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "netkf.experiments.plots", None)
+    out = tmp_path / "out"
+    assert main(["run", RING, "--out", str(out), "--set", "horizon=2.0"]) == 0
+    assert "pip install matplotlib" in capsys.readouterr().err
+    assert json.loads((out / "manifest.json").read_text())["status"] == "complete"
+    assert not (out / "run.png").exists()
+
+
 def test_no_bound_is_shown_where_none_is_promised(tmp_path, capsys):
     changes = ["--set", 'network.channel.delay={kind="exponential", mean=0.1}', "--no-plot"]
     assert main(["run", RING, "--out", str(tmp_path / "o"), "--set", "horizon=3.0", *changes]) == 0
