@@ -8,32 +8,45 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
 
 if TYPE_CHECKING:
-    from netkf import theory
+    from netkf import parts, theory
+    from netkf.experiments.run import save
     from netkf.experiments.simulate import simulate
     from netkf.scenario.reading import load
-    from netkf.scenario.scenario import Scenario
+    from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
     from netkf.trace.run import Run, first_difference
 
 __version__ = "0.1.0"
 
 _WHERE = {
+    "Belief": "netkf.scenario.scenario",
+    "Filtering": "netkf.scenario.scenario",
+    "Network": "netkf.scenario.scenario",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
     "first_difference": "netkf.trace.run",
     "load": "netkf.scenario.reading",
+    "parts": "netkf.parts",
+    "save": "netkf.experiments.run",
     "simulate": "netkf.experiments.simulate",
     "theory": "netkf.theory",
 }
 
+_MODULES = ("parts", "theory")
+
 __all__ = [
+    "Belief",
     "EngineError",
+    "Filtering",
     "NetkfError",
+    "Network",
     "Run",
     "Scenario",
     "ScenarioError",
     "TheoryError",
     "first_difference",
     "load",
+    "parts",
+    "save",
     "simulate",
     "theory",
 ]
@@ -44,7 +57,7 @@ def __getattr__(name: str) -> Any:
     if name not in _WHERE:
         raise AttributeError(f"module 'netkf' has no attribute {name!r}")
     module = importlib.import_module(_WHERE[name])
-    return module if name == "theory" else getattr(module, name)
+    return module if name in _MODULES else getattr(module, name)
 
 
 def __dir__() -> list[str]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import os
 import signal
 import sys
 import threading
 import tomllib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,23 +23,38 @@ if TYPE_CHECKING:
 
 BAD_USAGE, INTERRUPTED = 2, 130
 LONGEST_WORD = 1000
+MOST_NODES = 12
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status is 0 done, 2 bad usage or file, 130 interrupted."""
+    """Run the command line; the exit status is 0 done, 2 bad usage or file or a failure that one
+    line tells, 130 interrupted.
+    """
     options = _parser().parse_args(arguments)
     try:
         status: int = options.command(options)
+        sys.stdout.flush()
     except NetkfError as error:
         print(f"netkf: {error}", file=sys.stderr)
         return BAD_USAGE
-    except KeyboardInterrupt:
-        print("netkf: interrupted; what was finished is kept", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"netkf: interrupted; {stop}" if str(stop) else "netkf: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        print(f"netkf: cannot write: {error.strerror or error}{where}", file=sys.stderr)
+        _abandon_output()
+        return BAD_USAGE
     return status
+
+
+def _abandon_output() -> None:
+    """What could not be printed is not tried again when Python ends."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):
@@ -99,7 +117,10 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
         key, equals, text = setting.partition("=")
         key, text = key.strip(), text.strip()
         if not equals or not key or not text:
-            raise ScenarioError("--set", "must be KEY.PATH=VALUE", setting, "write it that way")
+            remedy = "write it that way"
+            if equals and key:
+                remedy = f"give a value; an empty text is written {key}='\"\"'"
+            raise ScenarioError("--set", "must be KEY.PATH=VALUE", setting, remedy)
         try:
             value = tomllib.loads(f"value = {text}")
             if list(value) != ["value"]:
@@ -132,6 +153,7 @@ def _notes(scenario: Scenario) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from netkf.experiments.files import missing_modules
     from netkf.experiments.run import run_to_directory
     from netkf.experiments.tables import summary_table
 
@@ -139,27 +161,47 @@ def _run(options: argparse.Namespace) -> int:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
     meter = _Meter(scenario.horizon)
-    finished = run_to_directory(scenario, options.out, options.engine, options.trace, meter)
-    meter.close()
+    picture = None if options.no_plot else partial(_picture, scenario)
+    try:
+        finished = run_to_directory(
+            scenario, options.out, options.engine, options.trace, meter, picture
+        )
+    finally:
+        meter.close()
     _notes(scenario)
+    for note in missing_modules(scenario):
+        print(f"note: {note}", file=sys.stderr)
     print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
     print()
-    print(summary_table(finished.summary))
+    promised = finished.promised
+    print(summary_table(finished.summary, promised.limit_words, promised.notes))
     rate = finished.events / max(finished.seconds, 1e-9)
     print(f"events: {finished.events:,} in {finished.seconds:.2f} s, {rate:,.0f} per second")
     if finished.status != "complete":
-        print(f"status: {finished.status}, a covariance overflowed before the horizon")
-    if not options.no_plot:
-        _picture(scenario, finished)
+        words = _divergence(finished)
+        print(f"status: {words}")
+        print(f"note: {words}", file=sys.stderr)
     print(f"written to {finished.directory}")
     return 0
+
+
+def _divergence(finished: Any) -> str:
+    nodes = finished.samples.diverged
+    listed = ", ".join(map(str, nodes[:MOST_NODES])) + (", ..." if len(nodes) > MOST_NODES else "")
+    several = "s" if len(nodes) > 1 else ""
+    blurred = finished.samples.rounding_from
+    left_out = "" if blurred is None else f"; averages are over the samples before {blurred:g} s"
+    return (
+        f"{finished.status}, the covariance of node{several} {listed} is no longer finite at "
+        f"{finished.samples.times[-1]:g} s and the run ended there{left_out}"
+    )
 
 
 def _picture(scenario: Scenario, finished: Any) -> None:
     try:
         from netkf.experiments.plots import run_picture
     except ImportError:
-        print('no picture: matplotlib is missing (pip install "netkf[plot]")')
+        print("no picture: matplotlib is missing (pip install matplotlib)", file=sys.stderr)
         return
     run_picture(scenario, finished)
 
@@ -188,10 +230,17 @@ class _Meter:
 
 
 def _theory(options: argparse.Namespace) -> int:
+    from netkf.experiments.failures import told
     from netkf.experiments.promises import promises, promises_text
 
     scenario = _load(options)
-    found = promises(scenario)
+    try:
+        found = promises(scenario)
+    except Exception as error:
+        reason = told(scenario, error)
+        if reason is error:
+            raise
+        raise reason from error
     _notes(scenario)
     if options.json:
         print(json.dumps(found, indent=2))

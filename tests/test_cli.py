@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -30,6 +31,15 @@ def test_run_ends_with_a_table_and_a_picture(tmp_path, capsys):
     ):
         assert words in printed.out
     assert (out / "run.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_missing_matplotlib_is_told_and_costs_the_picture_only(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "netkf.experiments.plots", None)
+    out = tmp_path / "out"
+    assert main(["run", RING, "--out", str(out), "--set", "horizon=2.0"]) == 0
+    assert "pip install matplotlib" in capsys.readouterr().err
+    assert json.loads((out / "manifest.json").read_text())["status"] == "complete"
+    assert not (out / "run.png").exists()
 
 
 def test_no_bound_is_shown_where_none_is_promised(tmp_path, capsys):
@@ -99,10 +109,35 @@ def test_an_interrupted_run_leaves_what_was_finished(tmp_path, name):
     run.send_signal(getattr(signal, name))
     _, printed = run.communicate(timeout=60)
     assert run.returncode == 130
-    assert printed == "netkf: interrupted; what was finished is kept\n"
+    assert printed == f"netkf: interrupted; what was finished is kept in {out}\n"
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"
     events = pd.read_parquet(out / "events.parquet")
     assert len(events) == manifest["events"] > 0
     assert pd.read_parquet(out / "states.parquet").t.max() > 0.0
     assert not list(out.glob("*.part"))
+
+
+def test_nothing_is_claimed_to_be_kept_where_nothing_was_written(capsys, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("netkf.experiments.promises.promises", stop)
+    assert main(["theory", RING]) == 130
+    assert capsys.readouterr().err == "netkf: interrupted\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_is_told_in_one_line(tmp_path):
+    arguments = ["run", RING, "--set", "horizon=2.0", "--no-plot", "--out", str(tmp_path / "out")]
+    code = f"import sys; from netkf.cli import main; sys.exit(main({arguments!r}))"
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            check=False,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert done.returncode == 2
+    assert done.stderr == "netkf: cannot write: No space left on device\n"

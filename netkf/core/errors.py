@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class NetkfError(Exception):
     """Root of every error that netkf raises on purpose."""
@@ -49,6 +51,14 @@ class ScenarioError(NetkfError, ValueError):
 def _printable(key: str, longest: int = 120) -> str:
     shown = key if key.isprintable() else key.encode("unicode_escape").decode()
     return shown if len(shown) <= longest else f"{shown[: longest // 2]} ... {shown[-20:]}"
+
+
+def nearest(word: object, known: Iterable[str]) -> str:
+    """``did you mean "..."?`` and a blank where one of the known words is close, else nothing."""
+    import difflib
+
+    found = difflib.get_close_matches(str(word), list(known), n=1)
+    return f'did you mean "{found[0]}"? ' if found else ""
 
 
 def quote(value: object, longest: int = 80) -> str:

@@ -40,12 +40,18 @@ class Rule:
         except ScenarioError as error:
             raise error.under(key) from None
         except (TypeError, ValueError, OverflowError) as error:
-            words = str(error) if isinstance(error, _BecauseError) else self.words
-            raise ScenarioError(key, words, value, self.remedy) from None
+            because = isinstance(error, _BecauseError)
+            words = str(error) if because else self.words
+            remedy = getattr(error, "remedy", "") or self.remedy
+            raise ScenarioError(key, words, value, remedy) from None
 
 
 class _BecauseError(ValueError):
-    """A ValueError whose message is meant for the user."""
+    """A ValueError whose message is meant for the user; ``remedy`` may say better what to do."""
+
+    def __init__(self, words: str, remedy: str = "") -> None:
+        super().__init__(words)
+        self.remedy = remedy
 
 
 def setting(rule: Rule, default: Any = MISSING) -> Any:
@@ -233,6 +239,9 @@ def array(dimensions: int, kind: str) -> Rule:
         if isinstance(value, (str, bytes)) or _has_bool(value):
             raise TypeError
         result = frozen(value)
+        if result.ndim == 0:
+            open_, close = "[" * dimensions, "]" * dimensions
+            raise _BecauseError(f"must be a {kind}", f"write {open_}{result.item():g}{close}")
         if result.ndim != dimensions or result.size == 0:
             raise _BecauseError(f"must be a {kind}")
         if not np.isfinite(result).all():

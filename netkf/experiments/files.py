@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
+from netkf.scenario.plugins import module_files
 from netkf.scenario.reading import source_files
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import resolved, to_toml
@@ -91,13 +92,30 @@ def check_sources(scenario: Scenario) -> None:
             raise ScenarioError("path", words, source.name, "rename the file")
 
 
-def write_scenario(directory: Path, scenario: Scenario) -> None:
-    """The scenario as resolved, with the files it names beside it; it gives the same run again."""
+def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None) -> None:
+    """The scenario as resolved, with the files it names and the modules that lie beside it, and
+    another root ``seed`` where one is given; it gives the same run again.
+    """
     for source in source_files(scenario):
         target = directory / source.name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source.full, target)
-    write_text(directory / "scenario.toml", to_toml(resolved(scenario)))
+    for module in module_files(scenario).values():
+        if module is not None:
+            shutil.copyfile(module, directory / module.name)
+    table = resolved(scenario)
+    table["seed"] = scenario.seed if seed is None else seed
+    write_text(directory / "scenario.toml", to_toml(table))
+
+
+def missing_modules(scenario: Scenario) -> list[str]:
+    """One line about each module that a run directory needs and does not hold."""
+    return [
+        f"the run directory needs the Python module {name}, which was not copied into it: it is no "
+        "single file beside the scenario"
+        for name, file in module_files(scenario).items()
+        if file is None
+    ]
 
 
 class ParquetSink(Sink):
@@ -144,6 +162,7 @@ class _Table:
     def __init__(self, path: Path) -> None:
         self._path, self._part = path, path.with_name(path.name + ".part")
         self._writer: Any = None
+        self._closed = False
 
     def write(self, columns: dict[str, Any]) -> None:
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
@@ -152,6 +171,9 @@ class _Table:
         self._writer.write_table(table)
 
     def close(self, empty: Callable[[], dict[str, Any]] | None) -> None:
+        if self._closed:
+            return
+        self._closed = True
         if self._writer is None and empty is not None:
             self.write(empty())
         if self._writer is not None:

@@ -19,6 +19,7 @@ from netkf.scenario.scenario import Scenario
 
 SENSING, RELAY, PROMISE, DARK = "#c1440e", "#3b6ea5", "#222222", "#555555"
 MOST_LINES = 60
+LONGEST_LEGEND = 72
 
 
 def run_picture(scenario: Scenario, finished: Finished) -> None:
@@ -56,14 +57,15 @@ def _lines(axes: Any, times: FloatArray, values: FloatArray, scenario: Scenario)
 
 
 def _legend(axes: Any) -> None:
-    if not axes.get_legend_handles_labels()[0]:
+    labels = axes.get_legend_handles_labels()[1]
+    if not labels:
         return
     axes.legend(
         frameon=False,
         fontsize=7.5,
         loc="lower left",
         bbox_to_anchor=(0.0, 0.98),
-        ncols=4,
+        ncols=4 if sum(map(len, labels)) < LONGEST_LEGEND else 2,
         columnspacing=1.2,
         handlelength=1.6,
         borderaxespad=0.2,
@@ -124,7 +126,7 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
             zorder=3,
         )
     for value, words, style in (
-        (promised.limit, "limit S, H(13)", "-."),
+        (promised.limit, promised.limit_words, "-."),
         (promised.central, "centralised filter", "-"),
     ):
         if math.isfinite(value):

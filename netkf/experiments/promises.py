@@ -12,6 +12,8 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.experiments.files import finite
 from netkf.experiments.tables import MOST_NODES, number, table
+from netkf.experiments.words import limit_words, mismatch_words, without_delay
+from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
     assumptions,
@@ -22,16 +24,14 @@ from netkf.theory import (
     steady_covariance_bound,
     true_limit_covariance,
 )
+from netkf.theory.steady import steady_by_node
 
-LIMITS: tuple[tuple[str, str, Callable[[Scenario], FloatArray]], ...] = (
-    ("limit_covariance", "limit of the bound as links tick ever faster, H(13)", limit_covariance),
-    (
-        "true_limit_covariance",
-        "limit of the true error covariance (derived)",
-        true_limit_covariance,
-    ),
-    ("central_covariance", "centralised filter with all readings", central_covariance),
-)
+MARKS = {True: "holds", False: "FAILS", None: "unknown"}
+LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
+    "limit_covariance": limit_covariance,
+    "true_limit_covariance": true_limit_covariance,
+    "central_covariance": central_covariance,
+}
 
 
 def promises(scenario: Scenario) -> dict[str, Any]:
@@ -41,10 +41,10 @@ def promises(scenario: Scenario) -> dict[str, Any]:
     rows = assumptions(scenario)
     found: dict[str, Any] = {
         "scenario": scenario.name,
-        "filter": type(scenario.filter.algorithm).__name__.lower(),
+        "filter": name_of("filter", scenario.filter.algorithm),
         "nodes": list(scenario.nodes),
         "assumptions": [
-            {"assumption": a, "source": s, "holds": bool(h), "evidence": e}
+            {"assumption": a, "source": s, "holds": None if h is None else bool(h), "evidence": e}
             for a, s, h, e in rows.itertuples(index=False)
         ],
     }
@@ -54,8 +54,8 @@ def promises(scenario: Scenario) -> dict[str, Any]:
         return plain
     ends = np.array([scenario.horizon])
     found["bound_at_horizon"] = _value(lambda: covariance_bound(scenario, ends)[0])
-    found["steady_bound"] = _value(lambda: steady_covariance_bound(scenario))
-    for name, _, function in LIMITS:
+    found["steady_bound"] = _steady(scenario)
+    for name, function in LIMITS.items():
         found[name] = _value(lambda function=function: function(scenario))  # type: ignore[misc]
     whole: dict[str, Any] = finite(found)
     return whole
@@ -65,6 +65,14 @@ def _slot_central(scenario: Scenario) -> FloatArray:
     """P*: the prediction covariance of a filter that gets every reading in every slot."""
     model = scenario.pooled_slot_model
     return steady_covariance(model.F, model.Q, model.H, model.R)
+
+
+def _steady(scenario: Scenario) -> dict[str, Any]:
+    """Where filters do not talk, some nodes may have a steady state and others none."""
+    found = _value(lambda: steady_covariance_bound(scenario))
+    if found["reason"] and not scenario.filter.algorithm.talks:
+        found = {**_value(lambda: steady_by_node(scenario)), "reason": found["reason"]}
+    return found
 
 
 def _value(function: Callable[[], FloatArray]) -> dict[str, Any]:
@@ -84,10 +92,10 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
         "assumptions",
     ]
     for row in found["assumptions"]:
-        mark = "holds" if row["holds"] else "FAILS"
-        lines.append(f"  {mark}  {row['assumption']}  [{row['source']}]")
+        mark = MARKS[row["holds"]]
+        lines.append(f"  {mark:7}  {row['assumption']}  [{row['source']}]")
         lines += textwrap.wrap(
-            row["evidence"], 92, initial_indent=" " * 9, subsequent_indent=" " * 9
+            row["evidence"], 94, initial_indent=" " * 11, subsequent_indent=" " * 11
         )
     if scenario.slotted:
         value = found["slot_central_covariance"]
@@ -104,11 +112,16 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
     if any(column["trace"] for column in columns):
         lines.append(textwrap.indent(_by_node(scenario, columns), "  "))
     lines += ["", "traces to compare"]
-    delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
-    for name, words, _ in LIMITS:
-        value = found[name]
-        note = ", if messages took no time" if delayed and name != "central_covariance" else ""
-        lines.append(f"  {words}{note}: {value['reason'] or number(value['trace'])}")
+    names = {
+        "limit_covariance": f"{limit_words(scenario)}, as links tick ever faster",
+        "true_limit_covariance": "limit of the true error covariance (derived)"
+        + without_delay(scenario),
+        "central_covariance": "centralised filter with all readings",
+    }
+    for name, words in names.items():
+        lines.append(f"  {words}: {found[name]['reason'] or number(found[name]['trace'])}")
+    if mismatch_words(scenario):
+        lines.append(f"note: {mismatch_words(scenario)}")
     return "\n".join(lines)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import platform
 import time
+import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,10 @@ from typing import Any
 import numpy as np
 
 import netkf
+from netkf.core.errors import ScenarioError
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress, silent
+from netkf.experiments.failures import told
 from netkf.experiments.files import (
     ParquetSink,
     check_sources,
@@ -22,8 +26,10 @@ from netkf.experiments.files import (
 )
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, SummarySink, promise, summarise
+from netkf.scenario.plugins import in_words
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
+from netkf.trace.run import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +51,16 @@ def run_to_directory(
     engine: str = "auto",
     trace: str = "full",
     progress: Progress = silent,
+    finish: Callable[[Finished], None] | None = None,
 ) -> Finished:
     """Run once and write scenario.toml, manifest.json, the Parquet tables and summary.json.
 
-    ``trace`` is full, first (the same for a single run) or none (no tables). A run that is
-    interrupted keeps what it had: the files are finished, the manifest says ``interrupted``, and
-    KeyboardInterrupt goes on. Raises ScenarioError and EngineError before anything is written.
+    ``trace`` is full, first (the same for a single run) or none (no tables). ``finish`` adds what
+    else belongs to the directory, before the manifest says that it is complete. A run that is
+    interrupted or fails keeps what it had: the files are finished, the manifest says
+    ``interrupted``, or ``failed`` with the error. Raises ScenarioError and EngineError before
+    anything is written, InterruptedRunError (a KeyboardInterrupt) when interrupted, and EngineError
+    where a plugged-in class fails.
     """
     chosen = choose_engine(engine, scenario)
     check_sources(scenario)
@@ -58,38 +68,118 @@ def run_to_directory(
     write_scenario(directory, scenario)
     samples, tables = SummarySink(), ParquetSink(directory, scenario, 0, trace != "none")
     recorder = Recorder([samples, tables])
-    manifest = {
-        "name": scenario.name,
-        "versions": {
-            "netkf": netkf.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
-        "seed": scenario.seed,
-        "runs": {"wanted": 1, "done": 0},
-        "engine": chosen.name,
-    }
+    manifest = Manifest(directory, scenario.name, scenario.seed, 0, chosen.name)
     # Written at once, so that a run that is killed outright says that it did not finish.
-    status, began = "interrupted", time.perf_counter()
-    write_json(directory / "manifest.json", {**manifest, "status": status})
+    manifest.write("interrupted", {})
+    began, done = time.perf_counter(), False
     try:
         status = chosen.run(scenario, Streams(scenario.seed, 0), recorder, progress)
-    finally:
-        seconds = time.perf_counter() - began
+        seconds, done = time.perf_counter() - began, status == "complete"
         tables.close()
-        manifest["runs"] = {"wanted": 1, "done": int(status == "complete")}
-        manifest |= {
-            "status": status,
-            "events": recorder.total,
-            "fingerprint": recorder.fingerprint,
-        }
-        write_json(directory / "manifest.json", manifest)
-    promised = promise(scenario, np.array(samples.times))
+        promised = promise(scenario, np.array(samples.times))
+        summary = _summary(directory, scenario, samples, promised, recorder.count)
+        finished = Finished(directory, status, summary, samples, promised, recorder.total, seconds)
+        if finish is not None:
+            finish(finished)
+    except BaseException as error:
+        tables.close()
+        status = "failed" if isinstance(error, Exception) else "interrupted"
+        if not (directory / "summary.json").exists():
+            nothing = Promise(None, np.nan, np.nan, f"not computed: the run {ENDS[status]}")
+            _summary(directory, scenario, samples, nothing, recorder.count)
+        manifest.write(status, _totals(recorder), done, error)
+        reason = told(scenario, error, directory)
+        if reason is error:
+            raise
+        raise reason from error
+    manifest.write(status, _totals(recorder), done)
+    return finished
+
+
+def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
+    """Write a run that is in memory as ``netkf run`` would have: scenario.toml, manifest.json, the
+    Parquet tables and summary.json; returns the directory, which must be new or empty.
+
+    The scenario.toml carries the run's seed; running it again gives the same files for replica 0.
+    Raises ScenarioError where the run is of another scenario.
+    """
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        rule = "must be a run of this scenario: its nodes or its state differ"
+        raise ScenarioError("run", rule, run, "save it with the scenario it was simulated from")
+    check_sources(scenario)
+    folder = new_directory(Path(directory), scenario.name)
+    write_scenario(folder, scenario, run.seed)
+    manifest = Manifest(folder, scenario.name, run.seed, run.replica, run.engine)
+    manifest.write("interrupted", {})
+    samples, tables = SummarySink(), ParquetSink(folder, scenario, run.replica, True)
+    for sink in (samples, tables):
+        sink.events(run.log)
+        for sample in zip(run.times.tolist(), run.x, run.xhat, run.P, strict=True):
+            sink.states(*sample)
+    tables.close()
+    _summary(folder, scenario, samples, promise(scenario, run.times), run.count)
+    totals = {"events": len(run.log), "fingerprint": run.fingerprint}
+    manifest.write(run.status, totals, run.status == "complete")
+    return folder
+
+
+def _totals(recorder: Recorder) -> dict[str, Any]:
+    return {"events": recorder.total, "fingerprint": recorder.fingerprint}
+
+
+ENDS = {"failed": "failed", "interrupted": "was interrupted"}
+
+
+def _summary(
+    directory: Path,
+    scenario: Scenario,
+    samples: SummarySink,
+    promised: Promise,
+    count: Callable[[str], int],
+) -> dict[str, Any]:
     messages = {
-        "sent": recorder.count("send"),
-        "delivered": recorder.count("deliver"),
-        "lost": recorder.count("lost"),
+        "sent": count("send"),
+        "delivered": count("deliver"),
+        "lost": count("lost"),
     }
     summary = summarise(scenario, samples, promised, messages)
     write_json(directory / "summary.json", summary)
-    return Finished(directory, status, summary, samples, promised, recorder.total, seconds)
+    return summary
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """``manifest.json`` of a directory that holds one run."""
+
+    directory: Path
+    name: str
+    seed: int
+    replica: int
+    engine: str
+
+    def write(
+        self,
+        status: str,
+        totals: dict[str, Any],
+        done: bool = False,
+        error: BaseException | None = None,
+    ) -> None:
+        """Say how the run stands."""
+        manifest: dict[str, Any] = {
+            "name": self.name,
+            "versions": {
+                "netkf": netkf.__version__,
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
+            "seed": self.seed,
+            "replica": self.replica,
+            "runs": {"wanted": 1, "done": int(done)},
+            "engine": self.engine,
+            "status": status,
+            **totals,
+        }
+        if status == "failed" and error is not None:
+            manifest["error"] = in_words(error)
+            manifest["traceback"] = traceback.format_exception(error)
+        write_json(self.directory / "manifest.json", manifest)

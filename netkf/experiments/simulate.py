@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netkf.core.errors import EngineError
+from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.processes.engine import ProcessesEngine
+from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
 from netkf.trace.schema import EVENT
 
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
-
+LOAD = "load it first: netkf.simulate(netkf.load(path))"
 ENGINES = ("auto", "processes", "compiled")
 
 
@@ -51,6 +49,8 @@ def simulate(
     ``seed`` defaults to the scenario's; runs of one seed differ by ``replica``. More ``sinks``
     receive the same rows and samples as they come. Raises EngineError and ScenarioError.
     """
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError("", "simulate takes a netkf.Scenario", scenario, LOAD)
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     replica = integer(low=0)("replica", replica)
     chosen = choose_engine(engine, scenario)

@@ -9,9 +9,11 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
+from netkf.experiments.words import limit_words, mismatch_words
 from netkf.scenario.scenario import Scenario
 from netkf.theory import central_covariance, covariance_bound, limit_covariance
 from netkf.theory.coupled import not_promised
+from netkf.theory.steady import has_steady_state
 from netkf.trace.recorder import Sink
 from netkf.trace.run import errors
 from netkf.trace.schema import CODES
@@ -22,7 +24,8 @@ ROUNDING = 4.0 * np.finfo(float).eps
 class SummarySink(Sink):
     """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES; and
     how many messages each link delivered. ``rounding_from`` is the first sample at which the state
-    is so large that rounding blurs the errors (unstable plants over long horizons).
+    is so large that rounding blurs the errors (unstable plants over long horizons), ``diverged``
+    are the nodes whose covariance was no longer finite at the last one.
     """
 
     def __init__(self) -> None:
@@ -32,9 +35,11 @@ class SummarySink(Sink):
         self.nees: list[FloatArray] = []
         self.delivered: dict[tuple[int, int], int] = {}
         self.rounding_from: float | None = None
+        self.diverged: list[int] = []
 
     def events(self, rows: np.ndarray) -> None:
         """Deliveries of each link are counted, both directions together."""
+        self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
         arrived = rows[rows["kind"] == CODES["deliver"]]
         ends = np.sort(np.column_stack([arrived["node"], arrived["peer"]]), axis=1)
         pairs, counts = np.unique(ends, axis=0, return_counts=True)
@@ -59,13 +64,15 @@ class Promise:
     """What H(12) and (13) say at the sample times; ``words`` says why where they say nothing.
 
     bound (T, N): trace of H(12); limit, central: traces of S and of the centralised covariance,
-    nan where they do not exist.
+    nan where they do not exist; limit_words names the limit, notes are what to know about both.
     """
 
     bound: FloatArray | None
     limit: float
     central: float
     words: str
+    limit_words: str = "limit S of H(13)"
+    notes: tuple[str, ...] = ()
 
 
 def promise(scenario: Scenario, times: FloatArray) -> Promise:
@@ -81,7 +88,17 @@ def promise(scenario: Scenario, times: FloatArray) -> Promise:
         _trace(limit_covariance, scenario),
         _trace(central_covariance, scenario),
         words or not_promised(scenario) or "",
+        limit_words(scenario),
+        tuple(note for note in (_steady_note(scenario), mismatch_words(scenario)) if note),
     )
+
+
+def _steady_note(scenario: Scenario) -> str:
+    if scenario.slotted or not_promised(scenario) or has_steady_state(scenario):
+        return ""
+    if not scenario.filter.algorithm.talks:
+        return "at some nodes P has no steady state, it grows without end; see netkf theory"
+    return "the bound has no steady state, it grows without end; see netkf theory"
 
 
 def _trace(function: Any, scenario: Scenario) -> float:
@@ -95,14 +112,17 @@ def summarise(
     scenario: Scenario, sink: SummarySink, promised: Promise, messages: dict[str, int]
 ) -> dict[str, Any]:
     """Per node and overall: time-averaged RMS error, mean trace of P, bound and their ratio, mean
-    NEES over the samples after time 0; messages sent, delivered, lost and still on their way.
+    NEES over the samples after time 0 (of a diverged run without those that rounding blurs);
+    messages sent, delivered, lost and still on their way. Nan where there is no sample.
     """
-    times = np.array(sink.times)
-    used = times > 0.0 if (times > 0.0).any() else times >= 0.0
+    used = _used(np.array(sink.times), sink.rounding_from if sink.diverged else None)
     with np.errstate(all="ignore"):
-        mean_square = np.array(sink.sq_error)[used].mean(axis=0)
-        trace = np.array(sink.trace)[used].mean(axis=0)
-        nees = np.array(sink.nees)[used].mean(axis=0)
+        mean_square, trace, nees = (
+            np.array(values)[used].mean(axis=0)
+            if len(used)
+            else np.full(len(scenario.nodes), np.nan)
+            for values in (sink.sq_error, sink.trace, sink.nees)
+        )
         bound = None if promised.bound is None else promised.bound[used].mean(axis=0)
         nodes = [
             _row(node, mean_square[k], trace[k], None if bound is None else bound[k], nees[k])
@@ -128,6 +148,14 @@ def summarise(
             "in_flight": messages["sent"] - messages["delivered"] - messages["lost"],
         },
     }
+
+
+def _used(times: FloatArray, rounding_from: float | None) -> np.ndarray:
+    """Places of the samples that the averages are over."""
+    for wanted in ((times > 0.0) & (times < (rounding_from or np.inf)), times > 0.0):
+        if wanted.any():
+            return np.flatnonzero(wanted)
+    return np.arange(len(times))
 
 
 def _row(node: int, mean_square: Any, trace: Any, bound: Any, nees: Any) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 MOST_NODES = 30
@@ -28,9 +29,11 @@ def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
 
-def summary_table(summary: dict[str, Any]) -> str:
+def summary_table(
+    summary: dict[str, Any], limit: str = "limit S of H(13)", notes: Sequence[str] = ()
+) -> str:
     """The table that ends a run: nodes (the worst and the best where there are many), all of them
-    together, and the messages.
+    together, what ``notes`` say about the promise, and the messages; ``limit`` names the limit.
     """
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     shown, left_out = nodes, 0
@@ -60,10 +63,11 @@ def summary_table(summary: dict[str, Any]) -> str:
             f"note: from {summary['rounding_from']:g} s on the state is so large that rounding "
             "blurs the errors; shorten the horizon"
         )
+    lines += [f"note: {note}" for note in notes]
     references = [
         f"{words} {number(value)}"
         for words, value in (
-            ("limit S of H(13)", summary["limit"]),
+            (limit, summary["limit"]),
             ("centralised filter", summary["central"]),
         )
         if value is not None and math.isfinite(value)

@@ -44,6 +44,7 @@ class Topology:
     delivery  : measured probability that a message from i reaches j, where the graph has them
     positions : (x, y) of each node, where the graph has them
     notes     : one line each about what was left out
+    left_out  : nodes that the graph names and does not have
     """
 
     nodes: tuple[int, ...]
@@ -52,6 +53,7 @@ class Topology:
     delivery: dict[Link, float] | None = None
     positions: dict[int, tuple[float, float]] | None = None
     notes: tuple[str, ...] = ()
+    left_out: frozenset[int] = frozenset()
 
     @cached_property
     def index(self) -> dict[int, int]:
@@ -319,9 +321,10 @@ class CsvGraph(Graph):
     """Links from a table ``sender,receiver`` with an optional ``delivery_probability``.
 
     ``minimum`` keeps a link only if it reaches that probability, in both directions where the
-    graph is undirected; nodes left without a link are left out, and a note says so. A table that
-    lists no link in both directions means each row both ways. ``positions`` is a table whose
-    first three columns are node, x and y.
+    graph is undirected; nodes left without a link are left out, and a note says so. A table of an
+    undirected graph that lists every link once means each row both ways; one that lists some links
+    both ways and others once leaves probabilities open, and is refused unless ``minimum`` drops
+    those others. ``positions`` is a table whose first three columns are node, x and y.
     """
 
     path: SourceFile = setting(source_file)
@@ -356,8 +359,19 @@ class CsvGraph(Graph):
                 "lower minimum or add rows",
             )
         kept = {node for link in links for node in link}
-        notes = _left_out(nodes - kept)
+        one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
+        if measured and links.intersection(one_way):
+            raise ScenarioError(
+                "path",
+                f"{self.path.name}: some links are listed in both directions and others in one, so "
+                "the probability of the other direction is not known",
+                _listed(one_way),
+                "list every link twice, or every link once (then the row counts both ways), or set "
+                "directed = true",
+            )
+        notes = (*_left_out(nodes - kept, least), *_one_way(one_way if measured else []))
         more: dict[str, Any] = {"notes": notes, "positions": self._positions(kept)}
+        more["left_out"] = frozenset(nodes - kept)
         if measured:
             pairs = links if self.directed else links | {(j, i) for i, j in links}
             more["delivery"] = {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
@@ -412,9 +426,20 @@ class CsvGraph(Graph):
         return {node: places[node] for node in sorted(nodes)}
 
 
-def _left_out(nodes: set[int]) -> tuple[str, ...]:
+def _left_out(nodes: set[int], minimum: float) -> tuple[str, ...]:
     if not nodes:
         return ()
     listed = ", ".join(map(str, sorted(nodes)))
     one = len(nodes) == 1
-    return (f"node{'' if one else 's'} {listed} left out: no link reaches the minimum",)
+    return (f"node{'' if one else 's'} {listed} left out: no link reaches the minimum {minimum:g}",)
+
+
+def _one_way(pairs: list[Link]) -> tuple[str, ...]:
+    if not pairs:
+        return ()
+    return (f"links listed in one direction only left out: {_listed(pairs)}",)
+
+
+def _listed(pairs: list[Link], most: int = 3) -> str:
+    shown = ", ".join(f"{i} to {j}" for i, j in pairs[:most])
+    return shown if len(pairs) <= most else f"{shown} and {len(pairs) - most} more"

@@ -98,11 +98,13 @@ def _sensors(scenario: Scenario) -> None:
         _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for place, node in enumerate(sensor.nodes):
             if node not in known:
+                left_out = node in scenario.topology.left_out
+                why = "none of its links reaches network.graph.minimum, lower that; "
                 raise ScenarioError(
                     f"{key}.nodes[{place}]",
                     "must be a node of the graph",
                     node,
-                    f"node ids here are {_ids(scenario.nodes)}",
+                    f"{why if left_out else ''}node ids here are {_ids(scenario.nodes)}",
                 )
         if len(set(sensor.nodes)) < len(sensor.nodes):
             raise ScenarioError(

@@ -9,14 +9,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, nearest
 from netkf.core.fields import Part, SourceFile, integer, source_file
 from netkf.network.channels import Channel
+from netkf.scenario.plugins import blame, in_words, is_ours
 from netkf.scenario.registry import SLOTTED, find
 from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
 from netkf.scenario.writing import as_table
 
 FORMAT = 1
+UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 
 
@@ -26,7 +28,17 @@ def load(path: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario
     try:
         return from_table(with_changes(_parsed(path), changes or {}), path.parent)
     except ScenarioError as error:
-        raise error.in_file(str(path)) from None
+        raise _left_over(error, changes or {}).in_file(str(path)) from None
+
+
+def _left_over(error: ScenarioError, changes: Mapping[str, Any]) -> ScenarioError:
+    """The mistake in other words where a change of kind left keys of the former kind behind."""
+    table = error.key.rpartition(".")[0]
+    if error.rule != UNKNOWN or f"{table}.kind" not in changes or error.key in changes:
+        return error
+    rule = f"is left over from the former kind of {table}"
+    remedy = f"set the whole table, --set '{table}={{ kind = \"...\", ... }}'"
+    return ScenarioError(error.key, rule, error.value, remedy, error.file)
 
 
 def _parsed(path: Path) -> dict[str, Any]:
@@ -50,7 +62,10 @@ def changed(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
     folder = getattr(scenario, "_folder", None)
     if folder is None:  # built in Python
         folder = next((s.folder for s in source_files(scenario)), Path.cwd())
-    return from_table(with_changes(as_table(scenario), changes), folder)
+    try:
+        return from_table(with_changes(as_table(scenario), changes), folder)
+    except ScenarioError as error:
+        raise _left_over(error, changes) from None
 
 
 def source_files(part: Any) -> list[SourceFile]:
@@ -130,7 +145,8 @@ def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str
     for key, value in table.items():
         if key not in fields:
             known = ", ".join([*others, *fields])
-            raise ScenarioError(key, "is not a key here", value, f"keys are {known}")
+            hint = nearest(key, [*others, *fields])
+            raise ScenarioError(key, UNKNOWN, value, f"{hint}keys are {known}")
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in table:
             remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
@@ -141,7 +157,22 @@ def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str
         else value
         for name, value in table.items()
     }
-    return cls(**values)
+    return _made(cls, values)
+
+
+def _made(cls: type[Any], values: dict[str, Any]) -> Any:
+    try:
+        return cls(**values)
+    except ScenarioError:
+        raise
+    except Exception as error:
+        # A class of the user's failed, this one or one that the scenario asked.
+        words = f"{cls.__name__} could not be made ({in_words(error)})"
+        if is_ours(cls):
+            words = blame(tuple(values.values()), error) or ""
+        if not words:
+            raise
+        raise ScenarioError("", words, None, "mend the class or its settings") from error
 
 
 def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:

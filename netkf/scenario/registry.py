@@ -10,7 +10,7 @@ from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
-from netkf.core.errors import ScenarioError, quote
+from netkf.core.errors import ScenarioError, nearest, quote
 from netkf.core.fields import Part
 from netkf.network import channels, clocks, graphs, matchings
 from netkf.plants.diffusion import Diffusion
@@ -109,7 +109,10 @@ def find(family: str, kind: object, folder: Path) -> type[Part]:
         raise ScenarioError("kind", words, kind, "change the plant or choose another kind")
     listed = ", ".join(f'"{name}"' for name in names)
     raise ScenarioError(
-        "kind", f"must be one of {listed}", kind, 'choose one, or write "package.module:Class"'
+        "kind",
+        f"must be one of {listed}",
+        kind,
+        f'{nearest(kind, names)}choose one, or write "package.module:Class"',
     )
 
 
@@ -149,7 +152,9 @@ def _forget_other(module_name: str, folder: Path) -> None:
     """A module beside the scenario wins over one of that name imported from elsewhere."""
     beside, loaded = folder / f"{module_name}.py", sys.modules.get(module_name)
     other = getattr(loaded, "__file__", None)
-    if loaded is not None and beside.exists() and (other is None or not beside.samefile(other)):
+    if loaded is None or not beside.exists():
+        return
+    if other is None or not Path(other).exists() or not beside.samefile(other):
         del sys.modules[module_name]
         importlib.invalidate_caches()
 

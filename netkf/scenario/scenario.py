@@ -98,7 +98,7 @@ class Placed(NamedTuple):
     ordinal: int
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scenario(Part):
     """What is simulated. Every value is checked on construction, alone and against the others;
     ScenarioError says what is wrong in one line.
@@ -122,6 +122,15 @@ class Scenario(Part):
         from netkf.scenario.checks import check
 
         check(self)
+
+    def __repr__(self) -> str:
+        kinds = (type(self.plant), type(self.network.graph), type(self.filter.algorithm))
+        plant, graph, algorithm = (kind.__name__ for kind in kinds)
+        return (
+            f"<netkf.Scenario {self.name!r}: {plant} of {self.plant.n} states, {graph} of "
+            f"{len(self.nodes)} nodes and {len(self.topology.links)} links, {len(self.sensing)} "
+            f"with sensors, {algorithm} filters, {self.horizon:g} s, seed {self.seed}>"
+        )
 
     def replace(self, changes: Mapping[str, Any]) -> Scenario:
         """A scenario with some keys changed, e.g. ``{"network.activation.rate": 5.0}``.

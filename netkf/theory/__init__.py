@@ -38,3 +38,7 @@ __all__ = [
     "support",
     "true_limit_covariance",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

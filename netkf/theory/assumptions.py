@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from netkf.algorithms.hybrid import Hybrid
-from netkf.network.clocks import LinkClock
+from netkf.network.clocks import LinkClock, RecordedClock
+from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
-from netkf.theory.coupled import coupling
+from netkf.theory.coupled import balanced
 from netkf.theory.matrices import unobservable
 from netkf.theory.slot_assumptions import Row, slot_rows
 
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
 
 
 def assumptions(scenario: Scenario) -> pd.DataFrame:
-    """A table with a row for each assumption: assumption, source, holds, evidence."""
+    """A table with a row for each assumption: assumption, source, holds, evidence; ``holds`` is
+    None where it is not known.
+    """
     import pandas as pd
 
     if scenario.slotted:
@@ -108,8 +111,14 @@ def _clocks(scenario: Scenario) -> list[Row]:
     assert isinstance(clock, LinkClock)
     rates = np.array([clock.mean_rate(link) for link in scenario.topology.links])
     known = rates[np.isfinite(rates)]
-    positive = len(known) == len(rates) and bool((known > 0.0).all())
+    unknown = len(known) < len(rates)
+    positive = None if unknown else bool((known > 0.0).all())
+    name, record = name_of("activation", clock), isinstance(clock, RecordedClock)
     spread = f"{known.min():g} .. {known.max():g} per second" if known.size else "no rate known"
+    if unknown:
+        spread = f"a {name} clock does not tell its rates beforehand"
+    elif known.size and np.ptp(known) == 0.0:
+        spread = f"{known[0]:g} per second on every link"
     return [
         ("the rates of all links are positive", "H II-B b", positive, spread),
         (
@@ -118,23 +127,22 @@ def _clocks(scenario: Scenario) -> list[Row]:
             clock.memoryless,
             "exponential gaps"
             if clock.memoryless
-            else f"the gaps of {type(clock).__name__} are not exponential: H(12) is not promised",
+            else "a record is one outcome, not a law: H(12) is not promised"
+            if record
+            else f"the gaps of a {name} clock are not exponential: H(12) is not promised",
         ),
         (
             "all links have one rate",
             "H Theorem 3",
-            positive and np.ptp(rates) == 0.0 if rates.size else True,
-            "the limit S does not need it when the rates grow together",
+            None if unknown else not rates.size or bool(np.ptp(rates) == 0.0),
+            f"{spread}; the limit does not need it when the rates grow together",
         ),
     ]
 
 
 def _channel(scenario: Scenario) -> list[Row]:
     channel = scenario.network.channel
-    rates = list(scenario.effective_rates().values())
-    c = coupling(scenario).toarray() if np.isfinite(rates).all() else None
-    fixed = channel.delay.fixed
-    symmetric = c is not None and bool(np.allclose(c, c.T, rtol=1e-12))
+    fixed, symmetric = channel.delay.fixed, balanced(scenario)
     return [
         (
             "losses are independent of each other and of the past",
@@ -142,7 +150,7 @@ def _channel(scenario: Scenario) -> list[Row]:
             channel.loss.independent,
             "arrivals are Poisson processes of lower rates"
             if channel.loss.independent
-            else "arrivals come in bursts: H(12) is not promised",
+            else "losses are recorded or come in bursts: H(12) is not promised",
         ),
         (
             "messages take no time, or one fixed time",
@@ -158,7 +166,9 @@ def _channel(scenario: Scenario) -> list[Row]:
             "both directions of a link arrive at one rate",
             "H (12), (13)",
             symmetric,
-            "the limit is S"
+            "not known beforehand"
+            if symmetric is None
+            else "the limit is S"
             if symmetric
             else "the limit is not S but weighs the nodes differently",
         ),

@@ -144,19 +144,35 @@ def linear_operator(
     return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks) + between)
 
 
+def balanced(scenario: Scenario) -> bool | None:
+    """Whether both directions of each link arrive at one rate, so that the limit is S of H(13);
+    None where the rates are not known beforehand.
+    """
+    if not np.isfinite(list(scenario.effective_rates().values())).all():
+        return None
+    c = coupling(scenario).toarray()
+    return bool(np.allclose(c, c.T, rtol=1e-12))
+
+
 def left_weights(scenario: Scenario) -> FloatArray:
     """(N,): the weights with which the nodes' information enters when links tick ever faster.
 
     The left null vector of the coupling, scaled to sum 1: 1/N where both directions of a link
     arrive at one rate. Raises TheoryError where some node is never heard.
     """
+    algorithm = scenario.filter.algorithm
+    if len(scenario.nodes) == 1:
+        return np.ones(1)
+    if not algorithm.talks:
+        name = type(algorithm).__name__.lower()
+        raise TheoryError(f"the {name} filter does not talk, links mean nothing to it")
     c = coupling(scenario).toarray()
     size = len(c)
-    if size == 1:
-        return np.ones(1)
     laplacian = np.diag(c.sum(axis=1)) - c
-    if not np.isfinite(laplacian).all() or math.isclose(float(np.abs(c).max()), 0.0):
-        raise TheoryError("the rates of the links are not known, or no message ever arrives")
+    if balanced(scenario) is None:
+        raise TheoryError("how often messages arrive is not known beforehand (a recorded table?)")
+    if math.isclose(float(np.abs(c).max()), 0.0):
+        raise TheoryError("no message ever arrives")
     laplacian /= np.abs(laplacian).max()
     system = np.concatenate([laplacian.T, np.ones((1, size))])
     target = np.concatenate([np.zeros(size), [1.0]])

@@ -39,6 +39,10 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     central, with delays and with models that differ from the truth. Raises TheoryError for other
     filters, and for a user's subclass that does more than choose its weights.
     """
+    if not isinstance(run, Run):
+        raise TheoryError(
+            f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
+        )
     algorithm, _ = scenario.filter.algorithm, scenario.truth  # raises for scenarios in slots
     if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")

@@ -48,6 +48,8 @@ def checked_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Sy
 
 def _observation(H: ArrayLike, n: int) -> FloatArray:
     array: FloatArray = np.asarray(H, dtype=np.float64)
+    if array.ndim == 0:
+        array = array.reshape(1, 1)
     if array.ndim != 2 or array.shape[1] != n or not np.isfinite(array).all():
         raise TheoryError(f"H must be a finite matrix of {n} columns, its shape is {array.shape}")
     return array

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.algorithms.hybrid import Hybrid
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
-from netkf.theory.coupled import informations, left_weights
+from netkf.theory.coupled import informations, left_weights, own_steps
 from netkf.theory.matrices import algebraic_riccati, lyapunov
 
 
@@ -19,6 +20,10 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     does not exist.
     """
     A, Q = scenario.belief
+    algorithm = scenario.filter.algorithm
+    if algorithm.talks and (not isinstance(algorithm, Hybrid) or own_steps(algorithm, Hybrid)):
+        name = type(algorithm).__name__
+        raise TheoryError(f"H(13) is about the hybrid filter, and {name} is another one")
     w = left_weights(scenario)
     return algebraic_riccati(A, Q, np.tensordot(w, informations(scenario), 1))
 

@@ -13,8 +13,10 @@ RESIDUAL = 1e-9
 
 
 def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
-    """A finite (n, n) float array; raises TheoryError otherwise."""
+    """A finite (n, n) float array, from a number where n is 1; raises TheoryError otherwise."""
     array: FloatArray = np.asarray(value, dtype=np.float64)
+    if array.ndim == 0:
+        array = array.reshape(1, 1)
     wanted = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
         raise TheoryError(f"{name} must be a {wanted} matrix, its shape is {array.shape}")

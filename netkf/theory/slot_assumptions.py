@@ -16,7 +16,7 @@ from netkf.theory.gossip import (
 )
 from netkf.theory.intermittent import critical_probability, unseen
 
-Row = tuple[str, str, bool, str]
+Row = tuple[str, str, bool | None, str]
 SHOWN = 12
 
 
@@ -64,7 +64,7 @@ def _matching(scenario: Scenario) -> list[Row]:
     try:
         mean = _mean(scenario)
     except TheoryError as error:
-        return [(name, "G C.1", False, f"not decided: {error}")]
+        return [(name, "G C.1", None, f"not decided: {error}")]
     irreducible, aperiodic, period = primitive(mean)
     if not irreducible:
         words = "some nodes are never reached from others"
@@ -91,7 +91,7 @@ def _walk(scenario: Scenario) -> list[Row]:
     try:
         walk = detecting_walk(scenario)
     except TheoryError as error:
-        return [(name, "G D.1", False, f"not decided: {error}")]
+        return [(name, "G D.1", None, f"not decided: {error}")]
     if walk is None:
         return [
             (

@@ -23,6 +23,7 @@ GROWN = 1e9  # a covariance that many times the first is taken to grow for ever
 RESIDUAL = 1e-9
 MOST_STEPS = 400
 LARGEST_FACTOR = 1e6
+SHOWN = 12
 FEW_UNKNOWNS = 400
 
 
@@ -34,9 +35,42 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     the link rates would have to reach for one to exist.
     """
     equations = coupled(scenario)
-    P = _stabilising(equations)
+    P = _steady(equations)
     if P is None:
         raise TheoryError(_no_steady_state(scenario, equations))
+    return P
+
+
+def has_steady_state(scenario: Scenario) -> bool:
+    """Whether H(12) has a steady state; raises TheoryError where H(12) does not apply."""
+    return _stabilising(coupled(scenario)) is not None
+
+
+def steady_by_node(scenario: Scenario) -> FloatArray:
+    """(N, n, n): for filters that do not talk, each node's own steady covariance, nan where it has
+    none.
+    """
+    equations = coupled(scenario)
+    if equations.coupling.nnz:
+        raise TheoryError("the nodes hear each other: their steady state is one for all")
+    every = [
+        _steady(
+            equations._replace(
+                G=equations.G[i : i + 1],
+                start=equations.start[i : i + 1],
+                coupling=equations.coupling[i : i + 1, i : i + 1],
+            )
+        )
+        for i in range(len(equations.G))
+    ]
+    nothing = np.full_like(equations.A, np.nan)
+    return np.stack([nothing if P is None else P[0] for P in every])
+
+
+def _steady(equations: Coupled) -> FloatArray | None:
+    P = _stabilising(equations)
+    if P is None:
+        return None
     for _ in range(60):
         following = _newton(equations, P)
         change = np.abs(following - P).max()
@@ -100,6 +134,14 @@ def _stabilising(equations: Coupled) -> FloatArray | None:
 
 
 def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
+    if equations.coupling.nnz == 0:
+        missing = np.isnan(steady_by_node(scenario)[:, 0, 0])
+        alone = [str(node) for node, no in zip(scenario.nodes, missing, strict=True) if no]
+        listed = ", ".join(alone[:SHOWN]) + (", ..." if len(alone) > SHOWN else "")
+        talks = scenario.filter.algorithm.talks
+        why = "no message ever arrives" if talks else "the filter does not talk"
+        several = "s" if len(alone) > 1 else ""
+        return f"{why}, and the covariance of node{several} {listed} alone has no steady state"
     factor = threshold_factor(equations)
     if factor is None:
         return "H(12) has no steady state, and faster links do not give it one"

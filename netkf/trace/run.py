@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.errors import quote
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Run:
     """What happened in one run.
 
@@ -28,12 +29,20 @@ class Run:
     x: FloatArray
     xhat: FloatArray
     P: FloatArray
-    log: np.ndarray = field(repr=False)
+    log: np.ndarray
     seed: int
     replica: int
     engine: str
     status: str
     fingerprint: str
+
+    def __repr__(self) -> str:
+        span = f"{self.times[0]:g} .. {self.times[-1]:g} s" if len(self.times) else "nothing"
+        return (
+            f"<netkf.Run: {self.status}, {len(self.times)} samples of {span}, {len(self.nodes)} "
+            f"nodes, {self.x.shape[-1]} states, {len(self.log):,} events, seed {self.seed}, "
+            f"replica {self.replica}>"
+        )
 
     @cached_property
     def events(self) -> pd.DataFrame:
@@ -112,6 +121,10 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
 
     Takes runs or event tables; nan equals nan.
     """
+    for given in (a, b):
+        if not isinstance(given, Run) and not hasattr(given, "iloc"):
+            words = f"first_difference takes runs or their event tables, got {quote(given)}"
+            raise TypeError(words)
     one, other = (t.events if isinstance(t, Run) else t for t in (a, b))
     names = [name for name in EVENT_COLUMNS if name not in ("run", "seq")]
     shorter = min(len(one), len(other))

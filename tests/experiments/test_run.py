@@ -95,6 +95,9 @@ def test_an_interrupted_run_keeps_what_it_had(ring, tmp_path):
     assert states.t.max() == 7.0
     pd.testing.assert_frame_equal(states, netkf.simulate(ring).states[: len(states)])
     assert not list((tmp_path / "cut").glob("*.part"))
+    summary = json.loads((tmp_path / "cut" / "summary.json").read_text())
+    after = states[states.t > 0.0]
+    assert summary["overall"]["rms_error"] == pytest.approx(np.sqrt(after.sq_error.mean()))
 
 
 def test_a_diverged_run_says_so(build, tmp_path):
@@ -105,6 +108,172 @@ def test_a_diverged_run_says_so(build, tmp_path):
     manifest = json.loads((done.directory / "manifest.json").read_text())
     assert manifest["status"] == "diverged"
     json.loads((done.directory / "summary.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_fine_nodes_of_a_diverged_run_are_not_judged_by_rounding(build, tmp_path):
+    """The sensing node's error stays of order 1 while the plant grows past 1e16."""
+    plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
+    scenario = build(horizon=600.0, probe=1.0, plant=plant, filter={"kind": "local"})
+    done = run_to_directory(scenario, tmp_path / "out")
+    assert done.samples.diverged == [1]
+    assert done.samples.rounding_from < 30.0
+    seeing, blind = done.summary["nodes"]
+    assert seeing["rms_error"] < 5.0
+    assert blind["rms_error"] > 1e6
+
+
+FAILING = """
+from netkf.algorithms.hybrid import Hybrid
+
+
+class Bad(Hybrid):
+    def absorb(self, state, messages):
+        return state._replace(xhat=1 / len(messages[1:]))
+
+
+class Nan(Hybrid):
+    def absorb(self, state, messages):
+        return state._replace(P=state.P * float("nan"))
+
+
+class Weightless(Hybrid):
+    def weight(self, degree, peer_degree):
+        return 1 / (degree - 2)
+
+
+class Limitless(Hybrid):
+    def largest_degree(self):
+        return self.nothing
+
+
+class Picky(Hybrid):
+    def __post_init__(self):
+        raise ValueError("not today")
+"""
+
+
+@pytest.fixture
+def plugged(tmp_path):
+    """The ring with a filter of a user's module that lies beside it."""
+
+    def make(name):
+        text = (SCENARIOS / "poisson_ring.toml").read_text()
+        (tmp_path / "failing_filters.py").write_text(FAILING)
+        (tmp_path / "ring.toml").write_text(text.replace('"hybrid"', f'"failing_filters:{name}"'))
+        return tmp_path / "ring.toml"
+
+    return make
+
+
+def test_a_filter_that_raises_is_named_in_one_line(plugged, tmp_path, capsys):
+    assert main(["run", str(plugged("Bad")), "--out", str(tmp_path / "out")]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith(
+        "netkf: failing_filters:Bad failed in absorb: ZeroDivisionError: division by zero; "
+    )
+    assert len(printed.err.splitlines()) == 1
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["status"] == "failed"
+    assert manifest["error"] == "ZeroDivisionError: division by zero"
+    assert "in absorb" in "".join(manifest["traceback"])
+    assert manifest["events"] == len(pd.read_parquet(tmp_path / "out" / "events.parquet")) > 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["messages"]["sent"] > 0
+
+
+FINE = """
+from netkf.algorithms.hybrid import Hybrid
+
+
+class Fine(Hybrid):
+    pass
+"""
+
+
+def test_a_module_beside_the_scenario_travels_with_the_run(tmp_path, ring, capsys):
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "fine_filters.py").write_text(FINE)
+    text = (SCENARIOS / "poisson_ring.toml").read_text().replace("20.0", "2.0")
+    (home / "ring.toml").write_text(text.replace('"hybrid"', '"fine_filters:Fine"'))
+    out = tmp_path / "out"
+    assert main(["run", str(home / "ring.toml"), "--out", str(out), "--no-plot"]) == 0
+    assert capsys.readouterr().err == ""
+    (home / "fine_filters.py").unlink()
+    again = run_to_directory(netkf.load(out / "scenario.toml"), tmp_path / "again")
+    assert again.summary == json.loads((out / "summary.json").read_text())
+
+
+def test_a_module_that_does_not_travel_is_named(tmp_path, capsys, monkeypatch):
+    package = tmp_path / "filters_of_mine"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "fine.py").write_text(FINE)
+    monkeypatch.syspath_prepend(tmp_path)
+    change = 'filter={kind="filters_of_mine.fine:Fine", epsilon=0.3}'
+    ring = [str(SCENARIOS / "poisson_ring.toml"), "--set", "horizon=2.0", "--no-plot"]
+    assert main(["run", *ring, "--set", change, "--out", str(tmp_path / "out")]) == 0
+    err = capsys.readouterr().err
+    assert err.startswith("note: the run directory needs the Python module filters_of_mine.fine,")
+    assert len(err.splitlines()) == 1
+
+
+def test_an_error_in_a_class_of_netkf_is_not_covered_up(ring, tmp_path, monkeypatch):
+    monkeypatch.setattr("netkf.algorithms.hybrid.Hybrid.absorb", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_to_directory(ring, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["status"] == "failed"
+
+
+def test_a_class_that_cannot_be_made_is_refused(plugged):
+    with pytest.raises(netkf.ScenarioError, match=r"filter: Picky could not .*not today"):
+        netkf.load(plugged("Picky"))
+    words = r"toml: failing_filters:Limitless failed in largest_degree: AttributeError.*; mend"
+    with pytest.raises(netkf.ScenarioError, match=words):
+        netkf.load(plugged("Limitless"))
+
+
+@pytest.mark.parametrize("command", ["run", "theory"])
+def test_a_class_that_fails_at_the_start_is_named_in_one_line(plugged, command, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "out")] if command == "run" else []
+    assert main([command, str(plugged("Weightless")), *out]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("netkf: failing_filters:Weightless failed in weight: ZeroDiv")
+    assert len(printed.err.splitlines()) == 1
+
+
+def test_a_covariance_that_is_not_a_number_is_not_called_an_overflow(plugged, tmp_path, capsys):
+    assert main(["run", str(plugged("Nan")), "--out", str(tmp_path / "out"), "--no-plot"]) == 0
+    printed = capsys.readouterr()
+    assert "overflow" not in printed.out
+    assert printed.err.startswith("note: diverged, the covariance of node")
+    assert "no longer finite at" in printed.err
+
+
+def test_complete_is_the_last_word(ring, tmp_path):
+    def look(finished):
+        manifest = json.loads((finished.directory / "manifest.json").read_text())
+        assert manifest["status"] == "interrupted"
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="kept in"):
+        run_to_directory(ring, tmp_path / "out", finish=look)
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert (manifest["status"], manifest["runs"]["done"]) == ("interrupted", 1)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["overall"]["bound"] > 0.0
+
+
+def test_a_run_stopped_before_its_first_sample_has_a_summary(ring, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("netkf.engines.processes.engine.ProcessesEngine.run", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run_to_directory(ring, tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["bound"] == "not computed: the run was interrupted"
+    assert summary["overall"]["rms_error"] is None
 
 
 def test_directories_are_never_overwritten(tmp_path, monkeypatch):

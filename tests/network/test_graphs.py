@@ -67,16 +67,31 @@ def test_csv_minimum_holds_in_both_directions(tmp_path):
     (tmp_path / "g.csv").write_text("sender,receiver,delivery_probability\n" + rows)
     topology = graphs.CsvGraph(path=str(tmp_path / "g.csv"), minimum=0.25).build(0)
     assert topology.links == ((2, 3),)
-    assert topology.notes == ("nodes 1, 4 left out: no link reaches the minimum",)
+    assert topology.notes == (
+        "nodes 1, 4 left out: no link reaches the minimum 0.25",
+        "links listed in one direction only left out: 3 to 4",
+    )
     directed = graphs.CsvGraph(path=str(tmp_path / "g.csv"), minimum=0.25, directed=True).build(0)
     assert directed.links == ((1, 2), (2, 3), (3, 2), (3, 4))
+
+
+def test_a_probability_that_a_table_leaves_open_is_not_made_up(tmp_path):
+    path = tmp_path / "g.csv"
+    path.write_text("sender,receiver,delivery_probability\n1,2,0.5\n2,1,0.2\n2,3,0.7\n3,4,0.9\n")
+    for least in (None, 0.0):
+        with pytest.raises(ScenarioError, match=r"others in one.*2 to 3, 3 to 4.*directed = "):
+            graphs.CsvGraph(path=str(path), minimum=least).build(0)
+    assert graphs.CsvGraph(path=str(path), directed=True).build(0).delivery[3, 4] == 0.9
+    # Without probabilities nothing is left open.
+    path.write_text("sender,receiver\n1,2\n2,1\n2,3\n")
+    assert graphs.CsvGraph(path=str(path)).build(0).links == ((1, 2), (2, 3))
 
 
 def test_intel_lab_network():
     topology = netkf.load(SCENARIOS / "intel_lab.toml").topology
     assert (len(topology.nodes), len(topology.links)) == (53, 202)
     assert 5 not in topology.nodes
-    assert topology.notes == ("node 5 left out: no link reaches the minimum",)
+    assert topology.notes == ("node 5 left out: no link reaches the minimum 0.25",)
     assert max(topology.degrees.values()) == 12
     assert networkx.is_connected(networkx.Graph(topology.links))
     assert all(

@@ -247,6 +247,12 @@ SENSORS = [
     ("sensor-R-missing", {"sensors.R": None}, "sensors[0].R", "is missing"),
     ("second-sensor", {"sensors": SECOND}, "sensors[1].H", "is missing"),
     ("node-unknown", {"sensors.nodes": "[0, 6]"}, "sensors[0].nodes[1]", "of the graph; got 6"),
+    (
+        "node-left-out",
+        listed("island.csv", "minimum = 0.5") | {"sensors.nodes": "[7]"},
+        "sensors[0].nodes[0]",
+        "got 7; none of its links reaches network.graph.minimum",
+    ),
     ("node-negative", {"sensors.nodes": "[-1]"}, "sensors[0].nodes[0]", "of the graph; got -1"),
     ("node-twice", {"sensors.nodes": "[3, 3]"}, "sensors[0].nodes", "node once; got [3, 3]"),
     (
@@ -1067,3 +1073,36 @@ def test_replace_leaves_the_scenario_alone(ring):
     with pytest.raises(netkf.ScenarioError):
         ring.replace({"horizon": 1.0, "network.activation.rate": -1.0})
     assert ring == before
+
+
+HINTS = [
+    ("key", "filter.epsillon=0.2", 'did you mean "epsilon"? keys are'),
+    ("table", "network.chanel.symmetric=true", 'did you mean "channel"? keys are'),
+    ("kind", "network.graph.kind=cyclic", 'did you mean "cycle"? choose one'),
+    ("number", "plant.cov=0.5", "must be a matrix; got 0.5; write [[0.5]]"),
+    ("vector", "plant.mean=0.5", "must be a vector; got 0.5; write [0.5]"),
+    ("nothing", "name=", "give a value; an empty text is written name='\"\"'"),
+    (
+        "left-over",
+        "network.activation.kind=periodic",
+        "network.activation.rate: is left over from the former kind of network.activation; "
+        "got 2.0; set the whole table, --set 'network.activation={ kind = ",
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), rows(HINTS))
+def test_a_refusal_points_to_what_was_meant(change, words, refusal, tmp_path):
+    ring = SCENARIOS / "poisson_ring.toml"
+    assert words in refusal("run", ring, "--set", change, "--out", tmp_path / "out")
+
+
+def test_a_kind_that_is_replaced_as_a_whole_leaves_nothing_over(ring):
+    with pytest.raises(netkf.ScenarioError, match="left over from the former kind"):
+        ring.replace({"network.activation.kind": "periodic"})
+    clock = {"kind": "periodic", "period": 0.5}
+    assert ring.replace({"network.activation": clock}).network.activation.period == 0.5
+    # A key that the change itself gives is a mistake of its own.
+    changes = {"network.activation.kind": "periodic", "network.activation.rate": 3.0}
+    with pytest.raises(netkf.ScenarioError, match=r"rate: is not a key here; got 3\.0"):
+        ring.replace(changes)

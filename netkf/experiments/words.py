@@ -1,0 +1,25 @@
+"""What promises are called, in `netkf theory`, in tables and in pictures alike."""
+
+from __future__ import annotations
+
+from netkf.scenario.scenario import Scenario
+from netkf.theory.coupled import balanced
+
+
+def limit_words(scenario: Scenario) -> str:
+    """What the limit of the bound as links tick ever faster is for this scenario."""
+    words = "limit S of H(13)" if balanced(scenario) else "weighted limit (not S of H(13))"
+    return words + without_delay(scenario)
+
+
+def without_delay(scenario: Scenario) -> str:
+    """The limits leave delays out, and say so where there are any."""
+    delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
+    return ", if messages took no time" if delayed else ""
+
+
+def mismatch_words(scenario: Scenario) -> str:
+    """What P and its bound are worth where the filters believe another model; empty where not."""
+    if scenario.filters_know_the_truth:
+        return ""
+    return "the filters' model differs from the truth: P and its bound need not bound the errors"

@@ -1,0 +1,59 @@
+"""Classes of users in a scenario: which there are, where they come from, and which one failed."""
+
+from __future__ import annotations
+
+import dataclasses
+import traceback
+from pathlib import Path
+from typing import Any
+
+from netkf.core.fields import Part
+
+
+def plugged_in(part: Any) -> list[Part]:
+    """The parts of a scenario whose classes are not netkf's own."""
+    if isinstance(part, tuple):
+        return [found for item in part for found in plugged_in(item)]
+    if not isinstance(part, Part):
+        return []
+    inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
+    own = [] if is_ours(type(part)) else [part]
+    return [*own, *(found for item in inside for found in plugged_in(item))]
+
+
+def is_ours(cls: type) -> bool:
+    """Whether a class is netkf's own."""
+    return cls.__module__.partition(".")[0] == "netkf"
+
+
+def module_files(scenario: Part) -> dict[str, Path | None]:
+    """The modules that a scenario's classes come from: the file where it is one file beside the
+    scenario, else None.
+    """
+    folder = getattr(scenario, "_folder", None)
+    found: dict[str, Path | None] = {}
+    for part in plugged_in(scenario):
+        name = type(part).__module__
+        beside = None if folder is None or "." in name else folder / f"{name}.py"
+        found[name] = beside if beside is not None and beside.is_file() else None
+    return found
+
+
+def blame(scenario: Any, error: Exception) -> str | None:
+    """``module:Class failed in method: error``, about the plugged-in class in whose method it
+    happened, or else the first one; None where all classes are netkf's own.
+    """
+    parts = plugged_in(scenario)
+    if not parts:
+        return None
+    part, where = parts[0], ""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        mine = [p for p in parts if frame.f_locals.get("self") is p]
+        if mine:
+            part, where = mine[0], f" in {frame.f_code.co_name}"
+    return f"{type(part).__module__}:{type(part).__qualname__} failed{where}: {in_words(error)}"
+
+
+def in_words(error: BaseException) -> str:
+    """The exception on one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300].rstrip(": ")

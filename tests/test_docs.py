@@ -1,0 +1,87 @@
+"""The reference in docs/ says what there is, and its snippets do what they say."""
+
+import dataclasses
+import re
+import tomllib
+
+import pytest
+
+import netkf
+from netkf.cli import _parser
+from netkf.scenario.registry import KINDS
+from netkf.scenario.scenario import Belief, Scenario
+from netkf.trace.schema import EVENT_COLUMNS
+from tests.conftest import ROOT, SCENARIOS
+
+TEXT = (ROOT / "docs" / "scenario_files.md").read_text(encoding="utf-8")
+HEADINGS = {
+    "plant": "plant.kind",
+    "sensor": "sensors.kind",
+    "graph": "network.graph.kind",
+    "activation": "network.activation.kind in continuous time",
+    "loss": "network.channel.loss.kind",
+    "delay": "network.channel.delay.kind",
+    "filter": "filter.kind in continuous time",
+    "slot activation": "network.activation.kind in slots",
+    "slot filter": "filter.kind in slots",
+}
+
+
+def section(heading):
+    _, found, rest = TEXT.partition(f"### {heading}\n")
+    assert found, f"docs/scenario_files.md has no section {heading}"
+    return re.split(r"^##", rest, flags=re.MULTILINE)[0]
+
+
+def described():
+    for family, names in KINDS.items():
+        for kind, cls in names.items():
+            yield pytest.param(family, kind, cls, id=f"{family}-{kind}")
+
+
+@pytest.mark.parametrize(("family", "kind", "cls"), list(described()))
+def test_every_kind_and_key_is_described(family, kind, cls):
+    lines = section(HEADINGS[family]).splitlines()
+    row = next((line for line in lines if line.startswith(f"| `{kind}`")), None)
+    assert row is not None, f"{kind} has no row"
+    for field in dataclasses.fields(cls):
+        assert f"`{field.name}`" in row, f"the row of {kind} does not mention {field.name}"
+
+
+def test_no_kind_is_described_that_does_not_exist():
+    for family, heading in HEADINGS.items():
+        named = re.findall(r"^\| `([^`]+)`", section(heading), flags=re.MULTILINE)
+        assert sorted(named) == sorted(KINDS[family])
+
+
+def test_shared_keys_columns_options_and_names_are_mentioned():
+    options = {o for a in _parser()._actions for o in a.option_strings if o.startswith("--")}
+    commands = _parser()._subparsers._group_actions[0].choices
+    for name, command in commands.items():
+        assert f"netkf {name}" in TEXT
+        options |= {o for a in command._actions for o in a.option_strings if o.startswith("--")}
+    for option in options - {"--help", "--version"}:
+        assert option in TEXT, option
+    keys = [f.name for cls in (Scenario, Belief) for f in dataclasses.fields(cls)]
+    for word in (*keys, *EVENT_COLUMNS):
+        assert f"`{word}`" in TEXT, word
+    for name in netkf.__all__:
+        assert name in TEXT, name
+
+
+def test_the_example_file_is_a_scenario(tmp_path):
+    example = re.search(r"```toml\n(.*?)```", TEXT, flags=re.DOTALL)[1]
+    tomllib.loads(example)
+    (tmp_path / "example.toml").write_text(example)
+    assert netkf.load(tmp_path / "example.toml").filter.algorithm.epsilon == 0.3
+
+
+def test_the_snippets_run(tmp_path, monkeypatch):
+    snippets = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
+    assert len(snippets) == 2
+    (tmp_path / "scenarios").symlink_to(SCENARIOS)
+    monkeypatch.chdir(tmp_path)
+    for snippet in snippets:
+        exec(compile(snippet, "docs/scenario_files.md", "exec"), {})
+    assert len((tmp_path / "replay" / "lost.csv").read_text().splitlines()) > 100
+    assert (tmp_path / "slower" / "summary.json").exists()

@@ -1,0 +1,114 @@
+"""The Python face: what users touch first."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import netkf
+from netkf.experiments.run import run_to_directory
+
+
+def test_a_scenario_can_be_built_from_public_parts(ring):
+    parts = netkf.parts
+    built = netkf.Scenario(
+        name="poisson-ring",
+        claim=ring.claim,
+        horizon=20.0,
+        probe=0.5,
+        seed=1,
+        plant=parts.Diffusion(
+            A=[[0.0, 1.0], [-1.0, 0.1]], B=[[0.0], [1.0]], mean=[0.0, 0.0], cov=np.eye(2)
+        ),
+        sensors=[parts.LinearSensor(nodes=[0, 3], H=[[1.0, 0.0]], R=[[0.25]])],
+        network=netkf.Network(
+            graph=parts.Cycle(6),
+            activation=parts.Poisson(rate=2.0),
+            channel=parts.Channel(loss=parts.Bernoulli(0.7)),
+        ),
+        filter=netkf.Filtering(parts.Hybrid(0.3), cov=np.eye(2)),
+    )
+    assert built == ring
+    assert netkf.simulate(built).fingerprint == netkf.simulate(ring).fingerprint
+
+
+def test_every_kind_has_a_name_of_its_own_among_the_parts():
+    classes = {cls for names in netkf.parts.kinds().values() for cls in names.values()}
+    for cls in classes:
+        assert getattr(netkf.parts, cls.__name__) is cls
+        assert cls.__name__ in dir(netkf.parts)
+    with pytest.raises(AttributeError, match="no attribute 'Radar'"):
+        _ = netkf.parts.Radar
+
+
+def test_runs_and_scenarios_show_themselves_in_a_line(ring):
+    run = netkf.simulate(ring)
+    assert repr(run) == (
+        "<netkf.Run: complete, 41 samples of 0 .. 20 s, 6 nodes, 2 states, "
+        f"{len(run.log):,} events, seed 1, replica 0>"
+    )
+    assert repr(ring) == (
+        "<netkf.Scenario 'poisson-ring': Diffusion of 2 states, Cycle of 6 nodes and 6 links, "
+        "2 with sensors, Hybrid filters, 20 s, seed 1>"
+    )
+
+
+def test_what_is_not_loaded_is_refused(ring):
+    with pytest.raises(netkf.ScenarioError, match=r"takes a netkf.Scenario; got 'a.toml'; load"):
+        netkf.simulate("a.toml")
+    with pytest.raises(TypeError, match="takes runs or their event tables, got 'a'"):
+        netkf.first_difference("a", "b")
+    run = netkf.simulate(ring.replace({"horizon": 1.0}))
+    with pytest.raises(netkf.TheoryError, match=r"must be a netkf.Run.* got a DataFrame"):
+        netkf.theory.error_covariance(ring, run.events)
+
+
+def test_a_saved_run_is_what_netkf_run_writes(ring, tmp_path):
+    written = run_to_directory(ring, tmp_path / "written").directory
+    saved = netkf.save(netkf.simulate(ring), ring, tmp_path / "saved")
+    assert {file.name for file in written.iterdir()} == {file.name for file in saved.iterdir()}
+    for file in written.iterdir():
+        if file.suffix == ".parquet":
+            pd.testing.assert_frame_equal(pd.read_parquet(file), pd.read_parquet(saved / file.name))
+        else:
+            assert file.read_bytes() == (saved / file.name).read_bytes(), file.name
+    with pytest.raises(netkf.ScenarioError, match="new or empty directory"):
+        netkf.save(netkf.simulate(ring), ring, saved)
+    other = ring.replace({"network.graph.nodes": 5})
+    with pytest.raises(netkf.ScenarioError, match="its nodes or its state differ"):
+        netkf.save(netkf.simulate(ring), other, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_saved_run_of_another_seed_keeps_its_random_graph(build, tmp_path):
+    scenario = build(
+        seed=3,
+        network={
+            "graph": {"kind": "geometric", "nodes": 8, "radius": 0.5, "connected": True},
+            "activation": {"kind": "poisson", "rate": 2.0},
+        },
+        filter={"kind": "hybrid", "epsilon": 0.1},
+    )
+    run = netkf.simulate(scenario, seed=9, replica=2)
+    folder = netkf.save(run, scenario, tmp_path / "saved")
+    again = netkf.load(folder / "scenario.toml")
+    assert again.topology.links == scenario.topology.links
+    assert netkf.first_difference(netkf.simulate(again, replica=2), run) is None
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert (manifest["seed"], manifest["replica"], manifest["status"]) == (9, 2, "complete")
+
+
+def test_numbers_stand_for_matrices_of_one_entry():
+    theory = netkf.theory
+    scalar = theory.steady_covariance(1.2, 1.0, 1.0, 0.5)
+    assert scalar == theory.steady_covariance([[1.2]], [[1.0]], [[1.0]], [[0.5]])
+    assert theory.lyapunov_step(2.0, 1.2, 1.0).item() == pytest.approx(1.2**2 * 2.0 + 1.0)
+    # dP = 1 - P^2 from 0 is tanh
+    assert theory.riccati_flow(0.0, 0.0, 1.0, 1.0, 0.7).item() == pytest.approx(np.tanh(0.7))
+    with pytest.raises(netkf.TheoryError, match="Q must be a 2 x 2 matrix"):
+        theory.lyapunov_step(np.eye(2), np.eye(2), 1.0)
+
+
+def test_the_theory_shows_its_public_names_only():
+    assert dir(netkf.theory) == sorted(netkf.theory.__all__)
