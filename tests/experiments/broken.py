@@ -9,9 +9,10 @@ from netkf.network.matchings import Matching
 
 @dataclass(frozen=True, eq=False)
 class UpdateThenSwap(Gossip):
-    """Updates first, then swaps what came of it."""
+    """Updates first, then swaps what came of it, from slot 0 on."""
 
     programme = ("sense", "exchange")
+    first_slot = 0
 
 
 @dataclass(frozen=True, eq=False)
