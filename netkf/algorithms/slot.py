@@ -28,7 +28,8 @@ Messages = Sequence[tuple[float, Any, float]]
 class SlotModel:
     """What one node believes: ``x[k+1] = F x[k] + w``, cov(w) = Q; ``y = H x + v``, cov(v) = R.
 
-    ``F, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0.
+    ``F, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0. Where H differs from slot to slot this
+    is the first one; each reading brings its own.
     """
 
     F: FloatArray
@@ -117,8 +118,8 @@ class SlotFilter(Part):
         return True
 
     @abstractmethod
-    def sense(self, state: Any, y: FloatArray) -> Any:
-        """The state once the node's reading ``y`` (p,) of this slot is known."""
+    def sense(self, state: Any, reading: Reading) -> Any:
+        """The state once the node's reading of this slot is known; p is 0 without sensors."""
 
     def emit(self, state: Any, phase: int) -> Any:
         """What the node sends in each step of exchange number ``phase``; None for nothing."""
@@ -193,9 +194,8 @@ class Gossip(SlotFilter):
             state = state._replace(xhat=pair.xhat, root=pair.root)
         return state
 
-    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+    def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Update with the own reading and predict."""
-        reading = Reading(y, state.model.H, state.model.R)
         xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
         return state._replace(xhat=xhat, root=root)
 
@@ -210,9 +210,9 @@ class Intermittent(SlotFilter):
 
     programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
 
-    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+    def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Keep the reading."""
-        return state._replace(kept=Reading(y, state.model.H, state.model.R))
+        return state._replace(kept=reading)
 
     def emit(self, state: SlotState, phase: int) -> Reading | None:
         """The reading, from nodes that have sensors."""
@@ -238,19 +238,19 @@ class SlotLocal(SlotFilter):
     predicts: ClassVar[bool] = False
     talks: ClassVar[bool] = False
 
-    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+    def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Predict from the slot before, then update; called from slot 1 on."""
-        model = state.model
+        model, (y, H, R) = state.model, reading
         xhat, root = model.F @ state.xhat, predict_root(state.root, model.F, model.root_Q)
         if not len(y):
             return state._replace(xhat=xhat, root=root)
-        p, n = model.H.shape
-        top = np.concatenate([model.H @ root, np.linalg.cholesky(model.R)], axis=1)
+        p, n = H.shape
+        top = np.concatenate([H @ root, np.linalg.cholesky(R)], axis=1)
         L = lower_triangular(
             np.concatenate([top, np.concatenate([root, np.zeros((n, p))], axis=1)])
         )
         gain = np.linalg.solve(L[:p, :p].T, L[p:, :p].T).T
-        return state._replace(xhat=xhat + gain @ (y - model.H @ xhat), root=L[p:, p:])
+        return state._replace(xhat=xhat + gain @ (y - H @ xhat), root=L[p:, p:])
 
 
 @dataclass(frozen=True, eq=False)
