@@ -27,7 +27,9 @@ def written(case, folder):
     for t, readings in enumerate(case["y"]):
         for node, y in enumerate(readings):
             if y:
-                rows.append(",".join([f"{t + 1}.0", str(node), *map(repr, y), *[""] * (p - len(y))]))
+                rows.append(
+                    ",".join([f"{t + 1}.0", str(node), *map(repr, y), *[""] * (p - len(y))])
+                )
     (folder / "readings.csv").write_text("\n".join(rows) + "\n")
     recorded = {"kind": "recorded", "path": "readings.csv"}
     table = {
@@ -70,7 +72,7 @@ def test_reference_cases(case, tmp_path):
     assert (np.abs(run.xhat - expected) <= 1e-12 * size).all()
     P = np.array(case["out"]["P_final"])
     size = np.abs(P).max(axis=(-1, -2), keepdims=True)
-    print(np.abs(run.xhat - expected).max(), np.abs(run.P[-1]-P).max())
+    print(np.abs(run.xhat - expected).max(), np.abs(run.P[-1] - P).max())
     assert (np.abs(run.P[-1] - P) <= 1e-12 * size).all()
     stops = run.events[run.events.kind == "stop"]
     first = np.array(case["out"]["stop"]).argmax(axis=0)
