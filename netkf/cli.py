@@ -148,7 +148,7 @@ def _load(options: argparse.Namespace) -> Scenario:
 
 
 def _notes(scenario: Scenario) -> None:
-    for note in scenario.topology.notes:
+    for note in scenario.notes:
         print(f"note: {note}", file=sys.stderr)
 
 
@@ -192,7 +192,7 @@ def _divergence(finished: Any) -> str:
     blurred = finished.samples.rounding_from
     left_out = "" if blurred is None else f"; averages are over the samples before {blurred:g} s"
     return (
-        f"{finished.status}, the covariance of node{several} {listed} is no longer finite at "
+        f"{finished.status}, the estimate or covariance of node{several} {listed} is no longer finite at "
         f"{finished.samples.times[-1]:g} s and the run ended there{left_out}"
     )
 

@@ -25,7 +25,7 @@ from netkf.experiments.files import (
     write_scenario,
 )
 from netkf.experiments.simulate import choose_engine
-from netkf.experiments.summary import Promise, SummarySink, promise, summarise
+from netkf.experiments.summary import Promise, SummarySink, conserved, promise, summarise
 from netkf.scenario.plugins import in_words
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
@@ -77,7 +77,7 @@ def run_to_directory(
         seconds, done = time.perf_counter() - began, status == "complete"
         tables.close()
         promised = promise(scenario, np.array(samples.times))
-        summary = _summary(directory, scenario, samples, promised, recorder.count)
+        summary = _summary(directory, scenario, samples, promised, recorder.count, recorder.sums)
         finished = Finished(directory, status, summary, samples, promised, recorder.total, seconds)
         if finish is not None:
             finish(finished)
@@ -86,7 +86,7 @@ def run_to_directory(
         status = "failed" if isinstance(error, Exception) else "interrupted"
         if not (directory / "summary.json").exists():
             nothing = Promise(None, np.nan, np.nan, f"not computed: the run {ENDS[status]}")
-            _summary(directory, scenario, samples, nothing, recorder.count)
+            _summary(directory, scenario, samples, nothing, recorder.count, recorder.sums)
         manifest.write(status, _totals(recorder), done, error)
         reason = told(scenario, error, directory)
         if reason is error:
@@ -117,7 +117,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
         for sample in zip(run.times.tolist(), run.x, run.xhat, run.P, strict=True):
             sink.states(*sample)
     tables.close()
-    _summary(folder, scenario, samples, promise(scenario, run.times), run.count)
+    _summary(folder, scenario, samples, promise(scenario, run.times), run.count, run.sums)
     totals = {"events": len(run.log), "fingerprint": run.fingerprint}
     manifest.write(run.status, totals, run.status == "complete")
     return folder
@@ -136,13 +136,16 @@ def _summary(
     samples: SummarySink,
     promised: Promise,
     count: Callable[[str], int],
+    sums: dict[str, tuple[float, float]],
 ) -> dict[str, Any]:
     messages = {
         "sent": count("send"),
         "delivered": count("deliver"),
-        "lost": count("lost"),
+        "lost": count("lost") + count("late"),
     }
     summary = summarise(scenario, samples, promised, messages)
+    if sums:
+        summary["conserved"] = conserved(sums)
     write_json(directory / "summary.json", summary)
     return summary
 

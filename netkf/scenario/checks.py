@@ -14,6 +14,9 @@ from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
+from netkf.scenario.push_sum import check_push_sum
+from netkf.scenario.records import check_records
+from netkf.scenario.registry import spoken
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -30,8 +33,10 @@ def check(scenario: Scenario) -> None:
     _sensors(scenario)
     _network(scenario)
     _filter(scenario)
+    check_records(scenario)
     if scenario.slotted:
         _slots(scenario)
+        check_push_sum(scenario)
     else:
         _sensing_period(scenario)
 
@@ -133,7 +138,7 @@ def _network(scenario: Scenario) -> None:
                 raise error.under(key) from None
     if not algorithm.talks:
         return
-    name = type(algorithm).__name__.lower()
+    name = spoken(algorithm)
     if network.activation is None:
         example = "broadcast" if scenario.slotted else "poisson"
         raise ScenarioError(
@@ -311,7 +316,7 @@ def _slots(scenario: Scenario) -> None:
     activation = scenario.network.activation
     if not algorithm.talks:
         return
-    name = type(algorithm).__name__.lower()
+    name = spoken(algorithm)
     pairs = isinstance(activation, Matching) or (
         isinstance(activation, RecordedSlots) and activation.matching
     )
@@ -328,5 +333,5 @@ def _slots(scenario: Scenario) -> None:
             "network.activation.phase",
             f"must leave {exchanges} exchange(s) room within the period {plant.period:g}",
             scenario.phase_length,
-            "shorten it",
+            "shorten it; the steps of an exchange share it",
         )

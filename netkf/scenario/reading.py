@@ -117,7 +117,7 @@ def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
     table.setdefault("sensors", [])
     time = ""
     if "plant" in table:
-        table["plant"] = _under("plant", partial(_kind, "plant", folder), table["plant"])
+        table["plant"] = _under("plant", lambda value: _plant(value, folder), table["plant"])
         time = "slot " if isinstance(table["plant"], SLOTTED) else ""
     readers: dict[str, Callable[[Any], Any]] = {
         "sensors": lambda value: _list(value, folder),
@@ -173,6 +173,15 @@ def _made(cls: type[Any], values: dict[str, Any]) -> Any:
         if not words:
             raise
         raise ScenarioError("", words, None, "mend the class or its settings") from error
+
+
+def _plant(value: Any, folder: Path) -> Any:
+    table = _table(value)
+    kind = table.get("kind")
+    if kind in ("recorded", "unknown") and ("A" in table or "B" in table):
+        remedy = "give F, Q and period in place of A and B"
+        raise ScenarioError("kind", "exists in slots only", kind, remedy)
+    return _kind("plant", folder, table)
 
 
 def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:

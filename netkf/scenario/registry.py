@@ -9,6 +9,7 @@ from pathlib import Path
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.core.errors import ScenarioError, nearest, quote
 from netkf.core.fields import Part
@@ -16,11 +17,12 @@ from netkf.network import channels, clocks, graphs, matchings
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
-from netkf.plants.sensors import LinearSensor
+from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.sensors import LinearSensor, Sensor
 
 FAMILIES: dict[str, type[Part]] = {
     "plant": Plant,
-    "sensor": LinearSensor,
+    "sensor": Sensor,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
     "loss": channels.Loss,
@@ -32,8 +34,13 @@ FAMILIES: dict[str, type[Part]] = {
 """The contract that the classes of each family keep."""
 
 KINDS: dict[str, dict[str, type[Part]]] = {
-    "plant": {"diffusion": Diffusion, "linear": LinearPlant},
-    "sensor": {"linear": LinearSensor},
+    "plant": {
+        "diffusion": Diffusion,
+        "linear": LinearPlant,
+        "recorded": RecordedPlant,
+        "unknown": UnknownPlant,
+    },
+    "sensor": {"linear": LinearSensor, "recorded": RecordedSensor},
     "graph": {
         "cycle": graphs.Cycle,
         "path": graphs.PathGraph,
@@ -75,6 +82,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
     "slot filter": {
         "gossip": Gossip,
         "intermittent": Intermittent,
+        "push-sum": PushSum,
         "local": SlotLocal,
         "central": SlotCentral,
     },
@@ -170,3 +178,9 @@ def name_of(family: str, part: Part) -> str:
             if type(part) is candidate:
                 return name
     return f"{type(part).__module__}:{type(part).__qualname__}"
+
+
+def spoken(part: Part, family: str = "filter") -> str:
+    """The kind of a part in a sentence: its name, or that of a user's class."""
+    name = name_of(family, part)
+    return type(part).__name__.lower() if ":" in name else name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,8 @@ class Run:
 
     times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n); ``log`` holds the events as a
     structured array (trace.schema.EVENT). ``status`` is complete, interrupted or diverged.
+    ``sums`` holds what exchanges should conserve, summed over all nodes: at the start and at the
+    last sample. Where the truth is not ``shown``, x is nan and tables have no columns of errors.
     """
 
     times: FloatArray
@@ -35,6 +37,8 @@ class Run:
     engine: str
     status: str
     fingerprint: str
+    sums: dict[str, tuple[float, float]] = field(default_factory=dict)
+    shown: bool = True
 
     def __repr__(self) -> str:
         span = f"{self.times[0]:g} .. {self.times[-1]:g} s" if len(self.times) else "nothing"
@@ -56,8 +60,8 @@ class Run:
         """Table of state samples, columns as trace.schema.state_columns."""
         import pandas as pd
 
-        columns = state_table(self.replica, self.times, self.nodes, self.x, self.xhat, self.P)
-        return pd.DataFrame(columns)
+        samples = (self.times, self.nodes, self.x, self.xhat, self.P)
+        return pd.DataFrame(state_table(self.replica, *samples, self.shown))
 
     def count(self, kind: str) -> int:
         """Number of events of a kind."""
@@ -97,8 +101,9 @@ def state_table(
     x: FloatArray,
     xhat: FloatArray,
     P: FloatArray,
+    shown: bool = True,
 ) -> dict[str, Any]:
-    """Samples as named columns, a row a time and node."""
+    """Samples as named columns, a row a time and node; errors only where the truth is shown."""
     count, n = len(nodes), x.shape[1]
     rows = len(times) * count
     upper = np.triu_indices(n)
@@ -113,7 +118,10 @@ def state_table(
         sq_error.reshape(rows),
         nees.reshape(rows),
     ]
-    return dict(zip(state_columns(n), values, strict=True))
+    table = dict(zip(state_columns(n), values, strict=True))
+    if not shown:
+        del table["sq_error"], table["nees"]
+    return table
 
 
 def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None:
