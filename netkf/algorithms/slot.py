@@ -66,13 +66,15 @@ class SlotFilter(Part):
     ``programme`` lists the phases of a slot, "exchange" or "sense"; ``first_slot`` is the first in
     which nodes exchange; ``predicts`` says that a sample shows the prediction with which a slot
     begins, else what is known after its reading; ``pairwise`` that nodes exchange in pairs (a
-    matching), else all with all neighbours. ``talks``, ``pooled``: as for flow filters.
+    matching), else all with all neighbours; ``one_way`` that links may go one way and that nodes
+    need not all be joined. ``talks``, ``pooled``: as for flow filters.
     """
 
     programme: ClassVar[tuple[str, ...]] = ("exchange", "sense")
     first_slot: ClassVar[int] = 0
     predicts: ClassVar[bool] = True
     pairwise: ClassVar[bool] = False
+    one_way: ClassVar[bool] = False
     talks: ClassVar[bool] = True
     pooled: ClassVar[bool] = False
 
@@ -162,6 +164,7 @@ class Intermittent(SlotFilter):
     """
 
     programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
+    one_way: ClassVar[bool] = True
 
     def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Keep the reading."""

@@ -226,7 +226,8 @@ class Broadcast(SlotActivation):
 @dataclass(frozen=True, eq=False)
 class RecordedSlots(SlotActivation):
     """Exchanges read from a table: ``slot,node,peer`` for matchings (the pairs of each slot), or
-    ``slot,phase,step,node,peer`` for broadcasts (the links that were up).
+    ``slot,phase,step,node,peer`` for broadcasts (the links that were up, from node to peer, in both
+    directions where the graph is undirected).
     """
 
     path: SourceFile = setting(source_file)
@@ -243,7 +244,8 @@ class RecordedSlots(SlotActivation):
     @cached_property
     def _pairs(self) -> dict[tuple[int, int], list[Link]]:
         names: tuple[str, ...] = ("slot", "node", "peer")
-        if not self.matching:
+        matching = self.matching
+        if not matching:
             names = ("slot", "phase", "step", "node", "peer")
         table = read_columns(self.path, names)
         columns = {name: whole(self.path, name, table[name]) for name in names}
@@ -251,11 +253,11 @@ class RecordedSlots(SlotActivation):
         for row, (slot, i, j) in enumerate(
             zip(columns["slot"], columns["node"], columns["peer"], strict=True)
         ):
-            phase = 0 if self.matching else columns["phase"][row]
+            phase = 0 if matching else columns["phase"][row]
             listed = pairs.setdefault((slot, phase), [])
-            link = (min(i, j), max(i, j))
+            link = (min(i, j), max(i, j)) if matching else (i, j)
             busy = {node for pair in listed for node in pair}
-            if self.matching and link not in listed and (i == j or busy & {i, j}):
+            if matching and link not in listed and (i == j or busy & {i, j}):
                 words = f"{self.path.name}: a node may be paired once a slot"
                 raise ScenarioError("path", words, [slot, i, j], "mend the row")
             if link not in listed:
@@ -263,7 +265,7 @@ class RecordedSlots(SlotActivation):
         return {key: sorted(listed) for key, listed in pairs.items()}
 
     def pairs(self, slot: int, phase: int) -> list[Link]:
-        """The pairs of one exchange, sorted."""
+        """The pairs of one exchange, sorted; for broadcasts as they are listed, from node to peer."""
         return self._pairs.get((slot, phase), [])
 
     def check(self, topology: Topology) -> None:

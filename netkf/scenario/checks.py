@@ -8,12 +8,13 @@ import numpy as np
 
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import longest_interval
-from netkf.algorithms.slot import Intermittent, SlotFilter
+from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.regressors import RegressorSensor
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -93,9 +94,12 @@ def _sensors(scenario: Scenario) -> None:
     n, known = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
-        _shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
-        p = len(sensor.H)
-        _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
+        if isinstance(sensor, RegressorSensor):
+            _regressor(scenario, key, sensor)
+        else:
+            _shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
+            p = len(sensor.H)
+            _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for place, node in enumerate(sensor.nodes):
             if node not in known:
                 raise ScenarioError(
@@ -111,6 +115,25 @@ def _sensors(scenario: Scenario) -> None:
                 list(sensor.nodes),
                 "write a second [[sensors]] entry for a second sensor",
             )
+
+
+def _regressor(scenario: Scenario, key: str, sensor: RegressorSensor) -> None:
+    if not scenario.slotted:
+        raise ScenarioError(
+            f"{key}.kind",
+            "belongs to plants in slots (linear), and this plant is in continuous time",
+            "regressor",
+            "change the plant or use a linear sensor",
+        )
+    m, q = len(sensor.A), sensor.B.shape[1]
+    why = f"{key}.A has {m} rows"
+    _shape(f"{key}.B", sensor.B, (m, None), why)
+    _shape(
+        f"{key}.C", sensor.C, (scenario.plant.n, m), f"the state has {scenario.plant.n} components"
+    )
+    _shape(f"{key}.start", sensor.start, (m,), why)
+    _shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
+    _shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
 
 
 def _ids(nodes: tuple[int, ...]) -> str:
@@ -142,14 +165,15 @@ def _network(scenario: Scenario) -> None:
         )
     if not scenario.slotted:
         _ticks(scenario)
-    if topology.directed:
+    one_way = isinstance(algorithm, SlotFilter) and algorithm.one_way
+    if topology.directed and not one_way:
         raise ScenarioError(
             "network.graph.directed",
             f"must be false for the {name} filter, whose links work both ways",
             True,
             "give an undirected graph",
         )
-    if len(topology.components) > 1 and not isinstance(algorithm, Intermittent):
+    if len(topology.components) > 1 and not one_way:
         smallest = sorted(topology.components[-1])
         raise ScenarioError(
             "network.graph",
@@ -232,7 +256,7 @@ def _believed_noise(scenario: Scenario) -> None:
             ("filter.model.R", R) if not isinstance(R, tuple) else (f"filter.model.R[{k}]", R[k])
         )
         p = len(sensor.H)
-        _shape(key, own, (p, p), f"sensors[{k}].H has {p} rows")
+        _shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
 
 
 def _degrees(scenario: Scenario) -> None:

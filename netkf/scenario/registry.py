@@ -16,11 +16,12 @@ from netkf.network import channels, clocks, graphs, matchings
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
-from netkf.plants.sensors import LinearSensor
+from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sensors import LinearSensor, Sensor
 
 FAMILIES: dict[str, type[Part]] = {
     "plant": Plant,
-    "sensor": LinearSensor,
+    "sensor": Sensor,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
     "loss": channels.Loss,
@@ -33,7 +34,7 @@ FAMILIES: dict[str, type[Part]] = {
 
 KINDS: dict[str, dict[str, type[Part]]] = {
     "plant": {"diffusion": Diffusion, "linear": LinearPlant},
-    "sensor": {"linear": LinearSensor},
+    "sensor": {"linear": LinearSensor, "regressor": RegressorSensor},
     "graph": {
         "cycle": graphs.Cycle,
         "path": graphs.PathGraph,

@@ -40,7 +40,8 @@ from netkf.network.matchings import SlotActivation
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
-from netkf.plants.sensors import LinearSensor
+from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sensors import LinearSensor, Sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,9 @@ class Scenario(Part):
     name: str = setting(text)
     horizon: float = setting(positive)
     plant: Plant = setting(instance(Plant))
-    sensors: tuple[LinearSensor, ...] = setting(several(instance(LinearSensor), "sensors", least=0))
+    sensors: tuple[LinearSensor | RegressorSensor, ...] = setting(
+        several(instance(Sensor), "sensors", least=0)
+    )
     network: Network = setting(instance(Network))
     filter: Filtering = setting(instance(Filtering))
     probe: float | FloatArray = setting(either(positive, array(1, "list of times"), nested(1)))
@@ -198,9 +201,11 @@ class Scenario(Part):
 
     @cached_property
     def slot_models(self) -> tuple[SlotModel, ...]:
-        """What each node believes, in the order of ``nodes``."""
+        """What each node believes, in the order of ``nodes``; H of slot 0 where it differs from slot
+        to slot.
+        """
         return tuple(
-            SlotModel(*self.slot_belief, *self.observation(node, believed=True))
+            SlotModel(*self.slot_belief, *self._stacked(self.placed.get(node, ()), believed=True))
             for node in self.nodes
         )
 
@@ -243,8 +248,11 @@ class Scenario(Part):
 
     def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
         """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together; p may be 0. With
-        ``believed``, R is what the filter takes it to be.
+        ``believed``, R is what the filter takes it to be. Raises TheoryError where H differs from
+        slot to slot.
         """
+        if any(self.sensors[place.entry].varying for place in self.placed.get(node, ())):
+            raise TheoryError(f"node {node} has a regressor sensor, whose H is random")
         return self._stacked(self.placed.get(node, ()), believed)
 
     def _stacked(self, placed: tuple[Placed, ...], believed: bool) -> tuple[FloatArray, FloatArray]:

@@ -111,8 +111,7 @@ def _swaps(scenario: Scenario) -> list[Row]:
 def _sight(scenario: Scenario) -> dict[int, FloatArray]:
     """For each node, H of all readings that can reach it."""
     near: dict[int, set[int]] = {node: {node} for node in scenario.nodes}
-    for i, j in scenario.topology.links:
-        near[i].add(j)
+    for i, j in scenario.topology.directions:
         near[j].add(i)
     return {
         node: np.concatenate([scenario.observation(peer)[0] for peer in sorted(peers)])
@@ -132,9 +131,7 @@ def _readings(scenario: Scenario) -> list[Row]:
 def _arrivals(scenario: Scenario) -> list[Row]:
     loss, F = scenario.network.channel.loss, scenario.slot_plant.F
     rates = [
-        loss.mean_delivery(link, scenario.measured(link))
-        for pair in scenario.topology.links
-        for link in (pair, pair[::-1])
+        loss.mean_delivery(link, scenario.measured(link)) for link in scenario.topology.directions
     ]
     known = [rate for rate in rates if np.isfinite(rate)]
     least = min(known, default=1.0)

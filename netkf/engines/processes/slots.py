@@ -179,6 +179,8 @@ class SlotProcess:
         elif isinstance(activation, RecordedSlots):
             listed = activation.pairs(slot, phase)
             pairs, up = (pairs, set(listed)) if broadcast else (listed, None)
+            if up is not None and not self._scenario.topology.directed:
+                up |= {(j, i) for i, j in listed}
         if broadcast:
             self._recorder.append((now, ROUND, -1, -1, -1, phase, NAN))
         letters = {
@@ -214,9 +216,7 @@ class SlotProcess:
 def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[int, SlotHost]:
     def sensors(node: int) -> list[SlotReadings]:
         return [
-            scenario.sensors[place.entry].slot_path(
-                partial(stream, streams, (node, place.ordinal))
-            )
+            scenario.sensors[place.entry].slot_path(partial(stream, streams, (node, place.ordinal)))
             for place in scenario.placed.get(node, ())
         ]
 

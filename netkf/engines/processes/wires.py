@@ -50,7 +50,7 @@ class Direction:
 
 
 class Wire:
-    """Both directions of one link."""
+    """Both directions of one link, or the one that it has where the graph is directed."""
 
     def __init__(
         self,
@@ -67,25 +67,25 @@ class Wire:
         self._timeline, self._recorder = timeline, recorder
         self._horizon = scenario.horizon
         forth = Fates(channel, partial(stream, streams, (i, j)))
-        # Symmetric: the messages of one activation share one draw.
-        back = forth if self._shared else Fates(channel, partial(stream, streams, (j, i)))
-        self._ways = (
-            Direction(scenario, (i, j), 2 * entity, receivers[j], forth),
-            Direction(scenario, (j, i), 2 * entity + 1, receivers[i], back),
-        )
+        self._ways = [Direction(scenario, (i, j), 2 * entity, receivers[j], forth)]
+        if not scenario.topology.directed:
+            # Symmetric: the messages of one activation share one draw.
+            back = forth if self._shared else Fates(channel, partial(stream, streams, (j, i)))
+            self._ways.append(Direction(scenario, (j, i), 2 * entity + 1, receivers[i], back))
 
     def exchange(
         self, now: float, payloads: tuple[Any, Any], phase: int = -1, up: bool = True
     ) -> None:
-        """Send one message each way; both are lost where the link is not ``up``.
+        """Send one message each way that there is, of the payloads of both ends; all are lost where
+        the link is not ``up``.
 
         None is not sent, but its fate is drawn all the same.
         """
-        forth, back = self._ways
-        fate = forth.fates.draw()
-        other = fate if self._shared else back.fates.draw()
-        self._send(now, forth, payloads[0], fate if up else DOWN, phase)
-        self._send(now, back, payloads[1], other if up else DOWN, phase)
+        fate = None
+        for way, payload in zip(self._ways, payloads, strict=False):
+            if fate is None or not self._shared:
+                fate = way.fates.draw()
+            self._send(now, way, payload, fate if up else DOWN, phase)
 
     def _send(
         self, now: float, way: Direction, payload: Any, fate: tuple[float, bool, float], phase: int
