@@ -51,6 +51,14 @@ class SlotState(NamedTuple):
     kept: Any = None
 
 
+class Role(NamedTuple):
+    """What a node may be told about the network before slot 0: its ``own`` weight, which is left to
+    it when the messages of all neighbours arrive.
+    """
+
+    own: float
+
+
 class Reading(NamedTuple):
     """One reading: ``y`` (p,), with the ``H`` (p, n) and ``R`` (p, p) that its sender believes."""
 
@@ -67,7 +75,8 @@ class SlotFilter(Part):
     which nodes exchange; ``predicts`` says that a sample shows the prediction with which a slot
     begins, else what is known after its reading; ``pairwise`` that nodes exchange in pairs (a
     matching), else all with all neighbours; ``one_way`` that links may go one way and that nodes
-    need not all be joined. ``talks``, ``pooled``: as for flow filters.
+    need not all be joined; ``inverts`` that covariances must never be singular. ``talks``,
+    ``pooled``: as for flow filters.
     """
 
     programme: ClassVar[tuple[str, ...]] = ("exchange", "sense")
@@ -75,12 +84,17 @@ class SlotFilter(Part):
     predicts: ClassVar[bool] = True
     pairwise: ClassVar[bool] = False
     one_way: ClassVar[bool] = False
+    inverts: ClassVar[bool] = False
     talks: ClassVar[bool] = True
     pooled: ClassVar[bool] = False
 
     def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> Any:
         """The state at slot 0."""
         return SlotState(mean, square_root(cov), model)
+
+    def place(self, state: Any, role: Role) -> Any:
+        """The state at slot 0 of a node that knows its role; asked for after ``init``."""
+        return state
 
     @abstractmethod
     def sense(self, state: Any, reading: Reading) -> Any:
@@ -99,6 +113,13 @@ class SlotFilter(Part):
     def weight(self, degree: int, peer_degree: int) -> float:
         """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
         return 1.0 / (1.0 + max(degree, peer_degree))
+
+    @property
+    def pair_weights(self) -> FloatArray | None:
+        """(N, N) in the order of node ids: entry [l, i] is the weight node i gives to a message of
+        node l. None where ``weight`` says it.
+        """
+        return None
 
     def largest_degree(self) -> float:
         """The largest number of links a node may have."""

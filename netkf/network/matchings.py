@@ -265,7 +265,7 @@ class RecordedSlots(SlotActivation):
         return {key: sorted(listed) for key, listed in pairs.items()}
 
     def pairs(self, slot: int, phase: int) -> list[Link]:
-        """The pairs of one exchange, sorted; for broadcasts as they are listed, from node to peer."""
+        """The pairs of one exchange, sorted; for broadcasts from node to peer, as listed."""
         return self._pairs.get((slot, phase), [])
 
     def check(self, topology: Topology) -> None:

@@ -22,8 +22,8 @@ from netkf.plants.sensors import Sensor
 class RegressorSensor(Sensor):
     """``y_k = phi_k' x_k + v_k``, cov(v) = R, with ``phi_k = C s_k``, D (1) and section VI.
 
-    ``s_0 = start`` and ``s_k = A s_{k-1} + B xi_k``, cov(xi) = ``xi_cov``, independent of everything
-    else and from node to node. ``A`` (m, m), ``B`` (m, q), ``C`` (n, m), ``start`` (m,),
+    ``s_0 = start`` and ``s_k = A s_{k-1} + B xi_k``, cov(xi) = ``xi_cov``, independent of all else
+    and from node to node. ``A`` (m, m), ``B`` (m, q), ``C`` (n, m), ``start`` (m,),
     ``xi_cov`` (q, q), ``R`` (1, 1).
     """
 

@@ -237,6 +237,9 @@ def _filter(scenario: Scenario) -> None:
             )
         _shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     _believed_noise(scenario)
+    _weights(scenario)
+    if filtering.algorithm.inverts:
+        _invertible(scenario)
     _degrees(scenario)
 
 
@@ -257,6 +260,50 @@ def _believed_noise(scenario: Scenario) -> None:
         )
         p = len(sensor.H)
         _shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
+
+
+def _weights(scenario: Scenario) -> None:
+    algorithm, nodes = scenario.filter.algorithm, scenario.nodes
+    given = algorithm.pair_weights if isinstance(algorithm, SlotFilter) else None
+    if given is None:
+        return
+    _shape("filter.weights", given, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
+    links = set(scenario.topology.directions)
+    for sender, receiver in np.argwhere(given > 0.0).tolist():
+        pair = (nodes[sender], nodes[receiver])
+        if sender != receiver and pair not in links:
+            raise ScenarioError(
+                f"filter.weights[{sender}][{receiver}]",
+                f"must be 0, because no link goes from node {pair[0]} to node {pair[1]}",
+                float(given[sender, receiver]),
+                "add the link; rows are senders, columns receivers",
+            )
+
+
+def _invertible(scenario: Scenario) -> None:
+    """Covariances never become singular: noise reaches every state, or they do not start so and no
+    state is forgotten at once.
+    """
+    n = scenario.plant.n
+    starts = [scenario.start(node)[1] for node in scenario.nodes]
+    whole = all(np.linalg.matrix_rank(cov, hermitian=True) == n for cov in starts)
+    if scenario.slotted:
+        F, Q = scenario.slot_belief
+        driven = np.linalg.matrix_rank(Q, hermitian=True) == n
+        regular = driven or (whole and np.linalg.matrix_rank(F) == n)
+    else:
+        A, Q = scenario.belief
+        reached = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
+        regular = whole or np.linalg.matrix_rank(np.concatenate(reached, axis=1)) == n
+    if not regular:
+        name = type(scenario.filter.algorithm).__name__.lower()
+        raise ScenarioError(
+            "filter.cov",
+            f"must be positive definite for the {name} filter, which inverts covariances, where "
+            "the noise does not drive every state",
+            None,
+            "give filter.cov, or a positive definite Q",
+        )
 
 
 def _degrees(scenario: Scenario) -> None:

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
+from netkf.algorithms.diffusion import Diffusion as DiffusionFilter
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
@@ -67,7 +69,12 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "uniform": channels.UniformDelay,
         "lognormal": channels.LognormalDelay,
     },
-    "filter": {"hybrid": Hybrid, "local": Local, "central": Central},
+    "filter": {
+        "hybrid": Hybrid,
+        "covariance-intersection": CovarianceIntersection,
+        "local": Local,
+        "central": Central,
+    },
     "slot activation": {
         "matching": matchings.Matching,
         "broadcast": matchings.Broadcast,
@@ -76,6 +83,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
     "slot filter": {
         "gossip": Gossip,
         "intermittent": Intermittent,
+        "diffusion": DiffusionFilter,
         "local": SlotLocal,
         "central": SlotCentral,
     },

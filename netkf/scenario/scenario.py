@@ -201,9 +201,7 @@ class Scenario(Part):
 
     @cached_property
     def slot_models(self) -> tuple[SlotModel, ...]:
-        """What each node believes, in the order of ``nodes``; H of slot 0 where it differs from slot
-        to slot.
-        """
+        """What each node believes, in the order of ``nodes``; H of slot 0 where H is random."""
         return tuple(
             SlotModel(*self.slot_belief, *self._stacked(self.placed.get(node, ()), believed=True))
             for node in self.nodes
@@ -325,9 +323,20 @@ class Scenario(Part):
         )
 
     def weight(self, receiver: int, sender: int) -> float:
-        """The weight a node gives to a message: pi_ij of H (7)."""
-        degrees = self.topology.degrees
-        return self.filter.algorithm.weight(degrees[receiver], degrees[sender])
+        """The weight a node gives to a message: pi_ij of H (7), a_ji of D (8)."""
+        algorithm, topology = self.filter.algorithm, self.topology
+        given = algorithm.pair_weights if isinstance(algorithm, SlotFilter) else None
+        if given is not None:
+            return float(given[topology.index[sender], topology.index[receiver]])
+        return algorithm.weight(topology.degrees[receiver], topology.degrees[sender])
+
+    @cached_property
+    def own_weights(self) -> dict[int, float]:
+        """What is left to each node when the messages of all its neighbours arrive together."""
+        own = dict.fromkeys(self.nodes, 1.0)
+        for sender, receiver in self.topology.directions:
+            own[receiver] -= self.weight(receiver, sender)
+        return {node: max(value, 0.0) for node, value in own.items()}
 
     def measured(self, link: Link) -> float:
         """The delivery probability of a direction in the graph's table, 1 where it has none."""

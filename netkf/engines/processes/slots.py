@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import simpy
 
-from netkf.algorithms.slot import Reading, SlotFilter, SlotModel
+from netkf.algorithms.slot import Reading, Role, SlotFilter, SlotModel
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
@@ -226,7 +226,10 @@ def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[
         model = scenario.pooled_slot_model
         shared = SlotHost(algorithm, -1, model, scenario.start(nodes[0]), every)
         return dict.fromkeys(nodes, shared)
-    return {
+    hosts = {
         node: SlotHost(algorithm, node, model, scenario.start(node), sensors(node))
         for node, model in zip(nodes, scenario.slot_models, strict=True)
     }
+    for node, host in hosts.items():
+        host.state = algorithm.place(host.state, Role(scenario.own_weights[node]))
+    return hosts
