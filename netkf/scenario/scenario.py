@@ -33,12 +33,13 @@ from netkf.core.fields import (
     text,
     vector,
 )
+from netkf.core.streams import Streams
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
 from netkf.plants.diffusion import Diffusion, default_sensing_period
-from netkf.plants.linear import LinearPlant
+from netkf.plants.linear import LinearPlant, SlotReadings
 from netkf.plants.plant import Plant
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
@@ -255,11 +256,17 @@ class Scenario(Part):
 
     def _stacked(self, placed: tuple[Placed, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
         H = [self.sensors[place.entry].H for place in placed]
-        R = [self._noise(place.entry, believed) for place in placed]
+        R = [self.noise(place.entry, believed) for place in placed]
         empty = np.zeros((0, self.plant.n))
         return np.concatenate([empty, *H]), block_diagonal(R)
 
-    def _noise(self, entry: int, believed: bool) -> FloatArray:
+    def slot_path(self, streams: Streams, node: int, place: Placed) -> SlotReadings:
+        """The readings of one sensor of a node in one run in slots."""
+        sensor = self.sensors[place.entry]
+        return sensor.slot_path(lambda purpose: streams.generator(purpose, node, place.ordinal))
+
+    def noise(self, entry: int, believed: bool) -> FloatArray:
+        """R (p, p) of a ``[[sensors]]`` entry, as it is or as the filters believe it."""
         R = self.filter.model.R
         if not believed or R is None:
             return self.sensors[entry].R
@@ -282,7 +289,7 @@ class Scenario(Part):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
         else:
             pairs = [*zip(self.belief, (self.truth.A, self.truth.Q), strict=True)]
-        pairs += [(self._noise(k, True), self._noise(k, False)) for k in range(len(self.sensors))]
+        pairs += [(self.noise(k, True), self.noise(k, False)) for k in range(len(self.sensors))]
         return all(np.array_equal(believed, true) for believed, true in pairs)
 
     @cached_property

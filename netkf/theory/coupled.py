@@ -41,13 +41,13 @@ class Coupled(NamedTuple):
 STEPS = ("init", "flow", "measure", "emit", "absorb", "estimate")
 
 
-def own_steps(algorithm: object, known: type) -> list[str]:
+def own_steps(algorithm: object, known: type, steps: tuple[str, ...] = STEPS) -> list[str]:
     """The steps that a user's subclass defines itself; theorems about ``known`` are not about it.
 
     Other weights are understood, they enter the equations.
     """
     mine = type(algorithm)
-    return [name for name in STEPS if getattr(mine, name, None) is not getattr(known, name)]
+    return [name for name in steps if getattr(mine, name, None) is not getattr(known, name, None)]
 
 
 def not_promised(scenario: Scenario) -> str | None:

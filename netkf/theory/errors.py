@@ -24,6 +24,7 @@ from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import own_steps
+from netkf.theory.slot_errors import stacked_slot_errors
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -32,14 +33,29 @@ _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
 
 def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> FloatArray:
-    """(T, N, n, n): covariance of x - xhat_i at ``run.times``, given the run's events.
+    """(T, N, n, n): covariance of x - xhat_i at ``run.times``, given the run's events and its
+    regressors.
 
     With ``stacked``, (T, N n, N n): the errors of all nodes together. H (10) says that each block
-    stays below P_i, which this shows without Monte Carlo. For the filters hybrid, local and
-    central, with delays and with models that differ from the truth. Raises TheoryError for other
-    filters, and for a user's subclass that does more than choose its weights.
+    stays below P_i, which this shows without Monte Carlo. For the filters hybrid, diffusion, local
+    and central, with delays and with models that differ from the truth. Raises TheoryError for
+    other filters, and for a user's subclass that does more than choose its weights.
     """
-    algorithm, _ = scenario.filter.algorithm, scenario.truth  # raises for scenarios in slots
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        raise TheoryError("the run is of another scenario: its nodes or its state differ")
+    flow = not scenario.slotted
+    whole = _stacked_errors(scenario, run) if flow else stacked_slot_errors(scenario, run)
+    nodes, n = len(scenario.nodes), scenario.plant.n
+    if whole.shape[-1] < nodes * n:
+        whole = np.tile(whole, (1, nodes, nodes))
+    if stacked:
+        return whole
+    blocks = whole.reshape(len(whole), nodes, n, nodes, n)
+    return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+
+
+def _stacked_errors(scenario: Scenario, run: Run) -> FloatArray:
+    algorithm, n = scenario.filter.algorithm, scenario.plant.n
     if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
     known = Hybrid if algorithm.talks else Local
@@ -47,9 +63,6 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     if own:
         words = f"{type(algorithm).__name__} defines {own[0]} itself"
         raise TheoryError(f"the exact error covariance is not known: {words}")
-    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
-        raise TheoryError("the run is of another scenario: its nodes or its state differ")
-    nodes, n = len(scenario.nodes), scenario.plant.n
     errors = _Errors(scenario)
     hosts = errors.hosts
     whole = np.empty((len(run.times), hosts * n, hosts * n))
@@ -61,12 +74,7 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
             following = next(moments, None)
         errors.advance(time)
         whole[k] = errors.of_hosts()
-    if hosts < nodes:
-        whole = np.tile(whole, (1, nodes, nodes))
-    if stacked:
-        return whole
-    blocks = whole.reshape(len(whole), nodes, n, nodes, n)
-    return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+    return whole
 
 
 class _Instant(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.processes.timeline import Timeline
-from netkf.engines.processes.wires import Wire, stream
+from netkf.engines.processes.wires import Wire
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.linear import LinearPath, LinearPlant, SlotReadings
@@ -215,10 +214,7 @@ class SlotProcess:
 
 def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[int, SlotHost]:
     def sensors(node: int) -> list[SlotReadings]:
-        return [
-            scenario.sensors[place.entry].slot_path(partial(stream, streams, (node, place.ordinal)))
-            for place in scenario.placed.get(node, ())
-        ]
+        return [scenario.slot_path(streams, node, place) for place in scenario.placed.get(node, ())]
 
     nodes = scenario.nodes
     if algorithm.pooled:
