@@ -1,9 +1,10 @@
 """Slot filters: node algorithms in discrete time.
 
 Each slot is a short programme of phases that the filter declares, such as ``("exchange",
-"sense")``. In an exchange every node may send once and then absorbs all that arrived before the
-inbox closed; in a sense phase it is handed the reading of the slot. States are NamedTuples of
-arrays that nothing changes in place. Covariances are carried as square roots, ``P = root root'``.
+"sense")``. An exchange has one step or several; in each every node may send once and then absorbs
+all that arrived before the inbox closed. In a sense phase it is handed the reading of the slot.
+States are NamedTuples of arrays that nothing changes in place. Covariances are carried as square
+roots, ``P = root root'``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
-from netkf.core.arrays import FloatArray, block_diagonal, square_root
+from netkf.core.arrays import FloatArray, block_diagonal, square_root, symmetric
 from netkf.core.fields import Part
 
 Messages = Sequence[tuple[float, Any, float]]
@@ -41,6 +42,11 @@ class SlotModel:
         """``root_Q root_Q' = Q``."""
         return square_root(self.Q)
 
+    @property
+    def information(self) -> FloatArray:
+        """``H' R^-1 H`` (n, n)."""
+        return symmetric(self.H.T @ np.linalg.solve(self.R, self.H))
+
 
 class SlotState(NamedTuple):
     """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, a ``kept`` reading."""
@@ -52,10 +58,16 @@ class SlotState(NamedTuple):
 
 
 class Role(NamedTuple):
-    """What a node may be told about the network before slot 0: its ``own`` weight, which is left to
-    it when the messages of all neighbours arrive.
+    """What a node may be told about the network before slot 0: its own id, how many ``neighbours``
+    it has when no link fails, how many ``nodes`` there are, the ``information`` (n, n) of all their
+    sensors together, the sum of H' R^-1 H as the filters believe it, and its ``own`` weight, which
+    is left to it when the messages of all neighbours arrive.
     """
 
+    node: int
+    neighbours: int
+    nodes: int
+    information: FloatArray
     own: float
 
 
@@ -96,19 +108,39 @@ class SlotFilter(Part):
         """The state at slot 0 of a node that knows its role; asked for after ``init``."""
         return state
 
+    def steps(self, phase: int) -> int:
+        """How often exchange number ``phase`` of a slot is repeated; its time is shared evenly."""
+        return 1
+
+    def redraws(self, phase: int, step: int) -> bool:
+        """Whether the links draw new fates in a step, else each keeps its last one; True in the
+        first.
+        """
+        return True
+
     @abstractmethod
     def sense(self, state: Any, reading: Reading) -> Any:
         """The state once the node's reading of this slot is known; p is 0 without sensors."""
 
     def emit(self, state: Any, phase: int) -> Any:
-        """What the node sends in exchange number ``phase`` of the slot; None for nothing."""
+        """What the node sends in each step of exchange number ``phase``; None for nothing."""
         return None
 
     def absorb(self, state: Any, phase: int, messages: Messages) -> Any:
-        """The state when the inbox of that exchange closes; called for every node, with all
+        """The state when the inbox of that step closes; called for every node, with all
         ``(weight, payload, age)`` that arrived in time in the order of their senders.
         """
         return state
+
+    def stopped(self, state: Any) -> bool:
+        """Whether the node has stopped learning what it learns from the others, for ever."""
+        return False
+
+    def conserved(self, state: Any) -> dict[str, float]:
+        """Quantities by name whose sums over all nodes no exchange changes as long as messages are
+        lost in both directions or in none; a run reports how far the sums have drifted.
+        """
+        return {}
 
     def weight(self, degree: int, peer_degree: int) -> float:
         """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""

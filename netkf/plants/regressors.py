@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -27,8 +26,6 @@ class RegressorSensor(Sensor):
     ``xi_cov`` (q, q), ``R`` (1, 1).
     """
 
-    varying: ClassVar[bool] = True
-
     A: FloatArray = setting(square)
     B: FloatArray = setting(matrix)
     C: FloatArray = setting(matrix)
@@ -37,11 +34,18 @@ class RegressorSensor(Sensor):
     R: FloatArray = setting(definite_covariance)
 
     @property
+    def varying(self) -> bool:
+        """True."""
+        return True
+
+    @property
     def H(self) -> FloatArray:
         """(1, n): the row of slot 0."""
         return frozen((self.C @ self.start)[None])
 
-    def slot_path(self, generator: Callable[[str], np.random.Generator]) -> RegressorReadings:
+    def slot_path(
+        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
+    ) -> RegressorReadings:
         """From the streams "noise" and "regressor"."""
         return RegressorReadings(self, generator("noise"), generator("regressor"))
 

@@ -11,6 +11,7 @@ from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import Diffusion as DiffusionFilter
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import Part
@@ -18,6 +19,7 @@ from netkf.network import channels, clocks, graphs, matchings
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
+from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
 
@@ -35,8 +37,13 @@ FAMILIES: dict[str, type[Part]] = {
 """The contract that the classes of each family keep."""
 
 KINDS: dict[str, dict[str, type[Part]]] = {
-    "plant": {"diffusion": Diffusion, "linear": LinearPlant},
-    "sensor": {"linear": LinearSensor, "regressor": RegressorSensor},
+    "plant": {
+        "diffusion": Diffusion,
+        "linear": LinearPlant,
+        "recorded": RecordedPlant,
+        "unknown": UnknownPlant,
+    },
+    "sensor": {"linear": LinearSensor, "regressor": RegressorSensor, "recorded": RecordedSensor},
     "graph": {
         "cycle": graphs.Cycle,
         "path": graphs.PathGraph,
@@ -84,6 +91,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "gossip": Gossip,
         "intermittent": Intermittent,
         "diffusion": DiffusionFilter,
+        "push-sum": PushSum,
         "local": SlotLocal,
         "central": SlotCentral,
     },

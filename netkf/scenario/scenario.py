@@ -12,7 +12,7 @@ import numpy as np
 
 from netkf.algorithms.flow import FlowFilter, FlowModel
 from netkf.algorithms.gains import longest_interval
-from netkf.algorithms.slot import SlotFilter, SlotModel
+from netkf.algorithms.slot import Role, SlotFilter, SlotModel
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
 from netkf.core.fields import (
@@ -39,8 +39,9 @@ from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
 from netkf.plants.diffusion import Diffusion, default_sensing_period
-from netkf.plants.linear import LinearPlant, SlotReadings
+from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.plant import Plant
+from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
 
@@ -112,7 +113,7 @@ class Scenario(Part):
     name: str = setting(text)
     horizon: float = setting(positive)
     plant: Plant = setting(instance(Plant))
-    sensors: tuple[LinearSensor | RegressorSensor, ...] = setting(
+    sensors: tuple[LinearSensor | RegressorSensor | RecordedSensor, ...] = setting(
         several(instance(Sensor), "sensors", least=0)
     )
     network: Network = setting(instance(Network))
@@ -163,6 +164,13 @@ class Scenario(Part):
         digits = 12 - min(0, int(np.floor(np.log10(self.probe))))
         return np.minimum(np.round(self.probe * np.arange(count + 1), digits), self.horizon)
 
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """One line each about what a user should know before anything runs."""
+        from netkf.scenario.push_sum import push_sum_notes
+
+        return (*self.topology.notes, *push_sum_notes(self))
+
     @property
     def slotted(self) -> bool:
         """Whether the scenario runs in slots, else in continuous time."""
@@ -182,8 +190,18 @@ class Scenario(Part):
         return tuple(round(t / period) for t in self.times.tolist())
 
     @property
+    def ends(self) -> float:
+        """When the last thing may happen: the horizon, or the end of the slot that begins there
+        where a sample shows what is known after the exchanges of its slot.
+        """
+        algorithm = self.filter.algorithm
+        if not isinstance(algorithm, SlotFilter) or algorithm.predicts:
+            return self.horizon
+        return self.horizon + self.slot_plant.period
+
+    @property
     def phase_length(self) -> float:
-        """Seconds that an exchange of a slot lasts."""
+        """Seconds that an exchange of a slot lasts; its steps share them evenly."""
         activation, algorithm = self.network.activation, self.filter.algorithm
         assert isinstance(activation, SlotActivation)
         assert isinstance(algorithm, SlotFilter)
@@ -207,6 +225,15 @@ class Scenario(Part):
             SlotModel(*self.slot_belief, *self._stacked(self.placed.get(node, ()), believed=True))
             for node in self.nodes
         )
+
+    @cached_property
+    def roles(self) -> tuple[Role, ...]:
+        """What each node may be told about the network, in the order of ``nodes``."""
+        information = np.zeros((self.plant.n, self.plant.n))
+        for model in self.slot_models:
+            information = information + model.information
+        degrees, own, size = self.topology.degrees, self.own_weights, len(self.nodes)
+        return tuple(Role(node, degrees[node], size, information, own[node]) for node in self.nodes)
 
     @cached_property
     def pooled_slot_model(self) -> SlotModel:
@@ -260,10 +287,12 @@ class Scenario(Part):
         empty = np.zeros((0, self.plant.n))
         return np.concatenate([empty, *H]), block_diagonal(R)
 
-    def slot_path(self, streams: Streams, node: int, place: Placed) -> SlotReadings:
+    def slot_path(self, streams: Streams, node: int, place: Placed) -> Readings:
         """The readings of one sensor of a node in one run in slots."""
-        sensor = self.sensors[place.entry]
-        return sensor.slot_path(lambda purpose: streams.generator(purpose, node, place.ordinal))
+        sensor, period = self.sensors[place.entry], self.slot_plant.period
+        return sensor.slot_path(
+            node, period, lambda purpose: streams.generator(purpose, node, place.ordinal)
+        )
 
     def noise(self, entry: int, believed: bool) -> FloatArray:
         """R (p, p) of a ``[[sensors]]`` entry, as it is or as the filters believe it."""
@@ -285,6 +314,8 @@ class Scenario(Part):
     def filters_know_the_truth(self) -> bool:
         """Whether the filters have the plant's matrices and the sensors' R."""
         plant = self.plant
+        if not (plant.drawn and all(sensor.drawn for sensor in self.sensors)):
+            return False
         if isinstance(plant, LinearPlant):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
         else:

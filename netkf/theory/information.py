@@ -29,6 +29,8 @@ _WEIGHTS = _STEP * _U * np.exp(-_U)
 NOTHING = 1e-12  # an eigenvalue that small, relative to the trace, is 0
 MOST_SEARCHED = 30  # numbers in a past that the search for the worst one can handle
 QUANTILE = 2.576
+ACCURACY = 1e-9
+"""Relative error of the integral, with room to spare."""
 
 
 def information_level(
@@ -36,13 +38,17 @@ def information_level(
 ) -> pd.DataFrame:
     """The conditional least eigenvalue lambda_k of D (19), and of D (5) for each sensor alone.
 
-    A row for the network (node -1) and for each sensor: node, window, level, low, high, least.
-    ``window`` is h in slots, by default the shortest of up to 2 n for which the network's least is
-    positive, else 2 n. lambda_k depends on the past through the regressors' states; ``level`` is
-    its mean over ``runs`` pasts from their law at random slots of the horizon with its 99 %
-    interval, and ``least`` the smallest over those, the past in which all states are 0, and what a
-    search from the best of them found: D (19) holds for every past where that does not vanish. As
-    printed, h terms are divided by h + 1. Raises TheoryError where a sensor's future is not known.
+    A row for the network (node -1) and for each sensor, with the columns
+
+    window           h in slots; by default the shortest of up to 2 n for which the network's level
+                     is positive, else 2 n
+    level, low, high the least lambda_k over the past, on which it depends through the regressors'
+                     states: over ``runs`` pasts from their law at random slots of the horizon, the
+                     one in which all states are 0, and what a search from both found; the interval
+                     is that of the integral at that past. Where it is positive D (19) holds
+    mean, mean_low, mean_high   lambda_k in the mean over the pasts drawn, with its 99 % interval
+
+    As printed, h terms are divided by h + 1. Raises TheoryError for sensors that are records.
     """
     import pandas as pd
 
@@ -55,10 +61,11 @@ def information_level(
     whole = (-1, sources, past)
     if window is None:
         longest = 2 * scenario.plant.n
-        window = next((h for h in range(1, longest) if _row(*whole, h)[-1] > 0.0), longest)
+        window = next((h for h in range(1, longest) if _row(*whole, h)[2] > 0.0), longest)
     rows = [_row(*whole, window)]
     rows += [_row(s.node, [s], [p], window) for s, p in zip(sources, past, strict=True)]
-    return pd.DataFrame(rows, columns=["node", "window", "level", "low", "high", "least"])
+    names = ["node", "window", "level", "low", "high", "mean", "mean_low", "mean_high"]
+    return pd.DataFrame(rows, columns=names)
 
 
 class _Source(NamedTuple):
@@ -80,10 +87,8 @@ def _sources(scenario: Scenario) -> list[_Source]:
                 drive = sensor.B @ sensor.xi_cov @ sensor.B.T
                 found.append(_Source(node, sensor.A, sensor.C, sensor.start, drive))
             elif isinstance(sensor, LinearSensor):
-                zero = np.zeros((0, 0))
-                found += [
-                    _Source(node, np.eye(1), row[:, None], np.ones(1), zero) for row in sensor.H
-                ]
+                still = (np.ones(1), np.zeros((0, 0)))
+                found += [_Source(node, np.eye(1), row[:, None], *still) for row in sensor.H]
             else:
                 raise TheoryError(f"the sensor of node {node} is a record, which has no law")
     if not found:
@@ -115,11 +120,13 @@ def _law(source: _Source, slots: np.ndarray, random: np.random.Generator) -> Flo
 
 def _row(
     node: int, sources: list[_Source], past: list[FloatArray], window: int
-) -> tuple[int, int, float, float, float, float]:
+) -> tuple[int, int, float, float, float, float, float, float]:
     values = _levels(sources, past, window)
     mean = float(values.mean())
     error = QUANTILE * float(values.std(ddof=1)) / np.sqrt(len(values))
-    return node, window, mean, mean - error, mean + error, _least(sources, past, values, window)
+    level = _least(sources, past, values, window)
+    interval = level * (1.0 - ACCURACY), level * (1.0 + ACCURACY)
+    return node, window, level, *interval, mean, mean - error, mean + error
 
 
 def _least(
@@ -150,7 +157,8 @@ def _least(
 
 def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> FloatArray:
     """lambda_k (k,) for each of k pasts."""
-    total = 0.0
+    n = len(sources[0].C)
+    total = np.zeros((len(past[0]), n, n))
     for source, states in zip(sources, past, strict=True):
         mean = states
         cov = np.zeros_like(source.A)
@@ -158,7 +166,7 @@ def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> Floa
             mean = mean @ source.A.T
             cov = source.A @ cov @ source.A.T + (source.drive if source.drive.size else 0.0)
             total = total + normalised_outer(mean @ source.C.T, source.C @ cov @ source.C.T)
-    values = np.linalg.eigvalsh(symmetric(np.asarray(total)))
+    values = np.linalg.eigvalsh(symmetric(total))
     least = values[:, 0] / (len(sources) * (window + 1))
     return np.where(values[:, 0] > NOTHING * values.sum(axis=1), least, 0.0)
 

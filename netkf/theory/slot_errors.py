@@ -16,7 +16,7 @@ from netkf.algorithms.slot import SlotCentral, SlotLocal
 from netkf.core.arrays import FloatArray, block_diagonal, symmetric
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
-from netkf.plants.linear import SlotReadings
+from netkf.plants.linear import Readings
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import own_steps
 from netkf.trace.run import Run
@@ -73,7 +73,7 @@ def _arrived(scenario: Scenario, run: Run) -> dict[int, Arrived]:
 class _Host(NamedTuple):
     """The sensors of one filter, their R as believed and the root of the true one."""
 
-    sensors: list[SlotReadings]
+    sensors: list[Readings]
     R: FloatArray
     root: FloatArray
 

@@ -66,6 +66,8 @@ class Wire:
         self._loss, self._shared = channel.loss, channel.symmetric
         self._timeline, self._recorder = timeline, recorder
         self._horizon = scenario.horizon
+        self._until = scenario.ends
+        self._kept: list[tuple[float, bool, float]] = []
         forth = Fates(channel, partial(stream, streams, (i, j)))
         self._ways = [Direction(scenario, (i, j), 2 * entity, receivers[j], forth)]
         if not scenario.topology.directed:
@@ -74,17 +76,25 @@ class Wire:
             self._ways.append(Direction(scenario, (j, i), 2 * entity + 1, receivers[i], back))
 
     def exchange(
-        self, now: float, payloads: tuple[Any, Any], phase: int = -1, up: bool = True
+        self,
+        now: float,
+        payloads: tuple[Any, Any],
+        phase: int = -1,
+        up: bool = True,
+        fresh: bool = True,
     ) -> None:
         """Send one message each way that there is, of the payloads of both ends; all are lost where
-        the link is not ``up``.
+        the link is not ``up``. Unless they are ``fresh`` the fates are those of the last time.
 
         None is not sent, but its fate is drawn all the same.
         """
-        fate = None
-        for way, payload in zip(self._ways, payloads, strict=False):
-            if fate is None or not self._shared:
-                fate = way.fates.draw()
+        if fresh:
+            first = self._ways[0].fates.draw()
+            self._kept = [
+                first,
+                *(first if self._shared else way.fates.draw() for way in self._ways[1:]),
+            ]
+        for way, payload, fate in zip(self._ways, payloads, self._kept, strict=False):
             self._send(now, way, payload, fate if up else DOWN, phase)
 
     def _send(
@@ -104,7 +114,7 @@ class Wire:
             way.receiver.receive(now, sender, number, way.weight, payload, 0.0)
             return
         arrival = now + delay
-        if arrival < self._horizon:
+        if arrival < self._until:
             event = self._timeline.at(arrival, Rank.DELIVER, way.entity)
             assert event.callbacks is not None
             event.callbacks.append(partial(self._arrive, way, number, payload, now, phase))
@@ -121,7 +131,8 @@ class Wire:
         now, (sender, receiver) = self._timeline.now, way.link
         in_time = way.receiver.accepts(payload)
         kind = DELIVER if in_time else LATE
-        self._recorder.append((now, kind, receiver, sender, number, phase, now - sent))
+        if now < self._horizon:
+            self._recorder.append((now, kind, receiver, sender, number, phase, now - sent))
         if in_time:
             way.receiver.receive(now, sender, number, way.weight, payload, now - sent)
 
