@@ -115,7 +115,8 @@ class RecordedSensor(Sensor):
         if self.varying and any(self._rows.values()):
             row = next(rows[0][1] for rows in self._rows.values() if rows)
             object.__setattr__(self, "H", frozen(row[None, 1:]))
-        if self.H is None:
+        H: FloatArray | None = self.H
+        if H is None:
             remedy = "add H = ..., or columns phi0, ... to the table"
             raise ScenarioError("H", "is missing", None, remedy)
         _ = self._rows  # a bad file is refused now
@@ -133,7 +134,8 @@ class RecordedSensor(Sensor):
 
     @property
     def _outputs(self) -> int:
-        return 1 if self.varying or self.H is None else len(self.H)
+        H: FloatArray | None = self.H
+        return 1 if self.varying or H is None else len(H)
 
     @cached_property
     def _lines(self) -> tuple[list[str], list[tuple[int, list[str]]]]:

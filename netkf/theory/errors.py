@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.baselines import Local
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.riccati import evaluate_hamiltonian
@@ -37,9 +38,10 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     regressors.
 
     With ``stacked``, (T, N n, N n): the errors of all nodes together. H (10) says that each block
-    stays below P_i, which this shows without Monte Carlo. For the filters hybrid, diffusion, local
-    and central, with delays and with models that differ from the truth. Raises TheoryError for
-    other filters, and for a user's subclass that does more than choose its weights.
+    stays below P_i, which this shows without Monte Carlo. For the filters hybrid,
+    covariance-intersection, diffusion, local and central, with delays and with models that differ
+    from the truth. Raises TheoryError for other filters, and for a user's subclass that does more
+    than choose its weights.
     """
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
@@ -58,7 +60,8 @@ def _stacked_errors(scenario: Scenario, run: Run) -> FloatArray:
     algorithm, n = scenario.filter.algorithm, scenario.plant.n
     if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
-    known = Hybrid if algorithm.talks else Local
+    intersects = isinstance(algorithm, CovarianceIntersection)
+    known = CovarianceIntersection if intersects else Hybrid if algorithm.talks else Local
     own = own_steps(algorithm, known)
     if own:
         words = f"{type(algorithm).__name__} defines {own[0]} itself"
@@ -127,6 +130,7 @@ class _Errors:
 
     def __init__(self, scenario: Scenario) -> None:
         self._n, self._plant = scenario.plant.n, scenario.truth
+        self._intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
         pooled = scenario.filter.algorithm.pooled
         self._models = [scenario.pooled_model] if pooled else list(scenario.models)
         first = scenario.models[0]
@@ -182,11 +186,20 @@ class _Errors:
                     place = sender if sent is None else self.hosts + self._messages.index(sent)
                     weights[node, place] += weight
                     weights[node, node] -= weight
-            self._P = np.tensordot(weights, self._P, 1)
-            whole = np.eye(len(weights) + first)
-            whole[first:, first:] = weights
-            self._mix(np.asarray(np.kron(whole, np.eye(n)), dtype=np.float64))
+            whole = np.eye(len(self._sigma))
+            whole[first * n :, first * n :] = self._mixing(weights)
+            self._mix(whole)
         self._drop(instant.arrived)
+
+    def _mixing(self, weights: FloatArray) -> FloatArray:
+        """What a reset makes of the errors, from the weights (B, B); P is reset too."""
+        n = self._n
+        if not self._intersects:
+            self._P = np.tensordot(weights, self._P, 1)
+            return np.asarray(np.kron(weights, np.eye(n)), dtype=np.float64)
+        shares = weights[:, :, None, None] * np.linalg.inv(self._P)
+        self._P = np.linalg.inv(shares.sum(axis=1))
+        return np.asarray((self._P[:, None] @ shares).swapaxes(1, 2).reshape(len(weights) * n, -1))
 
     def _mix(self, matrix: FloatArray) -> None:
         self._sigma = matrix @ self._sigma @ matrix.T

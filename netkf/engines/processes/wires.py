@@ -89,11 +89,9 @@ class Wire:
         None is not sent, but its fate is drawn all the same.
         """
         if fresh:
-            first = self._ways[0].fates.draw()
-            self._kept = [
-                first,
-                *(first if self._shared else way.fates.draw() for way in self._ways[1:]),
-            ]
+            first, *others = self._ways
+            fate = first.fates.draw()
+            self._kept = [fate, *(fate if self._shared else way.fates.draw() for way in others)]
         for way, payload, fate in zip(self._ways, payloads, self._kept, strict=False):
             self._send(now, way, payload, fate if up else DOWN, phase)
 
