@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.algorithms.diffusion import Diffusion
 from netkf.algorithms.slot import Gossip, Intermittent
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
+from netkf.theory.diffusion_assumptions import diffusion_rows
 from netkf.theory.gossip import detecting_walk, mean_matching, primitive
 from netkf.theory.intermittent import critical_probability, unseen
 
@@ -18,6 +20,8 @@ SHOWN = 12
 def slot_rows(scenario: Scenario) -> list[Row]:
     """(assumption, source, holds, evidence) of each."""
     algorithm = scenario.filter.algorithm
+    if isinstance(algorithm, Diffusion):
+        return diffusion_rows(scenario)
     rows = _plant(scenario)
     if isinstance(algorithm, Gossip):
         return [*_matching(scenario), *rows, *_walk(scenario), *_swaps(scenario)]
@@ -121,11 +125,16 @@ def _sight(scenario: Scenario) -> dict[int, FloatArray]:
 
 def _readings(scenario: Scenario) -> list[Row]:
     F = scenario.slot_plant.F
-    blind = [node for node, H in _sight(scenario).items() if unseen(F, H) is not None]
+    name = "(F, H) is detectable at every node"
+    try:
+        sight = _sight(scenario)
+    except TheoryError as error:
+        return [(name, "R Theorem 9", False, f"not decided: {error}")]
+    blind = [node for node, H in sight.items() if unseen(F, H) is not None]
     words = "its own readings and its neighbours' see every mode that does not decay"
     if blind:
         words = f"not at node{'s' if len(blind) > 1 else ''} {', '.join(map(str, blind[:SHOWN]))}"
-    return [("(F, H) is detectable at every node", "R Theorem 9", not blind, words)]
+    return [(name, "R Theorem 9", not blind, words)]
 
 
 def _arrivals(scenario: Scenario) -> list[Row]:
@@ -143,6 +152,8 @@ def _arrivals(scenario: Scenario) -> list[Row]:
             f"delivery from {least:g}" if loss.independent else "losses come in bursts or recorded",
         )
     ]
+    if any(sensor.varying for sensor in scenario.sensors):
+        return rows
     worst, words = 0.0, "every node sees enough by itself"
     for node, H in _sight(scenario).items():
         if unseen(F, scenario.observation(node)[0]) is None or unseen(F, H) is not None:
