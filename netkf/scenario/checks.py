@@ -301,7 +301,7 @@ def _invertible(scenario: Scenario) -> None:
         reached = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
         regular = whole or np.linalg.matrix_rank(np.concatenate(reached, axis=1)) == n
     if not regular:
-        name = type(scenario.filter.algorithm).__name__.lower()
+        name = spoken(scenario.filter.algorithm)
         raise ScenarioError(
             "filter.cov",
             f"must be positive definite for the {name} filter, which inverts covariances, where "
