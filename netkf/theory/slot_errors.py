@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.diffusion import Diffusion
-from netkf.algorithms.slot import SlotCentral, SlotLocal
+from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.core.arrays import FloatArray, block_diagonal, symmetric
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
@@ -22,7 +22,7 @@ from netkf.theory.coupled import own_steps
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-KNOWN = (Diffusion, SlotCentral, SlotLocal)
+KNOWN = (Diffusion, Gossip, Intermittent, SlotCentral, SlotLocal)
 STEPS = ("init", "place", "sense", "emit", "absorb", "share", "estimate")
 Arrived = dict[int, list[int]]
 
@@ -30,29 +30,34 @@ Arrived = dict[int, list[int]]
 def stacked_slot_errors(scenario: Scenario, run: Run) -> FloatArray:
     """(T, M n, M n): covariance of the stacked x - xhat_i of M hosts, 1 where all nodes share one.
 
-    For the filters diffusion, local and central; raises TheoryError for others.
+    For all filters in slots but push-sum; raises TheoryError for that and for users' own.
     """
     algorithm = scenario.filter.algorithm
     known = next((k for k in KNOWN if isinstance(algorithm, k)), None)
     name = type(algorithm).__name__
-    if known is None:
+    if known is None or not isinstance(algorithm, SlotFilter):
         raise TheoryError(f"no exact error covariance for {name}")
     own = own_steps(algorithm, known, STEPS)
     if own:
         raise TheoryError(
             f"the exact error covariance is not known: {name} defines {own[0]} itself"
         )
-    period, diffuses = scenario.slot_plant.period, isinstance(algorithm, Diffusion)
     errors = _Errors(scenario, Streams(run.seed, run.replica))
-    arrived = _arrived(scenario, run) if diffuses else {}
+    arrived = _arrived(scenario, run)
     whole, done = [], 0
-    for slot in np.round(run.times / period).astype(int).tolist():
+    for slot in np.round(run.times / scenario.slot_plant.period).astype(int).tolist():
         while done < slot:
-            if diffuses:
-                errors.adapt(done)
-                errors.combine(arrived.get(done, {}))
-            else:
+            here = arrived.get(done, {})
+            if not algorithm.predicts:
                 errors.filter(done + 1)
+            elif isinstance(algorithm, Gossip):
+                errors.swap(here)
+                errors.adapt(done, {})
+            elif isinstance(algorithm, Diffusion):
+                errors.adapt(done, {})
+                errors.combine(here)
+            else:
+                errors.adapt(done, here)
             done += 1
         whole.append(errors.of_hosts())
     return np.array(whole)
@@ -94,24 +99,45 @@ class _Errors:
         """The covariance of the errors."""
         return self._sigma[self._n :, self._n :]
 
-    def adapt(self, slot: int) -> None:
-        """D (6), (7), (12): update with the readings of a slot, and predict."""
+    def adapt(self, slot: int, arrived: Arrived) -> None:
+        """D (6), (7), (12), R (15): update with the readings of a slot, the own ones and those that
+        arrived, and predict.
+        """
         F, Q = self._scenario.slot_belief
-        moves, noises = [], []
-        for i, host in enumerate(self._hosts):
-            H, P = _matrix(host, slot, self._n), self._P[i]
-            L = np.linalg.solve(H @ P @ H.T + host.R, H @ P @ F.T).T
+        rows = [_matrix(host, slot, self._n) for host in self._hosts]
+        ends = np.cumsum([0, *map(len, rows)])
+        moves, noise = [], np.zeros((len(rows) * self._n, ends[-1]))
+        for i, node in enumerate(self._scenario.nodes):
+            used = sorted({i, *(self._scenario.topology.index[p] for p in arrived.get(node, []))})
+            H, R = np.concatenate([rows[j] for j in used]), self._noise(used)
+            P = self._P[i]
+            L = np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T
             closed = F - L @ H
-            self._P[i] = symmetric(closed @ P @ closed.T + L @ host.R @ L.T + Q)
+            self._P[i] = symmetric(closed @ P @ closed.T + L @ R @ L.T + Q)
             moves.append(closed)
-            noises.append(L @ host.root)
-        self._move(moves, noises, predicts=True)
+            columns = np.concatenate([np.arange(ends[j], ends[j + 1]) for j in used])
+            noise[i * self._n : (i + 1) * self._n, columns] = L
+        root = block_diagonal([host.root for host in self._hosts])
+        self._move(moves, noise @ root, predicts=True)
+
+    def _noise(self, hosts: list[int]) -> FloatArray:
+        return block_diagonal([self._hosts[j].R for j in hosts])
+
+    def swap(self, arrived: Arrived) -> None:
+        """G (10): what a node received takes the place of its own."""
+        index = self._scenario.topology.index
+        came = np.arange(len(self._P))
+        for node, peers in arrived.items():
+            came[index[node]] = index[peers[-1]]
+        blocks = np.concatenate([[0], 1 + came])
+        entries = (blocks[:, None] * self._n + np.arange(self._n)).reshape(-1)
+        self._P, self._sigma = self._P[came], self._sigma[np.ix_(entries, entries)]
 
     def filter(self, slot: int) -> None:
         """Predict to a slot, then update with its readings."""
         F, Q = self._scenario.slot_belief
         self._P = symmetric(F @ self._P @ F.T + Q)
-        self._move([F] * len(self._hosts), [], predicts=True)
+        self._move([F] * len(self._hosts), np.zeros((len(self._hosts) * self._n, 0)), predicts=True)
         moves, noises = [], []
         for i, host in enumerate(self._hosts):
             H, P = _matrix(host, slot, self._n), self._P[i]
@@ -120,7 +146,7 @@ class _Errors:
             self._P[i] = symmetric(closed @ P @ closed.T + K @ host.R @ K.T)
             moves.append(closed)
             noises.append(K @ host.root)
-        self._move(moves, noises, predicts=False)
+        self._move(moves, block_diagonal(noises), predicts=False)
 
     def combine(self, arrived: Arrived) -> None:
         """D (8)-(10) with the messages that arrived."""
@@ -141,7 +167,7 @@ class _Errors:
         self._P = P
         self._sigma = symmetric(mixed @ self._sigma @ mixed.T)
 
-    def _move(self, moves: list[FloatArray], noises: list[FloatArray], predicts: bool) -> None:
+    def _move(self, moves: list[FloatArray], noise: FloatArray, predicts: bool) -> None:
         plant, n = self._scenario.slot_plant, self._n
         whole = block_diagonal([plant.F if predicts else np.eye(n), *moves])
         if predicts:
@@ -150,8 +176,7 @@ class _Errors:
         sigma = whole @ self._sigma @ whole.T
         if predicts:
             sigma = sigma + np.tile(plant.Q, (1 + len(moves), 1 + len(moves)))
-        for i, noise in enumerate(noises):
-            sigma[_block(i, n), _block(i, n)] += noise @ noise.T
+        sigma[n:, n:] += noise @ noise.T
         self._sigma = symmetric(sigma)
 
 

@@ -208,7 +208,7 @@ def test_exact_error_covariance_of_the_cases(case, tmp_path):
     np.testing.assert_allclose(traces, truth["trace_per_sensor"], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["diffusion", "local", "central"])
+@pytest.mark.parametrize("kind", ["diffusion", "local", "central", "intermittent", "gossip"])
 def test_exact_error_covariance_against_the_engine_draw_by_draw(kind, tmp_path):
     """With losses, a blind node and filters that have a wrong F, Q and R."""
     table = {
@@ -234,6 +234,8 @@ def test_exact_error_covariance_against_the_engine_draw_by_draw(kind, tmp_path):
         },
         "filter": {"kind": kind, "model": {"F": [[1.0, 0.2], [-0.2, 1.0]], "R": [[0.4]]}},
     }
+    if kind == "gossip":
+        table["network"]["activation"] = {"kind": "matching", "protocol": "maximal"}
     scenario = from_table(table, tmp_path)
     by_draws, run = engine_covariance(scenario)
     exact = theory.error_covariance(scenario, run)
@@ -293,8 +295,13 @@ def test_theory_that_needs_a_fixed_H_says_so():
     assert netkf.simulate(gossip).status == "complete"
     with pytest.raises(netkf.TheoryError, match="whose H is random"):
         theory.detecting_walk(gossip)
-    with pytest.raises(netkf.TheoryError, match="no exact error covariance for Gossip"):
-        theory.error_covariance(gossip, netkf.simulate(gossip))
+    push_sum = section_vi(
+        network__graph__directed=False,
+        filter={"kind": "push-sum", "gamma": 1, "delta": 9.0},
+        sensors=[],
+    )
+    with pytest.raises(netkf.TheoryError, match="no exact error covariance for PushSum"):
+        theory.error_covariance(push_sum, netkf.simulate(push_sum))
 
 
 @pytest.mark.slow
