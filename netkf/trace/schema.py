@@ -26,7 +26,11 @@ tick     the link node - peer activated
 send     node sent message number ``message`` to peer
 lost     that message (node to peer) was lost by the channel
 deliver  node received message number ``message`` from peer, ``age`` seconds after it was sent
+late     the same, but the inbox that it was meant for had closed; it counts as lost
 absorb   node used all that had arrived at t in one reset; ``age`` is that of the oldest message
+swap     node put what it got from peer in place of its own
+round    a step of exchange number ``phase`` of the slot begins, in which every node sends
+stop     node has stopped learning from the others in exchange number ``phase``
 diverged the covariance of node was no longer finite
 """
 

@@ -88,7 +88,7 @@ class Wire:
 
         None is not sent, but its fate is drawn all the same.
         """
-        if fresh:
+        if fresh or not self._kept:
             first, *others = self._ways
             fate = first.fates.draw()
             self._kept = [fate, *(fate if self._shared else way.fates.draw() for way in others)]
