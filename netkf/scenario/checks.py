@@ -9,15 +9,16 @@ import numpy as np
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import longest_interval
 from netkf.algorithms.slot import SlotFilter
-from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.regressors import RegressorSensor
+from netkf.scenario.combination import check_invertible, check_regressor, check_weights
 from netkf.scenario.push_sum import check_push_sum
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import spoken
+from netkf.scenario.shapes import demand_shape
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -69,30 +70,18 @@ def _times(scenario: Scenario) -> None:
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
 
 
-def _shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
-    fits = len(value.shape) == len(shape) and all(
-        want is None or have == want for have, want in zip(value.shape, shape, strict=True)
-    )
-    if not fits:
-        words = " x ".join("any" if want is None else str(want) for want in shape)
-        got = " x ".join(map(str, value.shape))
-        raise ScenarioError(
-            key, f"must be {words}, not {got}, because {why}", value, "mend the shape"
-        )
-
-
 def _plant(scenario: Scenario) -> None:
     plant, n = scenario.plant, scenario.plant.n
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
-        _shape("plant.B", plant.B, (n, None), why)
+        demand_shape("plant.B", plant.B, (n, None), why)
     else:
         why = f"plant.F has {n} rows"
-        _shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
+        demand_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
     if plant.mean is not None:
-        _shape("plant.mean", plant.mean, (n,), why)
+        demand_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
-        _shape("plant.cov", plant.cov, (n, n), why)
+        demand_shape("plant.cov", plant.cov, (n, n), why)
 
 
 def _sensors(scenario: Scenario) -> None:
@@ -100,11 +89,11 @@ def _sensors(scenario: Scenario) -> None:
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
         if isinstance(sensor, RegressorSensor):
-            _regressor(scenario, key, sensor)
+            check_regressor(scenario, key, sensor)
         else:
-            _shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
+            demand_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
             p = len(sensor.H)
-            _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
+            demand_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for place, node in enumerate(sensor.nodes):
             if node not in known:
                 raise ScenarioError(
@@ -120,25 +109,6 @@ def _sensors(scenario: Scenario) -> None:
                 list(sensor.nodes),
                 "write a second [[sensors]] entry for a second sensor",
             )
-
-
-def _regressor(scenario: Scenario, key: str, sensor: RegressorSensor) -> None:
-    if not scenario.slotted:
-        raise ScenarioError(
-            f"{key}.kind",
-            "belongs to plants in slots (linear), and this plant is in continuous time",
-            "regressor",
-            "change the plant or use a linear sensor",
-        )
-    m, q = len(sensor.A), sensor.B.shape[1]
-    why = f"{key}.A has {m} rows"
-    _shape(f"{key}.B", sensor.B, (m, None), why)
-    _shape(
-        f"{key}.C", sensor.C, (scenario.plant.n, m), f"the state has {scenario.plant.n} components"
-    )
-    _shape(f"{key}.start", sensor.start, (m,), why)
-    _shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
-    _shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
 
 
 def _ids(nodes: tuple[int, ...]) -> str:
@@ -225,9 +195,9 @@ def _filter(scenario: Scenario) -> None:
                     "give one",
                 )
             for k, item in enumerate(value):
-                _shape(f"{key}[{k}]", item, shape, why)
+                demand_shape(f"{key}[{k}]", item, shape, why)
         elif value is not None:
-            _shape(key, value, shape, why)
+            demand_shape(key, value, shape, why)
     model = filtering.model
     for name in "ABFQ":
         value = getattr(model, name)
@@ -240,11 +210,11 @@ def _filter(scenario: Scenario) -> None:
                 value,
                 "use F and Q for linear plants, A and B for diffusions",
             )
-        _shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
+        demand_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     _believed_noise(scenario)
-    _weights(scenario)
+    check_weights(scenario)
     if filtering.algorithm.inverts:
-        _invertible(scenario)
+        check_invertible(scenario)
     _degrees(scenario)
 
 
@@ -264,51 +234,7 @@ def _believed_noise(scenario: Scenario) -> None:
             ("filter.model.R", R) if not isinstance(R, tuple) else (f"filter.model.R[{k}]", R[k])
         )
         p = len(sensor.H)
-        _shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
-
-
-def _weights(scenario: Scenario) -> None:
-    algorithm, nodes = scenario.filter.algorithm, scenario.nodes
-    given = algorithm.pair_weights if isinstance(algorithm, SlotFilter) else None
-    if given is None:
-        return
-    _shape("filter.weights", given, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
-    links = set(scenario.topology.directions)
-    for sender, receiver in np.argwhere(given > 0.0).tolist():
-        pair = (nodes[sender], nodes[receiver])
-        if sender != receiver and pair not in links:
-            raise ScenarioError(
-                f"filter.weights[{sender}][{receiver}]",
-                f"must be 0, because no link goes from node {pair[0]} to node {pair[1]}",
-                float(given[sender, receiver]),
-                "add the link; rows are senders, columns receivers",
-            )
-
-
-def _invertible(scenario: Scenario) -> None:
-    """Covariances never become singular: noise reaches every state, or they do not start so and no
-    state is forgotten at once.
-    """
-    n = scenario.plant.n
-    starts = [scenario.start(node)[1] for node in scenario.nodes]
-    whole = all(np.linalg.matrix_rank(cov, hermitian=True) == n for cov in starts)
-    if scenario.slotted:
-        F, Q = scenario.slot_belief
-        driven = np.linalg.matrix_rank(Q, hermitian=True) == n
-        regular = driven or (whole and np.linalg.matrix_rank(F) == n)
-    else:
-        A, Q = scenario.belief
-        reached = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
-        regular = whole or np.linalg.matrix_rank(np.concatenate(reached, axis=1)) == n
-    if not regular:
-        name = spoken(scenario.filter.algorithm)
-        raise ScenarioError(
-            "filter.cov",
-            f"must be positive definite for the {name} filter, which inverts covariances, where "
-            "the noise does not drive every state",
-            None,
-            "give filter.cov, or a positive definite Q",
-        )
+        demand_shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
 
 
 def _degrees(scenario: Scenario) -> None:
