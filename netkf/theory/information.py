@@ -45,8 +45,9 @@ def information_level(
                      is positive, else 2 n
     level, low, high the least lambda_k over the past, on which it depends through the regressors'
                      states: over ``runs`` pasts from their law at random slots of the horizon, the
-                     one in which all states are 0, and what a search from both found; the interval
-                     is that of the integral at that past. Where it is positive D (19) holds
+                     one in which all states are 0, and what a search within the range of these
+                     found; the interval is that of the integral at that past. D (19) holds where
+                     it is positive
     mean, mean_low, mean_high   lambda_k in the mean over the pasts drawn, with its 99 % interval
 
     As printed, h terms are divided by h + 1. Raises TheoryError for sensors that are records.
@@ -140,6 +141,9 @@ def _least(
             starts[1][k] = source.start
     moving = [k for k, source in enumerate(sources) if source.drive.size]
     found = [float(values[best])]
+    low = [np.minimum(past[k].min(axis=0), 0.0) for k in moving]
+    high = [np.maximum(past[k].max(axis=0), 0.0) for k in moving]
+    bounds = list(zip(np.concatenate([[], *low]), np.concatenate([[], *high]), strict=True))
     sizes = np.cumsum([0, *(len(sources[k].start) for k in moving)])
     for start in starts:
 
@@ -153,7 +157,7 @@ def _least(
         found.append(level(x))
         if 0 < len(x) <= MOST_SEARCHED and found[-1] > 0.0:
             search = scipy.optimize.minimize(
-                level, x, method="Nelder-Mead", options={"maxfev": MOST_TRIES}
+                level, x, method="Nelder-Mead", bounds=bounds, options={"maxfev": MOST_TRIES}
             )
             found.append(float(search.fun))
     return min(found)

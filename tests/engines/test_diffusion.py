@@ -10,6 +10,7 @@ import netkf
 from netkf import theory
 from netkf.core.streams import Streams
 from netkf.scenario.reading import from_table
+from netkf.scenario.writing import as_table
 from netkf.theory.information import normalised_outer
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
@@ -135,6 +136,54 @@ def test_messages_go_along_the_links_only():
     assert set(zip(sent.node, sent.peer, strict=True)) == {(0, 1), (1, 2), (2, 0)}
 
 
+def test_links_that_fail_for_sure_in_one_direction(tmp_path):
+    """A measured table on a digraph, and a record on a graph whose links work both ways."""
+    rows = "sender,receiver,delivery_probability\n0,1,1.0\n1,0,0.0\n1,2,1.0\n2,0,1.0\n"
+    (tmp_path / "links.csv").write_text(rows)
+    (tmp_path / "up.csv").write_text("slot,phase,step,node,peer\n0,0,0,1,0\n1,0,0,1,2\n")
+    table = as_table(section_vi(filter__weights="metropolis", horizon=4.0))
+    table["network"] = {
+        "graph": {"kind": "csv", "path": "links.csv", "directed": True},
+        "activation": {"kind": "broadcast"},
+        "channel": {"loss": {"kind": "per-link"}},
+    }
+    events = netkf.simulate(from_table(table, tmp_path)).events
+    lost = events[events.kind == "lost"]
+    assert set(zip(lost.node, lost.peer, strict=True)) == {(1, 0)}
+    assert len(lost) == 4
+    table["network"] = {
+        "graph": {"kind": "path", "nodes": 3},
+        "activation": {"kind": "recorded", "path": "up.csv"},
+    }
+    events = netkf.simulate(from_table(table, tmp_path)).events
+    got = events[events.kind == "deliver"]
+    pairs = sorted(zip(np.floor(got.t), got.peer, got.node, strict=True))
+    assert pairs == [(0, 0, 1), (0, 1, 0), (1, 1, 2), (1, 2, 1)]
+
+
+def test_readings_travel_one_way_too():
+    """On 0 -> 1 -> 2 node 0 is alone and node 1 never hears node 2."""
+    network = {
+        "graph": {"kind": "edges", "edges": [[0, 1], [1, 2]], "directed": True},
+        "activation": {"kind": "broadcast"},
+    }
+    fixed = [
+        {"nodes": [i], "H": [[float(k == i) for k in range(3)]], "R": [[1.0]]} for i in range(3)
+    ]
+    start = {"mean": [0.0] * 3, "cov": np.eye(3).tolist()}
+    changes = {"network": network, "sensors": fixed, "filter": {"kind": "intermittent", **start}}
+    scenario = section_vi(**changes)
+    trace = np.diagonal(netkf.simulate(scenario).P[-1], axis1=1, axis2=2)
+    seen = trace < 1.0 + 0.09 * 40 - 1e-9
+    assert seen.tolist() == [[True, False, False], [True, True, False], [False, True, True]]
+    rows = theory.assumptions(scenario).set_index("assumption")
+    assert "not at nodes 0, 1, 2" in rows.evidence["(F, H) is detectable at every node"]
+    moved = scenario.replace({"network.graph.edges": [[0, 2], [1, 2]]})
+    rows = theory.assumptions(moved).set_index("assumption")
+    assert "not at nodes 0, 1" in rows.evidence["(F, H) is detectable at every node"]
+    assert "2" not in rows.evidence["(F, H) is detectable at every node"].split("nodes")[1]
+
+
 def test_truth_and_regressors_do_not_depend_on_filter_and_network():
     base = netkf.simulate(section_vi())
     start = {"mean": [0.0] * 3, "cov": np.eye(3).tolist()}
@@ -210,7 +259,7 @@ def test_exact_error_covariance_of_the_cases(case, tmp_path):
 
 @pytest.mark.parametrize("kind", ["diffusion", "local", "central", "intermittent", "gossip"])
 def test_exact_error_covariance_against_the_engine_draw_by_draw(kind, tmp_path):
-    """With losses, a blind node and filters that have a wrong F, Q and R."""
+    """With losses, late messages, a blind node and filters that have a wrong F and R."""
     table = {
         "format": 1,
         "name": "small",
@@ -229,17 +278,23 @@ def test_exact_error_covariance_against_the_engine_draw_by_draw(kind, tmp_path):
         ],
         "network": {
             "graph": {"kind": "path", "nodes": 3},
-            "activation": {"kind": "broadcast"},
-            "channel": {"loss": {"kind": "bernoulli", "delivery": 0.6}, "symmetric": False},
+            "activation": {"kind": "broadcast", "phase": 0.5},
+            "channel": {
+                "loss": {"kind": "bernoulli", "delivery": 0.8},
+                "delay": {"kind": "uniform", "low": 0.0, "high": 0.8},
+                "symmetric": False,
+            },
         },
         "filter": {"kind": kind, "model": {"F": [[1.0, 0.2], [-0.2, 1.0]], "R": [[0.4]]}},
     }
     if kind == "gossip":
-        table["network"]["activation"] = {"kind": "matching", "protocol": "maximal"}
+        table["network"]["activation"] = {"kind": "matching", "protocol": "maximal", "phase": 0.5}
     scenario = from_table(table, tmp_path)
     by_draws, run = engine_covariance(scenario)
     exact = theory.error_covariance(scenario, run)
     np.testing.assert_allclose(by_draws, exact, rtol=1e-8, atol=1e-10)
+    if kind in ("diffusion", "intermittent"):
+        assert min(run.count(event) for event in ("deliver", "lost", "late")) > 0
 
 
 def test_the_filter_is_conservative_where_its_model_is():
