@@ -31,7 +31,7 @@ absorb   node used all that had arrived at t in one reset; ``age`` is that of th
 swap     node put what it got from peer in place of its own
 round    a step of exchange number ``phase`` of the slot begins, in which every node sends
 stop     node has stopped learning from the others in exchange number ``phase``
-diverged the covariance of node was no longer finite
+diverged the covariance or the estimate of node was no longer finite
 """
 
 CODES = {kind: code for code, kind in enumerate(KINDS)}
