@@ -338,6 +338,25 @@ def test_information_level_of_section_vi():
         theory.information_level(scenario, runs=1)
 
 
+def test_information_level_of_fixed_rows_is_a_formula(build):
+    """Rows e_1 and 2 e_2: h (1/2, 4/5) / (2 (h + 1)) on the diagonal; each alone sees one axis."""
+    scenario = build(
+        plant={"kind": "linear", "F": np.eye(2), "Q": np.eye(2), "period": 1.0},
+        sensors=[
+            {"nodes": [0], "H": [[1.0, 0.0]], "R": [[1.0]]},
+            {"nodes": [1], "H": [[0.0, 2.0]], "R": [[1.0]]},
+        ],
+        probe=1.0,
+        network={"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+        filter={"kind": "diffusion"},
+    )
+    table = theory.information_level(scenario)
+    assert table.window.tolist() == [1, 1, 1]
+    assert table.level.tolist() == pytest.approx([0.125, 0.0, 0.0], rel=1e-12)
+    table = theory.information_level(scenario, window=3)
+    assert table[["level", "mean"]].iloc[0].tolist() == pytest.approx([0.1875, 0.1875], rel=1e-12)
+
+
 def test_theory_that_needs_a_fixed_H_says_so():
     scenario = section_vi()
     with pytest.raises(netkf.TheoryError, match="node 0 has a regressor sensor, whose H is random"):
@@ -357,6 +376,22 @@ def test_theory_that_needs_a_fixed_H_says_so():
     )
     with pytest.raises(netkf.TheoryError, match="no exact error covariance for PushSum"):
         theory.error_covariance(push_sum, netkf.simulate(push_sum))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("delivery", "level"), [(0.9, 1.51), (0.7, 1.62), (0.5, 1.81), (0.3, 2.19)]
+)
+def test_plateaus_under_losses(delivery, level):
+    """Weights renormalised; exact given regressors and losses; P never below it."""
+    channel = {"loss": {"kind": "bernoulli", "delivery": delivery}}
+    scenario = section_vi(horizon=2000.0, network__channel=channel, filter__mean=[1.0] * 3)
+    runs = [netkf.simulate(scenario, replica=r) for r in range(4)]
+    exact = [theory.error_covariance(scenario, run) for run in runs]
+    means = [np.trace(e[100:], axis1=2, axis2=3).mean() for e in exact]
+    assert np.mean(means) == pytest.approx(level, rel=0.03)
+    for run, e in zip(runs, exact, strict=True):
+        assert np.linalg.eigvalsh(run.P - e).min() > 0.0
 
 
 @pytest.mark.slow
