@@ -39,8 +39,9 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
 
     With ``stacked``, (T, N n, N n): the errors of all nodes together. H (10) says that each block
     stays below P_i, which this shows without Monte Carlo. With delays, losses and models that
-    differ from the truth. Raises TheoryError for the push-sum filter, and for a user's subclass
-    that does more than choose its weights.
+    differ from the truth; where states or readings are recorded, as if they had the law that the
+    scenario gives them. Raises TheoryError for the push-sum filter, and for a user's subclass that
+    does more than choose its weights.
     """
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
