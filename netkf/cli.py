@@ -192,8 +192,8 @@ def _divergence(finished: Any) -> str:
     blurred = finished.samples.rounding_from
     left_out = "" if blurred is None else f"; averages are over the samples before {blurred:g} s"
     return (
-        f"{finished.status}, the estimate or covariance of node{several} {listed} is no longer finite at "
-        f"{finished.samples.times[-1]:g} s and the run ended there{left_out}"
+        f"{finished.status}, the estimate or covariance of node{several} {listed} is no longer "
+        f"finite at {finished.samples.times[-1]:g} s and the run ended there{left_out}"
     )
 
 

@@ -92,10 +92,11 @@ class FlowFilter(Part):
 
     The base class is the Kalman-Bucy filter of H (4a), (4b); filters differ mostly in ``absorb``.
     ``talks`` says whether its nodes exchange messages, ``pooled`` whether one filter reads the
-    sensors of all nodes at once.
+    sensors of all nodes at once, ``inverts`` that covariances must never be singular.
     """
 
     talks: ClassVar[bool] = True
+    inverts: ClassVar[bool] = False
     pooled: ClassVar[bool] = False
 
     def init(self, model: FlowModel, mean: FloatArray, cov: FloatArray) -> Any:

@@ -59,14 +59,16 @@ class SlotState(NamedTuple):
 
 class Role(NamedTuple):
     """What a node may be told about the network before slot 0: its own id, how many ``neighbours``
-    it has when no link fails, how many ``nodes`` there are, and the ``information`` (n, n) of all
-    their sensors together, the sum of H' R^-1 H as the filters believe it.
+    it has when no link fails, how many ``nodes`` there are, the ``information`` (n, n) of all their
+    sensors together, the sum of H' R^-1 H as the filters believe it, and its ``own`` weight, which
+    is left to it when the messages of all neighbours arrive.
     """
 
     node: int
     neighbours: int
     nodes: int
     information: FloatArray
+    own: float
 
 
 class Reading(NamedTuple):
@@ -84,13 +86,17 @@ class SlotFilter(Part):
     ``programme`` lists the phases of a slot, "exchange" or "sense"; ``first_slot`` is the first in
     which nodes exchange; ``predicts`` says that a sample shows the prediction with which a slot
     begins, else what is known after its reading; ``pairwise`` that nodes exchange in pairs (a
-    matching), else all with all neighbours. ``talks``, ``pooled``: as for flow filters.
+    matching), else all with all neighbours; ``one_way`` that links may go one way and that nodes
+    need not all be joined; ``inverts`` that covariances must never be singular. ``talks``,
+    ``pooled``: as for flow filters.
     """
 
     programme: ClassVar[tuple[str, ...]] = ("exchange", "sense")
     first_slot: ClassVar[int] = 0
     predicts: ClassVar[bool] = True
     pairwise: ClassVar[bool] = False
+    one_way: ClassVar[bool] = False
+    inverts: ClassVar[bool] = False
     talks: ClassVar[bool] = True
     pooled: ClassVar[bool] = False
 
@@ -139,6 +145,13 @@ class SlotFilter(Part):
     def weight(self, degree: int, peer_degree: int) -> float:
         """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
         return 1.0 / (1.0 + max(degree, peer_degree))
+
+    @property
+    def pair_weights(self) -> FloatArray | None:
+        """(N, N) in the order of node ids: entry [l, i] is the weight node i gives to a message of
+        node l. None where ``weight`` says it.
+        """
+        return None
 
     def largest_degree(self) -> float:
         """The largest number of links a node may have."""
@@ -204,6 +217,7 @@ class Intermittent(SlotFilter):
     """
 
     programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
+    one_way: ClassVar[bool] = True
 
     def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Keep the reading."""

@@ -145,7 +145,9 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
     topology = scenario.topology
     places = topology.positions or _layout(scenario)
     delivered = finished.samples.delivered
-    counts = np.array([delivered.get(link, 0) for link in topology.links], dtype=float)
+    counts = np.array(
+        [delivered.get((min(i, j), max(i, j)), 0) for i, j in topology.links], dtype=float
+    )
     if len(counts):
         share = counts / max(float(counts.max()), 1.0)
         axes.add_collection(

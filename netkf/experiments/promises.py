@@ -63,6 +63,8 @@ def promises(scenario: Scenario) -> dict[str, Any]:
 
 def _slot_central(scenario: Scenario) -> FloatArray:
     """P*: the prediction covariance of a filter that gets every reading in every slot."""
+    for node in scenario.sensing:
+        scenario.observation(node)  # raises where H is not fixed
     model = scenario.pooled_slot_model
     return steady_covariance(model.F, model.Q, model.H, model.R)
 

@@ -341,7 +341,8 @@ class Channel(Part):
     """Loss and delay of every message.
 
     ``symmetric``: the two messages of one activation share one draw of each, so that with equal
-    probabilities both arrive or none; else each direction has its own.
+    probabilities both arrive or none; else each direction has its own. In a directed graph every
+    link is one direction and has its own.
     """
 
     loss: Loss = setting(instance(Loss), default=NoLoss())

@@ -71,6 +71,12 @@ class Topology:
         return degrees
 
     @cached_property
+    def directions(self) -> tuple[Link, ...]:
+        """(sender, receiver) of all messages that can be sent: both ways unless directed."""
+        back = () if self.directed else tuple((j, i) for i, j in self.links)
+        return tuple(sorted((*self.links, *back)))
+
+    @cached_property
     def components(self) -> list[set[int]]:
         """The connected parts (weakly connected where the graph is directed), largest first."""
         import networkx

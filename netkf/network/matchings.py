@@ -231,7 +231,8 @@ class Broadcast(SlotActivation):
 @dataclass(frozen=True, eq=False)
 class RecordedSlots(SlotActivation):
     """Exchanges read from a table: ``slot,node,peer`` for matchings (the pairs of each slot), or
-    ``slot,phase,step,node,peer`` for broadcasts (the links that were up).
+    ``slot,phase,step,node,peer`` for broadcasts (the links that were up, from node to peer, in both
+    directions where the graph is undirected).
     """
 
     path: SourceFile = setting(source_file)
@@ -259,7 +260,7 @@ class RecordedSlots(SlotActivation):
         ):
             phase, step = (0, 0) if matching else (columns["phase"][row], columns["step"][row])
             listed = pairs.setdefault((slot, phase, step), [])
-            link = (min(i, j), max(i, j))
+            link = (min(i, j), max(i, j)) if matching else (i, j)
             if matching and link not in listed and (i == j or _meets(link, listed)):
                 words = f"{self.path.name}: a node may be paired once a slot"
                 raise ScenarioError("path", words, [slot, i, j], "mend the row")
@@ -273,7 +274,9 @@ class RecordedSlots(SlotActivation):
         return tuple(self._pairs)
 
     def pairs(self, slot: int, phase: int, step: int = 0) -> list[Link]:
-        """The pairs of one step of an exchange, sorted."""
+        """The pairs of one step of an exchange, sorted; for broadcasts from node to peer, as they
+        are listed.
+        """
         return self._pairs.get((slot, phase, step), [])
 
     def check(self, topology: Topology) -> None:

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
+from netkf.core.arrays import FloatArray, frozen
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -24,7 +24,7 @@ from netkf.core.fields import (
     several,
     source_file,
 )
-from netkf.core.tables import finite_numbers, read_columns, read_rows, whole
+from netkf.core.tables import finite_numbers, read_columns, read_header, read_rows, whole
 from netkf.plants.linear import LinearPlant
 from netkf.plants.sensors import Sensor
 
@@ -91,7 +91,9 @@ class RecordedPath:
 class RecordedSensor(Sensor):
     """Readings from a table ``t,node,y0,...``, one row a slot and node, t in seconds.
 
-    ``H`` (p, n) and ``R`` (p, p) are what the filters take them to be. ``nodes`` are by default all
+    ``H`` (p, n) and ``R`` (p, p) are what the filters take them to be. A table with columns
+    ``phi0,...`` (one for each state, p = 1) holds the H of every reading; ``H`` may then be left
+    out, or else is not looked at. ``nodes`` are by default all
     that the table lists; rows of other nodes may be there for other ``[[sensors]]``, which may have
     more or fewer components: what a row has beyond its own p must be empty, nan or 0.
     """
@@ -99,7 +101,7 @@ class RecordedSensor(Sensor):
     drawn: ClassVar[bool] = False
 
     path: SourceFile = setting(source_file)
-    H: FloatArray = setting(matrix)
+    H: FloatArray = setting(matrix, default=None)
     R: FloatArray = setting(definite_covariance)
     nodes: tuple[int, ...] = setting(several(integer(), "node ids"), default=None)
 
@@ -110,12 +112,35 @@ class RecordedSensor(Sensor):
             object.__setattr__(self, "nodes", self.listed)
         if not self.nodes:
             raise ScenarioError("path", f"{self.path.name} has no rows", None, "add some")
+        if self.varying and any(self._rows.values()):
+            row = next(rows[0][1] for rows in self._rows.values() if rows)
+            object.__setattr__(self, "H", frozen(row[None, 1:]))
+        H: FloatArray | None = self.H
+        if H is None:
+            remedy = "add H = ..., or columns phi0, ... to the table"
+            raise ScenarioError("H", "is missing", None, remedy)
         _ = self._rows  # a bad file is refused now
 
     @cached_property
+    def _regressors(self) -> list[str]:
+        header = read_header(self.path)
+        count = sum(_component(name, "phi") >= 0 for name in header)
+        return [f"phi{k}" for k in range(count)]
+
+    @property
+    def varying(self) -> bool:
+        """Whether the table has columns phi0, ..."""
+        return bool(self._regressors)
+
+    @property
+    def _outputs(self) -> int:
+        H: FloatArray | None = self.H
+        return 1 if self.varying or H is None else len(H)
+
+    @cached_property
     def _lines(self) -> tuple[list[str], list[tuple[int, list[str]]]]:
-        wanted = tuple(f"y{k}" for k in range(len(self.H)))
-        return read_rows(self.path, ("t", "node", *wanted))
+        wanted = tuple(f"y{k}" for k in range(self._outputs))
+        return read_rows(self.path, ("t", "node", *wanted, *self._regressors))
 
     @cached_property
     def listed(self) -> tuple[int, ...]:
@@ -132,8 +157,9 @@ class RecordedSensor(Sensor):
     @cached_property
     def _rows(self) -> dict[int, list[tuple[float, FloatArray]]]:
         header, lines = self._lines
-        p = len(self.H)
-        places = [header.index(name) for name in ("t", *(f"y{k}" for k in range(p)))]
+        p = self._outputs
+        names = ("t", *(f"y{k}" for k in range(p)), *self._regressors)
+        places = [header.index(name) for name in names]
         beyond = [k for k, name in enumerate(header) if _component(name) >= p]
         rows: dict[int, list[tuple[float, FloatArray]]] = {node: [] for node in self.nodes}
         for node, (line, entries) in zip(self._ids, lines, strict=True):
@@ -152,8 +178,9 @@ class RecordedSensor(Sensor):
                 raise ScenarioError("path", words, entries[place], "leave it empty or mend H")
 
     def table(self, node: int, period: float) -> Table:
-        """The readings (p,) of a node by slot of ``period`` seconds; raises ScenarioError for times
-        that are no slots and for slots that are there twice.
+        """The readings (p,) of a node, with their regressors where there are any, by slot of
+        ``period`` seconds; raises ScenarioError for times that are no slots and for slots that are
+        there twice.
         """
         return by_slot(self.path, self._rows[node], period, f" of node {node}")
 
@@ -171,22 +198,24 @@ class RecordedSensor(Sensor):
 
 
 class RecordedReadings:
-    """The readings of one node."""
+    """The readings of one node; a row of the table is y (p,), then phi (n,) where H varies."""
 
     def __init__(self, H: FloatArray, table: Table) -> None:
         self._H, self._table = H, table
 
     def matrix(self, slot: int) -> FloatArray:
-        """H (p, n) as the filters take it to be."""
-        return self._H
+        """H (p, n) as the filters take it to be, or as it is recorded."""
+        phi = self._table[slot][len(self._H) :]
+        return phi[None] if phi.size else self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """(p,) the reading of a slot."""
-        return self._table[slot]
+        return self._table[slot][: len(self._H)]
 
 
-def _component(name: str) -> int:
-    return int(name[1:]) if name[:1] == "y" and name[1:].isdecimal() else -1
+def _component(name: str, letter: str = "y") -> int:
+    number = name.removeprefix(letter)
+    return int(number) if name.startswith(letter) and number.isdecimal() else -1
 
 
 def by_slot(

@@ -31,16 +31,17 @@ from netkf.plants.linear import Readings, SlotReadings
 
 @dataclass(frozen=True, eq=False)
 class Sensor(Part):
-    """The contract: each of ``nodes`` has such a sensor, with noise of its own.
+    """The contract: each of ``nodes`` has such a sensor, with noise of its own."""
 
-    ``varying`` says that H differs from slot to slot; such sensors exist in slots only.
-    """
-
-    varying: ClassVar[bool] = False
     drawn: ClassVar[bool] = True
     """Whether runs draw the readings from H and R; else those are what the filters believe."""
 
     nodes: tuple[int, ...] = setting(several(integer(), "node ids"))
+
+    @property
+    def varying(self) -> bool:
+        """Whether H differs from slot to slot; such sensors exist in slots only."""
+        return False
 
     @abstractmethod
     def slot_path(

@@ -8,15 +8,17 @@ import numpy as np
 
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import longest_interval
-from netkf.algorithms.slot import Intermittent, SlotFilter
-from netkf.core.arrays import FloatArray
+from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.regressors import RegressorSensor
+from netkf.scenario.combination import check_invertible, check_regressor, check_weights
 from netkf.scenario.push_sum import check_push_sum
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import spoken
+from netkf.scenario.shapes import demand_shape
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -68,39 +70,30 @@ def _times(scenario: Scenario) -> None:
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
 
 
-def _shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
-    fits = len(value.shape) == len(shape) and all(
-        want is None or have == want for have, want in zip(value.shape, shape, strict=True)
-    )
-    if not fits:
-        words = " x ".join("any" if want is None else str(want) for want in shape)
-        got = " x ".join(map(str, value.shape))
-        raise ScenarioError(
-            key, f"must be {words}, not {got}, because {why}", value, "mend the shape"
-        )
-
-
 def _plant(scenario: Scenario) -> None:
     plant, n = scenario.plant, scenario.plant.n
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
-        _shape("plant.B", plant.B, (n, None), why)
+        demand_shape("plant.B", plant.B, (n, None), why)
     else:
         why = f"plant.F has {n} rows"
-        _shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
+        demand_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
     if plant.mean is not None:
-        _shape("plant.mean", plant.mean, (n,), why)
+        demand_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
-        _shape("plant.cov", plant.cov, (n, n), why)
+        demand_shape("plant.cov", plant.cov, (n, n), why)
 
 
 def _sensors(scenario: Scenario) -> None:
     n, known = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
-        _shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
-        p = len(sensor.H)
-        _shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
+        if isinstance(sensor, RegressorSensor):
+            check_regressor(scenario, key, sensor)
+        else:
+            demand_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
+            p = len(sensor.H)
+            demand_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
         for place, node in enumerate(sensor.nodes):
             if node not in known:
                 left_out = node in scenario.topology.left_out
@@ -149,14 +142,15 @@ def _network(scenario: Scenario) -> None:
         )
     if not scenario.slotted:
         _ticks(scenario)
-    if topology.directed:
+    one_way = isinstance(algorithm, SlotFilter) and algorithm.one_way
+    if topology.directed and not one_way:
         raise ScenarioError(
             "network.graph.directed",
             f"must be false for the {name} filter, whose links work both ways",
             True,
             "give an undirected graph",
         )
-    if len(topology.components) > 1 and not isinstance(algorithm, Intermittent):
+    if len(topology.components) > 1 and not one_way:
         smallest = sorted(topology.components[-1])
         raise ScenarioError(
             "network.graph",
@@ -203,9 +197,9 @@ def _filter(scenario: Scenario) -> None:
                     "give one",
                 )
             for k, item in enumerate(value):
-                _shape(f"{key}[{k}]", item, shape, why)
+                demand_shape(f"{key}[{k}]", item, shape, why)
         elif value is not None:
-            _shape(key, value, shape, why)
+            demand_shape(key, value, shape, why)
     model = filtering.model
     for name in "ABFQ":
         value = getattr(model, name)
@@ -218,8 +212,11 @@ def _filter(scenario: Scenario) -> None:
                 value,
                 "use F and Q for linear plants, A and B for diffusions",
             )
-        _shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
+        demand_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     _believed_noise(scenario)
+    check_weights(scenario)
+    if filtering.algorithm.inverts:
+        check_invertible(scenario)
     _degrees(scenario)
 
 
@@ -239,7 +236,7 @@ def _believed_noise(scenario: Scenario) -> None:
             ("filter.model.R", R) if not isinstance(R, tuple) else (f"filter.model.R[{k}]", R[k])
         )
         p = len(sensor.H)
-        _shape(key, own, (p, p), f"sensors[{k}].H has {p} rows")
+        demand_shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
 
 
 def _degrees(scenario: Scenario) -> None:

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
+from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.push_sum import PushSum
@@ -18,6 +20,7 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
 
 FAMILIES: dict[str, type[Part]] = {
@@ -40,7 +43,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "recorded": RecordedPlant,
         "unknown": UnknownPlant,
     },
-    "sensor": {"linear": LinearSensor, "recorded": RecordedSensor},
+    "sensor": {"linear": LinearSensor, "regressor": RegressorSensor, "recorded": RecordedSensor},
     "graph": {
         "cycle": graphs.Cycle,
         "path": graphs.PathGraph,
@@ -73,7 +76,12 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "uniform": channels.UniformDelay,
         "lognormal": channels.LognormalDelay,
     },
-    "filter": {"hybrid": Hybrid, "local": Local, "central": Central},
+    "filter": {
+        "hybrid": Hybrid,
+        "covariance-intersection": CovarianceIntersection,
+        "local": Local,
+        "central": Central,
+    },
     "slot activation": {
         "matching": matchings.Matching,
         "broadcast": matchings.Broadcast,
@@ -82,6 +90,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
     "slot filter": {
         "gossip": Gossip,
         "intermittent": Intermittent,
+        "diffusion": DiffusionFilter,
         "push-sum": PushSum,
         "local": SlotLocal,
         "central": SlotCentral,

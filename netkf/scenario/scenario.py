@@ -33,14 +33,16 @@ from netkf.core.fields import (
     text,
     vector,
 )
+from netkf.core.streams import Streams
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
 from netkf.plants.diffusion import Diffusion, default_sensing_period
-from netkf.plants.linear import LinearPlant
+from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import RecordedSensor
+from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
 
 
@@ -111,7 +113,7 @@ class Scenario(Part):
     name: str = setting(text)
     horizon: float = setting(positive)
     plant: Plant = setting(instance(Plant))
-    sensors: tuple[LinearSensor | RecordedSensor, ...] = setting(
+    sensors: tuple[LinearSensor | RegressorSensor | RecordedSensor, ...] = setting(
         several(instance(Sensor), "sensors", least=0)
     )
     network: Network = setting(instance(Network))
@@ -227,9 +229,9 @@ class Scenario(Part):
 
     @cached_property
     def slot_models(self) -> tuple[SlotModel, ...]:
-        """What each node believes, in the order of ``nodes``."""
+        """What each node believes, in the order of ``nodes``; H of slot 0 where H is random."""
         return tuple(
-            SlotModel(*self.slot_belief, *self.observation(node, believed=True))
+            SlotModel(*self.slot_belief, *self._stacked(self.placed.get(node, ()), believed=True))
             for node in self.nodes
         )
 
@@ -239,8 +241,8 @@ class Scenario(Part):
         information = np.zeros((self.plant.n, self.plant.n))
         for model in self.slot_models:
             information = information + model.information
-        degrees, size = self.topology.degrees, len(self.nodes)
-        return tuple(Role(node, degrees[node], size, information) for node in self.nodes)
+        degrees, own, size = self.topology.degrees, self.own_weights, len(self.nodes)
+        return tuple(Role(node, degrees[node], size, information, own[node]) for node in self.nodes)
 
     @cached_property
     def pooled_slot_model(self) -> SlotModel:
@@ -281,17 +283,28 @@ class Scenario(Part):
 
     def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
         """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together; p may be 0. With
-        ``believed``, R is what the filter takes it to be.
+        ``believed``, R is what the filter takes it to be. Raises TheoryError where H differs from
+        slot to slot.
         """
+        if any(self.sensors[place.entry].varying for place in self.placed.get(node, ())):
+            raise TheoryError(f"node {node} has a regressor sensor, whose H is random")
         return self._stacked(self.placed.get(node, ()), believed)
 
     def _stacked(self, placed: tuple[Placed, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
         H = [self.sensors[place.entry].H for place in placed]
-        R = [self._noise(place.entry, believed) for place in placed]
+        R = [self.noise(place.entry, believed) for place in placed]
         empty = np.zeros((0, self.plant.n))
         return np.concatenate([empty, *H]), block_diagonal(R)
 
-    def _noise(self, entry: int, believed: bool) -> FloatArray:
+    def slot_path(self, streams: Streams, node: int, place: Placed) -> Readings:
+        """The readings of one sensor of a node in one run in slots."""
+        sensor, period = self.sensors[place.entry], self.slot_plant.period
+        return sensor.slot_path(
+            node, period, lambda purpose: streams.generator(purpose, node, place.ordinal)
+        )
+
+    def noise(self, entry: int, believed: bool) -> FloatArray:
+        """R (p, p) of a ``[[sensors]]`` entry, as it is or as the filters believe it."""
         R = self.filter.model.R
         if not believed or R is None:
             return self.sensors[entry].R
@@ -321,7 +334,7 @@ class Scenario(Part):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
         else:
             pairs = [*zip(self.belief, (self.truth.A, self.truth.Q), strict=True)]
-        pairs += [(self._noise(k, True), self._noise(k, False)) for k in range(len(self.sensors))]
+        pairs += [(self.noise(k, True), self.noise(k, False)) for k in range(len(self.sensors))]
         return all(np.array_equal(believed, true) for believed, true in pairs)
 
     @cached_property
@@ -362,9 +375,20 @@ class Scenario(Part):
         )
 
     def weight(self, receiver: int, sender: int) -> float:
-        """The weight a node gives to a message: pi_ij of H (7)."""
-        degrees = self.topology.degrees
-        return self.filter.algorithm.weight(degrees[receiver], degrees[sender])
+        """The weight a node gives to a message: pi_ij of H (7), a_ji of D (8)."""
+        algorithm, topology = self.filter.algorithm, self.topology
+        given = algorithm.pair_weights if isinstance(algorithm, SlotFilter) else None
+        if given is not None:
+            return float(given[topology.index[sender], topology.index[receiver]])
+        return algorithm.weight(topology.degrees[receiver], topology.degrees[sender])
+
+    @cached_property
+    def own_weights(self) -> dict[int, float]:
+        """What is left to each node when the messages of all its neighbours arrive together."""
+        own = dict.fromkeys(self.nodes, 1.0)
+        for sender, receiver in self.topology.directions:
+            own[receiver] -= self.weight(receiver, sender)
+        return {node: max(value, 0.0) for node, value in own.items()}
 
     def measured(self, link: Link) -> float:
         """The delivery probability of a direction in the graph's table, 1 where it has none."""

@@ -4,6 +4,7 @@ from netkf.theory.assumptions import assumptions
 from netkf.theory.bounds import covariance_bound
 from netkf.theory.errors import error_covariance
 from netkf.theory.gossip import detecting_walk, mean_matching
+from netkf.theory.information import information_level
 from netkf.theory.intermittent import (
     critical_certificate,
     critical_probability,
@@ -26,6 +27,7 @@ __all__ = [
     "critical_probability",
     "detecting_walk",
     "error_covariance",
+    "information_level",
     "invariant_samples",
     "limit_covariance",
     "lyapunov_step",

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.hybrid import Hybrid
 from netkf.network.clocks import LinkClock, RecordedClock
 from netkf.scenario.registry import name_of
@@ -185,8 +186,15 @@ def _start(scenario: Scenario) -> list[Row]:
     return [
         (
             "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
-            "G (10)" if scenario.slotted else "H (9), (10)",
+            _start_source(scenario),
             worst >= -1e-12,
             f"least eigenvalue of the difference {worst:.3g}",
         )
     ]
+
+
+def _start_source(scenario: Scenario) -> str:
+    if not scenario.slotted:
+        return "H (9), (10)"
+    diffuses = isinstance(scenario.filter.algorithm, DiffusionFilter)
+    return "P_i consistent from the start; D does without" if diffuses else "G (10)"

@@ -15,11 +15,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.riccati import riccati_step, riccati_table
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.network.clocks import LinkClock
+from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
 
 
@@ -41,13 +43,13 @@ class Coupled(NamedTuple):
 STEPS = ("init", "flow", "measure", "emit", "absorb", "estimate")
 
 
-def own_steps(algorithm: object, known: type) -> list[str]:
+def own_steps(algorithm: object, known: type, steps: tuple[str, ...] = STEPS) -> list[str]:
     """The steps that a user's subclass defines itself; theorems about ``known`` are not about it.
 
     Other weights are understood, they enter the equations.
     """
     mine = type(algorithm)
-    return [name for name in STEPS if getattr(mine, name, None) is not getattr(known, name)]
+    return [name for name in steps if getattr(mine, name, None) is not getattr(known, name, None)]
 
 
 def not_promised(scenario: Scenario) -> str | None:
@@ -57,8 +59,9 @@ def not_promised(scenario: Scenario) -> str | None:
         return None
     name = type(algorithm).__name__
     if not isinstance(algorithm, Hybrid):
-        return f"H(12) is about the hybrid filter in continuous time, not about {name.lower()}"
-    own = own_steps(algorithm, Hybrid)
+        return f"H(12) is about the hybrid filter in continuous time, not about {spoken(algorithm)}"
+    intersects = isinstance(algorithm, CovarianceIntersection)  # its resets give no larger P
+    own = own_steps(algorithm, CovarianceIntersection if intersects else Hybrid)
     if own:
         return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
     assert isinstance(network.activation, LinkClock)
@@ -164,8 +167,7 @@ def left_weights(scenario: Scenario) -> FloatArray:
     if len(scenario.nodes) == 1:
         return np.ones(1)
     if not algorithm.talks:
-        name = type(algorithm).__name__.lower()
-        raise TheoryError(f"the {name} filter does not talk, links mean nothing to it")
+        raise TheoryError(f"the {spoken(algorithm)} filter does not talk, links mean nothing to it")
     c = coupling(scenario).toarray()
     size = len(c)
     laplacian = np.diag(c.sum(axis=1)) - c

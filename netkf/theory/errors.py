@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.baselines import Local
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.riccati import evaluate_hamiltonian
@@ -24,6 +25,7 @@ from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import own_steps
+from netkf.theory.slot_errors import stacked_slot_errors
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -32,28 +34,42 @@ _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
 
 def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> FloatArray:
-    """(T, N, n, n): covariance of x - xhat_i at ``run.times``, given the run's events.
+    """(T, N, n, n): covariance of x - xhat_i at ``run.times``, given the run's events and its
+    regressors.
 
     With ``stacked``, (T, N n, N n): the errors of all nodes together. H (10) says that each block
-    stays below P_i, which this shows without Monte Carlo. For the filters hybrid, local and
-    central, with delays and with models that differ from the truth. Raises TheoryError for other
-    filters, and for a user's subclass that does more than choose its weights.
+    stays below P_i, which this shows without Monte Carlo. With delays, losses and models that
+    differ from the truth; where states or readings are recorded, as if they had the law that the
+    scenario gives them. Raises TheoryError for the push-sum filter, and for a user's subclass that
+    does more than choose its weights.
     """
     if not isinstance(run, Run):
         raise TheoryError(
             f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
         )
-    algorithm, _ = scenario.filter.algorithm, scenario.truth  # raises for scenarios in slots
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        raise TheoryError("the run is of another scenario: its nodes or its state differ")
+    flow = not scenario.slotted
+    whole = _stacked_errors(scenario, run) if flow else stacked_slot_errors(scenario, run)
+    nodes, n = len(scenario.nodes), scenario.plant.n
+    if whole.shape[-1] < nodes * n:
+        whole = np.tile(whole, (1, nodes, nodes))
+    if stacked:
+        return whole
+    blocks = whole.reshape(len(whole), nodes, n, nodes, n)
+    return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+
+
+def _stacked_errors(scenario: Scenario, run: Run) -> FloatArray:
+    algorithm, n = scenario.filter.algorithm, scenario.plant.n
     if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
-    known = Hybrid if algorithm.talks else Local
+    intersects = isinstance(algorithm, CovarianceIntersection)
+    known = CovarianceIntersection if intersects else Hybrid if algorithm.talks else Local
     own = own_steps(algorithm, known)
     if own:
         words = f"{type(algorithm).__name__} defines {own[0]} itself"
         raise TheoryError(f"the exact error covariance is not known: {words}")
-    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
-        raise TheoryError("the run is of another scenario: its nodes or its state differ")
-    nodes, n = len(scenario.nodes), scenario.plant.n
     errors = _Errors(scenario)
     hosts = errors.hosts
     whole = np.empty((len(run.times), hosts * n, hosts * n))
@@ -65,12 +81,7 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
             following = next(moments, None)
         errors.advance(time)
         whole[k] = errors.of_hosts()
-    if hosts < nodes:
-        whole = np.tile(whole, (1, nodes, nodes))
-    if stacked:
-        return whole
-    blocks = whole.reshape(len(whole), nodes, n, nodes, n)
-    return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+    return whole
 
 
 class _Instant(NamedTuple):
@@ -123,6 +134,7 @@ class _Errors:
 
     def __init__(self, scenario: Scenario) -> None:
         self._n, self._plant = scenario.plant.n, scenario.truth
+        self._intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
         pooled = scenario.filter.algorithm.pooled
         self._models = [scenario.pooled_model] if pooled else list(scenario.models)
         first = scenario.models[0]
@@ -178,11 +190,20 @@ class _Errors:
                     place = sender if sent is None else self.hosts + self._messages.index(sent)
                     weights[node, place] += weight
                     weights[node, node] -= weight
-            self._P = np.tensordot(weights, self._P, 1)
-            whole = np.eye(len(weights) + first)
-            whole[first:, first:] = weights
-            self._mix(np.asarray(np.kron(whole, np.eye(n)), dtype=np.float64))
+            whole = np.eye(len(self._sigma))
+            whole[first * n :, first * n :] = self._mixing(weights)
+            self._mix(whole)
         self._drop(instant.arrived)
+
+    def _mixing(self, weights: FloatArray) -> FloatArray:
+        """What a reset makes of the errors, from the weights (B, B); P is reset too."""
+        n = self._n
+        if not self._intersects:
+            self._P = np.tensordot(weights, self._P, 1)
+            return np.asarray(np.kron(weights, np.eye(n)), dtype=np.float64)
+        shares = weights[:, :, None, None] * np.linalg.inv(self._P)
+        self._P = np.linalg.inv(shares.sum(axis=1))
+        return np.asarray((self._P[:, None] @ shares).swapaxes(1, 2).reshape(len(weights) * n, -1))
 
     def _mix(self, matrix: FloatArray) -> None:
         self._sigma = matrix @ self._sigma @ matrix.T

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.slot import Gossip, Intermittent
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
+from netkf.theory.diffusion_assumptions import diffusion_rows
 from netkf.theory.gossip import (
     detecting_walk,
     effective_matching,
@@ -23,6 +25,8 @@ SHOWN = 12
 def slot_rows(scenario: Scenario) -> list[Row]:
     """(assumption, source, holds, evidence) of each."""
     algorithm = scenario.filter.algorithm
+    if isinstance(algorithm, DiffusionFilter):
+        return list[Row](diffusion_rows(scenario))
     rows = _plant(scenario)
     if isinstance(algorithm, Gossip):
         return [*_matching(scenario), *rows, *_walk(scenario), *_swaps(scenario)]
@@ -129,8 +133,7 @@ def _swaps(scenario: Scenario) -> list[Row]:
 def _sight(scenario: Scenario) -> dict[int, FloatArray]:
     """For each node, H of all readings that can reach it."""
     near: dict[int, set[int]] = {node: {node} for node in scenario.nodes}
-    for i, j in scenario.topology.links:
-        near[i].add(j)
+    for i, j in scenario.topology.directions:
         near[j].add(i)
     return {
         node: np.concatenate([scenario.observation(peer)[0] for peer in sorted(peers)])
@@ -140,19 +143,22 @@ def _sight(scenario: Scenario) -> dict[int, FloatArray]:
 
 def _readings(scenario: Scenario) -> list[Row]:
     F = scenario.slot_plant.F
-    blind = [node for node, H in _sight(scenario).items() if unseen(F, H) is not None]
+    name = "(F, H) is detectable at every node"
+    try:
+        sight = _sight(scenario)
+    except TheoryError as error:
+        return [(name, "R Theorem 9", False, f"not decided: {error}")]
+    blind = [node for node, H in sight.items() if unseen(F, H) is not None]
     words = "its own readings and its neighbours' see every mode that does not decay"
     if blind:
         words = f"not at node{'s' if len(blind) > 1 else ''} {', '.join(map(str, blind[:SHOWN]))}"
-    return [("(F, H) is detectable at every node", "R Theorem 9", not blind, words)]
+    return [(name, "R Theorem 9", not blind, words)]
 
 
 def _arrivals(scenario: Scenario) -> list[Row]:
     loss, F = scenario.network.channel.loss, scenario.slot_plant.F
     rates = [
-        loss.mean_delivery(link, scenario.measured(link))
-        for pair in scenario.topology.links
-        for link in (pair, pair[::-1])
+        loss.mean_delivery(link, scenario.measured(link)) for link in scenario.topology.directions
     ]
     known = [rate for rate in rates if np.isfinite(rate)]
     least = min(known, default=1.0)
@@ -164,6 +170,8 @@ def _arrivals(scenario: Scenario) -> list[Row]:
             f"delivery from {least:g}" if loss.independent else "losses come in bursts or recorded",
         )
     ]
+    if any(sensor.varying for sensor in scenario.sensors):
+        return rows
     worst, words = 0.0, "every node sees enough by itself"
     for node, H in _sight(scenario).items():
         if unseen(F, scenario.observation(node)[0]) is None or unseen(F, H) is not None:

@@ -247,7 +247,7 @@ def test_a_covariance_that_is_not_a_number_is_not_called_an_overflow(plugged, tm
     assert main(["run", str(plugged("Nan")), "--out", str(tmp_path / "out"), "--no-plot"]) == 0
     printed = capsys.readouterr()
     assert "overflow" not in printed.out
-    assert printed.err.startswith("note: diverged, the covariance of node")
+    assert printed.err.startswith("note: diverged, the estimate or covariance of node")
     assert "no longer finite at" in printed.err
 
 

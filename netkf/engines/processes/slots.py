@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.processes.timeline import Timeline
-from netkf.engines.processes.wires import Wire, stream
+from netkf.engines.processes.wires import Wire
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.linear import LinearPlant, Readings, Truth
@@ -196,6 +195,8 @@ class SlotProcess:
         elif isinstance(activation, RecordedSlots):
             listed = activation.pairs(slot, phase, step)
             pairs, up = (pairs, set(listed)) if broadcast else (listed, None)
+            if up is not None and not self._scenario.topology.directed:
+                up |= {(j, i) for i, j in listed}
         if broadcast:
             self._recorder.append((now, ROUND, -1, -1, -1, phase, NAN))
         else:
@@ -238,15 +239,8 @@ class SlotProcess:
 
 
 def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[int, SlotHost]:
-    period = scenario.slot_plant.period
-
     def sensors(node: int) -> list[Readings]:
-        return [
-            scenario.sensors[place.entry].slot_path(
-                node, period, partial(stream, streams, (node, place.ordinal))
-            )
-            for place in scenario.placed.get(node, ())
-        ]
+        return [scenario.slot_path(streams, node, place) for place in scenario.placed.get(node, ())]
 
     nodes = scenario.nodes
     if algorithm.pooled:

@@ -50,7 +50,7 @@ class Direction:
 
 
 class Wire:
-    """Both directions of one link."""
+    """Both directions of one link, or the one that it has where the graph is directed."""
 
     def __init__(
         self,
@@ -69,12 +69,11 @@ class Wire:
         self._until = scenario.ends
         self._kept: list[tuple[float, bool, float]] = []
         forth = Fates(channel, partial(stream, streams, (i, j)))
-        # Symmetric: the messages of one activation share one draw.
-        back = forth if self._shared else Fates(channel, partial(stream, streams, (j, i)))
-        self._ways = (
-            Direction(scenario, (i, j), 2 * entity, receivers[j], forth),
-            Direction(scenario, (j, i), 2 * entity + 1, receivers[i], back),
-        )
+        self._ways = [Direction(scenario, (i, j), 2 * entity, receivers[j], forth)]
+        if not scenario.topology.directed:
+            # Symmetric: the messages of one activation share one draw.
+            back = forth if self._shared else Fates(channel, partial(stream, streams, (j, i)))
+            self._ways.append(Direction(scenario, (j, i), 2 * entity + 1, receivers[i], back))
 
     def exchange(
         self,
@@ -84,16 +83,16 @@ class Wire:
         up: bool = True,
         fresh: bool = True,
     ) -> None:
-        """Send one message each way; both are lost where the link is not ``up``. Unless they are
-        ``fresh`` the fates are those of the last time.
+        """Send one message each way that there is, of the payloads of both ends; all are lost where
+        the link is not ``up``. Unless they are ``fresh`` the fates are those of the last time.
 
         None is not sent, but its fate is drawn all the same.
         """
-        forth, back = self._ways
         if fresh or not self._kept:
-            fate = forth.fates.draw()
-            self._kept = [fate, fate if self._shared else back.fates.draw()]
-        for way, payload, fate in zip(self._ways, payloads, self._kept, strict=True):
+            first, *others = self._ways
+            fate = first.fates.draw()
+            self._kept = [fate, *(fate if self._shared else way.fates.draw() for way in others)]
+        for way, payload, fate in zip(self._ways, payloads, self._kept, strict=False):
             self._send(now, way, payload, fate if up else DOWN, phase)
 
     def _send(

@@ -16,6 +16,7 @@ from netkf.experiments.checking import gossip, intermittent
 from netkf.experiments.checking.evidence import BROKEN, Evidence, Row, judge
 from netkf.experiments.checking.words import look_at
 from netkf.experiments.simulate import simulate
+from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
 
@@ -58,7 +59,7 @@ def paper_of(scenario: Scenario) -> Any:
     for kind, module in PAPERS:
         if isinstance(scenario.filter.algorithm, kind):
             return module
-    name = type(scenario.filter.algorithm).__name__.lower()
+    name = spoken(scenario.filter.algorithm)
     raise TheoryError(f"nothing is promised of the {name} filter that could be checked")
 
 

@@ -1,0 +1,125 @@
+"""The diffusion filter of Xie, Gan and Liu: adapt, then combine by covariance intersection, D."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.intersection import intersection
+from netkf.algorithms.slot import (
+    Messages,
+    Pair,
+    Reading,
+    Role,
+    SlotFilter,
+    SlotModel,
+    update_and_predict,
+)
+from netkf.core.arrays import FloatArray, square_root
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import choice, either, nested, setting, square
+
+METROPOLIS = "metropolis"
+
+
+class DiffusionState(NamedTuple):
+    """Prediction ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, and the weight that
+    the node gives to itself when all messages arrive.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: SlotModel
+    own: float
+
+
+@dataclass(frozen=True, eq=False)
+class DiffusionFilter(SlotFilter):
+    """D Algorithm 1, (6)-(9), with any F in place of D's identity; samples are predictions.
+
+    weights entry [l][i] is the weight node i gives to what node l sends, in the order of node ids:
+            columns sum to 1, and D's theorems want the rows to (balanced); or "metropolis",
+            1 / (1 + the larger number of incoming links) for each link and the rest for oneself
+    on_loss what becomes of the weight of a message that did not come (its row in the trace is
+            "lost" or "late"): "renormalise" divides the weights of what came, the own one
+            included, by their sum; "keep-own" adds it to the own one
+
+    Either way the weights sum to 1 and P stays consistent; a node that heard nothing predicts.
+    """
+
+    weights: str | FloatArray = setting(
+        either(choice(METROPOLIS), square, nested(1)), default=METROPOLIS
+    )
+    on_loss: str = setting(choice("renormalise", "keep-own"), default="renormalise")
+
+    programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
+    one_way: ClassVar[bool] = True
+    inverts: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.weights, str):
+            return
+        if (self.weights < 0.0).any():
+            where = np.argwhere(self.weights < 0.0)[0].tolist()
+            raise ScenarioError(
+                "weights[{}][{}]".format(*where),
+                "must not be negative",
+                float(self.weights[tuple(where)]),
+                "give weights from 0 to 1",
+            )
+        sums = self.weights.sum(axis=0)
+        wrong = np.flatnonzero(np.abs(sums - 1.0) > 1e-9)
+        if wrong.size:
+            raise ScenarioError(
+                "weights",
+                f"column {wrong[0]}, what node number {wrong[0]} gives, must sum to 1",
+                float(sums[wrong[0]]),
+                "write the weights that a node gives below each other",
+            )
+
+    @property
+    def pair_weights(self) -> FloatArray | None:
+        """``weights`` where they are a matrix."""
+        return None if isinstance(self.weights, str) else self.weights
+
+    def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> DiffusionState:
+        """A node by itself."""
+        return DiffusionState(mean, square_root(cov), model, 1.0)
+
+    def place(self, state: DiffusionState, role: Role) -> DiffusionState:
+        """The node knows its own weight."""
+        return state._replace(own=role.own)
+
+    def sense(self, state: DiffusionState, reading: Reading) -> DiffusionState:
+        """Adapt, D (6) and (7), with the prediction to the next slot."""
+        xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
+        return state._replace(xhat=xhat, root=root)
+
+    def emit(self, state: DiffusionState, phase: int) -> Pair:
+        """The adapted estimate and its covariance."""
+        return Pair(state.xhat, state.root)
+
+    def absorb(self, state: DiffusionState, phase: int, messages: Messages) -> DiffusionState:
+        """Combine, D (8) and (9)."""
+        arrived = [weight for weight, _, _ in messages]
+        own, heard = self.share(state.own, arrived)
+        if own == 1.0:
+            return state
+        parts = [(own, state.xhat, state.root)]
+        parts += [
+            (w, pair.xhat, pair.root) for w, (_, pair, _) in zip(heard, messages, strict=True)
+        ]
+        xhat, root = intersection(parts)
+        return state._replace(xhat=xhat, root=root)
+
+    def share(self, own: float, arrived: list[float]) -> tuple[float, list[float]]:
+        """The own weight and those of the messages that arrived, which sum to 1, from the nominal
+        ones.
+        """
+        total = own + sum(arrived)
+        if self.on_loss == "keep-own" or total == 0.0:
+            return max(0.0, 1.0 - sum(arrived)), arrived
+        return own / total, [weight / total for weight in arrived]

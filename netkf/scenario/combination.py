@@ -1,0 +1,81 @@
+"""What regressors, weights of pairs and covariance intersection ask of the rest of a scenario."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from netkf.algorithms.slot import SlotFilter
+from netkf.core.errors import ScenarioError
+from netkf.plants.regressors import RegressorSensor
+from netkf.scenario.registry import spoken
+from netkf.scenario.shapes import demand_shape
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+
+def check_regressor(scenario: Scenario, key: str, sensor: RegressorSensor) -> None:
+    """Raise ScenarioError where the matrices of a regressor do not fit, or time is continuous."""
+    if not scenario.slotted:
+        raise ScenarioError(
+            f"{key}.kind",
+            "belongs to plants in slots (linear), and this plant is in continuous time",
+            "regressor",
+            "change the plant or use a linear sensor",
+        )
+    m, q = len(sensor.A), sensor.B.shape[1]
+    why = f"{key}.A has {m} rows"
+    demand_shape(f"{key}.B", sensor.B, (m, None), why)
+    demand_shape(
+        f"{key}.C", sensor.C, (scenario.plant.n, m), f"the state has {scenario.plant.n} components"
+    )
+    demand_shape(f"{key}.start", sensor.start, (m,), why)
+    demand_shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
+    demand_shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
+
+
+def check_weights(scenario: Scenario) -> None:
+    """Raise ScenarioError where weights given pair by pair do not fit nodes and links."""
+    algorithm, nodes = scenario.filter.algorithm, scenario.nodes
+    given = algorithm.pair_weights if isinstance(algorithm, SlotFilter) else None
+    if given is None:
+        return
+    demand_shape("filter.weights", given, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
+    links = set(scenario.topology.directions)
+    for sender, receiver in np.argwhere(given > 0.0).tolist():
+        pair = (nodes[sender], nodes[receiver])
+        if sender != receiver and pair not in links:
+            raise ScenarioError(
+                f"filter.weights[{sender}][{receiver}]",
+                f"must be 0, because no link goes from node {pair[0]} to node {pair[1]}",
+                float(given[sender, receiver]),
+                "add the link; rows are senders, columns receivers",
+            )
+
+
+def check_invertible(scenario: Scenario) -> None:
+    """Raise ScenarioError where a covariance may become singular: unless noise reaches every state,
+    or none starts so and no state is forgotten at once.
+    """
+    n = scenario.plant.n
+    starts = [scenario.start(node)[1] for node in scenario.nodes]
+    whole = all(np.linalg.matrix_rank(cov, hermitian=True) == n for cov in starts)
+    if scenario.slotted:
+        F, Q = scenario.slot_belief
+        driven = np.linalg.matrix_rank(Q, hermitian=True) == n
+        regular = driven or (whole and np.linalg.matrix_rank(F) == n)
+    else:
+        A, Q = scenario.belief
+        reached = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
+        regular = whole or np.linalg.matrix_rank(np.concatenate(reached, axis=1)) == n
+    if not regular:
+        name = spoken(scenario.filter.algorithm)
+        raise ScenarioError(
+            "filter.cov",
+            f"must be positive definite for the {name} filter, which inverts covariances, where "
+            "the noise does not drive every state",
+            None,
+            "give filter.cov, or a positive definite Q",
+        )

@@ -1,0 +1,19 @@
+"""The rule that arrays of a scenario fit together."""
+
+from __future__ import annotations
+
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import ScenarioError
+
+
+def demand_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
+    """Raise ScenarioError where an array does not have the shape; None stands for any length."""
+    fits = len(value.shape) == len(shape) and all(
+        want is None or have == want for have, want in zip(value.shape, shape, strict=True)
+    )
+    if not fits:
+        words = " x ".join("any" if want is None else str(want) for want in shape)
+        got = " x ".join(map(str, value.shape))
+        raise ScenarioError(
+            key, f"must be {words}, not {got}, because {why}", value, "mend the shape"
+        )
