@@ -68,7 +68,7 @@ class Role(NamedTuple):
     neighbours: int
     nodes: int
     information: FloatArray
-    own: float
+    own: float = 1.0
 
 
 class Reading(NamedTuple):
