@@ -6,7 +6,7 @@ prediction covariance and ``delivery`` the probability that a reading arrives.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -166,24 +166,35 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> Critical:
         )
     alpha = float(np.abs(np.linalg.eigvals(transition)).max())
     lower = max(0.0, 1.0 - 1.0 / alpha**2) if alpha > 0.0 else 0.0
-    search = _Contraction(transition, observation)
-    if search.radius(0.0) <= 1.0 or search.radius(lower) <= 1.0 + 1e-13:
+    search = _Contraction(transition, (observation[:0], observation))
+
+    def radius(g: float) -> float:
+        return search.best((1.0 - g, g))[0]
+
+    if radius(0.0) <= 1.0 or radius(lower) <= 1.0 + 1e-13:
         upper = lower
     else:
-        upper = float(
-            scipy.optimize.brentq(lambda g: np.log(search.radius(g)), lower, 1.0, xtol=1e-14)
-        )
+        upper = float(scipy.optimize.brentq(lambda g: np.log(radius(g)), lower, 1.0, xtol=1e-14))
     above, below = min(1.0, upper + 1e-6), max(0.0, upper - 1e-6)
-    _, gain, _ = search.best(above)
-    _, _, perron = search.best(below)
-    return Critical(lower, upper, gain, perron)
+    _, gains, _ = search.best((1.0 - above, above))
+    _, _, perron = search.best((1.0 - below, below))
+    return Critical(lower, upper, gains[1], perron)
+
+
+def contraction_radius(F: FloatArray, arrivals: Sequence[tuple[float, FloatArray]]) -> float:
+    """The least spectral radius, over gains K_s, of ``X -> sum_s p_s (F + K_s H_s) X (F + K_s
+    H_s)'``, for sets s of readings, ``H_s`` (p, n) together, that arrive with probability p_s.
+
+    Below 1 the mean of the covariance stays bounded (R (32), derived for several links).
+    """
+    return _Contraction(F, [H for _, H in arrivals]).best([p for p, _ in arrivals])[0]
 
 
 class _Contraction:
-    """min over K of the spectral radius of ``X -> (1-g) F X F' + g (F+KH) X (F+KH)'``."""
+    """min over K_s of the spectral radius of ``X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'``."""
 
-    def __init__(self, F: FloatArray, H: FloatArray) -> None:
-        self._F, self._H = F, H
+    def __init__(self, F: FloatArray, readings: Sequence[FloatArray]) -> None:
+        self._F, self._readings = F, readings
         n = len(F)
         rows, columns = np.triu_indices(n)
         # vec of a symmetric matrix from its upper triangle, and the triangle of a vec
@@ -192,33 +203,36 @@ class _Contraction:
         self._expand[columns * n + rows, np.arange(len(rows))] = 1.0
         self._pick = rows * n + columns
 
-    def radius(self, g: float) -> float:
-        """The least spectral radius at g."""
-        return self.best(g)[0]
-
-    def best(self, g: float) -> tuple[float, FloatArray, FloatArray]:
-        """The least spectral radius, the gain that reaches it and the Perron matrix."""
+    def best(self, chances: Sequence[float]) -> tuple[float, list[FloatArray], FloatArray]:
+        """The least spectral radius, the gains that reach it and the Perron matrix."""
         n = len(self._F)
-        K = self._improved(np.zeros((n, len(self._H))), np.eye(n))
-        best, X = self._perron(g, K)
-        gain = K
+        start = [np.zeros((n, len(H))) for H in self._readings]
+        gains = self._improved(start, np.eye(n))
+        best, X = self._perron(chances, gains)
         for _ in range(500):
-            K = self._improved(K, X)
-            rho, X_new = self._perron(g, K)
+            following = self._improved(gains, X)
+            rho, X_new = self._perron(chances, following)
             if not rho < best * (1.0 - 1e-15):
                 break
-            best, X, gain = rho, X_new, K
-        return best, gain, X
+            best, X, gains = rho, X_new, following
+        return best, gains, X
 
-    def _improved(self, K: FloatArray, X: FloatArray) -> FloatArray:
+    def _improved(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
         # Where X says nothing about a direction, what is known of it is kept.
-        S = self._H @ X @ self._H.T
-        wanted = -(self._F @ X @ self._H.T) - K @ S
-        return np.asarray(K + wanted @ np.linalg.pinv(S, rcond=1e-13, hermitian=True))
+        found = []
+        for K, H in zip(gains, self._readings, strict=True):
+            S = H @ X @ H.T
+            wanted = -(self._F @ X @ H.T) - K @ S
+            found.append(np.asarray(K + wanted @ np.linalg.pinv(S, rcond=1e-13, hermitian=True)))
+        return found
 
-    def _perron(self, g: float, K: FloatArray) -> tuple[float, FloatArray]:
-        closed = self._F + K @ self._H
-        whole = (1.0 - g) * np.kron(self._F, self._F) + g * np.kron(closed, closed)
+    def _perron(
+        self, chances: Sequence[float], gains: list[FloatArray]
+    ) -> tuple[float, FloatArray]:
+        whole = np.zeros((len(self._F) ** 2,) * 2)
+        for p, K, H in zip(chances, gains, self._readings, strict=True):
+            closed = self._F + K @ H
+            whole += p * np.kron(closed, closed)
         values, vectors = np.linalg.eig(whole[self._pick] @ self._expand)
         k = int(np.argmax(values.real))
         vector = (self._expand @ vectors[:, k]).real

@@ -8,6 +8,7 @@ import pytest
 import netkf
 from netkf import theory
 from tests.cases import FOLDER
+from tests.conftest import SCENARIOS
 
 CASES = json.loads((FOLDER / "intermittent.json").read_text())
 SCALAR = ([[2.0**0.5]], [[1.0]], [[1.0]], [[1.0]])
@@ -68,6 +69,30 @@ def test_lower_bound_is_not_sufficient():
     lower, upper = theory.critical_probability(np.diag([2.0**0.5, -(2.0**0.5)]), [[1.0, 1.0]])
     assert lower == pytest.approx(0.5, abs=1e-12)
     assert upper == pytest.approx(0.75, abs=1e-9)
+
+
+def test_readings_over_several_links_count_by_the_sets_that_arrive(tmp_path):
+    """Two scalar sensors at 0.3 each: nothing comes with probability 0.49, and 0.49 F^2 < 1, though
+    neither link alone reaches the critical 0.5. Two modes seen by one sensor each: the worse one.
+    """
+    from netkf.theory.intermittent import contraction_radius
+
+    F, one, none = np.array([[2.0**0.5]]), np.ones((1, 1)), np.zeros((0, 1))
+    sets = [(0.49, none), (0.21, one), (0.21, one), (0.09, np.ones((2, 1)))]
+    assert contraction_radius(F, sets) == pytest.approx(0.98)
+    modes, a, b = np.diag([1.2, 1.5]), np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]])
+    sets = [(0.08, a[:0]), (0.32, b), (0.12, a), (0.48, np.eye(2))]  # a at 0.6, b at 0.8
+    assert contraction_radius(modes, sets) == pytest.approx(max(0.4 * 1.44, 0.2 * 2.25))
+    scenario = netkf.load(SCENARIOS / "intermittent_scalar.toml").replace(
+        {
+            "network.graph": {"kind": "edges", "edges": [[0, 1], [1, 2]]},
+            "sensors.0.nodes": [0, 2],
+            "network.channel.loss.delivery": 0.3,
+        }
+    )
+    row = theory.assumptions(scenario).set_index("source").loc["R (32)"]
+    assert row.holds
+    assert "0.98 a slot" in row.evidence
 
 
 def test_a_step_survives_covariances_beyond_double_rounding():
