@@ -38,7 +38,7 @@ class Coupled(NamedTuple):
     start: FloatArray
 
 
-STEPS = ("init", "flow", "measure", "emit", "absorb", "estimate")
+STEPS = ("init", "flow", "measure", "sense", "emit", "absorb", "estimate")
 
 
 def own_steps(algorithm: object, known: type) -> list[str]:
@@ -47,7 +47,7 @@ def own_steps(algorithm: object, known: type) -> list[str]:
     Other weights are understood, they enter the equations.
     """
     mine = type(algorithm)
-    return [name for name in STEPS if getattr(mine, name, None) is not getattr(known, name)]
+    return [n for n in STEPS if getattr(mine, n, None) is not getattr(known, n, None)]
 
 
 def not_promised(scenario: Scenario) -> str | None:
