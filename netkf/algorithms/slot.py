@@ -1,9 +1,10 @@
 """Slot filters: node algorithms in discrete time.
 
 Each slot is a short programme of phases that the filter declares, such as ``("exchange",
-"sense")``. In an exchange every node may send once and then absorbs all that arrived before the
-inbox closed; in a sense phase it is handed the reading of the slot. States are NamedTuples of
-arrays that nothing changes in place. Covariances are carried as square roots, ``P = root root'``.
+"sense")``. An exchange has one step or several; in each every node may send once and then absorbs
+all that arrived before the inbox closed. In a sense phase it is handed the reading of the slot.
+States are NamedTuples of arrays that nothing changes in place. Covariances are carried as square
+roots, ``P = root root'``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
-from netkf.core.arrays import FloatArray, block_diagonal, square_root
+from netkf.core.arrays import FloatArray, block_diagonal, square_root, symmetric
 from netkf.core.fields import Part
 
 Messages = Sequence[tuple[float, Any, float]]
@@ -27,7 +28,8 @@ Messages = Sequence[tuple[float, Any, float]]
 class SlotModel:
     """What one node believes: ``x[k+1] = F x[k] + w``, cov(w) = Q; ``y = H x + v``, cov(v) = R.
 
-    ``F, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0.
+    ``F, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0. Where H differs from slot to slot this
+    is the first one; each reading brings its own.
     """
 
     F: FloatArray
@@ -40,6 +42,16 @@ class SlotModel:
         """``root_Q root_Q' = Q``."""
         return square_root(self.Q)
 
+    @cached_property
+    def weighted(self) -> FloatArray:
+        """``H' R^-1`` (n, p)."""
+        return np.asarray(np.linalg.solve(self.R, self.H).T)
+
+    @property
+    def information(self) -> FloatArray:
+        """``H' R^-1 H`` (n, n)."""
+        return symmetric(self.weighted @ self.H)
+
 
 class SlotState(NamedTuple):
     """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, a ``kept`` reading."""
@@ -48,6 +60,18 @@ class SlotState(NamedTuple):
     root: FloatArray
     model: SlotModel
     kept: Any = None
+
+
+class Role(NamedTuple):
+    """What a node may be told about the network before slot 0: its own id, how many ``neighbours``
+    it has when no link fails, how many ``nodes`` there are, and the ``information`` (n, n) of all
+    their sensors together, the sum of H' R^-1 H as the filters believe it.
+    """
+
+    node: int
+    neighbours: int
+    nodes: int
+    information: FloatArray
 
 
 class Reading(NamedTuple):
@@ -79,19 +103,43 @@ class SlotFilter(Part):
         """The state at slot 0."""
         return SlotState(mean, square_root(cov), model)
 
+    def place(self, state: Any, role: Role) -> Any:
+        """The state at slot 0 of a node that knows its role; asked for after ``init``."""
+        return state
+
+    def steps(self, phase: int) -> int:
+        """How often exchange number ``phase`` of a slot is repeated; its time is shared evenly."""
+        return 1
+
+    def redraws(self, phase: int, step: int) -> bool:
+        """Whether the links draw new fates in a step, else each keeps its last one; True in the
+        first.
+        """
+        return True
+
     @abstractmethod
-    def sense(self, state: Any, y: FloatArray) -> Any:
-        """The state once the node's reading ``y`` (p,) of this slot is known."""
+    def sense(self, state: Any, reading: Reading) -> Any:
+        """The state once the node's reading of this slot is known; p is 0 without sensors."""
 
     def emit(self, state: Any, phase: int) -> Any:
-        """What the node sends in exchange number ``phase`` of the slot; None for nothing."""
+        """What the node sends in each step of exchange number ``phase``; None for nothing."""
         return None
 
     def absorb(self, state: Any, phase: int, messages: Messages) -> Any:
-        """The state when the inbox of that exchange closes; called for every node, with all
+        """The state when the inbox of that step closes; called for every node, with all
         ``(weight, payload, age)`` that arrived in time in the order of their senders.
         """
         return state
+
+    def stopped(self, state: Any) -> bool:
+        """Whether the node has stopped learning what it learns from the others, for ever."""
+        return False
+
+    def conserved(self, state: Any) -> dict[str, float]:
+        """Quantities by name whose sums over all nodes no exchange changes as long as messages are
+        lost in both directions or in none; a run reports how far the sums have drifted.
+        """
+        return {}
 
     def weight(self, degree: int, peer_degree: int) -> float:
         """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
@@ -146,9 +194,8 @@ class Gossip(SlotFilter):
             state = state._replace(xhat=pair.xhat, root=pair.root)
         return state
 
-    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+    def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Update with the own reading and predict."""
-        reading = Reading(y, state.model.H, state.model.R)
         xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
         return state._replace(xhat=xhat, root=root)
 
@@ -163,9 +210,9 @@ class Intermittent(SlotFilter):
 
     programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
 
-    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+    def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Keep the reading."""
-        return state._replace(kept=Reading(y, state.model.H, state.model.R))
+        return state._replace(kept=reading)
 
     def emit(self, state: SlotState, phase: int) -> Reading | None:
         """The reading, from nodes that have sensors."""
@@ -191,19 +238,19 @@ class SlotLocal(SlotFilter):
     predicts: ClassVar[bool] = False
     talks: ClassVar[bool] = False
 
-    def sense(self, state: SlotState, y: FloatArray) -> SlotState:
+    def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Predict from the slot before, then update; called from slot 1 on."""
-        model = state.model
+        model, (y, H, R) = state.model, reading
         xhat, root = model.F @ state.xhat, predict_root(state.root, model.F, model.root_Q)
         if not len(y):
             return state._replace(xhat=xhat, root=root)
-        p, n = model.H.shape
-        top = np.concatenate([model.H @ root, np.linalg.cholesky(model.R)], axis=1)
+        p, n = H.shape
+        top = np.concatenate([H @ root, np.linalg.cholesky(R)], axis=1)
         L = lower_triangular(
             np.concatenate([top, np.concatenate([root, np.zeros((n, p))], axis=1)])
         )
         gain = np.linalg.solve(L[:p, :p].T, L[p:, :p].T).T
-        return state._replace(xhat=xhat + gain @ (y - model.H @ xhat), root=L[p:, p:])
+        return state._replace(xhat=xhat + gain @ (y - H @ xhat), root=L[p:, p:])
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,12 +67,16 @@ class SlotReadings:
         self._noise = Blocks(random, len(R))
         self._slot, self._v = -1, np.zeros(len(R))
 
+    def matrix(self, slot: int) -> FloatArray:
+        """H (p, n) of a slot not before the last one asked for."""
+        return self._H
+
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """(p,) the reading of a slot not before the last one asked for; each has its own noise."""
         while self._slot < slot:
             self._v = self._root @ self._noise.draw()
             self._slot += 1
-        return np.asarray(self._H @ x + self._v)
+        return np.asarray(self.matrix(slot) @ x + self._v)
 
 
 class Blocks:

@@ -1,4 +1,4 @@
-"""Sensors in continuous time, dy = H x dt + dv, and the readings of one run.
+"""Sensors: the contract, the fixed linear one, and its readings in continuous time.
 
 The noise of a sensor is drawn on the sensing grid from the sensor's own stream, as its two moments
 over each step. When the network wakes a node inside a step, the step is cut: the two moments of
@@ -9,7 +9,10 @@ keeps what is left. The noise on the grid therefore never depends on the network
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,22 +26,45 @@ from netkf.core.fields import (
     several,
 )
 from netkf.plants.diffusion import BLOCK, DiffusionPath
+from netkf.plants.linear import SlotReadings
 
 
 @dataclass(frozen=True, eq=False)
-class LinearSensor(Part):
-    """Each of ``nodes`` sees ``dy = H x dt + dv``, cov(dv) = R dt, H (3), with noise of its own.
+class Sensor(Part):
+    """The contract: each of ``nodes`` has such a sensor, with noise of its own.
+
+    ``varying`` says that H differs from slot to slot; such sensors exist in slots only.
+    """
+
+    varying: ClassVar[bool] = False
+
+    nodes: tuple[int, ...] = setting(several(integer(), "node ids"))
+
+    @abstractmethod
+    def slot_path(self, generator: Callable[[str], np.random.Generator]) -> SlotReadings:
+        """The readings of one of the nodes in one run in slots; ``generator`` makes the streams of
+        that sensor by purpose.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSensor(Sensor):
+    """In continuous time ``dy = H x dt + dv``, cov(dv) = R dt, H (3); in slots ``y = H x + v``,
+    cov(v) = R.
 
     ``H`` (p, n), ``R`` (p, p).
     """
 
-    nodes: tuple[int, ...] = setting(several(integer(), "node ids"))
     H: FloatArray = setting(matrix)
     R: FloatArray = setting(definite_covariance)
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
-        """The readings of one of the nodes in one run."""
+        """The readings of one of the nodes in one run in continuous time."""
         return SensorPath(self.H, self.R, random, cutting)
+
+    def slot_path(self, generator: Callable[[str], np.random.Generator]) -> SlotReadings:
+        """From the stream "noise"."""
+        return SlotReadings(self.H, self.R, generator("noise"))
 
 
 class SensorPath:

@@ -9,6 +9,7 @@ from pathlib import Path
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.fields import Part
@@ -75,6 +76,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
     "slot filter": {
         "gossip": Gossip,
         "intermittent": Intermittent,
+        "push-sum": PushSum,
         "local": SlotLocal,
         "central": SlotCentral,
     },

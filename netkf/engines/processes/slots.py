@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import simpy
 
-from netkf.algorithms.slot import SlotFilter
+from netkf.algorithms.slot import Reading, SlotFilter, SlotModel
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.processes.timeline import Timeline
-from netkf.engines.processes.wires import Wire
+from netkf.engines.processes.wires import Wire, stream
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.linear import LinearPath, LinearPlant, SlotReadings
@@ -37,15 +38,25 @@ class Letter(NamedTuple):
 class SlotHost:
     """One node's filter, its sensors and its inbox."""
 
-    def __init__(self, algorithm: SlotFilter, node: int, state: Any, sensors: list[Any]) -> None:
-        self.node, self.state, self._algorithm, self._sensors = node, state, algorithm, sensors
+    def __init__(
+        self,
+        algorithm: SlotFilter,
+        node: int,
+        model: SlotModel,
+        start: tuple[FloatArray, FloatArray],
+        sensors: list[SlotReadings],
+    ) -> None:
+        self.node, self.state = node, algorithm.init(model, *start)
+        self._algorithm, self._model, self._sensors = algorithm, model, sensors
         self._open = -1
         self._inbox: dict[int, tuple[int, float, Any, float]] = {}
 
     def sense(self, slot: int, x: FloatArray) -> None:
         """Take the reading of a slot; without sensors it is empty."""
-        y = np.concatenate([np.empty(0), *(s.reading(slot, x) for s in self._sensors)])
-        self.state = self._algorithm.sense(self.state, y)
+        model, sensors = self._model, self._sensors
+        y = np.concatenate([np.empty(0), *(sensor.reading(slot, x) for sensor in sensors)])
+        H = np.concatenate([model.H[:0], *(sensor.matrix(slot) for sensor in sensors)])
+        self.state = self._algorithm.sense(self.state, Reading(y, H, model.R))
 
     def emit(self, exchange: int, phase: int) -> Letter | None:
         """What the node sends in an exchange."""
@@ -203,10 +214,8 @@ class SlotProcess:
 def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[int, SlotHost]:
     def sensors(node: int) -> list[SlotReadings]:
         return [
-            SlotReadings(
-                scenario.sensors[place.entry].H,
-                scenario.sensors[place.entry].R,
-                streams.generator("noise", node, place.ordinal),
+            scenario.sensors[place.entry].slot_path(
+                partial(stream, streams, (node, place.ordinal))
             )
             for place in scenario.placed.get(node, ())
         ]
@@ -214,9 +223,10 @@ def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[
     nodes = scenario.nodes
     if algorithm.pooled:
         every = [path for node in scenario.sensing for path in sensors(node)]
-        state = algorithm.init(scenario.pooled_slot_model, *scenario.start(nodes[0]))
-        return dict.fromkeys(nodes, SlotHost(algorithm, -1, state, every))
+        model = scenario.pooled_slot_model
+        shared = SlotHost(algorithm, -1, model, scenario.start(nodes[0]), every)
+        return dict.fromkeys(nodes, shared)
     return {
-        node: SlotHost(algorithm, node, algorithm.init(model, *scenario.start(node)), sensors(node))
+        node: SlotHost(algorithm, node, model, scenario.start(node), sensors(node))
         for node, model in zip(nodes, scenario.slot_models, strict=True)
     }

@@ -1,0 +1,227 @@
+"""The push-sum filter: distributed Kalman filtering on links that fail, P Fig. 1.
+
+A node learns the number of nodes and the information of all sensors by push-sum, one round a slot,
+and its gain from them; its estimate is averaged with those of its neighbours in ``gamma`` steps.
+What differs from P Fig. 1: the lost sums of (5), and of (3) and (4) under failures, are those that
+keep the mass; the stop rule of step 2.3 fires when all links of a node are down and is one choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.slot import Messages, Role, SlotFilter, SlotModel
+from netkf.algorithms.square_root import lower_triangular, predict_root
+from netkf.core.arrays import FloatArray, square_root, symmetric
+from netkf.core.fields import boolean, choice, integer, number, positive, setting
+
+MASS, AVERAGE = 0, 1
+"""The two exchanges of a slot."""
+
+MOST_STEPS = 100_000
+MOST_DOUBLINGS = 60
+
+
+class Network(NamedTuple):
+    """What a node takes the whole network to be: ``information`` (n, n) of all sensors, G^(i) of
+    P (6), the ``number`` of nodes, N^(i), and the ``root`` of P_inf where the gains are the limits.
+    """
+
+    information: FloatArray
+    number: float
+    root: FloatArray | None = None
+
+
+class PushSumState(NamedTuple):
+    """Estimate ``xhat`` (n,), z between the exchanges; ``root`` (n, n) of its covariance; ``mass``
+    (2 + n^2,), the weight w, the number n~ and the information C~ of P (3)-(5); what the node makes
+    of it, ``network``; whether that is frozen, ``stopped``; its nominal ``degree``.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: SlotModel
+    mass: FloatArray
+    network: Network
+    stopped: bool
+    degree: int
+
+
+@dataclass(frozen=True, eq=False)
+class PushSum(SlotFilter):
+    """P Fig. 1, steps 1-6, samples are filtered.
+
+    gamma      averaging steps a slot
+    delta      the averaging gain is 1 / delta, P (9)
+    leader     the node whose weight starts at 1
+    asymptotic gains from the limits N and P_inf, P (12), from slot 1 on; no mass is exchanged
+    links      "fresh": links fail anew in each averaging step; "held": once for all of a slot
+    stop       "never"; "paper": P step 2.3, the node sends no more mass once its C~ moved by less
+               than ``tolerance`` (spectral norm); "safe": it goes on exchanging but freezes G^(i)
+               and N^(i) once they moved by less than ``tolerance`` (relative) while all its links
+               were up and its weight positive
+    """
+
+    gamma: int = setting(integer(low=1, high=MOST_STEPS))
+    delta: float = setting(positive)
+    leader: int = setting(integer(low=0), default=0)
+    asymptotic: bool = setting(boolean, default=False)
+    links: str = setting(choice("fresh", "held"), default="fresh")
+    stop: str = setting(choice("never", "safe", "paper"), default="never")
+    tolerance: float = setting(number(low=0.0), default=1e-6)
+
+    programme: ClassVar[tuple[str, ...]] = ("exchange", "sense", "exchange")
+    first_slot: ClassVar[int] = 1
+    predicts: ClassVar[bool] = False
+
+    def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> PushSumState:
+        """A node by itself: step 1 without the leader."""
+        information = model.information
+        mass = np.concatenate([[0.0, 1.0], information.reshape(-1)])
+        alone = Network(information, 1.0)
+        return PushSumState(mean, square_root(cov), model, mass, alone, False, 0)
+
+    def place(self, state: PushSumState, role: Role) -> PushSumState:
+        """Step 1: the leader gets the weight; with asymptotic gains every node knows the limits."""
+        if self.asymptotic:
+            root = asymptotic_root(state.model.F, state.model.Q, role.information)
+            state = state._replace(network=Network(role.information, float(role.nodes), root))
+        if role.node == self.leader:
+            state = state._replace(mass=np.concatenate([[1.0], state.mass[1:]]))
+        return state._replace(degree=role.neighbours)
+
+    def steps(self, phase: int) -> int:
+        """One for the mass, ``gamma`` for the estimates."""
+        return self.gamma if phase == AVERAGE else 1
+
+    def redraws(self, phase: int, step: int) -> bool:
+        """Links that are held keep the fate of the first averaging step."""
+        return self.links == "fresh" or step == 0
+
+    def emit(self, state: PushSumState, phase: int) -> FloatArray | None:
+        """Step 2.1, the node's share of its mass, or step 5.1, z."""
+        if phase == AVERAGE:
+            return state.xhat
+        silent = self.asymptotic or (self.stop == "paper" and state.stopped)
+        return None if silent else share(state.mass, state.degree)
+
+    def absorb(self, state: PushSumState, phase: int, messages: Messages) -> PushSumState:
+        """Steps 2.2 and 2.3, or step 5.2."""
+        received = [payload for _, payload, _ in messages]
+        if phase == AVERAGE:
+            return state._replace(xhat=averaged(state.xhat, received, self.delta))
+        if self.asymptotic or (self.stop == "paper" and state.stopped):
+            return state
+        mass = mixed(state.mass, received, state.degree)
+        whole = len(received) == state.degree
+        return self._learned(state._replace(mass=mass), state.mass, whole)
+
+    def _learned(self, state: PushSumState, before: FloatArray, whole: bool) -> PushSumState:
+        """P (6) and the stop rule; ``whole``: all links of the node were up."""
+        if state.stopped:
+            return state
+        found = network(state.mass, state.model)
+        stopped = False
+        if self.stop == "paper":
+            n = len(state.xhat)
+            now, then = state.mass[2:].reshape(n, n), before[2:].reshape(n, n)
+            stopped = bool(now.any() and np.linalg.norm(now - then, 2) < self.tolerance)
+        elif self.stop == "safe":
+            settled = _settled(found, state.network, self.tolerance)
+            stopped = bool(whole and state.mass[0] > 0.0 and settled)
+        return state._replace(network=found, stopped=stopped)
+
+    def sense(self, state: PushSumState, y: FloatArray) -> PushSumState:
+        """Steps 3 and 4, P (7) and (8)."""
+        model, root = state.model, state.network.root
+        if root is None:
+            ahead = predict_root(state.root, model.F, model.root_Q)
+            root = corrected_root(ahead, state.network.information)
+        predicted = model.F @ state.xhat
+        if not len(y):
+            return state._replace(xhat=predicted, root=root)
+        gain = state.network.number * (root @ (root.T @ model.weighted))
+        z = predicted + gain @ (y - model.H @ predicted)
+        return state._replace(xhat=z, root=root)
+
+    def stopped(self, state: PushSumState) -> bool:
+        """Whether G^(i) and N^(i) are frozen."""
+        return state.stopped
+
+    def conserved(self, state: PushSumState) -> dict[str, float]:
+        """The sum of the weights is 1, that of the numbers N."""
+        return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
+
+
+def share(mass: FloatArray, degree: int) -> FloatArray:
+    """What a node of ``degree`` neighbours sends to each of them: its mass over degree + 1."""
+    return mass / (degree + 1)
+
+
+def mixed(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
+    """P (3)-(5) as they conserve mass: the shares ``received`` and the node's own, which it keeps
+    once for itself and once for each link of its ``degree`` that failed.
+
+    ``mass`` and shares (m,), or stacks of them.
+    """
+    kept = (degree + 1 - len(received)) * share(mass, degree)
+    return kept + sum(received) if received else kept
+
+
+def network(mass: FloatArray, model: SlotModel) -> Network:
+    """P (6): C~ / w and n~ / w, or what the node knows of itself while its weight is exactly 0."""
+    weight, n = float(mass[0]), len(model.F)
+    if weight == 0.0:
+        return Network(model.information, 1.0)
+    return Network(symmetric(mass[2:].reshape(n, n) / weight), float(mass[1]) / weight)
+
+
+def _settled(new: Network, old: Network, tolerance: float) -> bool:
+    moved = float(np.linalg.norm(new.information - old.information))
+    return abs(new.number - old.number) < tolerance * new.number and moved <= tolerance * float(
+        np.linalg.norm(new.information)
+    )
+
+
+def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
+    """Root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for ``P = root root'``, possibly singular,
+    and the information G (n, n).
+
+    ``root L^-T`` with ``L L' = I + root' G root``, triangular by reflections: nothing is inverted.
+    """
+    seen = root.T @ square_root(information)
+    L = lower_triangular(np.concatenate([seen, np.eye(len(root))], axis=1))
+    return np.asarray(np.linalg.solve(L, root.T).T)
+
+
+def averaged(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
+    """P (9): z plus 1 / delta of the differences to the estimates that arrived."""
+    return z + sum(other - z for other in received) / delta if received else z
+
+
+def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
+    """Root of P_inf (n, n), P (12): the steady covariance of a filter that has all the
+    information (n, n) in each slot, after its reading; None where there is none.
+
+    By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
+    Wang, Int. J. Control 77, 2004).
+    """
+    A, G, P = F.T, information, Q
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(MOST_DOUBLINGS):
+            try:
+                solved = np.linalg.solve(np.eye(len(F)) + G @ P, np.concatenate([A, G], axis=1))
+            except np.linalg.LinAlgError:
+                return None
+            left, right = solved[:, : len(F)], solved[:, len(F) :]
+            following = symmetric(P + A.T @ P @ left)
+            if not np.isfinite(following).all():
+                return None
+            A, G, step, P = A @ left, symmetric(G + A @ right @ A.T), following - P, following
+            if np.abs(step).max() <= 1e-15 * np.abs(P).max():
+                return corrected_root(square_root(P), information)
+    return None
