@@ -1,7 +1,7 @@
-"""Moments of the averaging of P step 5: z_i <- z_i + 1/delta sum_j b_ij (z_j - z_i), gamma times.
+"""Moments of the averaging of P step 5, z_i <- z_i + 1/delta sum_j b_ij (z_j - z_i), gamma times.
 
-One step is ``M = I - 1/delta sum over links of b_ij e_i (e_i - e_j)' + b_ji e_j (e_j - e_i)'``. Links
-are independent, so with ``d = Y_ii - Y_ij - Y_ji + Y_jj`` of each link
+One step is ``M = I - 1/delta sum of b_ij e_i (e_i - e_j)' + b_ji e_j (e_j - e_i)'`` over links,
+which are independent. So with ``d = Y_ii - Y_ij - Y_ji + Y_jj`` of each link
 
     E[M Y M'] = E[M] Y E[M]' + 1/delta^2 sum over links of +-cov(b, b) d,
 
@@ -85,17 +85,20 @@ class Averaging:
         N, n = self.nodes, len(Y) // self.nodes
         if self._held:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)
-            pairs = (self.kron @ pairs).reshape(N, N, n, n)
-            return pairs.transpose(0, 2, 1, 3).reshape(N * n, N * n)
+            four = (self.kron @ pairs).reshape(N, N, n, n).transpose(0, 2, 1, 3)
+            return np.asarray(four.reshape(N * n, N * n))
         i, j = self.links.T
         own, cross, _, other = (c[:, None, None] for c in self._covariances)
+        each = np.arange(N)
         for _ in range(self.gamma):
             Z = Y.reshape(N, n, N, n)
             d = Z[i, :, i] - Z[i, :, j] - Z[j, :, i] + Z[j, :, j]
             Y = self._left(self._left(Y).T).T.copy()
             Z = Y.reshape(N, n, N, n)
-            np.add.at(Z, (i, slice(None), i), own * d)
-            np.add.at(Z, (j, slice(None), j), other * d)
+            at_node = np.zeros((N, n, n))
+            np.add.at(at_node, i, own * d)
+            np.add.at(at_node, j, other * d)
+            Z[each, :, each] += at_node
             Z[i, :, j] -= cross * d
             Z[j, :, i] -= cross * d
         return Y
@@ -110,7 +113,7 @@ class Averaging:
 
     @cached_property
     def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """(E,) covariances of (b_ij, b_ij), (b_ij, b_ji), (b_ji, b_ij), (b_ji, b_ji), by delta^2."""
+        """(E,) covariances of the pairs from (b_ij, b_ji), row by row, over delta^2."""
         first, second = self.hears.T
         cross = (self.both - first * second) / self.delta**2
         own, other = (p * (1.0 - p) / self.delta**2 for p in (first, second))

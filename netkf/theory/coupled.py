@@ -38,7 +38,18 @@ class Coupled(NamedTuple):
     start: FloatArray
 
 
-STEPS = ("init", "flow", "measure", "sense", "emit", "absorb", "estimate")
+STEPS = (
+    "init",
+    "place",
+    "flow",
+    "measure",
+    "sense",
+    "emit",
+    "absorb",
+    "steps",
+    "redraws",
+    "estimate",
+)
 
 
 def own_steps(algorithm: object, known: type) -> list[str]:

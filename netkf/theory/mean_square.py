@@ -1,10 +1,10 @@
 """Mean squares of the errors of the push-sum filter, exactly: P steps 4-5 at asymptotic gains.
 
-The stacked error obeys ``e+ = (M (x) I)(diag(A_i) e + h)`` with independent M, P (25), so that its
-covariance X obeys the linear, positive map ``T(X) = E[(M (x) I) diag(A_i) X diag(A_i)' (M (x) I)']``:
-X+ = T(X) + T_h. Its spectral radius is an eigenvalue with a semidefinite X (Krein and Rutman).
-Small systems are solved by dense eigenvalues on symmetric X, large ones by Arnoldi's method; there
-an X that is positive definite proves by ``T(X) <= c X`` that the radius is at most c (Collatz).
+The stacked error obeys ``e+ = (M (x) I)(A e + h)``, A = diag(A_i), with independent M, P (25); its
+covariance ``X+ = T(X) + E[(M (x) I) cov(h) (M (x) I)']`` with the linear, positive map
+``T(X) = E[(M (x) I) A X A' (M (x) I)']``. The radius of T is an eigenvalue with a semidefinite X
+(Krein and Rutman): the largest dense one on symmetric X for small systems, the rightmost one of
+Arnoldi's method for large ones, where a positive definite X proves it (Collatz and Wielandt).
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.averaging import Averaging
-from netkf.theory.push_sum import EstimationSteps, averaging_law, estimation_steps
+from netkf.theory.estimation_steps import EstimationSteps, averaging_law, estimation_steps
 
 FEW = 40  # rows of X up to which the map is written out
 RESIDUAL = 1e-10
 SLACK = 1e-6  # relative, of the radius where an X proves it
 BASIS = 24  # vectors that Arnoldi's method keeps
-MOST_ROUNDS = 20
 
 
 def push_sum_radius(scenario: Scenario) -> float:
@@ -81,20 +80,17 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
     size = np.abs(closed).max(axis=0)
     linked = size > 1e-14 * size.max()
     _, label = scipy.sparse.csgraph.connected_components(linked, directed=False)
-    return [closed[np.ix_(range(len(closed)), g, g)] for g in map(np.flatnonzero, _sets(label))]
-
-
-def _sets(label: np.ndarray) -> list[np.ndarray]:
-    return [label == k for k in range(label.max() + 1)]
+    groups = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+    return [closed[:, group[:, None], group] for group in groups]
 
 
 def _radius(law: Averaging, closed: FloatArray) -> float:
     if closed.shape[0] * closed.shape[1] <= FEW:
-        return float(np.abs(np.linalg.eigvals(_written_out(law, closed))).max())
+        return float(np.abs(np.linalg.eigvals(written_out(law, closed))).max())
     return _arnoldi(law, closed)
 
 
-def _written_out(law: Averaging, closed: FloatArray) -> FloatArray:
+def written_out(law: Averaging, closed: FloatArray) -> FloatArray:
     """T as a matrix on the upper triangles of symmetric X."""
     N, n, _ = closed.shape
     kron = law.kron.reshape(N, N, N, N)
@@ -107,7 +103,7 @@ def _written_out(law: Averaging, closed: FloatArray) -> FloatArray:
     return np.asarray(straight + np.where(rows == columns, 0.0, mirrored))
 
 
-def _mapping(law: Averaging, closed: FloatArray) -> Callable[[FloatArray], FloatArray]:
+def mapping(law: Averaging, closed: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """T on symmetric (N n, N n) matrices."""
     N, n, _ = closed.shape
 
@@ -124,12 +120,14 @@ def _arnoldi(law: Averaging, closed: FloatArray) -> float:
     definite beyond the residual proves the value; else a second search must find it again.
     """
     size = closed.shape[0] * closed.shape[1]
-    T = _mapping(law, closed)
+    T = mapping(law, closed)
     value, X = _rightmost(T, np.eye(size), "LR")
     spectrum = np.linalg.eigvalsh(X)
     rest = float(np.linalg.norm(T(X) - value * X, 2))
     if not rest <= RESIDUAL * value * spectrum[-1] or spectrum[0] < -1e-8 * spectrum[-1]:
-        raise TheoryError(f"the radius is near {value:.6g}, found with a residual of {rest:.1e} only")
+        raise TheoryError(
+            f"the radius is near {value:.6g}, found with a residual of {rest:.1e} only"
+        )
     if rest <= SLACK * value * spectrum[0]:
         return value
     again, _ = _rightmost(T, X + np.diag(np.linspace(0.5, 1.5, size)) * spectrum[-1], "LM")
@@ -156,61 +154,3 @@ def _rightmost(
         raise TheoryError(f"the radius was not found: {error}") from None
     X = symmetric(vectors[:, 0].real.reshape(size, size))
     return float(values[0].real), X * np.sign(np.trace(X))
-
-
-def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
-    """(N, n, n): exact steady covariance of x - xhat at every node, in the order of the nodes.
-
-    Of P steps 4-5 at the asymptotic gains, over noises and links. The filters' Q and R may differ
-    from the truth. Raises TheoryError where ``push_sum_radius`` is not below 1 or does not exist.
-    """
-    steps = estimation_steps(scenario)
-    found = radius(steps)
-    if not found < 1.0:
-        raise TheoryError(
-            f"no steady error covariance: the mean-square radius is {found:.6g}, not below 1; "
-            "raise gamma or the delivery probability"
-        )
-    N, n, _ = steps.closed.shape
-    scale = np.sqrt(np.diagonal(steps.limits.P)).clip(1e-150)
-    closed = steps.closed * (scale / scale[:, None])
-    every = np.tile(scale, N)
-    noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(every, every)))
-    X = _fixed_point(steps.averaging, closed, noise)
-    each = np.arange(N)
-    blocks = X.reshape(N, n, N, n)[each, :, each]
-    return symmetric(blocks * np.outer(scale, scale))
-
-
-def _fixed_point(law: Averaging, closed: FloatArray, noise: FloatArray) -> FloatArray:
-    """X = T(X) + noise, with a residual that is small beside the variances of its row and column."""
-    T, X = _mapping(law, closed), noise
-    if len(noise) <= FEW:
-        rows, columns = np.triu_indices(len(noise))
-        matrix = np.eye(len(rows)) - _written_out(law, closed)
-        X = np.zeros_like(noise)
-        X[rows, columns] = X[columns, rows] = np.linalg.solve(matrix, noise[rows, columns])
-    for _ in range(MOST_ROUNDS):
-        rest = noise + T(X) - X
-        variances = np.sqrt(np.abs(np.diagonal(X)))
-        if (np.abs(rest) <= RESIDUAL * np.outer(variances, variances)).all():
-            return X
-        X = X + _krylov(T, rest)
-    raise TheoryError(f"the steady covariance was solved to {np.abs(rest).max():.1e} only")
-
-
-def _krylov(T: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
-    """An approximate solution of X - T(X) = right by generalised minimal residuals."""
-    size = len(right)
-
-    def matvec(x: FloatArray) -> FloatArray:
-        X = symmetric(x.reshape(size, size))
-        return np.asarray((X - T(X)).ravel())
-
-    operator = scipy.sparse.linalg.LinearOperator(
-        (size**2, size**2), matvec=matvec, dtype=np.float64
-    )
-    x, _ = scipy.sparse.linalg.gmres(
-        operator, right.ravel(), rtol=1e-8, atol=0.0, restart=BASIS, maxiter=10
-    )
-    return symmetric(np.asarray(x).reshape(size, size))
