@@ -127,7 +127,7 @@ def _load(options: argparse.Namespace) -> Scenario:
 
 
 def _notes(scenario: Scenario) -> None:
-    for note in scenario.topology.notes:
+    for note in scenario.notes:
         print(f"note: {note}", file=sys.stderr)
 
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.slot import Messages, Role, SlotFilter, SlotModel
+from netkf.algorithms.slot import Messages, Reading, Role, SlotFilter, SlotModel
 from netkf.algorithms.square_root import lower_triangular, predict_root
 from netkf.core.arrays import FloatArray, square_root, symmetric
 from netkf.core.fields import boolean, choice, integer, number, positive, setting
@@ -135,18 +135,18 @@ class PushSum(SlotFilter):
             stopped = bool(whole and state.mass[0] > 0.0 and settled)
         return state._replace(network=found, stopped=stopped)
 
-    def sense(self, state: PushSumState, y: FloatArray) -> PushSumState:
+    def sense(self, state: PushSumState, reading: Reading) -> PushSumState:
         """Steps 3 and 4, P (7) and (8)."""
         model, root = state.model, state.network.root
         if root is None:
             ahead = predict_root(state.root, model.F, model.root_Q)
             root = corrected_root(ahead, state.network.information)
         predicted = model.F @ state.xhat
+        y, H, R = reading
         if not len(y):
             return state._replace(xhat=predicted, root=root)
-        gain = state.network.number * (root @ (root.T @ model.weighted))
-        z = predicted + gain @ (y - model.H @ predicted)
-        return state._replace(xhat=z, root=root)
+        gain = state.network.number * (root @ (root.T @ np.linalg.solve(R, H).T))
+        return state._replace(xhat=predicted + gain @ (y - H @ predicted), root=root)
 
     def stopped(self, state: PushSumState) -> bool:
         """Whether G^(i) and N^(i) are frozen."""

@@ -42,15 +42,10 @@ class SlotModel:
         """``root_Q root_Q' = Q``."""
         return square_root(self.Q)
 
-    @cached_property
-    def weighted(self) -> FloatArray:
-        """``H' R^-1`` (n, p)."""
-        return np.asarray(np.linalg.solve(self.R, self.H).T)
-
     @property
     def information(self) -> FloatArray:
         """``H' R^-1 H`` (n, n)."""
-        return symmetric(self.weighted @ self.H)
+        return symmetric(self.H.T @ np.linalg.solve(self.R, self.H))
 
 
 class SlotState(NamedTuple):

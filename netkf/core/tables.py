@@ -22,21 +22,32 @@ def read_columns(
     Raises ScenarioError, with the file and the line, for a missing column, a row of another
     length, or an entry that is not a finite number.
     """
-    header, rows = _read(source)
-    missing = [name for name in required if name not in header]
-    if missing:
-        words = f"{source.name} must have the columns {', '.join(required)}"
-        raise ScenarioError("path", words, header, f"add the column {missing[0]}")
+    header, rows = read_rows(source, required)
     names = [name for name in (*required, *optional) if name in header]
     places = [header.index(name) for name in names]
-    numbers = [_numbers(source, line, header, row, places) for line, row in rows]
+    numbers = [finite_numbers(source, line, header, row, places) for line, row in rows]
     columns = np.array(numbers, dtype=np.float64).reshape(len(rows), len(names)).T
     return dict(zip(names, columns, strict=True))
 
 
 def read_header(source: SourceFile) -> list[str]:
     """The names of the columns; raises ScenarioError where the file is no table."""
-    return _read(source)[0]
+    return read_rows(source, ())[0]
+
+
+def read_rows(
+    source: SourceFile, required: tuple[str, ...]
+) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names of the columns, and (line, entries) of every row that is not empty.
+
+    Raises ScenarioError where the file is no table or lacks a required column.
+    """
+    header, rows = _read(source)
+    missing = [name for name in required if name not in header]
+    if missing:
+        words = f"{source.name} must have the columns {', '.join(required)}"
+        raise ScenarioError("path", words, header, f"add the column {missing[0]}")
+    return header, rows
 
 
 def _read(source: SourceFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -50,9 +61,12 @@ def _read(source: SourceFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
         raise ScenarioError("path", words, str(error), "mend the file") from None
 
 
-def _numbers(
+def finite_numbers(
     source: SourceFile, line: int, header: list[str], entries: list[str], places: list[int]
 ) -> list[float]:
+    """The numbers at some places of a row; raises ScenarioError where one is not finite or the row
+    is not as long as the header.
+    """
     where = f"{source.name} line {line}"
     if len(entries) != len(header):
         raise ScenarioError(

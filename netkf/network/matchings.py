@@ -142,6 +142,10 @@ class Matching(SlotActivation):
         return dict(zip(links, shares, strict=True))
 
 
+def _meets(link: Link, pairs: list[Link]) -> bool:
+    return any(node in pair for pair in pairs for node in link)
+
+
 def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
     node = topology.nodes[int(random.integers(len(topology.nodes)))]
     share = random.random()
@@ -241,30 +245,35 @@ class RecordedSlots(SlotActivation):
         return "phase" not in read_header(self.path)
 
     @cached_property
-    def _pairs(self) -> dict[tuple[int, int], list[Link]]:
+    def _pairs(self) -> dict[tuple[int, int, int], list[Link]]:
         names: tuple[str, ...] = ("slot", "node", "peer")
-        if not self.matching:
+        matching = self.matching
+        if not matching:
             names = ("slot", "phase", "step", "node", "peer")
         table = read_columns(self.path, names)
         columns = {name: whole(self.path, name, table[name]) for name in names}
-        pairs: dict[tuple[int, int], list[Link]] = {}
+        pairs: dict[tuple[int, int, int], list[Link]] = {}
         for row, (slot, i, j) in enumerate(
             zip(columns["slot"], columns["node"], columns["peer"], strict=True)
         ):
-            phase = 0 if self.matching else columns["phase"][row]
-            listed = pairs.setdefault((slot, phase), [])
+            phase, step = (0, 0) if matching else (columns["phase"][row], columns["step"][row])
+            listed = pairs.setdefault((slot, phase, step), [])
             link = (min(i, j), max(i, j))
-            busy = {node for pair in listed for node in pair}
-            if self.matching and link not in listed and (i == j or busy & {i, j}):
+            if matching and link not in listed and (i == j or _meets(link, listed)):
                 words = f"{self.path.name}: a node may be paired once a slot"
                 raise ScenarioError("path", words, [slot, i, j], "mend the row")
             if link not in listed:
                 listed.append(link)
         return {key: sorted(listed) for key, listed in pairs.items()}
 
-    def pairs(self, slot: int, phase: int) -> list[Link]:
-        """The pairs of one exchange, sorted."""
-        return self._pairs.get((slot, phase), [])
+    @property
+    def recorded(self) -> tuple[tuple[int, int, int], ...]:
+        """The (slot, phase, step) that have rows."""
+        return tuple(self._pairs)
+
+    def pairs(self, slot: int, phase: int, step: int = 0) -> list[Link]:
+        """The pairs of one step of an exchange, sorted."""
+        return self._pairs.get((slot, phase, step), [])
 
     def check(self, topology: Topology) -> None:
         """Every recorded pair is a link."""

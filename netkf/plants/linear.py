@@ -7,6 +7,7 @@ the network does.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -37,9 +38,26 @@ class LinearPlant(Plant):
         """Seconds; rounded so that lattices of other periods meet it."""
         return float(round(k * self.period, 12))
 
-    def path(self, random: np.random.Generator) -> LinearPath:
-        """A path of its own."""
+    def truth(self, random: np.random.Generator) -> Truth:
+        """The truth of one run."""
         return LinearPath(self, random)
+
+
+class Truth(Protocol):
+    """The state of one run in slots."""
+
+    def state(self, slot: int) -> FloatArray:
+        """(n,) at a slot not before the last one asked for."""
+
+
+class Readings(Protocol):
+    """The readings of one sensor on one node in slots."""
+
+    def matrix(self, slot: int) -> FloatArray:
+        """H (p, n) of a slot not before the last one asked for."""
+
+    def reading(self, slot: int, x: FloatArray) -> FloatArray:
+        """(p,) of that slot, in which the state is x."""
 
 
 class LinearPath:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,6 +15,11 @@ from netkf.core.fields import Part, covariance, setting, vector
 @dataclass(frozen=True, eq=False)
 class Plant(Part):
     """x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n), both zero by default."""
+
+    drawn: ClassVar[bool] = True
+    """Whether runs draw the state from the model; else the model is what the filters believe."""
+    shown: ClassVar[bool] = True
+    """Whether the state is known, so that there are errors to speak of."""
 
     mean: FloatArray | None = setting(vector, default=None)
     cov: FloatArray | None = setting(covariance, default=None)

@@ -26,7 +26,7 @@ from netkf.core.fields import (
     several,
 )
 from netkf.plants.diffusion import BLOCK, DiffusionPath
-from netkf.plants.linear import SlotReadings
+from netkf.plants.linear import Readings, SlotReadings
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +37,17 @@ class Sensor(Part):
     """
 
     varying: ClassVar[bool] = False
+    drawn: ClassVar[bool] = True
+    """Whether runs draw the readings from H and R; else those are what the filters believe."""
 
     nodes: tuple[int, ...] = setting(several(integer(), "node ids"))
 
     @abstractmethod
-    def slot_path(self, generator: Callable[[str], np.random.Generator]) -> SlotReadings:
-        """The readings of one of the nodes in one run in slots; ``generator`` makes the streams of
-        that sensor by purpose.
+    def slot_path(
+        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
+    ) -> Readings:
+        """The readings of one of the nodes in one run, in slots of ``period`` seconds;
+        ``generator`` makes the streams of that sensor by purpose.
         """
 
 
@@ -62,7 +66,9 @@ class LinearSensor(Sensor):
         """The readings of one of the nodes in one run in continuous time."""
         return SensorPath(self.H, self.R, random, cutting)
 
-    def slot_path(self, generator: Callable[[str], np.random.Generator]) -> SlotReadings:
+    def slot_path(
+        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
+    ) -> SlotReadings:
         """From the stream "noise"."""
         return SlotReadings(self.H, self.R, generator("noise"))
 

@@ -14,6 +14,8 @@ from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
+from netkf.scenario.push_sum import check_push_sum
+from netkf.scenario.records import check_records
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -30,8 +32,10 @@ def check(scenario: Scenario) -> None:
     _sensors(scenario)
     _network(scenario)
     _filter(scenario)
+    check_records(scenario)
     if scenario.slotted:
         _slots(scenario)
+        check_push_sum(scenario)
     else:
         _sensing_period(scenario)
 

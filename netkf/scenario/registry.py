@@ -17,11 +17,12 @@ from netkf.network import channels, clocks, graphs, matchings
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
-from netkf.plants.sensors import LinearSensor
+from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.sensors import LinearSensor, Sensor
 
 FAMILIES: dict[str, type[Part]] = {
     "plant": Plant,
-    "sensor": LinearSensor,
+    "sensor": Sensor,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
     "loss": channels.Loss,
@@ -33,8 +34,13 @@ FAMILIES: dict[str, type[Part]] = {
 """The contract that the classes of each family keep."""
 
 KINDS: dict[str, dict[str, type[Part]]] = {
-    "plant": {"diffusion": Diffusion, "linear": LinearPlant},
-    "sensor": {"linear": LinearSensor},
+    "plant": {
+        "diffusion": Diffusion,
+        "linear": LinearPlant,
+        "recorded": RecordedPlant,
+        "unknown": UnknownPlant,
+    },
+    "sensor": {"linear": LinearSensor, "recorded": RecordedSensor},
     "graph": {
         "cycle": graphs.Cycle,
         "path": graphs.PathGraph,

@@ -12,7 +12,7 @@ import numpy as np
 
 from netkf.algorithms.flow import FlowFilter, FlowModel
 from netkf.algorithms.gains import longest_interval
-from netkf.algorithms.slot import SlotFilter, SlotModel
+from netkf.algorithms.slot import Role, SlotFilter, SlotModel
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
 from netkf.core.fields import (
@@ -40,7 +40,8 @@ from netkf.network.matchings import SlotActivation
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
-from netkf.plants.sensors import LinearSensor
+from netkf.plants.recorded import RecordedSensor
+from netkf.plants.sensors import LinearSensor, Sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,9 @@ class Scenario(Part):
     name: str = setting(text)
     horizon: float = setting(positive)
     plant: Plant = setting(instance(Plant))
-    sensors: tuple[LinearSensor, ...] = setting(several(instance(LinearSensor), "sensors", least=0))
+    sensors: tuple[LinearSensor | RecordedSensor, ...] = setting(
+        several(instance(Sensor), "sensors", least=0)
+    )
     network: Network = setting(instance(Network))
     filter: Filtering = setting(instance(Filtering))
     probe: float | FloatArray = setting(either(positive, array(1, "list of times"), nested(1)))
@@ -159,6 +162,13 @@ class Scenario(Part):
         digits = 12 - min(0, int(np.floor(np.log10(self.probe))))
         return np.minimum(np.round(self.probe * np.arange(count + 1), digits), self.horizon)
 
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """One line each about what a user should know before anything runs."""
+        from netkf.scenario.push_sum import push_sum_notes
+
+        return (*self.topology.notes, *push_sum_notes(self))
+
     @property
     def slotted(self) -> bool:
         """Whether the scenario runs in slots, else in continuous time."""
@@ -178,8 +188,18 @@ class Scenario(Part):
         return tuple(round(t / period) for t in self.times.tolist())
 
     @property
+    def ends(self) -> float:
+        """When the last thing may happen: the horizon, or the end of the slot that begins there
+        where a sample shows what is known after the exchanges of its slot.
+        """
+        algorithm = self.filter.algorithm
+        if not isinstance(algorithm, SlotFilter) or algorithm.predicts:
+            return self.horizon
+        return self.horizon + self.slot_plant.period
+
+    @property
     def phase_length(self) -> float:
-        """Seconds that an exchange of a slot lasts."""
+        """Seconds that an exchange of a slot lasts; its steps share them evenly."""
         activation, algorithm = self.network.activation, self.filter.algorithm
         assert isinstance(activation, SlotActivation)
         assert isinstance(algorithm, SlotFilter)
@@ -203,6 +223,15 @@ class Scenario(Part):
             SlotModel(*self.slot_belief, *self.observation(node, believed=True))
             for node in self.nodes
         )
+
+    @cached_property
+    def roles(self) -> tuple[Role, ...]:
+        """What each node may be told about the network, in the order of ``nodes``."""
+        information = np.zeros((self.plant.n, self.plant.n))
+        for model in self.slot_models:
+            information = information + model.information
+        degrees, size = self.topology.degrees, len(self.nodes)
+        return tuple(Role(node, degrees[node], size, information) for node in self.nodes)
 
     @cached_property
     def pooled_slot_model(self) -> SlotModel:
@@ -272,6 +301,8 @@ class Scenario(Part):
     def filters_know_the_truth(self) -> bool:
         """Whether the filters have the plant's matrices and the sensors' R."""
         plant = self.plant
+        if not (plant.drawn and all(sensor.drawn for sensor in self.sensors)):
+            return False
         if isinstance(plant, LinearPlant):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
         else:

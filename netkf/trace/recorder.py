@@ -48,6 +48,10 @@ class MemorySink(Sink):
         self.samples.append((t, x, xhat, P))
 
 
+def _ignore(row: tuple[float, int, int, int, int, int, float]) -> None:
+    """No event."""
+
+
 class Recorder:
     """Takes events and samples from an engine, counts them, fingerprints the events."""
 
@@ -59,6 +63,16 @@ class Recorder:
         self.append: Callable[[tuple[float, int, int, int, int, int, float]], None]
         self.append = self._rows.append
         """``append((t, kind code, node, peer, message, phase, age))`` records one event."""
+        self.sums: dict[str, tuple[float, float]] = {}
+        """Sums over all nodes that exchanges should conserve: at the start, at the last sample."""
+
+    def pause(self) -> None:
+        """Record no events until ``resume``."""
+        self.append = _ignore
+
+    def resume(self) -> None:
+        """Record events again."""
+        self.append = self._rows.append
 
     def flush_if_full(self) -> None:
         """Pass the gathered events on once there are enough of them."""

@@ -12,7 +12,7 @@ from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.processes.timeline import Timeline
 from netkf.plants.diffusion import DiffusionPath
-from netkf.plants.sensors import SensorPath
+from netkf.plants.sensors import LinearSensor, SensorPath
 from netkf.scenario.scenario import Placed, Scenario
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import CODES
@@ -148,7 +148,9 @@ def make_hosts(
 
 
 def _sensor(scenario: Scenario, streams: Streams, node: int, place: Placed) -> SensorPath:
-    return scenario.sensors[place.entry].path(
+    sensor = scenario.sensors[place.entry]
+    assert isinstance(sensor, LinearSensor)
+    return sensor.path(
         streams.generator("noise", node, place.ordinal),
         streams.generator("cut", node, place.ordinal),
     )

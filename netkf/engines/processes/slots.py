@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import simpy
 
-from netkf.algorithms.slot import Reading, SlotFilter, SlotModel
+from netkf.algorithms.slot import Reading, Role, SlotFilter, SlotModel
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
@@ -17,13 +18,13 @@ from netkf.engines.processes.timeline import Timeline
 from netkf.engines.processes.wires import Wire, stream
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
-from netkf.plants.linear import LinearPath, LinearPlant, SlotReadings
+from netkf.plants.linear import LinearPlant, Readings, Truth
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
-SENSE, TICK, ROUND, SWAP, ABSORB = (
-    CODES[kind] for kind in ("sense", "tick", "round", "swap", "absorb")
+SENSE, TICK, ROUND, SWAP, ABSORB, STOP = (
+    CODES[kind] for kind in ("sense", "tick", "round", "swap", "absorb", "stop")
 )
 Sampled = Callable[[float, FloatArray, FloatArray, FloatArray], None]
 
@@ -44,10 +45,14 @@ class SlotHost:
         node: int,
         model: SlotModel,
         start: tuple[FloatArray, FloatArray],
-        sensors: list[SlotReadings],
+        sensors: list[Readings],
+        role: Role | None = None,
     ) -> None:
         self.node, self.state = node, algorithm.init(model, *start)
+        if role is not None:
+            self.state = algorithm.place(self.state, role)
         self._algorithm, self._model, self._sensors = algorithm, model, sensors
+        self.stopped = False
         self._open = -1
         self._inbox: dict[int, tuple[int, float, Any, float]] = {}
 
@@ -86,6 +91,13 @@ class SlotHost:
         self.state = self._algorithm.absorb(self.state, phase, messages)
         return [(peer, number, age) for peer, number, _, _, age in taken]
 
+    def stops(self) -> bool:
+        """Whether the node's filter has stopped since the last time this was asked."""
+        if self.stopped or not self._algorithm.stopped(self.state):
+            return False
+        self.stopped = True
+        return True
+
 
 class SlotProcess:
     """All nodes of one run, slot after slot."""
@@ -103,9 +115,10 @@ class SlotProcess:
         assert isinstance(plant, LinearPlant)
         self._scenario, self._algorithm, self._plant = scenario, algorithm, plant
         self._timeline, self._recorder, self._sampled = timeline, recorder, sampled
-        self._truth: LinearPath = plant.path(streams.generator("plant"))
+        self._truth: Truth = plant.truth(streams.generator("plant"))
         self._hosts = _hosts(scenario, streams, algorithm)
         self._active = list({id(h): h for h in self._hosts.values()}.values())
+        self._talking = sorted({node for link in scenario.topology.links for node in link})
         self._matching_random = streams.generator("matching")
         self._wires: dict[Link, Wire] = {}
         if algorithm.talks:
@@ -115,6 +128,7 @@ class SlotProcess:
             }
         self._exchanges = 0
         self._samples = set(scenario.slots)
+        self._sums = self._conserved()
 
     def running(self) -> Generator[simpy.Event, Any, None]:
         """The process: sample, run the programme, and so on until the horizon."""
@@ -129,7 +143,10 @@ class SlotProcess:
                 self._sample(slot, start)
                 if last:
                     return
-            yield from self._programme(slot, start, silent=last)
+            if last:
+                self._recorder.pause()  # the horizon is half open: this slot makes its sample only
+            yield from self._programme(slot, start)
+            self._recorder.resume()
             if not self._algorithm.predicts:
                 self._sample(slot, start)
             if last:
@@ -137,31 +154,31 @@ class SlotProcess:
             self._recorder.flush_if_full()
             slot += 1
 
-    def _programme(
-        self, slot: int, start: float, silent: bool
-    ) -> Generator[simpy.Event, Any, None]:
-        programme = self._algorithm.programme
-        length = self._scenario.phase_length if self._algorithm.talks else 0.0
-        exchanged = 0
-        for phase in programme:
-            if phase == "sense":
-                self._sense(slot, silent)
+    def _programme(self, slot: int, start: float) -> Generator[simpy.Event, Any, None]:
+        algorithm, phase = self._algorithm, 0
+        for kind in algorithm.programme:
+            if kind == "sense":
+                self._sense(slot)
                 continue
-            if self._algorithm.talks and slot >= self._algorithm.first_slot:
-                self._open()
-                self._exchange(slot, exchanged)
-                closing = start + (exchanged + 1) * length
-                yield self._timeline.at(closing, Rank.ABSORB, 0)
-                self._close(closing, exchanged)
-            exchanged += 1
+            if algorithm.talks and slot >= algorithm.first_slot:
+                yield from self._steps(slot, start, phase)
+            phase += 1
 
-    def _sense(self, slot: int, silent: bool) -> None:
+    def _steps(self, slot: int, start: float, phase: int) -> Generator[simpy.Event, Any, None]:
+        length, steps = self._scenario.phase_length, self._algorithm.steps(phase)
+        for step in range(steps):
+            self._open()
+            self._exchange(slot, phase, step)
+            closing = start + (phase + (step + 1) / steps) * length
+            yield self._timeline.at(closing, Rank.ABSORB, 0)
+            self._close(closing, phase)
+
+    def _sense(self, slot: int) -> None:
         if slot == 0 and not self._algorithm.predicts:
             return  # a filtered estimate starts from what is known before any reading
         x, now = self._truth.state(slot), self._timeline.now
-        if not silent:
-            for node in self._scenario.sensing:
-                self._recorder.append((now, SENSE, node, -1, -1, -1, NAN))
+        for node in self._scenario.sensing:
+            self._recorder.append((now, SENSE, node, -1, -1, -1, NAN))
         for host in self._active:
             host.sense(slot, x)
 
@@ -170,26 +187,26 @@ class SlotProcess:
         for host in self._active:
             host.open(self._exchanges)
 
-    def _exchange(self, slot: int, phase: int) -> None:
+    def _exchange(self, slot: int, phase: int, step: int) -> None:
         now, activation = self._timeline.now, self._scenario.network.activation
         pairs, up = list(self._scenario.topology.links), None
-        broadcast = not self._algorithm.pairwise
+        broadcast, senders = not self._algorithm.pairwise, self._talking
         if isinstance(activation, Matching):
             pairs = activation.draw(self._scenario.topology, self._matching_random)
         elif isinstance(activation, RecordedSlots):
-            listed = activation.pairs(slot, phase)
+            listed = activation.pairs(slot, phase, step)
             pairs, up = (pairs, set(listed)) if broadcast else (listed, None)
         if broadcast:
             self._recorder.append((now, ROUND, -1, -1, -1, phase, NAN))
-        letters = {
-            node: self._hosts[node].emit(self._exchanges, phase)
-            for node in sorted({node for pair in pairs for node in pair})
-        }
+        else:
+            senders = sorted({node for pair in pairs for node in pair})
+        letters = {node: self._hosts[node].emit(self._exchanges, phase) for node in senders}
+        fresh = self._algorithm.redraws(phase, step)
         for i, j in pairs:
             if not broadcast:
                 self._recorder.append((now, TICK, i, j, -1, phase, NAN))
             here = up is None or (i, j) in up
-            self._wires[i, j].exchange(now, (letters[i], letters[j]), phase, here)
+            self._wires[i, j].exchange(now, (letters[i], letters[j]), phase, here, fresh)
 
     def _close(self, now: float, phase: int) -> None:
         append = self._recorder.append
@@ -201,6 +218,12 @@ class SlotProcess:
             elif taken:
                 oldest = max(age for _, _, age in taken)
                 append((now, ABSORB, host.node, -1, -1, phase, oldest))
+            if host.stops():
+                append((now, STOP, host.node, -1, -1, phase, NAN))
+
+    def _conserved(self) -> dict[str, float]:
+        parts = [self._algorithm.conserved(host.state) for host in self._active]
+        return {name: math.fsum(part[name] for part in parts) for name in parts[0]}
 
     def _sample(self, slot: int, start: float) -> None:
         if slot not in self._samples:
@@ -209,13 +232,18 @@ class SlotProcess:
         chosen = [estimates[id(self._hosts[node])] for node in self._scenario.nodes]
         xhat, P = (np.array([pair[k] for pair in chosen]) for k in range(2))
         self._sampled(start, self._truth.state(slot), xhat, P)
+        if self._sums:
+            now = self._conserved()
+            self._recorder.sums = {name: (sum_, now[name]) for name, sum_ in self._sums.items()}
 
 
 def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[int, SlotHost]:
-    def sensors(node: int) -> list[SlotReadings]:
+    period = scenario.slot_plant.period
+
+    def sensors(node: int) -> list[Readings]:
         return [
             scenario.sensors[place.entry].slot_path(
-                partial(stream, streams, (node, place.ordinal))
+                node, period, partial(stream, streams, (node, place.ordinal))
             )
             for place in scenario.placed.get(node, ())
         ]
@@ -227,6 +255,8 @@ def _hosts(scenario: Scenario, streams: Streams, algorithm: SlotFilter) -> dict[
         shared = SlotHost(algorithm, -1, model, scenario.start(nodes[0]), every)
         return dict.fromkeys(nodes, shared)
     return {
-        node: SlotHost(algorithm, node, model, scenario.start(node), sensors(node))
-        for node, model in zip(nodes, scenario.slot_models, strict=True)
+        role.node: SlotHost(
+            algorithm, role.node, model, scenario.start(role.node), sensors(role.node), role
+        )
+        for role, model in zip(scenario.roles, scenario.slot_models, strict=True)
     }

@@ -66,6 +66,8 @@ class Wire:
         self._loss, self._shared = channel.loss, channel.symmetric
         self._timeline, self._recorder = timeline, recorder
         self._horizon = scenario.horizon
+        self._until = scenario.ends
+        self._kept: list[tuple[float, bool, float]] = []
         forth = Fates(channel, partial(stream, streams, (i, j)))
         # Symmetric: the messages of one activation share one draw.
         back = forth if self._shared else Fates(channel, partial(stream, streams, (j, i)))
@@ -75,17 +77,24 @@ class Wire:
         )
 
     def exchange(
-        self, now: float, payloads: tuple[Any, Any], phase: int = -1, up: bool = True
+        self,
+        now: float,
+        payloads: tuple[Any, Any],
+        phase: int = -1,
+        up: bool = True,
+        fresh: bool = True,
     ) -> None:
-        """Send one message each way; both are lost where the link is not ``up``.
+        """Send one message each way; both are lost where the link is not ``up``. Unless they are
+        ``fresh`` the fates are those of the last time.
 
         None is not sent, but its fate is drawn all the same.
         """
         forth, back = self._ways
-        fate = forth.fates.draw()
-        other = fate if self._shared else back.fates.draw()
-        self._send(now, forth, payloads[0], fate if up else DOWN, phase)
-        self._send(now, back, payloads[1], other if up else DOWN, phase)
+        if fresh:
+            fate = forth.fates.draw()
+            self._kept = [fate, fate if self._shared else back.fates.draw()]
+        for way, payload, fate in zip(self._ways, payloads, self._kept, strict=True):
+            self._send(now, way, payload, fate if up else DOWN, phase)
 
     def _send(
         self, now: float, way: Direction, payload: Any, fate: tuple[float, bool, float], phase: int
@@ -104,7 +113,7 @@ class Wire:
             way.receiver.receive(now, sender, number, way.weight, payload, 0.0)
             return
         arrival = now + delay
-        if arrival < self._horizon:
+        if arrival < self._until:
             event = self._timeline.at(arrival, Rank.DELIVER, way.entity)
             assert event.callbacks is not None
             event.callbacks.append(partial(self._arrive, way, number, payload, now, phase))
@@ -121,7 +130,8 @@ class Wire:
         now, (sender, receiver) = self._timeline.now, way.link
         in_time = way.receiver.accepts(payload)
         kind = DELIVER if in_time else LATE
-        self._recorder.append((now, kind, receiver, sender, number, phase, now - sent))
+        if now < self._horizon:
+            self._recorder.append((now, kind, receiver, sender, number, phase, now - sent))
         if in_time:
             way.receiver.receive(now, sender, number, way.weight, payload, now - sent)
 

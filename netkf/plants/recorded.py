@@ -1,0 +1,215 @@
+"""Plants and sensors in slots whose truth or readings come from tables.
+
+``demand`` refuses, before a run starts, a table that lacks a slot that the run needs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import (
+    SourceFile,
+    definite_covariance,
+    integer,
+    matrix,
+    setting,
+    several,
+    source_file,
+)
+from netkf.core.tables import finite_numbers, read_columns, read_rows, whole
+from netkf.plants.linear import LinearPlant
+from netkf.plants.sensors import Sensor
+
+Table = dict[int, FloatArray]
+"""What is recorded, by slot."""
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownPlant(LinearPlant):
+    """Nobody knows the state; ``F``, ``Q``, ``mean`` and ``cov`` are the filters' model of it."""
+
+    drawn: ClassVar[bool] = False
+    shown: ClassVar[bool] = False
+
+    def truth(self, random: np.random.Generator) -> RecordedPath:
+        """Nan."""
+        return RecordedPath({}, np.full(self.n, math.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPlant(LinearPlant):
+    """The state is read from a table ``t,x0,x1,...``, one row a slot, t in seconds; ``F``, ``Q``,
+    ``mean`` and ``cov`` are the filters' model of it.
+    """
+
+    drawn: ClassVar[bool] = False
+
+    path: SourceFile = setting(source_file)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self.table  # a bad file is refused now
+
+    @cached_property
+    def table(self) -> Table:
+        """The states (n,) by slot."""
+        names = [f"x{k}" for k in range(self.n)]
+        columns = read_columns(self.path, ("t", *names))
+        states = np.stack([columns[name] for name in names], axis=1)
+        rows = list(zip(columns["t"].tolist(), states, strict=True))
+        return by_slot(self.path, rows, self.period, "")
+
+    def demand(self, slots: Iterable[int]) -> None:
+        """Raise ScenarioError where the table lacks one of the slots."""
+        _demand(self.path, self.table, slots, self.period, "state")
+
+    def truth(self, random: np.random.Generator) -> RecordedPath:
+        """The states of the table."""
+        return RecordedPath(self.table, np.full(self.n, math.nan))
+
+
+class RecordedPath:
+    """States by slot, or ``otherwise``."""
+
+    def __init__(self, states: Table, otherwise: FloatArray) -> None:
+        self._states, self._otherwise = states, otherwise
+
+    def state(self, slot: int) -> FloatArray:
+        """(n,) the state of any slot."""
+        return self._states.get(slot, self._otherwise)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSensor(Sensor):
+    """Readings from a table ``t,node,y0,...``, one row a slot and node, t in seconds.
+
+    ``H`` (p, n) and ``R`` (p, p) are what the filters take them to be. ``nodes`` are by default all
+    that the table lists; rows of other nodes may be there for other ``[[sensors]]``, which may have
+    more or fewer components: what a row has beyond its own p must be empty, nan or 0.
+    """
+
+    drawn: ClassVar[bool] = False
+
+    path: SourceFile = setting(source_file)
+    H: FloatArray = setting(matrix)
+    R: FloatArray = setting(definite_covariance)
+    nodes: tuple[int, ...] = setting(several(integer(), "node ids"), default=None)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given: tuple[int, ...] | None = self.nodes
+        if given is None:
+            object.__setattr__(self, "nodes", self.listed)
+        if not self.nodes:
+            raise ScenarioError("path", f"{self.path.name} has no rows", None, "add some")
+        _ = self._rows  # a bad file is refused now
+
+    @cached_property
+    def _lines(self) -> tuple[list[str], list[tuple[int, list[str]]]]:
+        wanted = tuple(f"y{k}" for k in range(len(self.H)))
+        return read_rows(self.path, ("t", "node", *wanted))
+
+    @cached_property
+    def listed(self) -> tuple[int, ...]:
+        """Ids of all nodes in the table."""
+        return tuple(sorted(set(self._ids)))
+
+    @cached_property
+    def _ids(self) -> list[int]:
+        header, lines = self._lines
+        places = [header.index("t"), header.index("node")]
+        read = [finite_numbers(self.path, line, header, row, places) for line, row in lines]
+        return whole(self.path, "node", np.array([node for _, node in read]))
+
+    @cached_property
+    def _rows(self) -> dict[int, list[tuple[float, FloatArray]]]:
+        header, lines = self._lines
+        p = len(self.H)
+        places = [header.index(name) for name in ("t", *(f"y{k}" for k in range(p)))]
+        beyond = [k for k, name in enumerate(header) if _component(name) >= p]
+        rows: dict[int, list[tuple[float, FloatArray]]] = {node: [] for node in self.nodes}
+        for node, (line, entries) in zip(self._ids, lines, strict=True):
+            if node in rows:
+                t, *y = finite_numbers(self.path, line, header, entries, places)
+                self._demand_empty(line, header, entries, beyond)
+                rows[node].append((t, np.array(y)))
+        return rows
+
+    def _demand_empty(
+        self, line: int, header: list[str], entries: list[str], beyond: list[int]
+    ) -> None:
+        for place in beyond:
+            if entries[place].strip().lower() not in ("", "nan", "0", "0.0"):
+                words = f"{self.path.name} line {line}: {header[place]} has no row in H"
+                raise ScenarioError("path", words, entries[place], "leave it empty or mend H")
+
+    def table(self, node: int, period: float) -> Table:
+        """The readings (p,) of a node by slot of ``period`` seconds; raises ScenarioError for times
+        that are no slots and for slots that are there twice.
+        """
+        return by_slot(self.path, self._rows[node], period, f" of node {node}")
+
+    def demand(self, slots: Iterable[int], period: float) -> None:
+        """Raise ScenarioError where the table lacks one of the slots for one of the nodes."""
+        for node in self.nodes:
+            table = self.table(node, period)
+            _demand(self.path, table, slots, period, f"reading of node {node}")
+
+    def slot_path(
+        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
+    ) -> RecordedReadings:
+        """Those of the table; nothing is drawn."""
+        return RecordedReadings(self.H, self.table(node, period))
+
+
+class RecordedReadings:
+    """The readings of one node."""
+
+    def __init__(self, H: FloatArray, table: Table) -> None:
+        self._H, self._table = H, table
+
+    def matrix(self, slot: int) -> FloatArray:
+        """H (p, n) as the filters take it to be."""
+        return self._H
+
+    def reading(self, slot: int, x: FloatArray) -> FloatArray:
+        """(p,) the reading of a slot."""
+        return self._table[slot]
+
+
+def _component(name: str) -> int:
+    return int(name[1:]) if name[:1] == "y" and name[1:].isdecimal() else -1
+
+
+def by_slot(
+    source: SourceFile, rows: Iterable[tuple[float, FloatArray]], period: float, whose: str
+) -> Table:
+    """Rows (t, values) by the slot that begins at t."""
+    table: Table = {}
+    for t, values in rows:
+        slot = round(t / period)
+        if slot < 0 or abs(t - slot * period) > 1e-9 * max(period, abs(t)):
+            words = f"{source.name}: t must be a slot, a multiple of the period {period:g}"
+            raise ScenarioError("path", words, t, "mend the row")
+        if slot in table:
+            words = f"{source.name}: there may be one row{whose} a slot"
+            raise ScenarioError("path", words, f"two at t = {t:g}", "remove one")
+        table[slot] = values
+    return table
+
+
+def _demand(
+    source: SourceFile, table: Table, slots: Iterable[int], period: float, what: str
+) -> None:
+    missing = next((slot for slot in slots if slot not in table), None)
+    if missing is not None:
+        words = f"{source.name} has no {what} for slot {missing}, t = {missing * period:g}"
+        raise ScenarioError("path", words, None, "add the row or shorten the horizon")

@@ -1,0 +1,89 @@
+"""What recorded states, readings and exchanges owe the rest of a scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from netkf.algorithms.slot import SlotFilter
+from netkf.core.errors import ScenarioError
+from netkf.network.matchings import RecordedSlots
+from netkf.plants.recorded import RecordedPlant, RecordedSensor
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+
+def check_records(scenario: Scenario) -> None:
+    """Raise ScenarioError where a table does not fit, or a run would look for a row in vain."""
+    for k, sensor in enumerate(scenario.sensors):
+        key = f"sensors[{k}]"
+        if isinstance(sensor, RecordedSensor):
+            _readings(scenario, key, sensor)
+        elif not scenario.plant.shown:
+            raise ScenarioError(
+                f"{key}.kind",
+                "must be recorded where the plant's state is unknown",
+                None,
+                'write kind = "recorded" and path = "readings.csv"',
+            )
+    plant = scenario.plant
+    if isinstance(plant, RecordedPlant):
+        wanted = set(scenario.slots)
+        if any(sensor.drawn for sensor in scenario.sensors):
+            wanted |= set(_sensed(scenario))
+        _under("plant", lambda: plant.demand(sorted(wanted)))
+    if scenario.slotted and scenario.filter.algorithm.talks:
+        _exchanges(scenario)
+
+
+def _under(key: str, check: Callable[[], None]) -> None:
+    try:
+        check()
+    except ScenarioError as error:
+        raise error.under(key) from None
+
+
+def _readings(scenario: Scenario, key: str, sensor: RecordedSensor) -> None:
+    if not scenario.slotted:
+        raise ScenarioError(
+            f"{key}.kind",
+            "belongs to plants in slots, and this plant is in continuous time",
+            "recorded",
+            "use a linear, recorded or unknown plant",
+        )
+    for node in sensor.listed:
+        if node not in scenario.topology.index:
+            words = f"{sensor.path.name} names a node that the graph does not have"
+            raise ScenarioError(f"{key}.path", words, node, "mend the row or the graph")
+    _under(key, lambda: sensor.demand(_sensed(scenario), scenario.slot_plant.period))
+
+
+def _sensed(scenario: Scenario) -> range:
+    """The slots in which a run hands readings to its filters."""
+    plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
+    assert isinstance(algorithm, SlotFilter)
+    end = max(int(scenario.horizon / plant.period) - 1, 0)
+    while plant.slot_time(end) < scenario.horizon:
+        end += 1
+    if algorithm.predicts:
+        return range(end)
+    return range(1, end + (end in scenario.slots))
+
+
+def _exchanges(scenario: Scenario) -> None:
+    activation, algorithm = scenario.network.activation, scenario.filter.algorithm
+    assert isinstance(algorithm, SlotFilter)
+    if not isinstance(activation, RecordedSlots) or activation.matching:
+        return
+    phases = algorithm.programme.count("exchange")
+    for slot, phase, step in activation.recorded:
+        steps = algorithm.steps(phase) if phase < phases else 0
+        if step >= steps:
+            limits = " and ".join(f"{algorithm.steps(k)} in phase {k}" for k in range(phases))
+            raise ScenarioError(
+                "network.activation.path",
+                f"{activation.path.name}: the filter has no such step, only {limits}",
+                f"slot {slot}, phase {phase}, step {step}",
+                "phases and steps count from 0; mend the row",
+            )
