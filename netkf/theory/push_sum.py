@@ -41,9 +41,14 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     """P Theorem 1, and Theorem 2 (in probability) when links fail in both directions together.
 
     With what the filters believe of the plant and the sensors. Raises TheoryError where the graph
-    is not connected, where P_inf does not exist and for scenarios without the push-sum filter.
+    is not connected, where P_inf does not exist, for sensors whose H varies and for scenarios
+    without the push-sum filter.
     """
     push_sum_filter(scenario)
+    if any(sensor.varying for sensor in scenario.sensors):
+        raise TheoryError(
+            "the sensors' H differs from slot to slot: their information has no limit"
+        )
     parts = len(scenario.topology.components)
     if parts > 1:
         raise TheoryError(f"the graph must be connected, it has {parts} parts")
