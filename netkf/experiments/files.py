@@ -105,6 +105,7 @@ class ParquetSink(Sink):
 
     def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
         self._nodes, self._replica, self._first = scenario.nodes, replica, 0
+        self._shown = scenario.plant.shown
         self._events = _Table(directory / "events.parquet") if events else None
         self._states = _Table(directory / "states.parquet") if events else None
         self._samples: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
@@ -127,7 +128,7 @@ class ParquetSink(Sink):
             return
         times, x, xhat, P = (np.array([s[k] for s in self._samples]) for k in range(4))
         self._samples.clear()
-        self._states.write(state_table(self._replica, times, self._nodes, x, xhat, P))
+        self._states.write(state_table(self._replica, times, self._nodes, x, xhat, P, self._shown))
 
     def close(self) -> None:
         """Finish the files and give them their names."""

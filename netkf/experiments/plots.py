@@ -81,6 +81,10 @@ def _scale(axes: Any, values: FloatArray) -> None:
 
 
 def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
+    if not scenario.plant.shown:
+        axes.text(0.0, 0.5, "nobody knows the truth, so there are no errors", color=DARK)
+        axes.axis("off")
+        return
     times = np.array(finished.samples.times)
     error = np.sqrt(np.array(finished.samples.sq_error))
     _lines(axes, times, error, scenario)
@@ -151,17 +155,18 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
                 zorder=1,
             )
         )
-    rms = {row["node"]: row["rms_error"] for row in finished.summary["nodes"]}
+    key = "rms_error" if scenario.plant.shown else "mean_trace"
+    shade = {row["node"]: row[key] for row in finished.summary["nodes"]}
     for sensing, marker, words in ((False, "o", "relays"), (True, "s", "has a sensor")):
         nodes = [n for n in scenario.nodes if (n in scenario.placed) == sensing]
         if not nodes:
             continue
         xy = np.array([places[n] for n in nodes])
-        values = [rms[n] for n in scenario.nodes if math.isfinite(rms[n])] or [0.0, 1.0]
+        values = [shade[n] for n in scenario.nodes if math.isfinite(shade[n])] or [0.0, 1.0]
         dots = axes.scatter(
             xy[:, 0],
             xy[:, 1],
-            c=[rms[n] for n in nodes],
+            c=[shade[n] for n in nodes],
             marker=marker,
             cmap="viridis_r",
             vmin=min(values),
@@ -192,7 +197,8 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
         f"links as wide as they delivered; {total['sent']:,} messages, {total['lost']:,} lost",
         fontsize=9,
     )
-    figure.colorbar(dots, ax=axes, shrink=0.5, label="RMS error", pad=0.01)
+    label = "RMS error" if scenario.plant.shown else "mean trace P"
+    figure.colorbar(dots, ax=axes, shrink=0.5, label=label, pad=0.01)
 
 
 def _layout(scenario: Scenario) -> dict[int, tuple[float, float]]:

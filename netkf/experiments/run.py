@@ -21,7 +21,7 @@ from netkf.experiments.files import (
     write_scenario,
 )
 from netkf.experiments.simulate import choose_engine
-from netkf.experiments.summary import Promise, SummarySink, promise, summarise
+from netkf.experiments.summary import Promise, SummarySink, conserved, promise, summarise
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 
@@ -88,8 +88,10 @@ def run_to_directory(
     messages = {
         "sent": recorder.count("send"),
         "delivered": recorder.count("deliver"),
-        "lost": recorder.count("lost"),
+        "lost": recorder.count("lost") + recorder.count("late"),
     }
     summary = summarise(scenario, samples, promised, messages)
+    if recorder.sums:
+        summary["conserved"] = conserved(recorder.sums)
     write_json(directory / "summary.json", summary)
     return Finished(directory, status, summary, samples, promised, recorder.total, seconds)

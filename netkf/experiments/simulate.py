@@ -84,4 +84,6 @@ def collect(
         engine=engine,
         status=status,
         fingerprint=recorder.fingerprint,
+        sums=recorder.sums,
+        shown=scenario.plant.shown,
     )

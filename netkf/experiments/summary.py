@@ -130,6 +130,16 @@ def summarise(
     }
 
 
+def conserved(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
+    """What exchanges should conserve, summed over all nodes: exact, at the last sample, and how far
+    that is off, relative to the exact value.
+    """
+    return {
+        name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
+        for name, (exact, total) in sums.items()
+    }
+
+
 def _row(node: int, mean_square: Any, trace: Any, bound: Any, nees: Any) -> dict[str, Any]:
     return {
         "node": node,

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 MOST_NODES = 30
+DRIFTED = 1e-9  # far above rounding
 
 
 def number(value: float | None) -> str:
@@ -70,11 +71,23 @@ def summary_table(summary: dict[str, Any]) -> str:
     ]
     if references:
         lines.append("traces to compare: " + ", ".join(references))
+    if "conserved" in summary:
+        lines.append("mass: " + _conserved(summary["conserved"]))
     lines.append(
         f"messages: {sent['sent']:,} sent, {sent['delivered']:,} delivered, {sent['lost']:,} lost"
         + (f", {sent['in_flight']:,} on their way at the end" if sent["in_flight"] else "")
     )
     return "\n".join(lines)
+
+
+def _conserved(found: dict[str, Any]) -> str:
+    words = [
+        f"{name} {number(sums['total'])} of {number(sums['exact'])} ({sums['drift']:+.1e})"
+        for name, sums in found.items()
+    ]
+    worst = max(abs(sums["drift"]) for sums in found.values())
+    lost = ", drifting: directions of a link do not fail together" if worst > DRIFTED else ""
+    return ", ".join(words) + lost
 
 
 def _key(value: float | None) -> float:

@@ -16,6 +16,7 @@ from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
 from netkf.scenario.push_sum import check_push_sum
 from netkf.scenario.records import check_records
+from netkf.scenario.registry import spoken
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -135,7 +136,7 @@ def _network(scenario: Scenario) -> None:
                 raise error.under(key) from None
     if not algorithm.talks:
         return
-    name = type(algorithm).__name__.lower()
+    name = spoken(algorithm)
     if network.activation is None:
         example = "broadcast" if scenario.slotted else "poisson"
         raise ScenarioError(
@@ -313,7 +314,7 @@ def _slots(scenario: Scenario) -> None:
     activation = scenario.network.activation
     if not algorithm.talks:
         return
-    name = type(algorithm).__name__.lower()
+    name = spoken(algorithm)
     pairs = isinstance(activation, Matching) or (
         isinstance(activation, RecordedSlots) and activation.matching
     )

@@ -102,7 +102,7 @@ def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
     table.setdefault("sensors", [])
     time = ""
     if "plant" in table:
-        table["plant"] = _under("plant", partial(_kind, "plant", folder), table["plant"])
+        table["plant"] = _under("plant", lambda value: _plant(value, folder), table["plant"])
         time = "slot " if isinstance(table["plant"], SLOTTED) else ""
     readers: dict[str, Callable[[Any], Any]] = {
         "sensors": lambda value: _list(value, folder),
@@ -142,6 +142,15 @@ def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str
         for name, value in table.items()
     }
     return cls(**values)
+
+
+def _plant(value: Any, folder: Path) -> Any:
+    table = _table(value)
+    kind = table.get("kind")
+    if kind in ("recorded", "unknown") and ("A" in table or "B" in table):
+        remedy = "give F, Q and period in place of A and B"
+        raise ScenarioError("kind", "exists in slots only", kind, remedy)
+    return _kind("plant", folder, table)
 
 
 def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:

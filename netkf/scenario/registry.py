@@ -173,3 +173,9 @@ def name_of(family: str, part: Part) -> str:
             if type(part) is candidate:
                 return name
     return f"{type(part).__module__}:{type(part).__qualname__}"
+
+
+def spoken(part: Part, family: str = "filter") -> str:
+    """The kind of a part in a sentence: its name, or that of a user's class."""
+    name = name_of(family, part)
+    return type(part).__name__.lower() if ":" in name else name

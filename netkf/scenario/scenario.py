@@ -298,10 +298,15 @@ class Scenario(Part):
         return A, np.asarray(B @ B.T)
 
     @property
+    def drawn(self) -> bool:
+        """Whether runs draw the state and all readings; else nobody knows their law."""
+        return self.plant.drawn and all(sensor.drawn for sensor in self.sensors)
+
+    @property
     def filters_know_the_truth(self) -> bool:
         """Whether the filters have the plant's matrices and the sensors' R."""
         plant = self.plant
-        if not (plant.drawn and all(sensor.drawn for sensor in self.sensors)):
+        if not self.drawn:
             return False
         if isinstance(plant, LinearPlant):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]

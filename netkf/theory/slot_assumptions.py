@@ -49,9 +49,14 @@ def _plant(scenario: Scenario) -> list[Row]:
             "the filters know the plant and the sensors",
             "G (10), R (15)",
             same,
-            "same F, Q and R" if same else "filter.model differs from the truth",
+            "same F, Q and R" if same else _other(scenario),
         ),
     ]
+
+
+def _other(scenario: Scenario) -> str:
+    recorded = "the state or readings are recorded, and nobody knows their law"
+    return "filter.model differs from the truth" if scenario.drawn else recorded
 
 
 def _matching(scenario: Scenario) -> list[Row]:

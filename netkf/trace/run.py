@@ -21,6 +21,8 @@ class Run:
 
     times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n); ``log`` holds the events as a
     structured array (trace.schema.EVENT). ``status`` is complete, interrupted or diverged.
+    ``sums`` holds what exchanges should conserve, summed over all nodes: at the start and at the
+    last sample. Where the truth is not ``shown``, x is nan and tables have no columns of errors.
     """
 
     times: FloatArray
@@ -34,6 +36,8 @@ class Run:
     engine: str
     status: str
     fingerprint: str
+    sums: dict[str, tuple[float, float]] = field(default_factory=dict)
+    shown: bool = True
 
     @cached_property
     def events(self) -> pd.DataFrame:
@@ -47,8 +51,8 @@ class Run:
         """Table of state samples, columns as trace.schema.state_columns."""
         import pandas as pd
 
-        columns = state_table(self.replica, self.times, self.nodes, self.x, self.xhat, self.P)
-        return pd.DataFrame(columns)
+        samples = (self.times, self.nodes, self.x, self.xhat, self.P)
+        return pd.DataFrame(state_table(self.replica, *samples, self.shown))
 
     def count(self, kind: str) -> int:
         """Number of events of a kind."""
@@ -88,8 +92,9 @@ def state_table(
     x: FloatArray,
     xhat: FloatArray,
     P: FloatArray,
+    shown: bool = True,
 ) -> dict[str, Any]:
-    """Samples as named columns, a row a time and node."""
+    """Samples as named columns, a row a time and node; errors only where the truth is shown."""
     count, n = len(nodes), x.shape[1]
     rows = len(times) * count
     upper = np.triu_indices(n)
@@ -104,7 +109,10 @@ def state_table(
         sq_error.reshape(rows),
         nees.reshape(rows),
     ]
-    return dict(zip(state_columns(n), values, strict=True))
+    table = dict(zip(state_columns(n), values, strict=True))
+    if not shown:
+        del table["sq_error"], table["nees"]
+    return table
 
 
 def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None:
