@@ -7,20 +7,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import coupling
 from netkf.theory.matrices import unobservable
+from netkf.theory.push_sum_assumptions import push_sum_rows
 from netkf.theory.slot_assumptions import Row, slot_rows
 
 if TYPE_CHECKING:
     import pandas as pd
+
+COLUMNS = ["assumption", "source", "holds", "evidence"]
 
 
 def assumptions(scenario: Scenario) -> pd.DataFrame:
     """A table with a row for each assumption: assumption, source, holds, evidence."""
     import pandas as pd
 
+    if isinstance(scenario.filter.algorithm, PushSum):
+        rows = push_sum_rows(scenario)
+        return pd.DataFrame(rows, columns=COLUMNS)
     if scenario.slotted:
         rows = slot_rows(scenario)
     else:
@@ -28,7 +35,7 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
         if scenario.filter.algorithm.talks:
             rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
     rows += _start(scenario)
-    return pd.DataFrame(rows, columns=["assumption", "source", "holds", "evidence"])
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def _graph(scenario: Scenario) -> list[Row]:

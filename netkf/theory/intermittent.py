@@ -104,6 +104,13 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     return P
 
 
+def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """(n, n): the steady covariance after a reading, where P* is that before it; P (12)."""
+    P = steady_covariance(F, Q, H, R)
+    information = H.T @ np.linalg.solve(R, H)
+    return symmetric(np.asarray(np.linalg.solve(np.eye(len(P)) + P @ information, P)))
+
+
 def _gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
 

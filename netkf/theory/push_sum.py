@@ -12,7 +12,7 @@ from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import own_steps
-from netkf.theory.intermittent import steady_covariance
+from netkf.theory.intermittent import filtered_covariance
 
 
 class PushSumLimits(NamedTuple):
@@ -57,16 +57,10 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     share /= share.sum()
     each = [np.linalg.solve(m.R, m.H).T for m in models]
     G = symmetric(np.sum([e @ m.H for e, m in zip(each, models, strict=True)], axis=0))
-    P, N = _filtered(scenario, G), len(models)
+    pooled, N = scenario.pooled_slot_model, len(models)
+    P = filtered_covariance(pooled.F, pooled.Q, pooled.H, pooled.R)
     gains = tuple(N * P @ e for e in each)
     return PushSumLimits(share[:, None, None] * G, share * N, share, G, N, P, gains)
-
-
-def _filtered(scenario: Scenario, G: FloatArray) -> FloatArray:
-    """P_inf (n, n) of P (12) from the prediction covariance."""
-    model = scenario.pooled_slot_model
-    predicted = steady_covariance(model.F, model.Q, model.H, model.R)
-    return symmetric(np.asarray(np.linalg.solve(np.eye(len(G)) + predicted @ G, predicted)))
 
 
 def push_sum_filter(scenario: Scenario) -> PushSum:

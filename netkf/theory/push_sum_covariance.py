@@ -20,8 +20,10 @@ MOST_ROUNDS = 20
 def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
     """(N, n, n): exact steady covariance of x - xhat at every node, in the order of the nodes.
 
-    Of P steps 4-5 at the asymptotic gains, over noises and links. The filters' Q and R may differ
-    from the truth. Raises TheoryError where ``push_sum_radius`` is not below 1 or does not exist.
+    Of P steps 4-5 at the asymptotic gains, over noises and links: those that the filter comes to
+    where links fail in both directions together and no gain is frozen early (P Theorem 2). The
+    filters' Q and R may differ from the truth. Raises TheoryError where ``push_sum_radius`` is not
+    below 1 or does not exist.
     """
     steps = estimation_steps(scenario)
     found = radius(steps)
