@@ -23,8 +23,9 @@ from netkf.core.arrays import FloatArray, IntArray
 from netkf.core.errors import TheoryError
 
 MOST_OUTCOMES = 2**20
+FEW_NODES = 16  # up to which the Kronecker square is cheap
 MOST_WORK = 1e12  # multiplications to enumerate
-CHUNK = 4096
+CHUNK = 8192  # outcomes at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +84,7 @@ class Averaging:
     def second_moment(self, Y: FloatArray) -> FloatArray:
         """(N n, N n) E[(M^gamma (x) I) Y (M^gamma (x) I)'] for one Y of that shape."""
         N, n = self.nodes, len(Y) // self.nodes
-        if self._held:
+        if self._held or N <= FEW_NODES:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)
             four = (self.kron @ pairs).reshape(N, N, n, n).transpose(0, 2, 1, 3)
             return np.asarray(four.reshape(N * n, N * n))
@@ -108,6 +109,11 @@ class Averaging:
         return np.asarray(product).reshape(Y.shape)
 
     @property
+    def certain(self) -> bool:
+        """Whether every link is always up or always down."""
+        return bool(np.isin(self.hears, (0.0, 1.0)).all())
+
+    @property
     def _held(self) -> bool:
         return self.held and self.gamma > 1  # one step is one draw either way
 
@@ -130,16 +136,15 @@ class Averaging:
                 "links held over gamma > 1 steps are enumerated, and there are too many outcomes: "
                 f"about {count:.2g} on {N} nodes; take a smaller graph or fresh links"
             )
+        half = len(fates) // 2
+        one, other = (_together(part, N * N) for part in (fates[:half], fates[half:]))
         mean, square = np.zeros(N * N), np.zeros((N * N, N * N))
-        shape = tuple(len(chance) for chance, _ in fates)
-        for start in range(0, count, CHUNK):
-            places = np.unravel_index(np.arange(start, min(start + CHUNK, count)), shape)
-            chance, M = np.ones(len(places[0]) if places else 1), np.eye(N).reshape(1, N * N)
-            for place, (chances, pieces) in zip(places, fates, strict=True):
-                chance = chance * chances[place]
-                M = M - pieces[place]
+        rows = max(1, CHUNK // len(other[0]))
+        for start in range(0, len(one[0]), rows):
+            chance, piece = (table[start : start + rows, None] for table in one)
+            M = np.eye(N).reshape(-1) - piece - other[1]
             power = np.linalg.matrix_power(M.reshape(-1, N, N), self.gamma).reshape(-1, N * N)
-            weighted = chance[:, None] * power
+            weighted = (chance * other[0]).reshape(-1, 1) * power
             mean += weighted.sum(axis=0)
             square += weighted.T @ power
         # entry ((i, j), (k, l)) of the sum is M_ij M_kl, of the Kronecker square M_ik M_jl
@@ -159,3 +164,14 @@ class Averaging:
             possible = chances > 1e-15
             found.append((chances[possible], pieces[possible].reshape(-1, N * N) / self.delta))
         return found
+
+
+def _together(
+    fates: list[tuple[FloatArray, FloatArray]], size: int
+) -> tuple[FloatArray, FloatArray]:
+    """Probabilities and sums of pieces of all outcomes of several links."""
+    chances, sums = np.ones(1), np.zeros((1, size))
+    for chance, pieces in fates:
+        chances = np.outer(chances, chance).reshape(-1)
+        sums = (sums[:, None] + pieces).reshape(-1, size)
+    return chances, sums

@@ -3,8 +3,8 @@
 The stacked error obeys ``e+ = (M (x) I)(A e + h)``, A = diag(A_i), with independent M, P (25); its
 covariance ``X+ = T(X) + E[(M (x) I) cov(h) (M (x) I)']`` with the linear, positive map
 ``T(X) = E[(M (x) I) A X A' (M (x) I)']``. The radius of T is an eigenvalue with a semidefinite X
-(Krein and Rutman): the largest dense one on symmetric X for small systems, the rightmost one of
-Arnoldi's method for large ones, where a positive definite X proves it (Collatz and Wielandt).
+(Krein and Rutman): the rightmost one, which Arnoldi's method finds and a positive definite X proves
+(Collatz and Wielandt); where X proves nothing, small systems are solved by dense eigenvalues.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.averaging import Averaging
 from netkf.theory.estimation_steps import EstimationSteps, averaging_law, estimation_steps
 
-FEW = 40  # rows of X up to which the map is written out
-RESIDUAL = 1e-10
+TINY, FEW = 10, 40  # rows of X up to which T is written out at once, or where nothing else helps
 SLACK = 1e-6  # relative, of the radius where an X proves it
 BASIS = 24  # vectors that Arnoldi's method keeps
 
@@ -64,12 +63,13 @@ def radius(steps: EstimationSteps) -> float:
 
 def mean_radius(steps: EstimationSteps) -> float:
     """Spectral radius of the mean dynamics, P (30): below 1 the estimates become unbiased."""
-    mean, worst = steps.averaging.mean, 0.0
-    for closed in _groups(steps.closed):
-        N, n, _ = closed.shape
-        whole = np.einsum("ij,jab->iajb", mean, closed).reshape(N * n, N * n)
-        worst = max(worst, float(np.abs(np.linalg.eigvals(whole)).max()))
-    return worst
+    return max(_mean_radius(steps.averaging, closed) for closed in _groups(steps.closed))
+
+
+def _mean_radius(law: Averaging, closed: FloatArray) -> float:
+    N, n, _ = closed.shape
+    whole = np.einsum("ij,jab->iajb", law.mean, closed).reshape(N * n, N * n)
+    return float(np.abs(np.linalg.eigvals(whole)).max())
 
 
 def _groups(closed: FloatArray) -> list[FloatArray]:
@@ -85,9 +85,14 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
 
 
 def _radius(law: Averaging, closed: FloatArray) -> float:
-    if closed.shape[0] * closed.shape[1] <= FEW:
-        return float(np.abs(np.linalg.eigvals(written_out(law, closed))).max())
-    return _arnoldi(law, closed)
+    if law.certain:  # no spread, so that T moves the mean's outer products
+        return _mean_radius(law, closed) ** 2
+    size = closed.shape[0] * closed.shape[1]
+    if size > TINY:
+        value, proved = _arnoldi(law, closed)
+        if proved or size > FEW:
+            return value
+    return float(np.abs(np.linalg.eigvals(written_out(law, closed))).max())
 
 
 def written_out(law: Averaging, closed: FloatArray) -> FloatArray:
@@ -113,27 +118,34 @@ def mapping(law: Averaging, closed: FloatArray) -> Callable[[FloatArray], FloatA
     return lambda X: symmetric(law.second_moment(left(left(X).T)))
 
 
-def _arnoldi(law: Averaging, closed: FloatArray) -> float:
-    """The rightmost eigenvalue, which is the radius because T is positive.
+def _arnoldi(law: Averaging, closed: FloatArray) -> tuple[float, bool]:
+    """The rightmost eigenvalue, which is the radius because T is positive, and whether its X is
+    positive definite beyond the residual, which proves it.
 
-    The start, an identity, has a part in the wanted direction for certain. An X that is positive
-    definite beyond the residual proves the value; else a second search must find it again.
+    The start, an identity, has a part in the wanted direction for certain. Where nothing is proved
+    of a large system, a second search from elsewhere must find the value again.
     """
     size = closed.shape[0] * closed.shape[1]
     T = mapping(law, closed)
     value, X = _rightmost(T, np.eye(size), "LR")
-    spectrum = np.linalg.eigvalsh(X)
-    rest = float(np.linalg.norm(T(X) - value * X, 2))
-    if not rest <= RESIDUAL * value * spectrum[-1] or spectrum[0] < -1e-8 * spectrum[-1]:
-        raise TheoryError(
-            f"the radius is near {value:.6g}, found with a residual of {rest:.1e} only"
-        )
-    if rest <= SLACK * value * spectrum[0]:
-        return value
-    again, _ = _rightmost(T, X + np.diag(np.linspace(0.5, 1.5, size)) * spectrum[-1], "LM")
+    proved = _least_factor(T, X) <= value * (1.0 + SLACK)
+    if proved or size <= FEW:
+        return value, proved
+    again, _ = _rightmost(T, X + np.diag(np.linspace(0.5, 1.5, size)) * np.trace(X), "LM")
     if not abs(again - value) <= 1e-8 * value:
-        raise TheoryError(f"two searches found different radii, {value:.8g} and {again:.8g}")
-    return value
+        raise TheoryError(f"the radius is not certain: searches found {value:.8g} and {again:.8g}")
+    return value, False
+
+
+def _least_factor(T: Callable[[FloatArray], FloatArray], X: FloatArray) -> float:
+    """The least c with T(X) <= c X, which bounds the radius; inf where X is not definite."""
+    try:
+        root = scipy.linalg.cholesky(X, lower=True)
+    except np.linalg.LinAlgError:
+        return np.inf
+    half = scipy.linalg.solve_triangular(root, T(X), lower=True)
+    whole = scipy.linalg.solve_triangular(root, half.T, lower=True)
+    return float(np.linalg.eigvalsh(symmetric(whole))[-1])
 
 
 def _rightmost(
@@ -150,7 +162,9 @@ def _rightmost(
         values, vectors = scipy.sparse.linalg.eigs(
             operator, k=1, which=which, v0=start.ravel(), ncv=BASIS, tol=1e-13
         )
-    except scipy.sparse.linalg.ArpackNoConvergence as error:
+    except scipy.sparse.linalg.ArpackError as error:
+        if size <= FEW:
+            return 0.0, np.zeros((size, size))  # proves nothing
         raise TheoryError(f"the radius was not found: {error}") from None
     X = symmetric(vectors[:, 0].real.reshape(size, size))
     return float(values[0].real), X * np.sign(np.trace(X))

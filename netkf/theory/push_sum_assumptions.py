@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from netkf.core.errors import TheoryError
+from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.certified_gamma import Moment, minimum_gamma
 from netkf.theory.disconnection import disconnection_probability
@@ -132,7 +133,7 @@ def _gain(scenario: Scenario) -> list[Row]:
 
 def _stop(scenario: Scenario) -> Row:
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
-    lossless = loss.certain and all(
+    lossless = isinstance(scenario.network.activation, Broadcast) and all(
         loss.mean_delivery(way, scenario.measured(way)) == 1.0
         for i, j in scenario.topology.links
         for way in ((i, j), (j, i))

@@ -12,9 +12,10 @@ from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.averaging import Averaging
 from netkf.theory.estimation_steps import estimation_steps
-from netkf.theory.mean_square import BASIS, FEW, RESIDUAL, mapping, radius, written_out
+from netkf.theory.mean_square import BASIS, FEW, TINY, mapping, radius, written_out
 
 MOST_ROUNDS = 20
+RESIDUAL = 1e-10
 
 
 def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
@@ -46,18 +47,23 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
 def _fixed_point(law: Averaging, closed: FloatArray, noise: FloatArray) -> FloatArray:
     """X = T(X) + noise; its residual is small beside the variances of the row and the column."""
     T, X = mapping(law, closed), noise
-    if len(noise) <= FEW:
-        rows, columns = np.triu_indices(len(noise))
-        matrix = np.eye(len(rows)) - written_out(law, closed)
-        X = np.zeros_like(noise)
-        X[rows, columns] = X[columns, rows] = np.linalg.solve(matrix, noise[rows, columns])
     for _ in range(MOST_ROUNDS):
         rest = noise + T(X) - X
         variances = np.sqrt(np.abs(np.diagonal(X)))
         if (np.abs(rest) <= RESIDUAL * np.outer(variances, variances)).all():
             return X
-        X = X + _krylov(T, rest)
+        X = _dense(law, closed, noise) if len(noise) <= TINY else X + _krylov(T, rest)
+    if len(noise) <= FEW:
+        return _dense(law, closed, noise)
     raise TheoryError(f"the steady covariance was solved to {np.abs(rest).max():.1e} only")
+
+
+def _dense(law: Averaging, closed: FloatArray, noise: FloatArray) -> FloatArray:
+    rows, columns = np.triu_indices(len(noise))
+    matrix = np.eye(len(rows)) - written_out(law, closed)
+    X = np.zeros_like(noise)
+    X[rows, columns] = X[columns, rows] = np.linalg.solve(matrix, noise[rows, columns])
+    return X
 
 
 def _krylov(T: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
