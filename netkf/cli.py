@@ -148,7 +148,9 @@ def _run(options: argparse.Namespace) -> int:
     rate = finished.events / max(finished.seconds, 1e-9)
     print(f"events: {finished.events:,} in {finished.seconds:.2f} s, {rate:,.0f} per second")
     if finished.status != "complete":
-        print(f"status: {finished.status}, a covariance overflowed before the horizon")
+        print(
+            f"status: {finished.status}, a covariance or an estimate overflowed before the horizon"
+        )
     if not options.no_plot:
         _picture(scenario, finished)
     print(f"written to {finished.directory}")

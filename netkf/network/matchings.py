@@ -34,8 +34,9 @@ MOST_EDGES = 20  # beyond it the recursions over sets of edges take too long
 class SlotActivation(Part):
     """Who exchanges in the slots of a slot filter.
 
-    ``phase`` is the length of one exchange in seconds, after which its inbox closes; by default
-    half of the period is shared evenly among the exchanges of a slot.
+    ``phase`` is the length of one exchange in seconds, shared evenly among its steps; the inbox of
+    a step closes when its time is over. By default half of the period is shared evenly among the
+    exchanges of a slot.
     """
 
     phase: float | None = setting(positive, default=None)
@@ -221,7 +222,7 @@ def _greedy_shares(links: tuple[Link, ...]) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Broadcast(SlotActivation):
-    """In each exchange every node sends to every neighbour."""
+    """In each step of an exchange every node sends to every neighbour."""
 
     def check(self, topology: Topology) -> None:
         """Any graph will do."""

@@ -331,5 +331,5 @@ def _slots(scenario: Scenario) -> None:
             "network.activation.phase",
             f"must leave {exchanges} exchange(s) room within the period {plant.period:g}",
             scenario.phase_length,
-            "shorten it",
+            "shorten it; the steps of an exchange share it",
         )

@@ -26,8 +26,12 @@ tick     the link node - peer activated
 send     node sent message number ``message`` to peer
 lost     that message (node to peer) was lost by the channel
 deliver  node received message number ``message`` from peer, ``age`` seconds after it was sent
+late     the same, but the inbox that it was meant for had closed; it counts as lost
 absorb   node used all that had arrived at t in one reset; ``age`` is that of the oldest message
-diverged the covariance of node was no longer finite
+swap     node put what it got from peer in place of its own
+round    a step of exchange number ``phase`` of the slot begins, in which every node sends
+stop     node has stopped learning from the others in exchange number ``phase``
+diverged the covariance or the estimate of node was no longer finite
 """
 
 CODES = {kind: code for code, kind in enumerate(KINDS)}

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from netkf.algorithms.push_sum import (
     MASS,
@@ -56,6 +58,27 @@ def drift(rounds, replicas, delivery, seed):
 @pytest.mark.parametrize("delivery", [0.3, 0.7, 1.0])
 def test_mass_is_conserved_to_rounding(delivery):
     assert drift(5000, 64, delivery, 1) <= 1e-14
+
+
+links = st.tuples(st.integers(0, 6), st.integers(0, 6)).filter(lambda link: link[0] < link[1])
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    edges=st.lists(links, min_size=1, unique=True),
+    masses=st.lists(st.floats(0.0, 1e9), min_size=7, max_size=7),
+    data=st.data(),
+)
+def test_no_graph_and_no_failure_changes_the_total(edges, masses, data):
+    ends = sorted({node for link in edges for node in link})
+    edges = [(ends.index(i), ends.index(j)) for i, j in edges]
+    now = [np.array([mass]) for mass in masses[: len(ends)]]
+    total = math.fsum(mass[0] for mass in now)
+    for _ in range(5):
+        up = data.draw(st.lists(st.booleans(), min_size=len(edges), max_size=len(edges)))
+        now = one_round(now, edges, up)
+        assert min(mass[0] for mass in now) >= 0.0
+        assert abs(math.fsum(mass[0] for mass in now) - total) <= 1e-14 * total
 
 
 @pytest.mark.slow

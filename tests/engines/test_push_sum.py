@@ -169,6 +169,32 @@ def test_on_a_complete_network_without_loss_it_is_the_centralised_filter(planar)
     assert run.count("send") == 39 * 90  # the limits are known, so no mass is exchanged
 
 
+def test_a_node_by_itself_is_the_local_filter(planar):
+    both = [{"nodes": [0], "H": np.eye(2, 4), "R": 0.01 * np.eye(2)}]
+    graph = {"kind": "edges", "edges": [], "nodes": 1}
+    alone = planar.replace({"network.graph": graph, "sensors": both})
+    run = netkf.simulate(alone)
+    local = netkf.simulate(alone.replace({"filter": {"kind": "local"}}))
+    np.testing.assert_allclose(run.xhat, local.xhat, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.P, local.P, rtol=1e-9, atol=1e-15)
+
+
+def test_a_run_whose_estimates_or_covariances_overflow_says_so(planar):
+    """Nobody hears anything, so P of a growing plant grows; with gamma = 1 estimates may alone."""
+    growing = planar.replace(
+        {
+            "plant.F": 8.0 * np.eye(4),
+            "horizon": 100.0,
+            "probe": 10.0,
+            "sensors": [{"nodes": [0], "H": np.eye(4), "R": np.eye(4)}],
+        }
+    )
+    for changes in ({"network.channel.loss.delivery": 0.0}, {"filter.asymptotic": True}):
+        run = netkf.simulate(growing.replace({"filter.gamma": 1, **changes}))
+        assert run.status == "diverged"
+        assert np.isfinite(run.P[-1]).all() == ("filter.asymptotic" in changes)
+
+
 def test_all_filters_meet_the_same_truth(planar):
     base = netkf.simulate(planar)
     for changes in (

@@ -26,7 +26,7 @@ Processes = list[Generator[simpy.Event, Any, None]]
 
 
 class DivergedError(Exception):
-    """A covariance is no longer finite."""
+    """A covariance or an estimate is no longer finite."""
 
 
 @dataclass
@@ -142,7 +142,7 @@ def _record(
     recorder.sample(time, x, xhat, P)
     recorder.flush_if_full()
     progress(time)
-    broken = np.flatnonzero(~np.isfinite(P).all(axis=(1, 2)))
+    broken = np.flatnonzero(~(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)))
     if broken.size:
         for k in broken:
             recorder.append((time, DIVERGED, scenario.nodes[k], -1, -1, -1, NAN))

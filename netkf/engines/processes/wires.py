@@ -90,7 +90,7 @@ class Wire:
         None is not sent, but its fate is drawn all the same.
         """
         forth, back = self._ways
-        if fresh:
+        if fresh or not self._kept:
             fate = forth.fates.draw()
             self._kept = [fate, fate if self._shared else back.fates.draw()]
         for way, payload, fate in zip(self._ways, payloads, self._kept, strict=True):
