@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import netkf
 from netkf import theory
-from netkf.theory import mean_square, push_sum_covariance
+from netkf.theory import averaging, mean_square, push_sum_covariance
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import RHO_T1, T1, of_case, planar, scenario
 
@@ -153,16 +153,31 @@ def test_against_plain_enumeration(gamma, symmetric, links):
             theory.push_sum_error_covariance(made)
 
 
+RING = [[k, (k + 1) % 10] for k in range(10)]
+
+
 @pytest.mark.parametrize(
-    ("gamma", "delivery", "links"), [(1, 0.7, "fresh"), (3, 0.8, "fresh"), (2, 0.7, "held")]
+    "settings",
+    [
+        {"gamma": 1, "delivery": 0.7},
+        {"gamma": 3, "delivery": 0.8},
+        {"gamma": 3, "delivery": 0.8, "symmetric": False},
+        {"gamma": 6, "delivery": 0.9, "delta": 3.0, "edges": RING, "links": "held"},
+    ],
+    ids=str,
 )
-def test_the_method_for_large_networks_agrees_with_the_dense_one(
-    gamma, delivery, links, monkeypatch
-):
-    made = planar(gamma, delivery, links=links)
+def test_the_methods_for_large_networks_agree_with_dense_ones(settings, monkeypatch):
+    made = planar(**settings)
     radius, P = theory.push_sum_radius(made), theory.push_sum_error_covariance(made)
+    monkeypatch.setattr(averaging, "FEW_NODES", 1)
+    assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
     monkeypatch.setattr(mean_square, "FEW", 1)
     monkeypatch.setattr(push_sum_covariance, "FEW", 1)
+    assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
+    np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7, atol=1e-12)
+    monkeypatch.undo()
+    monkeypatch.setattr(mean_square, "TINY", 40)
+    monkeypatch.setattr(push_sum_covariance, "TINY", 40)
     assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7, atol=1e-12)
 
