@@ -90,7 +90,9 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
     try:
-        P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
+        P = np.zeros_like(F)  # without readings the step below finds all
+        if len(H):
+            P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising fixed point of f_1: {error}") from None
     # One step of Newton's method takes what is left of the residual away.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
@@ -47,7 +48,7 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
 def central_covariance(scenario: Scenario) -> FloatArray:
     """(n, n): steady covariance of the Kalman-Bucy filter that reads all sensors and knows the
     true model; in slots that of the Kalman filter, after its reading. Raises TheoryError where it
-    does not exist.
+    does not exist, and in slots for filters whose samples are predictions: it is none.
     """
     if scenario.slotted:
         return _slot_central(scenario)
@@ -59,7 +60,11 @@ def central_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _slot_central(scenario: Scenario) -> FloatArray:
-    plant = scenario.slot_plant
+    plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
+    if isinstance(algorithm, SlotFilter) and algorithm.predicts:
+        raise TheoryError("the filter's samples are predictions, the central filter's are not")
+    if any(sensor.varying for sensor in scenario.sensors):
+        raise TheoryError("H differs from slot to slot: there is no steady covariance")
     truth = [scenario.observation(node) for node in scenario.sensing]
     H = np.concatenate([np.zeros((0, plant.n)), *(H for H, _ in truth)])
     return filtered_covariance(plant.F, plant.Q, H, block_diagonal([R for _, R in truth]))

@@ -160,7 +160,7 @@ def _rightmost(
     )
     try:
         values, vectors = scipy.sparse.linalg.eigs(
-            operator, k=1, which=which, v0=start.ravel(), ncv=BASIS, tol=1e-13
+            operator, k=1, which=which, v0=start.ravel(), ncv=BASIS, tol=1e-12, maxiter=200
         )
     except scipy.sparse.linalg.ArpackError as error:
         if size <= FEW:

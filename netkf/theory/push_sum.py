@@ -10,6 +10,7 @@ from netkf.algorithms.push_sum import PushSum
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
+from netkf.scenario.push_sum import laplacian_radius
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import own_steps
 from netkf.theory.intermittent import filtered_covariance
@@ -97,9 +98,5 @@ def consensus_gain_bound(graph: Scenario | Topology) -> GainBound:
     if topology.directed:
         raise TheoryError("the graph must be undirected")
     N, degrees = len(topology.nodes), topology.degrees
-    laplacian = np.diag([float(degrees[node]) for node in topology.nodes])
-    for i, j in topology.links:
-        a, b = topology.index[i], topology.index[j]
-        laplacian[a, b] = laplacian[b, a] = -1.0
     local = max((degrees[i] + degrees[j] for i, j in topology.links), default=0)
-    return GainBound(float(np.linalg.eigvalsh(laplacian)[-1]), local, N)
+    return GainBound(laplacian_radius(topology), local, N)

@@ -34,23 +34,29 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
             "raise gamma or the delivery probability"
         )
     N, n, _ = steps.closed.shape
-    scale = np.sqrt(np.diagonal(steps.limits.P)).clip(1e-150)
+    variances = np.diagonal(steps.limits.P)
+    scale = np.sqrt(np.maximum(variances, max(1e-12 * variances.max(), 1e-150)))
     closed = steps.closed * (scale / scale[:, None])
     every = np.tile(scale, N)
     noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(every, every)))
-    X = _fixed_point(steps.averaging, closed, noise)
+    # what is left over grows by 1 / (1 - radius) in the solution
+    tolerance = RESIDUAL * max(1.0 - found, 1e-3)
+    X = _fixed_point(steps.averaging, closed, noise, tolerance)
     each = np.arange(N)
     blocks = X.reshape(N, n, N, n)[each, :, each]
     return symmetric(blocks * np.outer(scale, scale))
 
 
-def _fixed_point(law: Averaging, closed: FloatArray, noise: FloatArray) -> FloatArray:
+def _fixed_point(
+    law: Averaging, closed: FloatArray, noise: FloatArray, tolerance: float
+) -> FloatArray:
     """X = T(X) + noise; its residual is small beside the variances of the row and the column."""
     T, X = mapping(law, closed), noise
     for _ in range(MOST_ROUNDS):
         rest = noise + T(X) - X
-        variances = np.sqrt(np.abs(np.diagonal(X)))
-        if (np.abs(rest) <= RESIDUAL * np.outer(variances, variances)).all():
+        deviations = np.sqrt(np.abs(np.diagonal(X)))
+        allowed = np.outer(deviations, deviations) + 1e-6 * deviations.max(initial=0.0) ** 2
+        if (np.abs(rest) <= tolerance * allowed).all():
             return X
         X = _dense(law, closed, noise) if len(noise) <= TINY else X + _krylov(T, rest)
     if len(noise) <= FEW:

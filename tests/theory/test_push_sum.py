@@ -257,6 +257,27 @@ def test_certain_links_are_fresh_and_held_alike(seed, delivery):
     assert theory.push_sum_radius(one) == theory.push_sum_radius(same)
 
 
+def test_close_to_the_threshold_the_errors_are_still_exact(monkeypatch):
+    made = planar(1, 0.6387)
+    radius = theory.push_sum_radius(made)
+    assert 0.9999 < radius < 1.0
+    P = theory.push_sum_error_covariance(made)
+    monkeypatch.setattr(push_sum_covariance, "TINY", 40)
+    np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7)
+
+
+def test_systems_at_the_edge():
+    """One node is the central filter; no sensors: the plant's own covariance; F = 0: no memory."""
+    one = scenario([], [[0.9]], [[1.0]], {0: [[1.0]]}, {0: [[1.0]]}, 3, 4.0, 0.5, nodes=1)
+    alone = theory.push_sum_error_covariance(one)[0]
+    np.testing.assert_allclose(alone, theory.central_covariance(one), rtol=1e-12)
+    blind = scenario([[0, 1]], [[0.9]], [[1.0]], {}, {}, 2, 4.0, 0.5)
+    np.testing.assert_allclose(theory.push_sum_error_covariance(blind), [[[1 / 0.19]]] * 2)
+    chain = [[k, k + 1] for k in range(19)]
+    forgetful = scenario(chain, [[0.0]], [[1.0]], {0: [[1.0]]}, {0: [[1.0]]}, 2, 4.0, 0.5)
+    assert theory.push_sum_radius(forgetful) == 0.0
+
+
 def test_the_stability_map_is_made_of_radii():
     made = planar(1, 0.9)
     found = theory.push_sum_stability(made, [1, 2], [0.5, 1.0])
