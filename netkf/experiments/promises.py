@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.push_sum import PushSum
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.experiments.files import finite
+from netkf.experiments.push_sum_promises import push_sum_lines, push_sum_promises
 from netkf.experiments.tables import MOST_NODES, number, table
 from netkf.experiments.words import limit_words, mismatch_words, without_delay
 from netkf.scenario.registry import name_of
@@ -48,8 +50,11 @@ def promises(scenario: Scenario) -> dict[str, Any]:
             for a, s, h, e in rows.itertuples(index=False)
         ],
     }
-    if scenario.slotted:
+    if isinstance(scenario.filter.algorithm, PushSum):
+        found["push_sum"] = push_sum_promises(scenario)
+    elif scenario.slotted:
         found["slot_central_covariance"] = _value(lambda: _slot_central(scenario))
+    if scenario.slotted:
         plain: dict[str, Any] = finite(found)
         return plain
     ends = np.array([scenario.horizon])
@@ -99,6 +104,8 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
         lines += textwrap.wrap(
             row["evidence"], 94, initial_indent=" " * 11, subsequent_indent=" " * 11
         )
+    if "push_sum" in found:
+        return "\n".join([*lines, "", *push_sum_lines(found["push_sum"])])
     if scenario.slotted:
         value = found["slot_central_covariance"]
         words = value["reason"] or number(value["trace"])

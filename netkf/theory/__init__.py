@@ -2,6 +2,8 @@
 
 from netkf.theory.assumptions import assumptions
 from netkf.theory.bounds import covariance_bound
+from netkf.theory.certified_gamma import exact_minimum_gamma, gamma_constants, minimum_gamma
+from netkf.theory.disconnection import Probability, disconnection_probability
 from netkf.theory.errors import error_covariance
 from netkf.theory.gossip import detecting_walk, mean_matching
 from netkf.theory.information import information_level
@@ -16,22 +18,35 @@ from netkf.theory.intermittent import (
 )
 from netkf.theory.limits import central_covariance, limit_covariance, true_limit_covariance
 from netkf.theory.matrices import riccati_flow
+from netkf.theory.mean_square import push_sum_radius, push_sum_stability
+from netkf.theory.push_sum import consensus_gain_bound, push_sum_limits
+from netkf.theory.push_sum_covariance import push_sum_error_covariance
 from netkf.theory.scalar_law import scalar_law
 from netkf.theory.steady import steady_covariance_bound
 
 __all__ = [
+    "Probability",
     "assumptions",
     "central_covariance",
+    "consensus_gain_bound",
     "covariance_bound",
     "critical_certificate",
     "critical_probability",
     "detecting_walk",
+    "disconnection_probability",
     "error_covariance",
+    "exact_minimum_gamma",
+    "gamma_constants",
     "information_level",
     "invariant_samples",
     "limit_covariance",
     "lyapunov_step",
     "mean_matching",
+    "minimum_gamma",
+    "push_sum_error_covariance",
+    "push_sum_limits",
+    "push_sum_radius",
+    "push_sum_stability",
     "riccati_flow",
     "riccati_step",
     "scalar_law",

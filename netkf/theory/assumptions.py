@@ -8,15 +8,19 @@ import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.network.clocks import LinkClock, RecordedClock
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import balanced
 from netkf.theory.matrices import unobservable
+from netkf.theory.push_sum_assumptions import push_sum_rows
 from netkf.theory.slot_assumptions import Row, slot_rows
 
 if TYPE_CHECKING:
     import pandas as pd
+
+COLUMNS = ["assumption", "source", "holds", "evidence"]
 
 
 def assumptions(scenario: Scenario) -> pd.DataFrame:
@@ -25,6 +29,8 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
     """
     import pandas as pd
 
+    if isinstance(scenario.filter.algorithm, PushSum):
+        return pd.DataFrame(push_sum_rows(scenario), columns=COLUMNS)
     if scenario.slotted:
         rows = slot_rows(scenario)
     else:
@@ -32,7 +38,7 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
         if scenario.filter.algorithm.talks:
             rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
     rows += _start(scenario)
-    return pd.DataFrame(rows, columns=["assumption", "source", "holds", "evidence"])
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def _graph(scenario: Scenario) -> list[Row]:

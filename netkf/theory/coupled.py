@@ -40,7 +40,18 @@ class Coupled(NamedTuple):
     start: FloatArray
 
 
-STEPS = ("init", "flow", "measure", "emit", "absorb", "estimate")
+STEPS = (
+    "init",
+    "place",
+    "flow",
+    "measure",
+    "sense",
+    "emit",
+    "absorb",
+    "steps",
+    "redraws",
+    "estimate",
+)
 
 
 def own_steps(algorithm: object, known: type, steps: tuple[str, ...] = STEPS) -> list[str]:

@@ -95,7 +95,9 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
     try:
-        P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
+        P = np.zeros_like(F)  # without readings the step below finds all
+        if len(H):
+            P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising fixed point of f_1: {error}") from None
     # One step of Newton's method takes what is left of the residual away.
@@ -107,6 +109,13 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     if not np.abs(np.linalg.eigvals(F - _gain(P, F, H, R) @ H)).max() < 1.0:
         raise TheoryError("the fixed point found does not stabilise the filter")
     return P
+
+
+def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """(n, n): the steady covariance after a reading, where P* is that before it; P (12)."""
+    P = steady_covariance(F, Q, H, R)
+    information = H.T @ np.linalg.solve(R, H)
+    return symmetric(np.asarray(np.linalg.solve(np.eye(len(P)) + P @ information, P)))
 
 
 def _gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.algorithms.hybrid import Hybrid
-from netkf.core.arrays import FloatArray
+from netkf.algorithms.slot import SlotFilter
+from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import informations, left_weights, own_steps
+from netkf.theory.intermittent import filtered_covariance
 from netkf.theory.matrices import algebraic_riccati, lyapunov
 
 
@@ -50,10 +52,24 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
 
 def central_covariance(scenario: Scenario) -> FloatArray:
     """(n, n): steady covariance of the Kalman-Bucy filter that reads all sensors and knows the
-    true model. Raises TheoryError where it does not exist.
+    true model; in slots that of the Kalman filter, after its reading. Raises TheoryError where it
+    does not exist, and in slots for filters whose samples are predictions: it is none.
     """
+    if scenario.slotted:
+        return _slot_central(scenario)
     G = np.zeros((scenario.plant.n, scenario.plant.n))
     for node in scenario.sensing:
         H, R = scenario.observation(node)
         G += H.T @ np.linalg.solve(R, H)
     return algebraic_riccati(scenario.truth.A, scenario.truth.Q, G)
+
+
+def _slot_central(scenario: Scenario) -> FloatArray:
+    plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
+    if isinstance(algorithm, SlotFilter) and algorithm.predicts:
+        raise TheoryError("the filter's samples are predictions, the central filter's are not")
+    if any(sensor.varying for sensor in scenario.sensors):
+        raise TheoryError("H differs from slot to slot: there is no steady covariance")
+    truth = [scenario.observation(node) for node in scenario.sensing]
+    H = np.concatenate([np.zeros((0, plant.n)), *(H for H, _ in truth)])
+    return filtered_covariance(plant.F, plant.Q, H, block_diagonal([R for _, R in truth]))

@@ -28,6 +28,8 @@ def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
 def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
     """A symmetric positive semidefinite (n, n) array; raises TheoryError otherwise."""
     array = as_square(name, value, n)
+    if n == 0:
+        return array
     if not np.allclose(array, array.T, rtol=1e-9, atol=1e-12 * np.abs(array).max()):
         raise TheoryError(f"{name} must be symmetric")
     if not is_semidefinite(array):
