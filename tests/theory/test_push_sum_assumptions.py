@@ -67,7 +67,7 @@ GOOD = {"gamma": 2, "delivery": 0.7, "delta": 1.01 * RHO_T1}
             },
         ),
     ],
-    ids=str,
+    ids=lambda value: str(sorted(value)),
 )
 def test_what_fails_and_nothing_else(changes, failing):
     found = holds(planar(**(GOOD | changes)))
