@@ -266,6 +266,38 @@ def test_close_to_the_threshold_the_errors_are_still_exact(monkeypatch):
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7)
 
 
+def test_units_do_not_matter():
+    """Several units in one state: the same radius, and errors in those units."""
+    made, units = planar(2, 0.7), np.diag([1e-2, 1.0, 1e2, 1.0])
+    back = np.linalg.inv(units)
+    other = scenario(
+        T1,
+        (units @ made.plant.F @ back).tolist(),
+        (units @ made.plant.Q @ units).tolist(),
+        {k: (made.observation(k)[0] @ back).tolist() for k in (4, 9)},
+        {4: [[0.01]], 9: [[0.01]]},
+        2,
+        4.01,
+        0.7,
+    )
+    assert theory.push_sum_radius(other) == pytest.approx(theory.push_sum_radius(made), rel=1e-6)
+    P = back @ theory.push_sum_error_covariance(other) @ back
+    np.testing.assert_allclose(P, theory.push_sum_error_covariance(made), rtol=1e-5, atol=1e-9)
+
+
+def test_certain_links_need_no_enumeration():
+    chain = [[k, k + 1] for k in range(99)]
+    H = R = {k: [[1.0]] for k in range(100)}
+    fresh, held = (
+        scenario(chain, [[0.5]], [[1.0]], H, R, 3, 4.5, 1.0, links=links)
+        for links in ("fresh", "held")
+    )
+    assert theory.push_sum_radius(held) == theory.push_sum_radius(fresh)
+    np.testing.assert_array_equal(
+        theory.push_sum_error_covariance(held), theory.push_sum_error_covariance(fresh)
+    )
+
+
 def test_systems_at_the_edge():
     """One node is the central filter; no sensors: the plant's own covariance; F = 0: no memory."""
     one = scenario([], [[0.9]], [[1.0]], {0: [[1.0]]}, {0: [[1.0]]}, 3, 4.0, 0.5, nodes=1)
