@@ -22,7 +22,7 @@ import scipy.sparse
 from netkf.core.arrays import FloatArray, IntArray
 from netkf.core.errors import TheoryError
 
-MOST_OUTCOMES = 2**20
+MOST_NODES, MOST_OUTCOMES = 60, 2**20
 FEW_NODES = 16  # up to which the Kronecker square is cheap
 MOST_WORK = 1e12  # multiplications to enumerate
 CHUNK = 8192  # outcomes at a time
@@ -115,7 +115,7 @@ class Averaging:
 
     @property
     def _held(self) -> bool:
-        return self.held and self.gamma > 1  # one step is one draw either way
+        return self.held and self.gamma > 1 and not self.certain  # else one draw either way
 
     @cached_property
     def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -131,10 +131,10 @@ class Averaging:
         N = self.nodes
         fates = self._fates
         count = math.prod(len(chance) for chance, _ in fates)
-        if count > MOST_OUTCOMES or count * (N**4 + N**3) > MOST_WORK:
+        if N > MOST_NODES or count > MOST_OUTCOMES or count * (N**4 + N**3) > MOST_WORK:
             raise TheoryError(
-                "links held over gamma > 1 steps are enumerated, and there are too many outcomes: "
-                f"about {count:.2g} on {N} nodes; take a smaller graph or fresh links"
+                "the outcomes of links held over gamma > 1 steps are enumerated, and there are too "
+                f"many: 2^{math.log2(count):.0f} on {N} nodes; take a smaller graph or fresh links"
             )
         half = len(fates) // 2
         one, other = (_together(part, N * N) for part in (fates[:half], fates[half:]))

@@ -72,7 +72,7 @@ def _conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
         raise TheoryError(
             f"P Theorems 5 and 6 need delta above rho(L) = {least:.6g}, it is {law.delta:g}"
         )
-    if law.held and law.gamma > 1:
+    if law.held:
         raise TheoryError('P Theorems 5 and 6 need links = "fresh", a draw for each step')
     if not np.array_equal(law.hears.min(axis=1), law.both):
         raise TheoryError("P Theorems 5 and 6 need failures of both directions together")

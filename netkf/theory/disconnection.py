@@ -119,16 +119,21 @@ def _network(
 
 
 def _chance(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
-    p: float | None = None
+    p: Any = None
     if isinstance(delivery, Mapping):
         p = delivery.get(link, delivery.get(link[::-1]))
     elif delivery is not None:
         p = delivery
     if p is None:
         raise TheoryError(f"delivery must be given for link {link}")
-    if not 0.0 <= p <= 1.0:
+    try:
+        chance = float(p)
+    except (TypeError, ValueError):
+        words = "delivery must be a number, or a mapping from links to numbers"
+        raise TheoryError(f"{words}, got {p!r}") from None
+    if not 0.0 <= chance <= 1.0:
         raise TheoryError(f"delivery must lie in [0, 1], got {p!r} for link {link}")
-    return float(p)
+    return chance
 
 
 def _of_channel(scenario: Scenario) -> dict[Edge, float]:

@@ -43,6 +43,25 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     scenario gives them. Raises TheoryError for the push-sum filter, and for a user's subclass that
     does more than choose its weights.
     """
+    whole, _ = _replayed(scenario, run)
+    nodes, n = len(scenario.nodes), scenario.plant.n
+    if stacked:
+        return whole
+    blocks = whole.reshape(len(whole), nodes, n, nodes, n)
+    return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+
+
+def replayed_covariances(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
+    """(T, N, n, n) twice: P_i as the filter's equations make it of the run's events, computed here
+    and not by the engine, and the covariance of x - xhat_i, as :func:`error_covariance`.
+    """
+    whole, P = _replayed(scenario, run)
+    blocks = whole.reshape(*P.shape[:3], *P.shape[1:3])
+    return P, np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+
+
+def _replayed(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
+    """(T, N n, N n) and (T, N, n, n)."""
     if not isinstance(run, Run):
         raise TheoryError(
             f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
@@ -50,17 +69,14 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     flow = not scenario.slotted
-    whole = _stacked_errors(scenario, run) if flow else stacked_slot_errors(scenario, run)
+    whole, P = _stacked_errors(scenario, run) if flow else stacked_slot_errors(scenario, run)
     nodes, n = len(scenario.nodes), scenario.plant.n
     if whole.shape[-1] < nodes * n:
-        whole = np.tile(whole, (1, nodes, nodes))
-    if stacked:
-        return whole
-    blocks = whole.reshape(len(whole), nodes, n, nodes, n)
-    return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+        whole, P = np.tile(whole, (1, nodes, nodes)), np.tile(P, (1, nodes, 1, 1))
+    return whole, P
 
 
-def _stacked_errors(scenario: Scenario, run: Run) -> FloatArray:
+def _stacked_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
     algorithm, n = scenario.filter.algorithm, scenario.plant.n
     if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
@@ -73,6 +89,7 @@ def _stacked_errors(scenario: Scenario, run: Run) -> FloatArray:
     errors = _Errors(scenario)
     hosts = errors.hosts
     whole = np.empty((len(run.times), hosts * n, hosts * n))
+    P = np.empty((len(run.times), hosts, n, n))
     moments = iter(_instants(scenario, run))
     following = next(moments, None)
     for k, time in enumerate(run.times.tolist()):
@@ -80,8 +97,8 @@ def _stacked_errors(scenario: Scenario, run: Run) -> FloatArray:
             errors.happen(following)
             following = next(moments, None)
         errors.advance(time)
-        whole[k] = errors.of_hosts()
-    return whole
+        whole[k], P[k] = errors.of_hosts(), errors.covariances()
+    return whole, P
 
 
 class _Instant(NamedTuple):
@@ -171,6 +188,10 @@ class _Errors:
         first = self._n * self._follows
         last = first + self.hosts * self._n
         return np.asarray(self._sigma[first:last, first:last])
+
+    def covariances(self) -> FloatArray:
+        """P of the nodes."""
+        return self._P[: self.hosts]
 
     def happen(self, instant: _Instant) -> None:
         """Advance to an instant, keep what is sent, reset what receives."""

@@ -35,6 +35,17 @@ class EstimationSteps:
     limits: PushSumLimits
 
     @cached_property
+    def scale(self) -> FloatArray:
+        """(n,) units in which P_inf has a diagonal of ones, but for states known almost exactly."""
+        variances = np.diagonal(self.limits.P)
+        return np.sqrt(np.maximum(variances, max(1e-12 * variances.max(), 1e-150)))
+
+    @cached_property
+    def scaled(self) -> FloatArray:
+        """(N, n, n) ``closed`` in those units."""
+        return np.asarray(self.closed * (self.scale / self.scale[:, None]))
+
+    @cached_property
     def noise(self) -> FloatArray:
         """(N n, N n) covariance of h."""
         N, n, _ = self.closed.shape

@@ -58,12 +58,12 @@ def push_sum_stability(
 
 def radius(steps: EstimationSteps) -> float:
     """The spectral radius of T; the largest over groups of states that do not mix."""
-    return max(_radius(steps.averaging, closed) for closed in _groups(steps.closed))
+    return max(_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 
 
 def mean_radius(steps: EstimationSteps) -> float:
     """Spectral radius of the mean dynamics, P (30): below 1 the estimates become unbiased."""
-    return max(_mean_radius(steps.averaging, closed) for closed in _groups(steps.closed))
+    return max(_mean_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 
 
 def _mean_radius(law: Averaging, closed: FloatArray) -> float:
@@ -78,7 +78,7 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
     The cross covariance of two groups grows no faster than the geometric mean of their own.
     """
     size = np.abs(closed).max(axis=0)
-    linked = size > 1e-14 * size.max()
+    linked = size > 1e-13 * size.max()
     _, label = scipy.sparse.csgraph.connected_components(linked, directed=False)
     groups = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
     return [closed[:, group[:, None], group] for group in groups]

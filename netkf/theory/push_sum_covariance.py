@@ -34,14 +34,12 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
             "raise gamma or the delivery probability"
         )
     N, n, _ = steps.closed.shape
-    variances = np.diagonal(steps.limits.P)
-    scale = np.sqrt(np.maximum(variances, max(1e-12 * variances.max(), 1e-150)))
-    closed = steps.closed * (scale / scale[:, None])
+    scale = steps.scale
     every = np.tile(scale, N)
     noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(every, every)))
     # what is left over grows by 1 / (1 - radius) in the solution
     tolerance = RESIDUAL * max(1.0 - found, 1e-3)
-    X = _fixed_point(steps.averaging, closed, noise, tolerance)
+    X = _fixed_point(steps.averaging, steps.scaled, noise, tolerance)
     each = np.arange(N)
     blocks = X.reshape(N, n, N, n)[each, :, each]
     return symmetric(blocks * np.outer(scale, scale))

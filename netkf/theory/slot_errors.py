@@ -27,8 +27,9 @@ STEPS = ("init", "place", "sense", "emit", "absorb", "share", "estimate")
 Arrived = dict[int, list[int]]
 
 
-def stacked_slot_errors(scenario: Scenario, run: Run) -> FloatArray:
-    """(T, M n, M n): covariance of the stacked x - xhat_i of M hosts, 1 where all nodes share one.
+def stacked_slot_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
+    """(T, M n, M n): covariance of the stacked x - xhat_i of M hosts, 1 where all nodes share one,
+    and (T, M, n, n), their P.
 
     For all filters in slots but push-sum; raises TheoryError for that and for users' own.
     """
@@ -44,7 +45,7 @@ def stacked_slot_errors(scenario: Scenario, run: Run) -> FloatArray:
         )
     errors = _Errors(scenario, Streams(run.seed, run.replica))
     arrived = _arrived(scenario, run)
-    whole, done = [], 0
+    whole, covariances, done = [], [], 0
     for slot in np.round(run.times / scenario.slot_plant.period).astype(int).tolist():
         while done < slot:
             here = arrived.get(done, {})
@@ -60,7 +61,8 @@ def stacked_slot_errors(scenario: Scenario, run: Run) -> FloatArray:
                 errors.adapt(done, here)
             done += 1
         whole.append(errors.of_hosts())
-    return np.array(whole)
+        covariances.append(errors.covariances())
+    return np.array(whole), np.array(covariances)
 
 
 def _arrived(scenario: Scenario, run: Run) -> dict[int, Arrived]:
@@ -98,6 +100,10 @@ class _Errors:
     def of_hosts(self) -> FloatArray:
         """The covariance of the errors."""
         return self._sigma[self._n :, self._n :]
+
+    def covariances(self) -> FloatArray:
+        """P of the hosts."""
+        return self._P.copy()
 
     def adapt(self, slot: int, arrived: Arrived) -> None:
         """D (6), (7), (12), R (15): update with the readings of a slot, the own ones and those that

@@ -90,6 +90,7 @@ def test_an_interval_where_it_is_not_exact(monkeypatch):
         (networkx.DiGraph([(0, 1)]), 0.5, "undirected"),
         ([(0, 1)], 1.5, "must lie in"),
         ([(0, 1)], float("nan"), "must lie in"),
+        ([(0, 1)], [0.5], "must be a number"),
         ([(0, 1), (1, 2)], {(1, 0): 0.5}, "must be given for link"),
         ([(0, 1)], None, "must be given"),
         ([], 0.5, "must have a node"),

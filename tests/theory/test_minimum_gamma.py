@@ -97,7 +97,7 @@ def test_norms_of_p_35():
     ("made", "words"),
     [
         (lambda: planar(1, 0.7), r"rho\(L\) = 6.68"),
-        (lambda: planar(2, 0.7, delta=7.0, links="held"), "fresh"),
+        (lambda: planar(1, 0.7, delta=7.0, links="held"), "fresh"),
         (lambda: planar(2, 0.7, delta=7.0, symmetric=False), "both directions"),
         (lambda: planar(2, 0.0, delta=7.0), "no gamma up to"),
     ],

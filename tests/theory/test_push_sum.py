@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import netkf
 from netkf import theory
+from netkf.scenario.reading import from_table
 from netkf.theory import averaging, mean_square, push_sum_covariance
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import RHO_T1, T1, of_case, planar, scenario
@@ -244,6 +245,39 @@ def test_a_simulation_stays_within_its_interval():
     assert np.abs(z).max() < 4.0
 
 
+def test_each_direction_has_its_own_probability(tmp_path):
+    """Node 1 mostly hears node 0, node 0 hardly hears node 1; the engine sees it the same way."""
+    rows = "sender,receiver,delivery_probability\n0,1,0.9\n1,0,0.2\n1,2,0.8\n2,1,0.6\n"
+    (tmp_path / "links.csv").write_text(rows)
+    table = {
+        "format": 1,
+        "name": "directions",
+        "horizon": 31.0,
+        "probe": [30.0],
+        "plant": {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0},
+        "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}],
+        "network": {
+            "graph": {"kind": "csv", "path": "links.csv"},
+            "activation": {"kind": "broadcast"},
+            "channel": {"loss": {"kind": "per-link"}, "symmetric": False},
+        },
+        "filter": {"kind": "push-sum", "gamma": 2, "delta": 3.5, "asymptotic": True},
+    }
+    made = from_table(table, tmp_path)
+    assert theory.push_sum_radius(made) < 0.8
+    P = theory.push_sum_error_covariance(made)[:, 0, 0]
+    runs = [netkf.simulate(made, seed=2, replica=k) for k in range(400)]
+    squares = np.array([(run.x[-1] - run.xhat[-1])[:, 0] ** 2 for run in runs])
+    z = (squares.mean(axis=0) - P) / (squares.std(axis=0, ddof=1) / np.sqrt(len(squares)))
+    assert np.abs(z).max() < 4.0
+    (tmp_path / "links.csv").write_text(
+        rows.replace("0.9", "x").replace("0.2", "0.9").replace("x", "0.2")
+    )
+    turned = theory.push_sum_error_covariance(from_table(table, tmp_path))[:, 0, 0]
+    off = (squares.mean(axis=0) - turned) / (squares.std(axis=0, ddof=1) / np.sqrt(len(squares)))
+    assert np.abs(off).max() > 6.0  # the test would see the directions exchanged
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.4, 0.7, 0.9]))
 def test_certain_links_are_fresh_and_held_alike(seed, delivery):
@@ -264,6 +298,38 @@ def test_close_to_the_threshold_the_errors_are_still_exact(monkeypatch):
     P = theory.push_sum_error_covariance(made)
     monkeypatch.setattr(push_sum_covariance, "TINY", 40)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7)
+
+
+def test_units_do_not_matter():
+    """Several units in one state: the same radius, and errors in those units."""
+    made, units = planar(2, 0.7), np.diag([1e-2, 1.0, 1e2, 1.0])
+    back = np.linalg.inv(units)
+    other = scenario(
+        T1,
+        (units @ made.plant.F @ back).tolist(),
+        (units @ made.plant.Q @ units).tolist(),
+        {k: (made.observation(k)[0] @ back).tolist() for k in (4, 9)},
+        {4: [[0.01]], 9: [[0.01]]},
+        2,
+        4.01,
+        0.7,
+    )
+    assert theory.push_sum_radius(other) == pytest.approx(theory.push_sum_radius(made), rel=1e-6)
+    P = back @ theory.push_sum_error_covariance(other) @ back
+    np.testing.assert_allclose(P, theory.push_sum_error_covariance(made), rtol=1e-5, atol=1e-9)
+
+
+def test_certain_links_need_no_enumeration():
+    chain = [[k, k + 1] for k in range(99)]
+    H = R = {k: [[1.0]] for k in range(100)}
+    fresh, held = (
+        scenario(chain, [[0.5]], [[1.0]], H, R, 3, 4.5, 1.0, links=links)
+        for links in ("fresh", "held")
+    )
+    assert theory.push_sum_radius(held) == theory.push_sum_radius(fresh)
+    np.testing.assert_array_equal(
+        theory.push_sum_error_covariance(held), theory.push_sum_error_covariance(fresh)
+    )
 
 
 def test_systems_at_the_edge():
