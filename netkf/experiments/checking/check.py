@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
-from netkf.experiments.checking import gossip, intermittent
+from netkf.experiments.checking import diffusion, gossip, hybrid, intermittent, push_sum
 from netkf.experiments.checking.evidence import BROKEN, Evidence, Row, judge
+from netkf.experiments.checking.exact import promised_filter, stand_in
 from netkf.experiments.checking.words import look_at
 from netkf.experiments.simulate import simulate
 from netkf.scenario.registry import spoken
@@ -23,7 +27,13 @@ from netkf.theory import assumptions
 if TYPE_CHECKING:
     import pandas as pd
 
-PAPERS: tuple[tuple[type, ModuleType], ...] = ((Gossip, gossip), (Intermittent, intermittent))
+PAPERS: tuple[tuple[type, ModuleType], ...] = (
+    (Hybrid, hybrid),
+    (Gossip, gossip),
+    (Intermittent, intermittent),
+    (DiffusionFilter, diffusion),
+    (PushSum, push_sum),
+)
 FEWEST = 10
 
 
@@ -56,17 +66,19 @@ class Verdict:
 
 def paper_of(scenario: Scenario) -> Any:
     """The module with the promises of the scenario's filter; raises TheoryError without one."""
+    promised = promised_filter(scenario.filter.algorithm)
     for kind, module in PAPERS:
-        if isinstance(scenario.filter.algorithm, kind):
+        if isinstance(promised, kind):
             return module
-    name = spoken(scenario.filter.algorithm)
-    raise TheoryError(f"nothing is promised of the {name} filter that could be checked")
+    raise TheoryError(f"nothing is promised of the {spoken(promised)} filter that could be checked")
 
 
 def watched(scenario: Scenario) -> Scenario:
     """The scenario with samples where the promises look."""
-    period = scenario.slot_plant.period
-    return dataclasses.replace(scenario, probe=np.round(period * np.array(look_at(scenario)), 12))
+    times = hybrid.times(scenario)
+    if scenario.slotted:
+        times = [round(scenario.slot_plant.period * slot, 12) for slot in look_at(scenario)]
+    return dataclasses.replace(scenario, probe=np.array(times))
 
 
 def witness(scenario: Scenario, seed: int, replica: int) -> Any:
@@ -79,7 +91,7 @@ def verdict(scenario: Scenario, witnesses: Iterable[Any], seed: int, confidence:
     paper, listed = paper_of(scenario), list(witnesses)
     stacked = paper.Witness(*map(np.array, zip(*listed, strict=True)))
     seen = paper.Seen(scenario, stacked, seed)
-    table = [Row(*row) for row in assumptions(scenario).itertuples(index=False)]
+    table = [Row(*row) for row in assumptions(stand_in(scenario)).itertuples(index=False)]
     found = judge(
         paper.promises(scenario),
         seen,
@@ -100,7 +112,7 @@ def check(
     count = integer(low=FEWEST)("runs", runs)
     sure = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
-    if look_at(scenario)[-1] < FEWEST:
+    if scenario.slotted and look_at(scenario)[-1] < FEWEST:
         raise ScenarioError("horizon", "is too short to check limits", scenario.horizon, "lengthen")
     chosen = watched(scenario)
     return verdict(chosen, (witness(chosen, root, r) for r in range(count)), root, sure)

@@ -62,7 +62,7 @@ class Row(NamedTuple):
 
     assumption: str
     source: str
-    holds: bool
+    holds: bool | None
     evidence: str
 
 

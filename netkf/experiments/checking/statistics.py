@@ -103,11 +103,40 @@ def distance_to(
     return Interval(value, max(0.0, value - width), min(1.0, value + width))
 
 
-def mean_ratio(total: float, freedom: int, level: float) -> Interval:
+def mean_ratio(total: float, freedom: float, level: float) -> Interval:
     """Of ``c`` where ``total`` is c times a chi-square variable of that many degrees of freedom."""
     upper = 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, 1.0 - level / 2.0))
     lower = 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, level / 2.0))
     return Interval(total / freedom, total / upper, total / lower)
+
+
+def mean_of(values: FloatArray, level: float) -> Interval:
+    """Of the mean of positive values with a variance: their sum is taken for a scaled chi-square
+    variable, whose skewness a normal one lacks.
+    """
+    mean, variance = float(values.mean()), float(values.var(ddof=1)) if len(values) > 1 else 0.0
+    if variance <= 0.0 or not mean > 0.0:
+        return Interval(mean, mean, mean)
+    freedom = 2.0 * len(values) * mean * mean / variance
+    ratio = mean_ratio(freedom, freedom, level)
+    return Interval(mean, mean * ratio.low, mean * ratio.high)
+
+
+def spread(samples: FloatArray, level: float) -> Interval:
+    """Of the largest eigenvalue of the mean of symmetric (R, n, n) samples with a variance: all
+    directions at once, by Scheffe's method for the n (n + 1) / 2 entries.
+    """
+    count, n = len(samples), samples.shape[-1]
+    mean = samples.mean(axis=0)
+    values, vectors = np.linalg.eigh(mean)
+    entries = n * (n + 1) // 2
+    reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(entries / 2.0, level)) / count)
+    along = np.einsum("ia,rij,ja->ra", vectors, samples, vectors).std(axis=0, ddof=1)
+    low = float((values - reach * along).max())
+    flat = samples.reshape(count, -1)
+    covariance = np.atleast_2d(np.cov(flat, rowvar=False))
+    widest = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+    return Interval(float(values[-1]), low, float(values[-1]) + reach * widest)
 
 
 def chi_square(counts: np.ndarray, chances: FloatArray) -> tuple[float, int]:

@@ -1,0 +1,156 @@
+"""Runs against their exact covariances: what the filter's equations make of a run's events, P and
+the covariance of the errors, computed by theory and not by the engine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.flow import FlowFilter
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import TheoryError
+from netkf.core.fields import Part
+from netkf.experiments.checking.evidence import Finding, identity
+from netkf.experiments.checking.laws import NEES, chi_squared, worst
+from netkf.experiments.checking.statistics import Interval, mean_of
+from netkf.scenario.registry import KINDS
+from netkf.scenario.scenario import Scenario
+from netkf.theory.coupled import own_steps
+from netkf.theory.errors import replayed_covariances
+from netkf.trace.run import Run, errors
+
+MOST = 400
+"""Replicas whose exact covariances are computed; the others show their errors only."""
+ROUNDING = 1e-7
+
+
+class Exact(NamedTuple):
+    """What one run says at K times; nan in replicas whose exact covariances are not computed.
+
+    P, e       : (K, N, n, n), (K, N, n) covariances and errors
+    nees       : (K, N) e' P^-1 e
+    replayed   : (K, N, n, n) P as the equations have it
+    Sigma      : (K, N, n, n) covariance of the errors given the events
+    """
+
+    P: FloatArray
+    e: FloatArray
+    nees: FloatArray
+    replayed: FloatArray
+    Sigma: FloatArray
+
+
+def exact(scenario: Scenario, run: Run) -> Exact:
+    """Reduce a run."""
+    _, nees = errors(run.x, run.xhat, run.P)
+    replayed = Sigma = np.full(run.P.shape, np.nan)
+    if run.replica < MOST:
+        replayed, Sigma = replayed_covariances(stand_in(scenario), run)
+    return Exact(run.P, run.x[:, None] - run.xhat, nees, replayed, Sigma)
+
+
+def stand_in(scenario: Scenario) -> Scenario:
+    """The scenario with the filter that a user's class derives from, where it defines steps of its
+    own: promises are about that one.
+    """
+    base = promised_filter(scenario.filter.algorithm)
+    if base is scenario.filter.algorithm:
+        return scenario
+    return dataclasses.replace(
+        scenario, filter=dataclasses.replace(scenario.filter, algorithm=base)
+    )
+
+
+def promised_filter(algorithm: Any) -> Any:
+    """A filter of this package: the given one, or what it is derived from, or what its settings
+    make of it. Raises TheoryError where nothing is promised of it.
+    """
+    for kind in type(algorithm).__mro__:
+        if any(kind in family.values() for family in (KINDS["filter"], KINDS["slot filter"])):
+            return algorithm if not own_steps(algorithm, kind) else _like(kind, algorithm)
+    if isinstance(algorithm, FlowFilter) and hasattr(algorithm, "epsilon"):
+        return _like(KINDS["filter"]["hybrid"], algorithm)
+    name = type(algorithm).__name__
+    raise TheoryError(
+        f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which one "
+        "it should be"
+    )
+
+
+def _like(kind: type[Part], algorithm: Any) -> Part:
+    names = [field.name for field in dataclasses.fields(kind)]
+    return kind(**{name: getattr(algorithm, name) for name in names})
+
+
+def computed(P: FloatArray) -> np.ndarray:
+    """(runs,) which replicas have exact covariances."""
+    return np.asarray(np.isfinite(P).all(axis=(1, 2, 3, 4)))
+
+
+def replay(seen: Any, level: float) -> Finding:
+    """Every covariance is what the equations make of the run's events."""
+    P, expected = seen.runs.P[:MOST], seen.runs.replayed[:MOST]
+    size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
+    apart = np.nan_to_num(np.abs(P - expected) / size, nan=np.inf).max(axis=(-1, -2))
+    run, time, node = np.unravel_index(int(np.argmax(apart)), apart.shape)
+    words = (
+        f"{apart.size:,} covariances replayed from the events of their runs; the worst in run "
+        f"{run} at {seen.places[time * len(seen.scenario.nodes) + node]}"
+    )
+    return identity(float(apart.max()), ROUNDING, words)
+
+
+def not_too_small(seen: Any, level: float) -> Finding:
+    """P - Sigma has no negative eigenvalue, with the exact covariance Sigma of the errors."""
+    P, Sigma = seen.runs.P[:MOST], seen.runs.Sigma[:MOST]
+    size = np.trace(Sigma, axis1=-2, axis2=-1)
+    gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
+    least = np.linalg.eigvalsh(gap)[..., 0] / np.maximum(size, 1e-300)
+    words = f"least eigenvalue of P - Sigma relative to its trace in {least.size:,} covariances"
+    return identity(float(max(0.0, -least.min())), 1e-8, words)
+
+
+def as_computed(seen: Any, level: float) -> Finding:
+    """Errors whitened by their exact covariance are chi-square at every node and time."""
+    e, Sigma = seen.runs.e[:MOST], seen.runs.Sigma[:MOST]
+    whitened = np.einsum("rkna,rkna->rkn", e, _solved(Sigma, e))
+    n = seen.scenario.plant.n
+    found = chi_squared(whitened.reshape(len(e), -1), n, seen.places, level)
+    return found._replace(words=found.words.replace("mean NEES", "mean e' Sigma^-1 e"))
+
+
+def expected_nees(seen: Any, level: float) -> Finding:
+    """The mean NEES is at most n, and is what the exact errors say: trace of P^-1 Sigma."""
+    runs, n = seen.runs, seen.scenario.plant.n
+    places = runs.nees.shape[1] * runs.nees.shape[2]
+    wanted = np.trace(
+        np.linalg.pinv(runs.replayed[:MOST]) @ runs.Sigma[:MOST], axis1=-2, axis2=-1
+    ).reshape(-1, places)
+    nees = runs.nees.reshape(-1, places)
+    found = []
+    for k in np.flatnonzero(np.isfinite(nees).all(axis=0)).tolist():
+        one = mean_of(nees[:, k], level / (2.0 * places))
+        other = mean_of(wanted[:, k], level / (2.0 * places))
+        low = max(0.0, one.low - other.high, other.low - one.high) / n
+        high = max(one.high - other.low, other.high - one.low) / n
+        found.append(
+            (Interval(abs(one.value - other.value) / n, low, high), f"at {seen.places[k]}")
+        )
+    if not found:
+        nan = float("nan")
+        return Finding((nan, nan, nan), NEES, "NEES does not exist: P is singular or not finite")
+    words = (
+        f"mean NEES {np.nanmean(nees):.4g}, exact errors say {wanted.mean():.4g}, n is {n}; "
+        "largest difference, relative to n,"
+    )
+    return worst(found, NEES, words)
+
+
+def _solved(Sigma: FloatArray, e: FloatArray) -> FloatArray:
+    try:
+        return np.asarray(np.linalg.solve(Sigma, e[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        return np.asarray((np.linalg.pinv(Sigma, hermitian=True) @ e[..., None])[..., 0])
