@@ -37,6 +37,7 @@ def replicate(
     workers: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
+    pool: Pool | None = None,
     progress: Progress | None = None,
     first: int = 0,
     block: int | None = None,
@@ -53,7 +54,8 @@ def replicate(
 
     By default the work is done by processes of our own, ``workers`` of them (as many as there are
     cores; 1 is this process), else by any ``executor`` of concurrent.futures, or by the Dask
-    ``scheduler`` at an address. ``seed`` defaults to the scenario's.
+    ``scheduler`` at an address; a ``pool`` of make_pool stands for all three, and is closed at the
+    end. ``seed`` defaults to the scenario's.
 
     ``block`` is the number of replicas handed out together, a power of two. Blocks are numbered
     from 0; those that are ``known`` are not done again but called for, and ``received(number,
@@ -68,9 +70,8 @@ def replicate(
     runs, first = integer(low=1)("runs", runs), integer(low=0)("first", first)
     if merge is None:
         task, merge = partial(_listed, task), operator.add
-    pool = make_pool(
-        scenario, runs if block is None else -(-runs // block), workers, executor, scheduler
-    )
+    if pool is None:
+        pool = make_pool(scenario, -(-runs // (block or 1)), workers, executor, scheduler)
     size = block or block_size(runs, pool.width)
     ended = False
     try:

@@ -110,7 +110,7 @@ def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Ta
     trace = np.trace(P, axis1=2, axis2=3)
     blurred = _rounding_from(run.times[:kept], x, P)
     used = _after_start(run.times[:kept], blurred if diverged else np.inf)
-    averages = np.stack([values[used].mean(axis=0) for values in (sq_error, trace, nees)], axis=1)
+    averages = np.stack([_mean(values[used]) for values in (sq_error, trace, nees)], axis=1)
     lost = recorder.count("lost") + recorder.count("late")
     sent, delivered = recorder.count("send"), recorder.count("deliver")
     return Tally(
@@ -148,6 +148,10 @@ def _after_start(times: FloatArray, end: float) -> np.ndarray:
         if wanted.any():
             return np.flatnonzero(wanted)
     return np.arange(len(times))
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
 
 
 def _rounding_from(times: FloatArray, x: FloatArray, P: FloatArray) -> float:
