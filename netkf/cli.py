@@ -22,7 +22,7 @@ from netkf.core.errors import NetkfError, ScenarioError, quote
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
-BAD_USAGE, INTERRUPTED = 2, 130
+NOT_KEPT, BAD_USAGE, INTERRUPTED = 1, 2, 130
 LONGEST_WORD = 1000
 MOST_NODES = 12
 
@@ -77,9 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--seed", type=_seed, help="root seed instead of the scenario's")
     run.add_argument("--engine", default="auto", choices=["auto", "processes", "compiled"])
     run.add_argument("--out", type=Path, help="directory for the run (default: runs/NAME-k)")
-    workers = run.add_mutually_exclusive_group()
-    workers.add_argument("--workers", type=_count, help="processes (default: one a core)")
-    workers.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
+    _pool(run)
     run.add_argument(
         "--trace",
         choices=["full", "first", "none"],
@@ -89,6 +87,17 @@ def _parser() -> argparse.ArgumentParser:
         "--resume", action="store_true", help="go on with the runs of --out that were stopped"
     )
     run.add_argument("--no-plot", action="store_true", help="no picture")
+    check = _command(commands, "check", _check, "theory against simulation, a row a promise")
+    check.add_argument("--runs", type=_count, default=500, help="how many (default: 500)")
+    check.add_argument("--seed", type=_seed, help="root seed instead of the scenario's")
+    check.add_argument(
+        "--confidence",
+        type=float,
+        default=0.99,
+        help="with which all intervals hold together (default: 0.99)",
+    )
+    _pool(check)
+    check.add_argument("--json", action="store_true", help="one JSON document, nothing else")
     theory = _command(commands, "theory", _theory, "what is promised; no simulation")
     theory.add_argument("--json", action="store_true", help="one JSON document, nothing else")
     return parser
@@ -108,6 +117,12 @@ def _command(
     )
     parser.set_defaults(command=command)
     return parser
+
+
+def _pool(parser: argparse.ArgumentParser) -> None:
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument("--workers", type=_count, help="processes (default: one a core)")
+    workers.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
 
 
 def _seed(text: str) -> int:
@@ -322,6 +337,30 @@ class _Countdown:
     def close(self) -> None:
         if self._shown:
             print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from netkf.experiments.checking.check import check, verdict_json, verdict_text
+
+    scenario = _load(options)
+    meter = _Countdown()
+    try:
+        found = check(
+            scenario,
+            options.runs,
+            confidence=options.confidence,
+            workers=options.workers,
+            scheduler=options.scheduler,
+            progress=meter,
+        )
+    finally:
+        meter.close()
+    _notes(scenario)
+    if options.json:
+        print(json.dumps(verdict_json(found), indent=2))
+    else:
+        print(verdict_text(found, scenario.claim))
+    return 0 if found else NOT_KEPT
 
 
 def _theory(options: argparse.Namespace) -> int:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+import textwrap
+from collections import Counter
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +19,19 @@ from netkf.algorithms.slot import Gossip, Intermittent
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
 from netkf.experiments.checking import diffusion, gossip, hybrid, intermittent, push_sum
-from netkf.experiments.checking.evidence import BROKEN, Evidence, Row, judge
+from netkf.experiments.checking.evidence import (
+    BROKEN,
+    NOT_PROMISED,
+    VERDICTS,
+    Evidence,
+    Row,
+    judge,
+)
 from netkf.experiments.checking.exact import promised_filter, stand_in
 from netkf.experiments.checking.words import look_at
-from netkf.experiments.simulate import simulate
+from netkf.experiments.ensembles.replicas import replicate
+from netkf.experiments.files import finite
+from netkf.experiments.simulate import LOAD, simulate
 from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
@@ -103,16 +115,78 @@ def verdict(scenario: Scenario, witnesses: Iterable[Any], seed: int, confidence:
 
 
 def check(
-    scenario: Scenario, runs: int = 500, seed: int | None = None, confidence: float = 0.99
+    scenario: Scenario,
+    runs: int = 500,
+    seed: int | None = None,
+    confidence: float = 0.99,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Verdict:
     """Hold everything that is promised of the scenario's filter against ``runs`` replicas.
 
+    The state is sampled where the promises look, whatever ``probe`` says. A filter of one's own is
+    held to what is promised of the one that it derives from. ``workers``, ``executor``,
+    ``scheduler`` and ``progress`` as for ``netkf.monte_carlo``; they do not change the verdict.
+
     Raises TheoryError where nothing is promised, ScenarioError for bad arguments.
     """
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError("", "check takes a netkf.Scenario", scenario, LOAD)
     count = integer(low=FEWEST)("runs", runs)
     sure = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
+    paper_of(scenario)
+    if not scenario.drawn:
+        raise TheoryError("the truth or the readings are recorded: there is one run, and no law")
     if scenario.slotted and look_at(scenario)[-1] < FEWEST:
-        raise ScenarioError("horizon", "is too short to check limits", scenario.horizon, "lengthen")
+        words = f"must have at least {FEWEST} slots to check limits"
+        raise ScenarioError("horizon", words, scenario.horizon, "lengthen it")
     chosen = watched(scenario)
-    return verdict(chosen, (witness(chosen, root, r) for r in range(count)), root, sure)
+    seen = replicate(
+        witness,
+        chosen,
+        count,
+        root,
+        workers=workers,
+        executor=executor,
+        scheduler=scheduler,
+        progress=progress,
+    )
+    return verdict(chosen, seen, root, sure)
+
+
+def verdict_text(found: Verdict, claim: str = "") -> str:
+    """For a terminal."""
+    lines = [f"{found.scenario}: {claim}" if claim else found.scenario, ""]
+    for row in found.rows:
+        lines.append(
+            f"{row.verdict.upper() if row.verdict == BROKEN else row.verdict:<13}"
+            f"{row.promise}  [{row.source}]"
+        )
+        words = row.evidence
+        if row.verdict == NOT_PROMISED:
+            words = row.assumptions
+        elif row.low < row.high:
+            words += f"; margin {row.margin:.3g} in [{row.low:.3g}, {row.high:.3g}]"
+            words += f", {row.tolerance:g} below 0 is tolerated" if row.tolerance else ""
+        if row.needed is not None:
+            words += f"; needs about {row.needed:,} runs"
+        indent = " " * 13
+        lines += textwrap.wrap(words, 87, initial_indent=indent, subsequent_indent=indent)
+    counts = Counter(row.verdict for row in found.rows)
+    shown = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
+    sure = f"{found.confidence:.6g}"
+    lines += [
+        "",
+        f"{shown}; {found.runs:,} runs, all intervals together hold with probability {sure}",
+    ]
+    return "\n".join(lines)
+
+
+def verdict_json(found: Verdict) -> dict[str, Any]:
+    """Plain values."""
+    document = dataclasses.asdict(found)
+    plain: dict[str, Any] = finite({**document, "holds": bool(found)})
+    return plain

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not promised"
+VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
 
 
 @dataclass(frozen=True)
