@@ -48,6 +48,8 @@ STEPS = (
     "sense",
     "emit",
     "absorb",
+    "share",
+    "stretch",
     "steps",
     "redraws",
     "estimate",

@@ -52,12 +52,12 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
 
 
 def replayed_covariances(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
-    """(T, N, n, n) twice: P_i as the filter's equations make it of the run's events, computed here
-    and not by the engine, and the covariance of x - xhat_i, as :func:`error_covariance`.
+    """(T, N, n, n): P_i as the filter's equations make it of the run's events, computed here and
+    not by the engine; (T, N n, N n): the covariance of all x - xhat_i together, as
+    :func:`error_covariance`.
     """
     whole, P = _replayed(scenario, run)
-    blocks = whole.reshape(*P.shape[:3], *P.shape[1:3])
-    return P, np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+    return P, whole
 
 
 def _replayed(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:

@@ -2,6 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.flow import Payload, predict
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import AVERAGE, PushSum, averaged
 from netkf.algorithms.slot import Gossip, Intermittent
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
@@ -70,3 +76,187 @@ class Overconfident(Intermittent):
     def estimate(self, state):
         xhat, P = super().estimate(state)
         return xhat, 0.25 * P
+
+
+@dataclass(frozen=True, eq=False)
+class WrongSign(Hybrid):
+    """Moves away from what it hears."""
+
+    def absorb(self, state, messages):
+        right = super().absorb(state, messages)
+        return right._replace(xhat=2.0 * state.xhat - right.xhat)
+
+
+@dataclass(frozen=True, eq=False)
+class MissingP(Hybrid):
+    """Mixes estimates and keeps its covariance."""
+
+    def absorb(self, state, messages):
+        return super().absorb(state, messages)._replace(P=state.P)
+
+
+@dataclass(frozen=True, eq=False)
+class MissingX(Hybrid):
+    """Mixes covariances and keeps its estimate."""
+
+    def absorb(self, state, messages):
+        return super().absorb(state, messages)._replace(xhat=state.xhat)
+
+
+@dataclass(frozen=True, eq=False)
+class WrongWeight(Hybrid):
+    """Gives twice the weight."""
+
+    def absorb(self, state, messages):
+        return super().absorb(state, [(2.0 * w, payload, age) for w, payload, age in messages])
+
+
+@dataclass(frozen=True, eq=False)
+class OneAfterTheOther(Hybrid):
+    """Resets once for each message of an instant."""
+
+    def absorb(self, state, messages):
+        for message in messages:
+            state = super().absorb(state, [message])
+        return state
+
+
+@dataclass(frozen=True, eq=False)
+class Stale(Hybrid):
+    """Takes old estimates for new ones."""
+
+    def absorb(self, state, messages):
+        return super().absorb(state, [(w, payload, 0.0) for w, payload, _ in messages])
+
+
+@dataclass(frozen=True, eq=False)
+class ForgottenNoise(Hybrid):
+    """Leaves the noise of the plant out of its covariance."""
+
+    def flow(self, state, gap):
+        state = super().flow(state, gap)
+        return state._replace(P=state.P - 0.9 * gap * state.model.Q)
+
+
+@dataclass(frozen=True, eq=False)
+class SwappedIndex(Hybrid):
+    """Sends its first two states exchanged."""
+
+    def emit(self, state):
+        return Payload(state.xhat[::-1].copy(), state.P)
+
+
+@dataclass(frozen=True, eq=False)
+class TimeOff(Hybrid):
+    """Predicts what it hears too far."""
+
+    def absorb(self, state, messages):
+        late = [(w, predict(state.model, payload, 0.3), age) for w, payload, age in messages]
+        return super().absorb(state, late)
+
+
+@dataclass(frozen=True, eq=False)
+class Deaf(Hybrid):
+    """Counts readings in its covariance and does not use them."""
+
+    def measure(self, state, reading):
+        return state
+
+
+@dataclass(frozen=True, eq=False)
+class Eager(Hybrid):
+    """Uses every reading twice."""
+
+    def measure(self, state, reading):
+        once = super().measure(state, reading)
+        return once._replace(xhat=2.0 * once.xhat - state.xhat)
+
+
+@dataclass(frozen=True, eq=False)
+class TooSure(Hybrid):
+    """Fuses estimates as if their errors were independent."""
+
+    def absorb(self, state, messages):
+        for _, payload, _ in messages:
+            gain = np.linalg.solve(state.P + payload.P + 1e-9 * np.eye(len(state.P)), state.P).T
+            P = state.P - gain @ state.P
+            state = state._replace(xhat=state.xhat + gain @ (payload.xhat - state.xhat), P=P)
+        return state
+
+
+@dataclass(frozen=True, eq=False)
+class LosesMass(PushSum):
+    """Does not keep what could not be sent."""
+
+    def absorb(self, state, phase, messages):
+        if phase != AVERAGE:
+            state = state._replace(degree=len(messages))
+        return super().absorb(state, phase, messages)
+
+
+@dataclass(frozen=True, eq=False)
+class SendsTooMuch(PushSum):
+    """Divides its mass by its degree, not by one more."""
+
+    def emit(self, state, phase):
+        sent = super().emit(state, phase)
+        return sent if phase == AVERAGE else sent * (state.degree + 1) / state.degree
+
+
+@dataclass(frozen=True, eq=False)
+class NeverAverages(PushSum):
+    """Skips the averaging of estimates."""
+
+    def absorb(self, state, phase, messages):
+        return state if phase == AVERAGE else super().absorb(state, phase, messages)
+
+
+@dataclass(frozen=True, eq=False)
+class Overshoots(PushSum):
+    """Averages with half of delta."""
+
+    def absorb(self, state, phase, messages):
+        if phase != AVERAGE:
+            return super().absorb(state, phase, messages)
+        received = [payload for _, payload, _ in messages]
+        return state._replace(xhat=averaged(state.xhat, received, 0.6 * self.delta))
+
+
+@dataclass(frozen=True, eq=False)
+class ForgetsN(PushSum):
+    """Leaves the factor N out of its gain."""
+
+    def sense(self, state, reading):
+        whole = state.network
+        alone = state._replace(network=whole._replace(number=1.0))
+        return super().sense(alone, reading)._replace(network=whole)
+
+
+@dataclass(frozen=True, eq=False)
+class Arithmetic(DiffusionFilter):
+    """Averages covariances in place of their inverses."""
+
+    def absorb(self, state, phase, messages):
+        own, heard = self.share(state.own, [w for w, _, _ in messages])
+        P = own * state.root @ state.root.T
+        xhat = own * state.xhat
+        for weight, (_, pair, _) in zip(heard, messages, strict=True):
+            P = P + weight * pair.root @ pair.root.T
+            xhat = xhat + weight * pair.xhat
+        return state._replace(xhat=xhat, root=np.linalg.cholesky(P))
+
+
+@dataclass(frozen=True, eq=False)
+class DropsWeight(DiffusionFilter):
+    """Leaves the weight of lost messages out."""
+
+    def share(self, own, arrived):
+        return own, arrived
+
+
+@dataclass(frozen=True, eq=False)
+class KeepsX(DiffusionFilter):
+    """Combines covariances and keeps its estimate."""
+
+    def absorb(self, state, phase, messages):
+        return super().absorb(state, phase, messages)._replace(xhat=state.xhat)

@@ -39,6 +39,7 @@ class Witness(NamedTuple):
     nees: FloatArray
     replayed: FloatArray
     Sigma: FloatArray
+    whole: FloatArray
     alone: FloatArray
 
 

@@ -25,6 +25,10 @@ from netkf.trace.run import Run, errors
 MOST = 400
 """Replicas whose exact covariances are computed; the others show their errors only."""
 ROUNDING = 1e-7
+SAMPLED, EXACT = 0.02, 1e-8
+"""Relative variances that are looked at: where readings are integrated over steps, an error of
+1e-3 of the largest ones is allowed for; in slots there is none.
+"""
 
 
 class Exact(NamedTuple):
@@ -34,6 +38,8 @@ class Exact(NamedTuple):
     nees       : (K, N) e' P^-1 e
     replayed   : (K, N, n, n) P as the equations have it
     Sigma      : (K, N, n, n) covariance of the errors given the events
+    whole      : (K, 2) of the errors of all nodes together: their square, whitened by their
+                 covariance given the events, and its degrees of freedom
     """
 
     P: FloatArray
@@ -41,15 +47,38 @@ class Exact(NamedTuple):
     nees: FloatArray
     replayed: FloatArray
     Sigma: FloatArray
+    whole: FloatArray
 
 
 def exact(scenario: Scenario, run: Run) -> Exact:
     """Reduce a run."""
     _, nees = errors(run.x, run.xhat, run.P)
+    e = run.x[:, None] - run.xhat
     replayed = Sigma = np.full(run.P.shape, np.nan)
+    whole = np.full((len(run.times), 2), np.nan)
     if run.replica < MOST:
-        replayed, Sigma = replayed_covariances(stand_in(scenario), run)
-    return Exact(run.P, run.x[:, None] - run.xhat, nees, replayed, Sigma)
+        replayed, stacked = replayed_covariances(stand_in(scenario), run)
+        Sigma = blocks(stacked, *e.shape[1:])
+        whole = whitened(e, stacked, EXACT if scenario.slotted else SAMPLED)
+    return Exact(run.P, e, nees, replayed, Sigma, whole)
+
+
+def blocks(stacked: FloatArray, nodes: int, n: int) -> FloatArray:
+    """(K, N, n, n) diagonal blocks of (K, N n, N n)."""
+    return np.ascontiguousarray(
+        np.einsum("tiaib->tiab", stacked.reshape(len(stacked), nodes, n, nodes, n))
+    )
+
+
+def whitened(e: FloatArray, stacked: FloatArray, least: float) -> FloatArray:
+    """(K, 2): ``e' Sigma^-1 e`` of all nodes together in the directions whose variance is at least
+    that share of the largest, and their number. Small ones show how far nodes disagree.
+    """
+    values, vectors = np.linalg.eigh(stacked)
+    kept = values > least * values[:, -1:]
+    along = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1))
+    square = np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0).sum(axis=1)
+    return np.stack([square, kept.sum(axis=1)], axis=1)
 
 
 def stand_in(scenario: Scenario) -> Scenario:
@@ -114,12 +143,18 @@ def not_too_small(seen: Any, level: float) -> Finding:
 
 
 def as_computed(seen: Any, level: float) -> Finding:
-    """Errors whitened by their exact covariance are chi-square at every node and time."""
-    e, Sigma = seen.runs.e[:MOST], seen.runs.Sigma[:MOST]
-    whitened = np.einsum("rkna,rkna->rkn", e, _solved(Sigma, e))
+    """Errors whitened by their exact covariance are chi-square at every node and time, and for all
+    nodes together.
+    """
+    e, Sigma, whole = seen.runs.e[:MOST], seen.runs.Sigma[:MOST], seen.runs.whole[:MOST]
+    alone = np.einsum("rkna,rkna->rkn", e, _solved(Sigma, e)).reshape(len(e), -1)
     n = seen.scenario.plant.n
-    found = chi_squared(whitened.reshape(len(e), -1), n, seen.places, level)
-    return found._replace(words=found.words.replace("mean NEES", "mean e' Sigma^-1 e"))
+    ratios = np.concatenate([alone / n, whole[..., 0] / whole[..., 1]], axis=1)
+    freedom = [n * len(e)] * alone.shape[1] + whole[..., 1].sum(axis=0).tolist()
+    nodes = len(seen.scenario.nodes)
+    moments = [place.rsplit(",", 1)[0] for place in seen.places[::nodes]]
+    places = [*seen.places, *(f"{moment}, all nodes" for moment in moments)]
+    return chi_squared(ratios, freedom, places, level, "e' Sigma^-1 e")
 
 
 def expected_nees(seen: Any, level: float) -> Finding:

@@ -14,9 +14,9 @@ from netkf.core.streams import Streams
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
 from netkf.experiments.checking.laws import (
     Pair,
-    chi_squared,
     distances,
     exact_start,
+    nees_is_chi_squared,
     not_growing,
     same_laws,
     worst,
@@ -264,12 +264,6 @@ def forgotten(seen: Seen, level: float) -> Finding:
     return same_laws(pairs, level)
 
 
-def consistent(seen: Seen, level: float) -> Finding:
-    """Given the swaps, errors are Gaussian with covariance P at every node and time."""
-    nees = seen.runs.nees.reshape(seen.count, -1)
-    return chi_squared(nees, seen.scenario.plant.n, seen.places, level)
-
-
 CHAIN = ("every exchange is a swap", "slots are independent")
 ERGODIC = (*CHAIN, "G C.1", "G S.1", "G D.1")
 PROMISES = (
@@ -322,7 +316,7 @@ PROMISES = (
         "errors are as large as P says: the mean NEES is n",
         "G (9)",
         ("the filters know", "the filters start"),
-        consistent,
+        nees_is_chi_squared,
     ),
 )
 

@@ -14,9 +14,9 @@ from netkf.core.streams import Streams
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
 from netkf.experiments.checking.laws import (
     Pair,
-    chi_squared,
     distances,
     exact_start,
+    nees_is_chi_squared,
     not_growing,
     same_laws,
     worst,
@@ -292,12 +292,6 @@ def forgotten(seen: Seen, level: float) -> Finding:
     return same_laws(pairs, level)
 
 
-def consistent(seen: Seen, level: float) -> Finding:
-    """Given the arrivals, errors are Gaussian with covariance P at every node and time."""
-    nees = seen.runs.nees.reshape(seen.count, -1)
-    return chi_squared(nees, seen.scenario.plant.n, seen.places, level)
-
-
 def listeners(scenario: Scenario) -> dict[int, ScalarLaw]:
     """Nodes of a scalar scenario whose only reading comes over one link, with their exact laws."""
     laws = {}
@@ -388,7 +382,9 @@ PROMISES = (
         bounded,
     ),
     Promise("the law in the end does not depend on the start", "R Theorem 9 [i]", LIMIT, forgotten),
-    Promise("errors are as large as P says: the mean NEES is n", "R (15)", KNOWN, consistent),
+    Promise(
+        "errors are as large as P says: the mean NEES is n", "R (15)", KNOWN, nees_is_chi_squared
+    ),
 )
 SCALAR = (
     Promise(

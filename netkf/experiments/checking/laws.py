@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -75,19 +75,30 @@ def not_growing(pairs: Sequence[Pair], level: float) -> Finding:
     return worst(found, LAW, words)
 
 
-def chi_squared(nees: FloatArray, n: int, places: Sequence[str], level: float) -> Finding:
-    """Whether NEES (runs, places) have mean n; their sum over runs is chi-square exactly."""
-    kept = np.flatnonzero(np.isfinite(nees).all(axis=0))
+def chi_squared(
+    ratios: FloatArray, freedom: Sequence[float], places: Sequence[str], level: float, words: str
+) -> Finding:
+    """Whether squares over their degrees of freedom (runs, places) have mean 1; over all runs of a
+    place they have ``freedom`` together, and are chi-square exactly.
+    """
+    kept = np.flatnonzero(np.isfinite(ratios).all(axis=0))
     if not len(kept):
         nan = float("nan")
-        return Finding((nan, nan, nan), NEES, "NEES does not exist: P is singular or not finite")
+        return Finding((nan, nan, nan), NEES, f"{words} does not exist: singular or not finite")
     found = []
     for k in kept.tolist():
-        ratio = mean_ratio(float(nees[:, k].sum()), n * len(nees), level / len(kept))
+        total = float(ratios[:, k].mean()) * freedom[k]
+        ratio = mean_ratio(total, freedom[k], level / len(kept))
         ends = sorted((abs(ratio.low - 1.0), abs(ratio.high - 1.0)))
         least = 0.0 if ratio.low <= 1.0 <= ratio.high else ends[0]
         found.append((Interval(abs(ratio.value - 1.0), least, ends[1]), f"at {places[k]}"))
-    return worst(found, NEES, "largest relative difference of the mean NEES from n")
+    return worst(found, NEES, f"largest relative difference of the mean {words} from its freedom")
+
+
+def nees_is_chi_squared(seen: Any, level: float) -> Finding:
+    """Given the exchanges, errors are Gaussian with covariance P at every node and time."""
+    n, nees = seen.scenario.plant.n, seen.runs.nees.reshape(len(seen.runs.P), -1)
+    return chi_squared(nees / n, [n * len(nees)] * nees.shape[1], seen.places, level, "NEES")
 
 
 def exact_start(scenario: Scenario) -> Row:

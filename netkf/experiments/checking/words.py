@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.chains import Letters, advance, alphabet
+from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray, block_diagonal, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -41,8 +42,13 @@ class Book(NamedTuple):
 
 
 def look_at(scenario: Scenario) -> tuple[int, ...]:
-    """Slots to look at: small ones, half of the horizon and its end."""
-    last = max(1, int(np.floor(scenario.horizon / scenario.slot_plant.period + 1e-9)))
+    """Slots to look at: small ones, half of the horizon and its end; a filtered estimate at the
+    horizon itself has seen exchanges that are not in the trace.
+    """
+    period, algorithm = scenario.slot_plant.period, scenario.filter.algorithm
+    last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
+    if isinstance(algorithm, SlotFilter) and not algorithm.predicts:
+        last = max(1, int(np.ceil(scenario.horizon / period - 1e-9)) - 1)
     return tuple(sorted({min(2, last), min(5, last), max(1, last // 2), last}))
 
 
