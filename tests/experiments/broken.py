@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.flow import Payload, predict
+from netkf.algorithms.flow import FlowFilter, Payload, predict
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.push_sum import AVERAGE, PushSum, averaged
-from netkf.algorithms.slot import Gossip, Intermittent
+from netkf.algorithms.slot import Gossip, Intermittent, SlotFilter, update_and_predict
+from netkf.core.fields import positive, setting
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
 
@@ -260,3 +261,39 @@ class KeepsX(DiffusionFilter):
 
     def absorb(self, state, phase, messages):
         return super().absorb(state, phase, messages)._replace(xhat=state.xhat)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnReset(FlowFilter):
+    """A reset filter from scratch that forgets its own share."""
+
+    epsilon: float = setting(positive)
+
+    def absorb(self, state, messages):
+        P = state.P
+        for weight, payload, _ in messages:
+            P = P + weight * payload.P
+        return state._replace(P=P)
+
+    def weight(self, degree, peer_degree):
+        return self.epsilon
+
+
+@dataclass(frozen=True, eq=False)
+class OwnSwap(SlotFilter):
+    """A gossip filter from scratch that takes twice the partner's covariance."""
+
+    first_slot = 1
+    pairwise = True
+
+    def emit(self, state, phase):
+        return state.xhat, state.root
+
+    def absorb(self, state, phase, messages):
+        for _, (xhat, root), _ in messages:
+            state = state._replace(xhat=xhat, root=1.4 * root)
+        return state
+
+    def sense(self, state, reading):
+        xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
+        return state._replace(xhat=xhat, root=root)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.fields import Part
@@ -100,8 +101,9 @@ def promised_filter(algorithm: Any) -> Any:
     for kind in type(algorithm).__mro__:
         if any(kind in family.values() for family in (KINDS["filter"], KINDS["slot filter"])):
             return algorithm if not own_steps(algorithm, kind) else _like(kind, algorithm)
-    if isinstance(algorithm, FlowFilter) and hasattr(algorithm, "epsilon"):
-        return _like(KINDS["filter"]["hybrid"], algorithm)
+    for kind in RESEMBLES:
+        if kind(algorithm) is not None:
+            return _like(kind(algorithm), algorithm)
     name = type(algorithm).__name__
     raise TheoryError(
         f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which one "
@@ -109,14 +111,32 @@ def promised_filter(algorithm: Any) -> Any:
     )
 
 
+def _flow_kind(algorithm: Any) -> type[Part] | None:
+    """By its settings: a weight for all links makes a hybrid filter."""
+    known = isinstance(algorithm, FlowFilter) and hasattr(algorithm, "epsilon")
+    return KINDS["filter"]["hybrid"] if known else None
+
+
+def _slot_kind(algorithm: Any) -> type[Part] | None:
+    """By its settings and its programme."""
+    if not isinstance(algorithm, SlotFilter):
+        return None
+    name = None
+    if hasattr(algorithm, "gamma") and hasattr(algorithm, "delta"):
+        name = "push-sum"
+    elif algorithm.pairwise:
+        name = "gossip"
+    elif algorithm.programme == ("sense", "exchange") and algorithm.predicts:
+        name = "diffusion" if hasattr(algorithm, "weights") else "intermittent"
+    return None if name is None else KINDS["slot filter"][name]
+
+
+RESEMBLES = (_flow_kind, _slot_kind)
+
+
 def _like(kind: type[Part], algorithm: Any) -> Part:
-    names = [field.name for field in dataclasses.fields(kind)]
+    names = [field.name for field in dataclasses.fields(kind) if hasattr(algorithm, field.name)]
     return kind(**{name: getattr(algorithm, name) for name in names})
-
-
-def computed(P: FloatArray) -> np.ndarray:
-    """(runs,) which replicas have exact covariances."""
-    return np.asarray(np.isfinite(P).all(axis=(1, 2, 3, 4)))
 
 
 def replay(seen: Any, level: float) -> Finding:
