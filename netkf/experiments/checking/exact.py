@@ -101,9 +101,9 @@ def promised_filter(algorithm: Any) -> Any:
     for kind in type(algorithm).__mro__:
         if any(kind in family.values() for family in (KINDS["filter"], KINDS["slot filter"])):
             return algorithm if not own_steps(algorithm, kind) else _like(kind, algorithm)
-    for kind in RESEMBLES:
-        if kind(algorithm) is not None:
-            return _like(kind(algorithm), algorithm)
+    resembled = _flow_kind(algorithm) or _slot_kind(algorithm)
+    if resembled is not None:
+        return _like(resembled, algorithm)
     name = type(algorithm).__name__
     raise TheoryError(
         f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which one "
@@ -129,9 +129,6 @@ def _slot_kind(algorithm: Any) -> type[Part] | None:
     elif algorithm.programme == ("sense", "exchange") and algorithm.predicts:
         name = "diffusion" if hasattr(algorithm, "weights") else "intermittent"
     return None if name is None else KINDS["slot filter"][name]
-
-
-RESEMBLES = (_flow_kind, _slot_kind)
 
 
 def _like(kind: type[Part], algorithm: Any) -> Part:
