@@ -28,6 +28,7 @@ from netkf.experiments.checking.evidence import (
     judge,
 )
 from netkf.experiments.checking.exact import promised_filter, stand_in
+from netkf.experiments.checking.seen import times
 from netkf.experiments.checking.words import look_at
 from netkf.experiments.ensembles.replicas import replicate
 from netkf.experiments.files import finite
@@ -87,10 +88,7 @@ def paper_of(scenario: Scenario) -> Any:
 
 def watched(scenario: Scenario) -> Scenario:
     """The scenario with samples where the promises look."""
-    times = hybrid.times(scenario)
-    if scenario.slotted:
-        times = [round(scenario.slot_plant.period * slot, 12) for slot in look_at(scenario)]
-    return dataclasses.replace(scenario, probe=np.array(times))
+    return dataclasses.replace(scenario, probe=np.array(times(scenario)))
 
 
 def witness(scenario: Scenario, seed: int, replica: int) -> Any:
@@ -102,7 +100,7 @@ def verdict(scenario: Scenario, witnesses: Iterable[Any], seed: int, confidence:
     """The verdict on a watched scenario from what its runs say."""
     paper, listed = paper_of(scenario), list(witnesses)
     stacked = paper.Witness(*map(np.array, zip(*listed, strict=True)))
-    seen = paper.Seen(scenario, stacked, seed)
+    seen = paper.Observed(scenario, stacked, seed)
     table = [Row(*row) for row in assumptions(stand_in(scenario)).itertuples(index=False)]
     found = judge(
         paper.promises(scenario),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +17,10 @@ from netkf.experiments.checking.exact import (
     exact,
     expected_nees,
     not_too_small,
-    replay,
     stand_in,
 )
-from netkf.experiments.checking.laws import Pair, exact_start, not_growing
-from netkf.experiments.checking.words import look_at
+from netkf.experiments.checking.laws import exact_start
+from netkf.experiments.checking.seen import Seen, bounded, replay
 from netkf.experiments.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.theory import error_covariance, information_level
@@ -61,19 +59,7 @@ def _silent(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, filter=chosen, probe=scenario.times[-1:])
 
 
-@dataclass(frozen=True)
-class Seen:
-    """Witnesses of many runs, stacked."""
-
-    scenario: Scenario
-    runs: Witness
-    seed: int = 0
-
-    @property
-    def places(self) -> list[str]:
-        """Words for each of the (K, N) places, slot by slot."""
-        nodes = self.scenario.nodes
-        return [f"slot {t}, node {node}" for t in look_at(self.scenario) for node in nodes]
+Observed = Seen
 
 
 def rows(scenario: Scenario) -> list[Row]:
@@ -84,13 +70,6 @@ def rows(scenario: Scenario) -> list[Row]:
         Row("the filters know the plant and the sensors", "D Algorithm 1", same, words),
         exact_start(scenario),
     ]
-
-
-def bounded(seen: Seen, level: float) -> Finding:
-    """The end against half of the time."""
-    P = seen.runs.P
-    nodes = enumerate(seen.scenario.nodes)
-    return not_growing([Pair(f"node {node}", P[:, -2, i], P[:, -1, i]) for i, node in nodes], level)
 
 
 def excited(seen: Seen, level: float) -> Finding:

@@ -25,7 +25,6 @@ from netkf.trace.run import Run, errors
 
 MOST = 400
 """Replicas whose exact covariances are computed; the others show their errors only."""
-ROUNDING = 1e-7
 SAMPLED, EXACT = 0.02, 1e-8
 """Relative variances that are looked at: where readings are integrated over steps, an error of
 1e-3 of the largest ones is allowed for; in slots there is none.
@@ -136,19 +135,6 @@ def _like(kind: type[Part], algorithm: Any) -> Part:
     return kind(**{name: getattr(algorithm, name) for name in names})
 
 
-def replay(seen: Any, level: float) -> Finding:
-    """Every covariance is what the equations make of the run's events."""
-    P, expected = seen.runs.P[:MOST], seen.runs.replayed[:MOST]
-    size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
-    apart = np.nan_to_num(np.abs(P - expected) / size, nan=np.inf).max(axis=(-1, -2))
-    run, time, node = np.unravel_index(int(np.argmax(apart)), apart.shape)
-    words = (
-        f"{apart.size:,} covariances replayed from the events of their runs; the worst in run "
-        f"{run} at {seen.places[time * len(seen.scenario.nodes) + node]}"
-    )
-    return identity(float(apart.max()), ROUNDING, words)
-
-
 def not_too_small(seen: Any, level: float) -> Finding:
     """P - Sigma has no negative eigenvalue, with the exact covariance Sigma of the errors."""
     P, Sigma = seen.runs.P[:MOST], seen.runs.Sigma[:MOST]
@@ -168,9 +154,7 @@ def as_computed(seen: Any, level: float) -> Finding:
     n = seen.scenario.plant.n
     ratios = np.concatenate([alone / n, whole[..., 0] / whole[..., 1]], axis=1)
     freedom = [n * len(e)] * alone.shape[1] + whole[..., 1].sum(axis=0).tolist()
-    nodes = len(seen.scenario.nodes)
-    moments = [place.rsplit(",", 1)[0] for place in seen.places[::nodes]]
-    places = [*seen.places, *(f"{moment}, all nodes" for moment in moments)]
+    places = [*seen.places, *(f"{moment}, all nodes" for moment in seen.moments)]
     return chi_squared(ratios, freedom, places, level, "e' Sigma^-1 e")
 
 

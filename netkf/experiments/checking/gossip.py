@@ -16,11 +16,10 @@ from netkf.experiments.checking.laws import (
     Pair,
     distances,
     exact_start,
-    nees_is_chi_squared,
-    not_growing,
     same_laws,
     worst,
 )
+from netkf.experiments.checking.seen import Seen, bounded, nees_is_chi_squared, replay
 from netkf.experiments.checking.statistics import off_by, share
 from netkf.experiments.checking.words import (
     gossip_book,
@@ -106,23 +105,8 @@ class Reference(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observed(Seen):
     """Witnesses of many runs, stacked, with what they are held against."""
-
-    scenario: Scenario
-    runs: Witness
-    seed: int = 0
-
-    @property
-    def count(self) -> int:
-        """Number of runs."""
-        return len(self.runs.P)
-
-    @property
-    def places(self) -> list[str]:
-        """Words for each of the (K, N) places, slot by slot."""
-        nodes = self.scenario.nodes
-        return [f"slot {t}, node {node}" for t in look_at(self.scenario) for node in nodes]
 
     @cached_property
     def matching(self) -> FloatArray:
@@ -166,20 +150,7 @@ def rows(scenario: Scenario) -> list[Row]:
     ]
 
 
-def replay(seen: Seen, level: float) -> Finding:
-    """Every covariance is what the swaps of its run make of the start."""
-    P, expected = seen.runs.P, seen.runs.replayed
-    size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
-    apart = np.nan_to_num(np.abs(P - expected) / size, nan=np.inf).max(axis=(-1, -2))
-    run, slot, node = np.unravel_index(int(np.argmax(apart)), apart.shape)
-    words = (
-        f"{apart.size:,} covariances replayed from the swaps of their runs; the worst in run {run} "
-        f"at {seen.places[slot * len(seen.scenario.nodes) + node]}"
-    )
-    return identity(float(apart.max()), ROUNDING, words)
-
-
-def walks(seen: Seen, level: float) -> Finding:
+def walks(seen: Observed, level: float) -> Finding:
     """The last readings of a pair bound it, whatever was before."""
     P, bound = seen.runs.P, seen.runs.bounds
     size = np.trace(bound, axis1=-2, axis2=-1)
@@ -197,7 +168,7 @@ def walks(seen: Seen, level: float) -> Finding:
     return identity(float(max(0.0, -least.min())), ROUNDING, words)
 
 
-def pairings(seen: Seen, level: float) -> Finding:
+def pairings(seen: Observed, level: float) -> Finding:
     """Tokens move by the mean matching; slots are independent, so counts are binomial."""
     i, j = np.nonzero(~np.eye(len(seen.matching), dtype=bool))
     trials, totals = int(np.sum(seen.runs.slots)), seen.runs.pairs.sum(axis=0)
@@ -212,7 +183,7 @@ def pairings(seen: Seen, level: float) -> Finding:
     return worst(found, SHARE, f"largest difference from Abar over {trials:,} slots")
 
 
-def random_sensor(seen: Seen, level: float) -> Finding:
+def random_sensor(seen: Observed, level: float) -> Finding:
     """One sensor a run, drawn at random for each slot."""
     random = Streams(seen.seed).generator("random sensor")
     runs, nodes = np.arange(seen.count), len(seen.scenario.nodes)
@@ -224,7 +195,7 @@ def random_sensor(seen: Seen, level: float) -> Finding:
     return same_laws(pairs, level)
 
 
-def each_sensor(seen: Seen, level: float) -> Finding:
+def each_sensor(seen: Observed, level: float) -> Finding:
     """law(Phat_n(t)) = law(Ptilde(t) given ptilde(t - 1) = n)."""
     P, _, places = seen.reference
     pairs = [
@@ -235,7 +206,7 @@ def each_sensor(seen: Seen, level: float) -> Finding:
     return same_laws(pairs, level)
 
 
-def tokens(seen: Seen, level: float) -> Finding:
+def tokens(seen: Observed, level: float) -> Finding:
     """Each token at the end against the stationary switched chain, which may not be there yet."""
     runs, last, pairs = np.arange(seen.count), len(look_at(seen.scenario)) - 1, []
     everywhere, origin = seen.reference.P[last], seen.reference.places[:, 0]
@@ -246,14 +217,7 @@ def tokens(seen: Seen, level: float) -> Finding:
     return same_laws(pairs, level)
 
 
-def bounded(seen: Seen, level: float) -> Finding:
-    """The end against half of the time."""
-    P = seen.runs.P
-    nodes = enumerate(seen.scenario.nodes)
-    return not_growing([Pair(f"node {node}", P[:, -2, i], P[:, -1, i]) for i, node in nodes], level)
-
-
-def forgotten(seen: Seen, level: float) -> Finding:
+def forgotten(seen: Observed, level: float) -> Finding:
     """The runs against their own swaps from a start a thousand times larger."""
     runs, (P, restarted, places) = seen.runs, seen.reference
     pairs = []

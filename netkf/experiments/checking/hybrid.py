@@ -16,10 +16,10 @@ from netkf.experiments.checking.exact import (
     exact,
     expected_nees,
     not_too_small,
-    replay,
     stand_in,
 )
 from netkf.experiments.checking.laws import exact_start, worst
+from netkf.experiments.checking.seen import Seen, replay, times
 from netkf.experiments.checking.statistics import Interval, spread
 from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, limit_covariance, steady_covariance_bound
@@ -34,29 +34,14 @@ FASTER = (30.0, 300.0)
 Witness = Exact
 
 
-def times(scenario: Scenario) -> list[float]:
-    """Where promises look: an eighth, a quarter, half and all of the horizon."""
-    return [scenario.horizon * share for share in (0.125, 0.25, 0.5, 1.0)]
-
-
 def witness(scenario: Scenario, run: Run) -> Exact:
     """Reduce a run whose samples are at ``times``."""
     return exact(scenario, run)
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observed(Seen):
     """Witnesses of many runs, stacked, with what they are held against."""
-
-    scenario: Scenario
-    runs: Exact
-    seed: int = 0
-
-    @property
-    def places(self) -> list[str]:
-        """Words for each of the (K, N) places, time by time."""
-        nodes = self.scenario.nodes
-        return [f"{t:g} s, node {node}" for t in times(self.scenario) for node in nodes]
 
     @cached_property
     def bound(self) -> FloatArray:
@@ -95,7 +80,7 @@ def _variance(scenario: Scenario) -> Row:
     return Row(name, source, rate < 0.0, words if rate < 0.0 else f"{words}; {void}")
 
 
-def bounded(seen: Seen, level: float) -> Finding:
+def bounded(seen: Observed, level: float) -> Finding:
     """E[P_i(t)] <= calP_i(t), in all directions at once; both are scaled by calP."""
     _, times_, nodes = seen.runs.P.shape[:3]
     share = level / (times_ * nodes)
@@ -114,7 +99,7 @@ def bounded(seen: Seen, level: float) -> Finding:
     return worst(found, BOUND, "largest excess of the mean of P over the bound, relative,")
 
 
-def steady(seen: Seen, level: float) -> Finding:
+def steady(seen: Observed, level: float) -> Finding:
     """H (12) settles: the bound at ten horizons against the steady solution."""
     promised = stand_in(seen.scenario)
     steady_bound = steady_covariance_bound(promised)
@@ -127,7 +112,7 @@ def steady(seen: Seen, level: float) -> Finding:
     return Finding((-apart, -apart, min(0.0, 0.01 - apart)), 0.01, words)
 
 
-def approach(seen: Seen, level: float) -> Finding:
+def approach(seen: Observed, level: float) -> Finding:
     """The distance of the steady bound to S falls as one over the rate."""
     promised = stand_in(seen.scenario)
     S, apart = limit_covariance(promised), []

@@ -16,11 +16,10 @@ from netkf.experiments.checking.laws import (
     Pair,
     distances,
     exact_start,
-    nees_is_chi_squared,
-    not_growing,
     same_laws,
     worst,
 )
+from netkf.experiments.checking.seen import Seen, bounded, nees_is_chi_squared, replay
 from netkf.experiments.checking.statistics import (
     chi_square,
     distance_to,
@@ -127,23 +126,8 @@ class Reference(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observed(Seen):
     """Witnesses of many runs, stacked, with what they are held against."""
-
-    scenario: Scenario
-    runs: Witness
-    seed: int = 0
-
-    @property
-    def count(self) -> int:
-        """Number of runs."""
-        return len(self.runs.P)
-
-    @property
-    def places(self) -> list[str]:
-        """Words for each of the (K, N) places, slot by slot."""
-        nodes = self.scenario.nodes
-        return [f"slot {t}, node {node}" for t in look_at(self.scenario) for node in nodes]
 
     @cached_property
     def reference(self) -> Reference:
@@ -200,20 +184,7 @@ def rows(scenario: Scenario) -> list[Row]:
     ]
 
 
-def replay(seen: Seen, level: float) -> Finding:
-    """Every covariance is what the arrivals of its run make of the start."""
-    P, expected = seen.runs.P, seen.runs.replayed
-    size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
-    apart = np.nan_to_num(np.abs(P - expected) / size, nan=np.inf).max(axis=(-1, -2))
-    run, slot, node = np.unravel_index(int(np.argmax(apart)), apart.shape)
-    words = (
-        f"{apart.size:,} covariances replayed from the arrivals of their runs; the worst in run "
-        f"{run} at {seen.places[slot * len(seen.scenario.nodes) + node]}"
-    )
-    return identity(float(apart.max()), ROUNDING, words)
-
-
-def above_least(seen: Seen, level: float) -> Finding:
+def above_least(seen: Observed, level: float) -> Finding:
     """No path is below the one on which every reading arrives; that one converges to P*."""
     slots = list(look_at(seen.scenario))
     full = everything(seen.scenario, slots[-1])
@@ -226,7 +197,7 @@ def above_least(seen: Seen, level: float) -> Finding:
     return identity(max(0.0, below), ROUNDING, words)
 
 
-def in_support(seen: Seen, level: float) -> Finding:
+def in_support(seen: Observed, level: float) -> Finding:
     """At the end P is the point of the support that its own arrivals spell, up to what the word has
     not yet forgotten of the start.
     """
@@ -244,7 +215,7 @@ def in_support(seen: Seen, level: float) -> Finding:
     return identity(largest, 1e-6, words)
 
 
-def arriving(seen: Seen, level: float) -> Finding:
+def arriving(seen: Observed, level: float) -> Finding:
     """Slots are independent, so counts of arrivals are binomial."""
     pairs = directions(seen.scenario)
     sent, got = seen.runs.sent.sum(axis=0), seen.runs.got.sum(axis=0)
@@ -260,7 +231,7 @@ def arriving(seen: Seen, level: float) -> Finding:
     return worst(found, SHARE, f"largest difference in {int(sent.sum()):,} messages")
 
 
-def law(seen: Seen, level: float) -> Finding:
+def law(seen: Observed, level: float) -> Finding:
     """Each node at each time against filters with independent arrivals."""
     pairs = [
         Pair(f"slot {slot}, node {node}", seen.runs.P[:, k, i], seen.reference.P[i, k])
@@ -270,14 +241,7 @@ def law(seen: Seen, level: float) -> Finding:
     return same_laws(pairs, level)
 
 
-def bounded(seen: Seen, level: float) -> Finding:
-    """The end against half of the time."""
-    P = seen.runs.P
-    nodes = enumerate(seen.scenario.nodes)
-    return not_growing([Pair(f"node {node}", P[:, -2, i], P[:, -1, i]) for i, node in nodes], level)
-
-
-def forgotten(seen: Seen, level: float) -> Finding:
+def forgotten(seen: Observed, level: float) -> Finding:
     """The runs against their own arrivals from a start a thousand times larger."""
     P, restarted = seen.reference
     pairs = [
@@ -308,7 +272,7 @@ def listeners(scenario: Scenario) -> dict[int, ScalarLaw]:
     return laws
 
 
-def cells(seen: Seen, level: float) -> Finding:
+def cells(seen: Observed, level: float) -> Finding:
     """Counts of P between the holes of the support; an outage of k slots has g (1 - g)^k."""
     laws, found = listeners(seen.scenario), []
     for k, exact in laws.items():
@@ -340,7 +304,7 @@ def outage_edges(exact: ScalarLaw) -> FloatArray:
     return np.array(edges)
 
 
-def scalar(seen: Seen, level: float) -> Finding:
+def scalar(seen: Observed, level: float) -> Finding:
     """P at the end against the exact distribution function."""
     laws = listeners(seen.scenario)
     found = [

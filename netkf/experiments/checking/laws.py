@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -93,12 +93,6 @@ def chi_squared(
         least = 0.0 if ratio.low <= 1.0 <= ratio.high else ends[0]
         found.append((Interval(abs(ratio.value - 1.0), least, ends[1]), f"at {places[k]}"))
     return worst(found, NEES, f"largest relative difference of the mean {words} from its freedom")
-
-
-def nees_is_chi_squared(seen: Any, level: float) -> Finding:
-    """Given the exchanges, errors are Gaussian with covariance P at every node and time."""
-    n, nees = seen.scenario.plant.n, seen.runs.nees.reshape(len(seen.runs.P), -1)
-    return chi_squared(nees / n, [n * len(nees)] * nees.shape[1], seen.places, level, "NEES")
 
 
 def exact_start(scenario: Scenario) -> Row:

@@ -17,11 +17,11 @@ from netkf.experiments.checking.exact import (
     EXACT,
     as_computed,
     blocks,
-    replay,
     stand_in,
     whitened,
 )
 from netkf.experiments.checking.laws import exact_start, worst
+from netkf.experiments.checking.seen import Seen, replay
 from netkf.experiments.checking.statistics import Interval, mean_of
 from netkf.experiments.checking.words import look_at, slots_of
 from netkf.scenario.scenario import Scenario
@@ -168,18 +168,8 @@ def _arrived(scenario: Scenario, run: Run, gamma: int) -> dict[tuple[int, int, i
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observed(Seen):
     """Witnesses of many runs, stacked, with what they are held against."""
-
-    scenario: Scenario
-    runs: Witness
-    seed: int = 0
-
-    @property
-    def places(self) -> list[str]:
-        """Words for each of the (K, N) places, slot by slot."""
-        nodes = self.scenario.nodes
-        return [f"slot {t}, node {node}" for t in look_at(self.scenario) for node in nodes]
 
     @cached_property
     def whitened(self) -> FloatArray:
@@ -207,14 +197,14 @@ def rows(scenario: Scenario) -> list[Row]:
     ]
 
 
-def conserved(seen: Seen, level: float) -> Finding:
+def conserved(seen: Observed, level: float) -> Finding:
     """The totals at the end against 1 and N."""
     drift = float(np.nan_to_num(np.abs(seen.runs.drift), nan=np.inf).max())
     words = f"drift of the totals of weight and number in {len(seen.runs.P)} runs"
     return identity(drift, MASS, words)
 
 
-def settled(seen: Seen, level: float) -> Finding:
+def settled(seen: Observed, level: float) -> Finding:
     """P of every node comes to P_inf."""
     limit = push_sum_limits(stand_in(seen.scenario)).P
     apart = np.abs(seen.runs.P - limit).max(axis=(0, 2, 3, 4)) / np.abs(limit).max()
@@ -225,7 +215,7 @@ def settled(seen: Seen, level: float) -> Finding:
     return Finding((margin, margin if not moving else -1.0, 0.0 if moving else margin), 0.0, words)
 
 
-def unbiased(seen: Seen, level: float) -> Finding:
+def unbiased(seen: Observed, level: float) -> Finding:
     """The mean of the whitened errors at the end is 0 in all directions at once."""
     nodes = seen.scenario.nodes
     found = []
@@ -246,7 +236,7 @@ def _normal_reach(level: float, n: int) -> float:
     return float(np.sqrt(2.0 * scipy.special.gammainccinv(n / 2.0, level)))
 
 
-def mean_square(seen: Seen, level: float) -> Finding:
+def mean_square(seen: Observed, level: float) -> Finding:
     """The mean square of the whitened errors at the end is 1 on average over directions."""
     nodes, n = seen.scenario.nodes, seen.scenario.plant.n
     found = []
@@ -258,7 +248,7 @@ def mean_square(seen: Seen, level: float) -> Finding:
     return worst(found, SQUARE, "largest relative difference of mean squares from the exact ones")
 
 
-def certified(seen: Seen, level: float) -> Finding:
+def certified(seen: Observed, level: float) -> Finding:
     """The gamma that Theorem 6 certifies is at least the exact one; by far more than is needed."""
     scenario = stand_in(seen.scenario)
     gamma, needed = minimum_gamma(scenario, "mean-square"), exact_minimum_gamma(scenario)
