@@ -62,7 +62,11 @@ def own_steps(algorithm: object, known: type, steps: tuple[str, ...] = STEPS) ->
     Other weights are understood, they enter the equations.
     """
     mine = type(algorithm)
-    return [name for name in steps if getattr(mine, name, None) is not getattr(known, name, None)]
+    return [
+        name
+        for name in steps
+        if hasattr(known, name) and getattr(mine, name) is not getattr(known, name)
+    ]
 
 
 def not_promised(scenario: Scenario) -> str | None:
