@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
 
 if TYPE_CHECKING:
-    from netkf import parts, theory
+    from netkf import parts, testing, theory
     from netkf.experiments.run import save
     from netkf.experiments.simulate import simulate
     from netkf.scenario.reading import load
@@ -28,10 +28,11 @@ _WHERE = {
     "parts": "netkf.parts",
     "save": "netkf.experiments.run",
     "simulate": "netkf.experiments.simulate",
+    "testing": "netkf.testing",
     "theory": "netkf.theory",
 }
 
-_MODULES = ("parts", "theory")
+_MODULES = ("parts", "testing", "theory")
 
 __all__ = [
     "Belief",
@@ -48,6 +49,7 @@ __all__ = [
     "parts",
     "save",
     "simulate",
+    "testing",
     "theory",
 ]
 
