@@ -9,6 +9,7 @@ from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryErro
 
 if TYPE_CHECKING:
     from netkf import parts, testing, theory
+    from netkf.experiments.ensembles.monte_carlo import Ensemble, monte_carlo
     from netkf.experiments.run import save
     from netkf.experiments.simulate import simulate
     from netkf.scenario.reading import load
@@ -19,12 +20,14 @@ __version__ = "0.1.0"
 
 _WHERE = {
     "Belief": "netkf.scenario.scenario",
+    "Ensemble": "netkf.experiments.ensembles.monte_carlo",
     "Filtering": "netkf.scenario.scenario",
     "Network": "netkf.scenario.scenario",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
     "first_difference": "netkf.trace.run",
     "load": "netkf.scenario.reading",
+    "monte_carlo": "netkf.experiments.ensembles.monte_carlo",
     "parts": "netkf.parts",
     "save": "netkf.experiments.run",
     "simulate": "netkf.experiments.simulate",
@@ -37,6 +40,7 @@ _MODULES = ("parts", "testing", "theory")
 __all__ = [
     "Belief",
     "EngineError",
+    "Ensemble",
     "Filtering",
     "NetkfError",
     "Network",
@@ -46,6 +50,7 @@ __all__ = [
     "TheoryError",
     "first_difference",
     "load",
+    "monte_carlo",
     "parts",
     "save",
     "simulate",

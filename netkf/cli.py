@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import tomllib
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -71,15 +72,21 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"netkf {netkf.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-    run = _command(commands, "run", _run, "simulate a scenario once and keep what happened")
+    run = _command(commands, "run", _run, "simulate a scenario and keep what happened")
+    run.add_argument("--runs", type=_count, help="how many times, with other draws (default: 1)")
     run.add_argument("--seed", type=_seed, help="root seed instead of the scenario's")
     run.add_argument("--engine", default="auto", choices=["auto", "processes", "compiled"])
     run.add_argument("--out", type=Path, help="directory for the run (default: runs/NAME-k)")
+    workers = run.add_mutually_exclusive_group()
+    workers.add_argument("--workers", type=_count, help="processes (default: one a core)")
+    workers.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
     run.add_argument(
         "--trace",
-        default="full",
         choices=["full", "first", "none"],
-        help="which runs leave tables of events and states",
+        help="which runs leave tables of events and states (default: full for one run, else first)",
+    )
+    run.add_argument(
+        "--resume", action="store_true", help="go on with the runs of --out that were stopped"
     )
     run.add_argument("--no-plot", action="store_true", help="no picture")
     theory = _command(commands, "theory", _theory, "what is promised; no simulation")
@@ -106,6 +113,13 @@ def _command(
 def _seed(text: str) -> int:
     if not text.isdecimal() or len(text) > 30:
         words = f"must be a non-negative integer of at most 30 digits, got {quote(text)}"
+        raise argparse.ArgumentTypeError(words)
+    return int(text)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or len(text) > 12 or int(text) < 1:
+        words = f"must be an integer of at least 1, got {quote(text)}"
         raise argparse.ArgumentTypeError(words)
     return int(text)
 
@@ -153,28 +167,35 @@ def _notes(scenario: Scenario) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.experiments.files import missing_modules
-    from netkf.experiments.run import run_to_directory
-    from netkf.experiments.tables import summary_table
-
     scenario = _load(options)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
+    if options.resume and options.out is None:
+        remedy = "add --out DIR with the directory of the run that was stopped"
+        raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
+    if (options.runs or 1) == 1:
+        return _run_once(scenario, options)
+    return _run_many(scenario, options)
+
+
+def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
+    from netkf.experiments.ensembles.directory import clear_unfinished
+    from netkf.experiments.run import run_to_directory
+
+    if options.scheduler is not None:
+        raise ScenarioError("--scheduler", "is for several runs", options.scheduler, "add --runs R")
+    if options.resume and not clear_unfinished(options.out, scenario):
+        print(f"nothing left to do in {options.out}")
+        return 0
     meter = _Meter(scenario.horizon)
-    picture = None if options.no_plot else partial(_picture, scenario)
+    picture = None if options.no_plot else partial(_picture, scenario, "run_picture")
     try:
         finished = run_to_directory(
-            scenario, options.out, options.engine, options.trace, meter, picture
+            scenario, options.out, options.engine, options.trace or "full", meter, picture
         )
     finally:
         meter.close()
-    _notes(scenario)
-    for note in missing_modules(scenario):
-        print(f"note: {note}", file=sys.stderr)
-    print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
-    print()
-    promised = finished.promised
-    print(summary_table(finished.summary, promised.limit_words, promised.notes))
+    _told(scenario, finished)
     rate = finished.events / max(finished.seconds, 1e-9)
     print(f"events: {finished.events:,} in {finished.seconds:.2f} s, {rate:,.0f} per second")
     if finished.status != "complete":
@@ -183,6 +204,57 @@ def _run(options: argparse.Namespace) -> int:
         print(f"note: {words}", file=sys.stderr)
     print(f"written to {finished.directory}")
     return 0
+
+
+def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
+    from netkf.experiments.ensembles.directory import runs_to_directory
+
+    meter = _Countdown()
+    picture = None if options.no_plot else partial(_picture, scenario, "ensemble_picture")
+    try:
+        finished = runs_to_directory(
+            scenario,
+            options.runs,
+            options.out,
+            options.engine,
+            options.trace or "first",
+            workers=options.workers,
+            scheduler=options.scheduler,
+            resume=options.resume,
+            progress=meter,
+            finish=picture,
+        )
+    finally:
+        meter.close()
+    if finished is None:
+        print(f"nothing left to do in {options.out}")
+        return 0
+    _told(scenario, finished)
+    ensemble, seconds = finished.ensemble, max(finished.seconds, 1e-9)
+    print(
+        f"averages over {options.runs:,} runs, +- one standard error; {finished.simulated:,} "
+        f"simulated in {seconds:.2f} s, {finished.simulated / seconds:,.1f} per second"
+    )
+    if ensemble.diverged:
+        words = f"{ensemble.diverged:,} of {options.runs:,} runs diverged and ended early"
+        print(f"status: diverged, {words}")
+        print(f"note: {words}; averages over time are over what they had", file=sys.stderr)
+    print(f"written to {finished.directory}")
+    return 0
+
+
+def _told(scenario: Scenario, finished: Any) -> None:
+    """The table that ends a run, with what to know beforehand."""
+    from netkf.experiments.files import missing_modules
+    from netkf.experiments.tables import summary_table
+
+    _notes(scenario)
+    for note in missing_modules(scenario):
+        print(f"note: {note}", file=sys.stderr)
+    print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
+    print()
+    promised = finished.promised
+    print(summary_table(finished.summary, promised.limit_words, promised.notes))
 
 
 def _divergence(finished: Any) -> str:
@@ -197,13 +269,13 @@ def _divergence(finished: Any) -> str:
     )
 
 
-def _picture(scenario: Scenario, finished: Any) -> None:
+def _picture(scenario: Scenario, name: str, finished: Any) -> None:
     try:
-        from netkf.experiments.plots import run_picture
+        from netkf.experiments import plots
     except ImportError:
         print("no picture: matplotlib is missing (pip install matplotlib)", file=sys.stderr)
         return
-    run_picture(scenario, finished)
+    getattr(plots, name)(scenario, finished)
 
 
 class _Meter:
@@ -226,6 +298,29 @@ class _Meter:
 
     def close(self) -> None:
         if self._shown >= 0:
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+
+class _Countdown:
+    """Runs done and the time left, on a terminal; silence in a pipe."""
+
+    def __init__(self) -> None:
+        self._live, self._shown = sys.stderr.isatty(), False
+        self._began: tuple[float, int] | None = None
+
+    def __call__(self, done: int, wanted: int) -> None:
+        now = time.monotonic()
+        if self._began is None:
+            self._began = now, done
+        if not self._live:
+            return
+        seconds, runs = now - self._began[0], done - self._began[1]
+        left = f", about {seconds * (wanted - done) / runs:.0f} s left" if runs else ""
+        self._shown = True
+        print(f"\r\033[K{done:,} of {wanted:,} runs{left}", end="", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        if self._shown:
             print("\r\033[K", end="", file=sys.stderr, flush=True)
 
 

@@ -12,9 +12,9 @@ from netkf.scenario.scenario import Scenario
 class InterruptedRunError(KeyboardInterrupt):
     """A run was stopped; ``directory`` holds what it had."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, remedy: str = "") -> None:
         self.directory = directory
-        super().__init__(f"what was finished is kept in {directory}")
+        super().__init__(f"what was finished is kept in {directory}{remedy}")
 
 
 def told(scenario: Scenario, error: BaseException, directory: Path | None = None) -> BaseException:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -108,6 +109,16 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
     write_text(directory / "scenario.toml", to_toml(table))
 
 
+def scenario_digest(scenario: Scenario) -> str:
+    """SHA-256 of the scenario as resolved and of the files and modules that go with it."""
+    digest = hashlib.sha256(to_toml(resolved(scenario)).encode())
+    files = {source.name: source.full for source in source_files(scenario)}
+    files |= {f"{name}.py": file for name, file in module_files(scenario).items() if file}
+    for name, file in sorted(files.items()):
+        digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
 def missing_modules(scenario: Scenario) -> list[str]:
     """One line about each module that a run directory needs and does not hold."""
     return [
@@ -159,13 +170,63 @@ class ParquetSink(Sink):
                 table.close(empty)
 
 
+class TraceTables:
+    """``events.parquet`` and ``states.parquet`` of several runs, one after the other."""
+
+    def __init__(self, directory: Path, scenario: Scenario) -> None:
+        self._nodes, self._shown = scenario.nodes, scenario.plant.shown
+        self._events = _Table(directory / "events.parquet")
+        self._states = _Table(directory / "states.parquet")
+        self._gathered: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])
+        self._rows = 0
+
+    def add(
+        self,
+        replica: int,
+        log: np.ndarray,
+        times: FloatArray,
+        x: FloatArray,
+        xhat: FloatArray,
+        P: FloatArray,
+    ) -> None:
+        """All of one run: EVENT rows, and samples as in ``netkf.Run``."""
+        states = state_table(replica, times, self._nodes, x, xhat, P, self._shown)
+        for gathered, columns in zip(
+            self._gathered, (event_columns(log, replica, 0), states), strict=True
+        ):
+            gathered.append(pd.DataFrame(columns))
+        self._rows += max(len(log), len(times) * len(self._nodes))
+        if self._rows >= ROWS:
+            self._flush()
+
+    def _flush(self) -> None:
+        for gathered, table in zip(self._gathered, (self._events, self._states), strict=True):
+            if gathered:
+                table.write(pd.concat(gathered, ignore_index=True))
+                gathered.clear()
+        self._rows = 0
+
+    def close(self) -> None:
+        """Finish the files and give them their names."""
+        self._flush()
+        self._events.close(None)
+        self._states.close(None)
+
+
+def write_table(path: Path, columns: dict[str, Any]) -> None:
+    """A whole Parquet file at once."""
+    table = _Table(path)
+    table.write(columns)
+    table.close(None)
+
+
 class _Table:
     def __init__(self, path: Path) -> None:
         self._path, self._part = path, path.with_name(path.name + ".part")
         self._writer: Any = None
         self._closed = False
 
-    def write(self, columns: dict[str, Any]) -> None:
+    def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
         if self._writer is None:
             self._writer = pq.ParquetWriter(self._part, table.schema, compression="zstd")

@@ -14,7 +14,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from netkf.core.arrays import FloatArray
+from netkf.experiments.ensembles.directory import FinishedEnsemble
 from netkf.experiments.run import Finished
+from netkf.experiments.summary import Promise
 from netkf.scenario.scenario import Scenario
 
 SENSING, RELAY, PROMISE, DARK = "#c1440e", "#3b6ea5", "#222222", "#555555"
@@ -41,13 +43,66 @@ def run_picture(scenario: Scenario, finished: Finished) -> None:
         os.replace(part, path)
 
 
+def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
+    """Write ``run.png``: root mean square errors and square roots of the mean trace of P over time,
+    each with a band of at least two standard errors, against the bound and the limits.
+    """
+    ensemble = finished.ensemble
+    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(9.0, 6.4), layout="constrained")
+        FigureCanvasAgg(figure)
+        above, below = figure.subplots(2, 1)
+        if ensemble.shown:
+            _bands(above, scenario, finished, ensemble.mean_error, ensemble.se_error)
+            above.set(ylabel="root mean square error", xlabel="simulated seconds")
+        else:
+            above.text(0.0, 0.5, "nobody knows the truth, so there are no errors", color=DARK)
+            above.axis("off")
+        _bands(below, scenario, finished, ensemble.mean_P, ensemble.se_P)
+        below.set(ylabel="square root of mean trace P", xlabel="simulated seconds")
+        name = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
+        title = f"{name} ({int(ensemble.runs.max()):,} runs)"
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+        path = finished.directory / "run.png"
+        part = path.with_name("run.png.part")
+        figure.savefig(part, dpi=130, format="png")
+        os.replace(part, path)
+
+
+def _bands(
+    axes: Any,
+    scenario: Scenario,
+    finished: FinishedEnsemble,
+    mean: FloatArray,
+    error: FloatArray,
+) -> None:
+    """Of the traces of (T, N, n, n) matrices; a trace's standard error is at most their sum."""
+    times, promised = finished.ensemble.times, finished.promised
+    trace = np.trace(mean, axis1=2, axis2=3)
+    spread = 2.0 * np.trace(error, axis1=2, axis2=3)
+    _lines(axes, times, np.sqrt(trace), scenario)
+    sensing = [node in scenario.placed for node in scenario.nodes]
+    for k in _evenly(np.arange(len(scenario.nodes))):
+        ends = (np.sqrt(np.maximum(trace[:, k] + s * spread[:, k], 0.0)) for s in (-1.0, 1.0))
+        colour = SENSING if sensing[k] else RELAY
+        axes.fill_between(times, *ends, color=colour, alpha=0.2, lw=0)
+    _promises(axes, times, promised)
+    _scale(axes, np.sqrt(trace))
+    _legend(axes)
+
+
+def _evenly(places: np.ndarray) -> np.ndarray:
+    """At most MOST_LINES of them."""
+    if len(places) <= MOST_LINES:
+        return places
+    return np.asarray(places[np.linspace(0, len(places) - 1, MOST_LINES).astype(int)])
+
+
 def _lines(axes: Any, times: FloatArray, values: FloatArray, scenario: Scenario) -> None:
     """A thin line a node, sensing nodes on top; at most MOST_LINES evenly chosen ones."""
     sensing = np.array([node in scenario.placed for node in scenario.nodes])
     for group, colour, order in ((~sensing, RELAY, 1), (sensing, SENSING, 2)):
-        places = np.flatnonzero(group)
-        if len(places) > MOST_LINES:
-            places = places[np.linspace(0, len(places) - 1, MOST_LINES).astype(int)]
+        places = _evenly(np.flatnonzero(group))
         segments = [np.column_stack([times, values[:, k]]) for k in places]
         width = 1.1 if len(scenario.nodes) <= 12 else 0.5
         axes.add_collection(
@@ -109,6 +164,14 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
     times, promised = np.array(finished.samples.times), finished.promised
     root = np.sqrt(np.maximum(np.array(finished.samples.trace), 0.0))
     _lines(axes, times, root, scenario)
+    _promises(axes, times, promised)
+    shown = root if promised.bound is None else np.concatenate([root, np.sqrt(promised.bound)])
+    _scale(axes, shown)
+    axes.set(ylabel="square root of trace P", xlabel="simulated seconds")
+    _legend(axes)
+
+
+def _promises(axes: Any, times: FloatArray, promised: Promise) -> None:
     if promised.bound is not None:
         bound = np.sqrt(promised.bound)
         axes.plot(
@@ -135,10 +198,6 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
     ):
         if math.isfinite(value):
             axes.axhline(math.sqrt(value), color="#2e8b57", ls=style, lw=1.1, label=words)
-    shown = root if promised.bound is None else np.concatenate([root, np.sqrt(promised.bound)])
-    _scale(axes, shown)
-    axes.set(ylabel="square root of trace P", xlabel="simulated seconds")
-    _legend(axes)
 
 
 def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) -> None:

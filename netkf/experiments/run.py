@@ -150,34 +150,40 @@ def _summary(
     return summary
 
 
+def versions() -> dict[str, str]:
+    """Of what decides about the last bit."""
+    return {
+        "netkf": netkf.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
+
+
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """``manifest.json`` of a directory that holds one run."""
+    """``manifest.json`` of a directory of one run, or of ``wanted`` runs from ``replica`` on."""
 
     directory: Path
     name: str
     seed: int
     replica: int
     engine: str
+    wanted: int = 1
 
     def write(
         self,
         status: str,
         totals: dict[str, Any],
-        done: bool = False,
+        done: int = 0,
         error: BaseException | None = None,
     ) -> None:
         """Say how the run stands."""
         manifest: dict[str, Any] = {
             "name": self.name,
-            "versions": {
-                "netkf": netkf.__version__,
-                "numpy": np.__version__,
-                "python": platform.python_version(),
-            },
+            "versions": versions(),
             "seed": self.seed,
             "replica": self.replica,
-            "runs": {"wanted": 1, "done": int(done)},
+            "runs": {"wanted": self.wanted, "done": int(done)},
             "engine": self.engine,
             "status": status,
             **totals,

@@ -78,8 +78,9 @@ def summary_table(
     if "conserved" in summary:
         lines.append("mass: " + _conserved(summary["conserved"]))
     lines.append(
-        f"messages: {sent['sent']:,} sent, {sent['delivered']:,} delivered, {sent['lost']:,} lost"
-        + (f", {sent['in_flight']:,} on their way at the end" if sent["in_flight"] else "")
+        f"messages: {_count(sent['sent'])} sent, {_count(sent['delivered'])} delivered, "
+        f"{_count(sent['lost'])} lost"
+        + (f", {_count(sent['in_flight'])} on their way at the end" if sent["in_flight"] else "")
     )
     return "\n".join(lines)
 
@@ -100,4 +101,13 @@ def _key(value: float | None) -> float:
 
 def _cells(name: str, row: dict[str, Any]) -> list[str]:
     keys = ("rms_error", "mean_trace", "bound", "ratio", "mean_nees")
-    return [name, *(number(row[key]) for key in keys)]
+    return [name, *(number(row[key]) + _give_or_take(row.get(f"{key}_se")) for key in keys)]
+
+
+def _give_or_take(error: float | None) -> str:
+    known = error is not None and math.isfinite(error)
+    return f" +- {error:.1g}" if known else ""
+
+
+def _count(value: float) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"

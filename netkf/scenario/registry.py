@@ -138,7 +138,7 @@ def _imported(family: str, kind: str, folder: Path) -> type[Part]:
     places = [place for place in (str(folder), str(Path.cwd())) if place not in sys.path]
     sys.path[:0] = places
     try:
-        _forget_other(module_name, folder)
+        forget_other(module_name, folder)
         found = getattr(importlib.import_module(module_name), class_name)
     except (Exception, SystemExit) as error:
         raise ScenarioError(
@@ -165,7 +165,7 @@ def _imported(family: str, kind: str, folder: Path) -> type[Part]:
     return found
 
 
-def _forget_other(module_name: str, folder: Path) -> None:
+def forget_other(module_name: str, folder: Path) -> None:
     """A module beside the scenario wins over one of that name imported from elsewhere."""
     beside, loaded = folder / f"{module_name}.py", sys.modules.get(module_name)
     other = getattr(loaded, "__file__", None)

@@ -128,6 +128,13 @@ class Scenario(Part):
 
         check(self)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What travels when it is pickled: the settings, and the network, which may have been read
+        from a file.
+        """
+        kept = {field.name for field in dataclasses.fields(self)} | {"_folder", "topology"}
+        return {name: value for name, value in self.__dict__.items() if name in kept}
+
     def __repr__(self) -> str:
         kinds = (type(self.plant), type(self.network.graph), type(self.filter.algorithm))
         plant, graph, algorithm = (kind.__name__ for kind in kinds)

@@ -54,7 +54,19 @@ EVENT_COLUMNS = ("run", "seq", "t", "kind", "node", "peer", "message", "phase", 
 
 def state_columns(n: int) -> list[str]:
     """Columns of the table of states for an n-dimensional plant; P by rows of its upper half."""
-    join = "" if n <= 10 else "_"
-    upper = [f"P{i}{join}{j}" for i in range(n) for j in range(i, n)]
     states = [f"{name}{i}" for name in ("x", "xhat") for i in range(n)]
-    return ["run", "t", "node", *states, *upper, "sq_error", "nees"]
+    return ["run", "t", "node", *states, *_upper("P", n), "sq_error", "nees"]
+
+
+def ensemble_columns(n: int) -> list[str]:
+    """Columns of the table of an ensemble: means over ``runs`` of P, of E = (x - xhat)(x - xhat)'
+    and of NEES, each followed by its standard error.
+    """
+    P, E = _upper("P", n), _upper("E", n)
+    matrices = [*P, *(f"{name}_se" for name in P), *E, *(f"{name}_se" for name in E)]
+    return ["t", "node", "runs", *matrices, "nees", "nees_se"]
+
+
+def _upper(name: str, n: int) -> list[str]:
+    join = "" if n <= 10 else "_"
+    return [f"{name}{i}{join}{j}" for i in range(n) for j in range(i, n)]

@@ -1,0 +1,163 @@
+"""One run reduced to a tally, and tallies of neighbours merged into one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams
+from netkf.engines.base import silent
+from netkf.experiments.ensembles.moments import Moments, merge_moments, single
+from netkf.experiments.simulate import choose_engine, collect
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import MemorySink, Recorder
+from netkf.trace.run import Run, errors
+
+ROUNDING = 4.0 * np.finfo(float).eps
+MESSAGES = ("sent", "delivered", "lost", "in_flight")
+
+
+class Trace(NamedTuple):
+    """Everything of one run: events as EVENT rows, samples as in ``netkf.Run``."""
+
+    replica: int
+    log: np.ndarray
+    times: FloatArray
+    x: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+
+
+class Tally(NamedTuple):
+    """Some runs, reduced.
+
+    ``samples``: (T, N, 2 u + 1) upper triangles of P and of e e' with e = x - xhat, then NEES;
+    size (T, 1, 1). ``averages``: (N + 1, 3) of every run: mean square error, mean trace of P and
+    mean NEES over the samples after time 0, of the nodes and of all; size (1, 1). ``messages``:
+    (4,) as MESSAGES, size (1,). ``totals`` are events, diverged runs. ``conserved``: of each sum
+    its mean at the start and at the end, then the largest relative drift. ``rounding_from`` is the
+    first sample of any run at which rounding blurs the errors, inf where none. ``fingerprint`` is
+    that of the first run. ``traces`` are those that were asked for, in order.
+    """
+
+    samples: Moments
+    averages: Moments
+    messages: Moments
+    totals: np.ndarray
+    conserved: dict[str, tuple[Moments, float]]
+    rounding_from: float
+    fingerprint: str
+    traces: tuple[Trace, ...] = ()
+
+    @property
+    def runs(self) -> int:
+        """How many runs are in it."""
+        return int(self.averages.size[0, 0])
+
+
+def merge(a: Tally, b: Tally) -> Tally:
+    """The runs of ``a`` followed by those of ``b``."""
+    conserved = {
+        name: (merge_moments(a.conserved[name][0], b.conserved[name][0]), max(drifts, key=abs))
+        for name, drifts in (
+            (name, (a.conserved[name][1], b.conserved[name][1])) for name in a.conserved
+        )
+    }
+    return Tally(
+        merge_moments(a.samples, b.samples),
+        merge_moments(a.averages, b.averages),
+        merge_moments(a.messages, b.messages),
+        a.totals + b.totals,
+        conserved,
+        min(a.rounding_from, b.rounding_from),
+        a.fingerprint,
+        a.traces + b.traces,
+    )
+
+
+class _Samples(MemorySink):
+    """Keeps samples, and events where they are wanted."""
+
+    def __init__(self, traced: bool) -> None:
+        super().__init__()
+        self._traced = traced
+
+    def events(self, rows: np.ndarray) -> None:
+        if self._traced:
+            super().events(rows)
+
+
+def reduced_run(
+    scenario: Scenario, seed: int, replica: int, engine: str = "auto", traces: int = 0
+) -> Tally:
+    """Simulate one replica and reduce it; the first ``traces`` replicas keep everything too."""
+    traced = replica < traces
+    memory, chosen = _Samples(traced), choose_engine(engine, scenario)
+    recorder = Recorder([memory])
+    status = chosen.run(scenario, Streams(seed, replica), recorder, silent)
+    run = collect(scenario, memory, recorder, seed, replica, chosen.name, status)
+    return _tally(run, recorder, scenario.times, traced)
+
+
+def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Tally:
+    """A sample at which a node's estimate or covariance is no longer finite is left out."""
+    diverged = run.status == "diverged"
+    kept = len(run.times) - 1 if diverged else len(run.times)
+    x, xhat, P = run.x[:kept], run.xhat[:kept], run.P[:kept]
+    sq_error, nees = errors(x, xhat, P)
+    trace = np.trace(P, axis1=2, axis2=3)
+    blurred = _rounding_from(run.times[:kept], x, P)
+    used = _after_start(run.times[:kept], blurred if diverged else np.inf)
+    averages = np.stack([_mean(values[used]) for values in (sq_error, trace, nees)], axis=1)
+    lost = recorder.count("lost") + recorder.count("late")
+    sent, delivered = recorder.count("send"), recorder.count("deliver")
+    return Tally(
+        single(*_padded(_columns(x, xhat, P, nees), len(wanted))),
+        single(np.vstack([averages, averages.mean(axis=0)]), np.ones((1, 1))),
+        single(np.array([sent, delivered, lost, sent - delivered - lost], float), np.ones(1)),
+        np.array([recorder.total, int(diverged)]),
+        {
+            name: (single(np.array(sums), np.ones(1)), (sums[1] - sums[0]) / sums[0])
+            for name, sums in run.sums.items()
+        },
+        blurred,
+        run.fingerprint,
+        (Trace(run.replica, run.log, run.times, run.x, run.xhat, run.P),) if traced else (),
+    )
+
+
+def _columns(x: FloatArray, xhat: FloatArray, P: FloatArray, nees: FloatArray) -> FloatArray:
+    i, j = np.triu_indices(x.shape[1])
+    e = x[:, None, :] - xhat
+    with np.errstate(over="ignore"):
+        return np.concatenate([P[:, :, i, j], e[:, :, i] * e[:, :, j], nees[:, :, None]], axis=2)
+
+
+def _padded(values: FloatArray, length: int) -> tuple[FloatArray, FloatArray]:
+    """Zeros for samples that are missing at the end, and 1 or 0 (T, 1, 1) for those that exist."""
+    whole = np.zeros((length, *values.shape[1:]))
+    whole[: len(values)] = values
+    return whole, (np.arange(length) < len(values)).astype(float)[:, None, None]
+
+
+def _after_start(times: FloatArray, end: float) -> np.ndarray:
+    """Places of the samples that averages over time are over, as in the summary of one run."""
+    for wanted in ((times > 0.0) & (times < end), times > 0.0):
+        if wanted.any():
+            return np.flatnonzero(wanted)
+    return np.arange(len(times))
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
+
+
+def _rounding_from(times: FloatArray, x: FloatArray, P: FloatArray) -> float:
+    if not len(times):
+        return np.inf
+    least = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
+    deviation = 0.01 * np.sqrt(np.maximum(least, 0.0))
+    blurred = (ROUNDING * np.abs(x).max(axis=1) > deviation) & (deviation > 0.0)
+    return float(times[np.argmax(blurred)]) if blurred.any() else np.inf
