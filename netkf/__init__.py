@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from netkf.experiments.ensembles.monte_carlo import Ensemble, monte_carlo
     from netkf.experiments.run import save
     from netkf.experiments.simulate import simulate
+    from netkf.experiments.studies.compare import compare
+    from netkf.experiments.studies.size import size
+    from netkf.experiments.studies.sweep import sweep
     from netkf.scenario.reading import load
     from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
     from netkf.trace.run import Run, first_difference
@@ -25,12 +28,15 @@ _WHERE = {
     "Network": "netkf.scenario.scenario",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
+    "compare": "netkf.experiments.studies.compare",
     "first_difference": "netkf.trace.run",
     "load": "netkf.scenario.reading",
     "monte_carlo": "netkf.experiments.ensembles.monte_carlo",
     "parts": "netkf.parts",
     "save": "netkf.experiments.run",
     "simulate": "netkf.experiments.simulate",
+    "size": "netkf.experiments.studies.size",
+    "sweep": "netkf.experiments.studies.sweep",
     "testing": "netkf.testing",
     "theory": "netkf.theory",
 }
@@ -48,12 +54,15 @@ __all__ = [
     "Scenario",
     "ScenarioError",
     "TheoryError",
+    "compare",
     "first_difference",
     "load",
     "monte_carlo",
     "parts",
     "save",
     "simulate",
+    "size",
+    "sweep",
     "testing",
     "theory",
 ]
