@@ -40,10 +40,11 @@ def sweep_picture(title: str, swept: Swept) -> bool:
         else:
             _two_keys(axes, places, table, keys[1])
         axes.set_xlabel(keys[0])
-        axes.set_ylabel("RMS error, units of the state")
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.04)
         axes.legend(frameon=False, fontsize=8)
+        bars = "; bars: two standard errors, shared draws" if table["runs"].max() > 1 else ""
+        axes.set_ylabel(f"RMS error, units of the state{bars}", fontsize=8)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         path = swept.directory / "sweep.png"
         part = path.with_name("sweep.png.part")
@@ -59,6 +60,9 @@ def _places(axes: Any, values: pd.Series[Any]) -> FloatArray:
         places = values.to_numpy(dtype=np.float64)
         if places.min() > 0.0 and places.max() > SPREAD * places.min():
             axes.set_xscale("log")
+            ticks = np.unique(places)
+            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+            axes.minorticks_off()
         return places
     texts = values.astype(str)
     names = list(dict.fromkeys(texts))

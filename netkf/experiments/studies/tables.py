@@ -54,7 +54,8 @@ def sizing_text(found: Sizing) -> str:
         for p in sorted(found.probes)
     ]
     if found.by == "theory":
-        header, rows = [*header[:2], header[-1]], [[*row[:2], row[-1]] for row in rows]
+        header = [*header[:2], header[-1]]
+        rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(found.probes)]
     lines = [table(header, rows), ""]
     lines += [answer(found), f"{found.target.quantity}: {found.quantity}", f"sure: {found.sure}"]
     return "\n".join(lines)
@@ -65,7 +66,9 @@ def answer(found: Sizing) -> str:
     values = [probe.value for probe in found.probes]
     span = f"{min(values):g} .. {max(values):g}"
     if found.value is None:
-        return f"no value of {found.key} in {span} reaches {found.target}"
+        undecided = any(probe.target == "undecided" for probe in found.probes)
+        words = "was shown to reach" if undecided else "reaches"
+        return f"no value of {found.key} in {span} {words} {found.target}"
     which = "largest" if found.grows else "smallest"
     if found.misses is None:
         return f"{found.key} = {found.value:g}: all of {span} reaches {found.target}"
