@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from netkf.experiments.run import save
     from netkf.experiments.simulate import simulate
     from netkf.experiments.studies.compare import compare
+    from netkf.experiments.studies.consistency import consistency
     from netkf.experiments.studies.size import size
     from netkf.experiments.studies.sweep import sweep
     from netkf.scenario.reading import load
@@ -29,6 +30,7 @@ _WHERE = {
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
     "compare": "netkf.experiments.studies.compare",
+    "consistency": "netkf.experiments.studies.consistency",
     "first_difference": "netkf.trace.run",
     "load": "netkf.scenario.reading",
     "monte_carlo": "netkf.experiments.ensembles.monte_carlo",
@@ -55,6 +57,7 @@ __all__ = [
     "ScenarioError",
     "TheoryError",
     "compare",
+    "consistency",
     "first_difference",
     "load",
     "monte_carlo",

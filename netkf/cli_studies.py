@@ -1,4 +1,4 @@
-"""The commands about many scenarios: sweep, size, compare."""
+"""The commands about many scenarios: sweep, size, consistency, compare."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Command = Callable[[argparse.Namespace], int]
 Add = Callable[[str, Command, str], argparse.ArgumentParser]
 Load = Callable[[argparse.Namespace], "Scenario"]
-NOT_REACHED = 1
+NOT_KEPT = 1
 
 
 def add_commands(
@@ -45,7 +45,11 @@ def add_commands(
         "--runs", type=count, default=1000, help="most runs at a value (default: 1000)"
     )
     sized.add_argument("--confidence", type=float, default=0.95, help="of all decisions together")
-    for command in (swept, sized):
+    words = "whether P says what the errors are: NEES and NIS, and what they should be"
+    judged = scenario_command("consistency", partial(_consistency, load), words)
+    judged.add_argument("--runs", type=count, default=50, help="how many runs (default: 50)")
+    judged.add_argument("--confidence", type=float, default=0.95, help="of all verdicts together")
+    for command in (swept, sized, judged):
         command.add_argument("--seed", type=seed, help="root seed instead of the scenario's")
         command.add_argument("--engine", default="auto", choices=["auto", "processes", "compiled"])
         workers = command.add_mutually_exclusive_group()
@@ -58,7 +62,7 @@ def add_commands(
     compared.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
     compared.add_argument("--confidence", type=float, default=0.95, help="of all marks together")
     compared.set_defaults(command=_compare)
-    for command in (swept, sized, compared):
+    for command in (swept, sized, judged, compared):
         command.add_argument("--json", action="store_true", help="one JSON document, nothing else")
 
 
@@ -146,7 +150,32 @@ def _size(load: Load, options: argparse.Namespace) -> int:
         print(sizing_text(found))
     if not found:
         print(f"netkf: {answer(found)}", file=sys.stderr)
-        return NOT_REACHED
+        return NOT_KEPT
+    return 0
+
+
+def _consistency(load: Load, options: argparse.Namespace) -> int:
+    from netkf.experiments.studies.consistency import consistency
+    from netkf.experiments.studies.tables import consistency_text
+
+    found = consistency(
+        load(options),
+        options.runs,
+        confidence=options.confidence,
+        workers=options.workers,
+        scheduler=options.scheduler,
+        engine=options.engine,
+    )
+    if options.json:
+        _print_json({**vars(found), "rows": [vars(row) for row in found.rows]})
+    else:
+        print(f"{found.scenario}\n\n{consistency_text(found)}")
+    if not found:
+        nodes = [str(row.node) for row in found.rows if row.verdict.startswith("BROKEN")]
+        print(
+            f"netkf: errors are not what they should be at node {', '.join(nodes)}", file=sys.stderr
+        )
+        return NOT_KEPT
     return 0
 
 

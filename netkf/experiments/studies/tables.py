@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from netkf.experiments.studies.compare import Comparison, Entry
+from netkf.experiments.studies.consistency import Consistency
 from netkf.experiments.studies.size import Sizing
 from netkf.experiments.tables import number, table
 
@@ -77,6 +78,38 @@ def answer(found: Sizing) -> str:
     return (
         f"{found.key} = {found.value:g} is the {which} that reaches {found.target}; "
         f"{found.misses:g} {words}"
+    )
+
+
+def consistency_text(found: Consistency) -> str:
+    """A row a node, and what the numbers should be."""
+    header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
+    rows = [
+        [
+            str(row.node),
+            f"{number(row.nees)} +- {row.width:.1g}",
+            number(row.expected),
+            f"{row.inside:.0%}",
+            number(row.nis),
+            number(row.expected_nis),
+            row.verdict,
+        ]
+        for row in found.rows
+    ]
+    if len(rows) > MOST_ROWS:
+        middle = [f"({len(rows) - MOST_ROWS} more)", *[""] * (len(header) - 1)]
+        rows = [*rows[: MOST_ROWS // 2], middle, *rows[-MOST_ROWS // 2 :]]
+    ends = f"{found.low:.4g} .. {found.high:.4g}"
+    scaled = f"{found.low / found.n:.4g} .. {found.high / found.n:.4g}"
+    return "\n".join(
+        [
+            table(header, rows),
+            "",
+            f"{found.runs:,} runs, n = {found.n}; +-: half width of the interval on the difference "
+            f"from what NEES should be, all nodes together at confidence {found.confidence:g}",
+            f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
+            f"chi-square bounds at {found.confidence:g} where P is exact",
+        ]
     )
 
 
