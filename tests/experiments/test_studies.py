@@ -12,7 +12,16 @@ import netkf
 from netkf.cli import main
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.experiments.studies.compare import compare
-from netkf.experiments.studies.figures import Figures, bound_traces, central_trace
+from netkf.experiments.studies.figures import (
+    Figures,
+    bound_traces,
+    central_trace,
+    expected_errors_known,
+    one_expected_run,
+    one_run,
+    overall,
+    together,
+)
 from netkf.experiments.studies.size import size
 from netkf.experiments.studies.sweep import sweep, sweep_to_directory
 from netkf.experiments.studies.targets import Target, by_simulation, parse_target
@@ -275,6 +284,28 @@ def test_simulation_brackets_what_a_long_simulation_says(build):
     missed = [p.value for p in found.probes if p.target == "missed"]
     check = netkf.monte_carlo(scenario.replace({key: max(missed)}), runs=120, seed=99, workers=1)
     assert check.average[:-1, 1].max() + 4.0 * check.se_average[:-1, 1].max() > 1.37
+
+
+def test_exact_errors_given_the_events_have_the_mean_of_squared_ones(build):
+    """And so little spread that the first batch decides what 200 runs would not."""
+    network = {"graph": {"kind": "path", "nodes": 2}}
+    network["activation"] = {"kind": "matching", "protocol": "one-edge", "lazy": 0.5}
+    network["channel"] = {"loss": {"kind": "bernoulli", "delivery": 0.5}}
+    sensors = [{"nodes": [0], "H": [[1.0]], "R": [[0.5]]}]
+    changes = {**SCALAR, "network": network, "sensors": sensors, "filter": {"kind": "gossip"}}
+    scenario = build(**changes)
+    assert expected_errors_known(scenario)
+    exact, plain = (
+        together([task(scenario, 0, k) for k in range(60)]) for task in (one_expected_run, one_run)
+    )
+    one, other = (overall(found.mean_square) for found in (exact, plain))
+    assert abs(one.value - other.value) < 4.0 * np.hypot(one.error, other.error)
+    assert one.error < 0.7 * other.error
+    assert overall(exact.trace) == overall(plain.trace)
+    found = size(
+        scenario, "network.channel.loss.delivery", 0.1, 1.0, "worst_rms<=2.4", runs=32, workers=1
+    )
+    assert "exact expected squared error" in found.quantity
 
 
 def test_integers_are_searched_as_integers(ring):

@@ -14,8 +14,11 @@ from netkf.algorithms.slot import SlotCentral, SlotModel
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.experiments.ensembles.tallies import reduced_run
+from netkf.experiments.simulate import simulate
 from netkf.scenario.scenario import Filtering, Scenario
-from netkf.theory import covariance_bound, riccati_step
+from netkf.theory import covariance_bound, error_covariance, riccati_step
+
+MOST_ERRORS = 24
 
 
 class Figures(NamedTuple):
@@ -39,6 +42,35 @@ def one_run(scenario: Scenario, seed: int, replica: int, engine: str = "auto") -
 def together(runs: Sequence[Figures]) -> Figures:
     """The figures of several runs, stacked."""
     return Figures(*(np.stack(values) for values in zip(*runs, strict=True)))
+
+
+def one_expected_run(scenario: Scenario, seed: int, replica: int, engine: str = "auto") -> Figures:
+    """As ``one_run``, with the expected square of the error given the events of the run: what luck
+    with noise adds is left out, and far fewer runs are enough.
+    """
+    run = simulate(scenario, seed, replica, engine)
+    if run.status != "complete":
+        return one_run(scenario, seed, replica, engine)
+    square, trace = (
+        averaged(scenario, np.trace(matrices, axis1=2, axis2=3))
+        for matrices in (error_covariance(scenario, run), run.P)
+    )
+    sent, arrived = run.count("send"), run.count("deliver")
+    lost = run.count("lost") + run.count("late")
+    messages = np.array([sent, arrived, lost, sent - arrived - lost], dtype=np.float64)
+    return Figures(square, trace, messages, np.zeros(1, dtype=np.int64))
+
+
+def expected_errors_known(scenario: Scenario) -> bool:
+    """Whether ``one_expected_run`` can be done, and in about the time of a few runs."""
+    small = len(scenario.nodes) * scenario.plant.n <= MOST_ERRORS
+    if not (scenario.slotted and small and scenario.drawn):
+        return False
+    try:
+        error_covariance(scenario, simulate(scenario))
+    except TheoryError:
+        return False
+    return True
 
 
 class Estimate(NamedTuple):

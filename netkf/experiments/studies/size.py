@@ -14,7 +14,14 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import choice, integer, number
 from netkf.experiments.ensembles.replicas import replicate
 from netkf.experiments.simulate import choose_engine
-from netkf.experiments.studies.figures import Figures, central_trace, one_run, together
+from netkf.experiments.studies.figures import (
+    Figures,
+    central_trace,
+    expected_errors_known,
+    one_expected_run,
+    one_run,
+    together,
+)
 from netkf.experiments.studies.pools import shared_pool
 from netkf.experiments.studies.targets import (
     QUANTITIES,
@@ -32,6 +39,8 @@ if TYPE_CHECKING:
 REACHED, MISSED, UNDECIDED = "reached", "missed", "undecided"
 LOAD = "load it first: netkf.size(netkf.load(path), ...)"
 FIRST_BATCH = 16
+CLOSE = 1.25
+"""Values whose ratio is below it are not told apart further once one of them is undecided."""
 MOST_PROBES = {"theory": 40, "simulation": 16}
 DIGITS = {"theory": 4, "simulation": 2}
 """Significant digits of the values that are tried."""
@@ -102,8 +111,10 @@ def size(
     ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: theory
     where it has an answer. By simulation, runs are added at each value until an interval decides,
     ``runs`` at most; every value meets the same draws, and all decisions together are right with
-    probability ``confidence``. The quantity is taken to be monotone in the key; that is checked at
-    the values that are tried.
+    probability ``confidence``. Where the exact covariance of the errors given the events of a run
+    is known and cheap (small networks in slots) it stands for the squared errors, which takes far
+    fewer runs. The quantity is taken to be monotone in the key; that is checked at the values that
+    are tried.
 
     Raises ScenarioError for a key, a range or a target that is wrong, TheoryError with
     ``by="theory"`` where theory does not tell.
@@ -125,9 +136,12 @@ def size(
     with shared_pool(base, runs, workers, executor, scheduler) as handed:
         search = _Search(base, key, wanted, whole, "simulation", progress)
         level = (1.0 - sure) / (MOST_PROBES["simulation"] * _looks(runs))
-        task = partial(one_run, engine=engine)
+        exact = wanted.of_errors and expected_errors_known(base.replace({key: low}))
+        task = partial(one_expected_run if exact else one_run, engine=engine)
         decide = partial(search.simulation, task=task, runs=runs, level=level, handed=handed)
         words = f"{QUANTITIES[wanted.quantity]}, over the runs"
+        if exact:
+            words += ", each with its exact expected squared error given its events"
         return search.found(low, high, decide, sure, words)
 
 
@@ -228,6 +242,8 @@ class _Search:
                 reached = self._tried(middle, decide).target == REACHED
                 value, misses = (middle, misses) if reached else (value, middle)
                 self._ends = value, misses
+                if self._blurred(misses) and max(value, misses) <= CLOSE * min(value, misses):
+                    break
         else:
             misses = good.value
             self._tried(self._middle(low, high) or low, decide)
@@ -250,6 +266,10 @@ class _Search:
         self._ends = good, bad
         while len(self.probes) < MOST_PROBES[self._by]:
             yield self._middle(*sorted(self._ends))
+
+    def _blurred(self, value: float) -> bool:
+        """Whether a value stayed undecided: then noise hides where the target is reached."""
+        return any(p.value == value and p.target == UNDECIDED for p in self.probes)
 
     def _tried(self, value: float, decide: Callable[[float], Probe]) -> Probe:
         self.probes.append(decide(value))
