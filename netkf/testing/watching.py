@@ -174,7 +174,10 @@ class Watched:
         except NetkfError as error:
             fail(where, f"failed: {error}")
         except Exception as error:
-            raise AssertionError(f"{where}: failed with {in_words(error)}") from error
+            singular = isinstance(error, np.linalg.LinAlgError)
+            remedy = "; set inverts = True where covariances must not be singular"
+            words = f"{where}: failed with {in_words(error)}{remedy if singular else ''}"
+            raise AssertionError(words) from error
         demand(
             global_randomness() == before,
             where,

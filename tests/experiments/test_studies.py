@@ -26,6 +26,7 @@ from netkf.experiments.studies.size import size
 from netkf.experiments.studies.sweep import sweep, sweep_to_directory
 from netkf.experiments.studies.targets import Target, by_simulation, parse_target
 from netkf.experiments.studies.variations import parse_grid, parse_interval
+from netkf.scenario.reading import from_table
 from tests.conftest import SCENARIOS
 
 RING = str(SCENARIOS / "poisson_ring.toml")
@@ -83,7 +84,7 @@ def test_grids_are_lists_ranges_tables_and_words():
     [
         (["sweep", RING, "--vary", "rate"], "--vary: must be KEY.PATH=VALUE"),
         (["sweep", RING, "--vary", f"{RATE}=1,2", "--vary", f"{RATE}=3"], "is varied twice"),
-        (["sweep", RING, "--vary", f"{RATE}=1,-2"], f"{RATE}: must be a finite number above 0"),
+        (["sweep", RING, "--vary", f"{RATE}=1,-2"], f"at {RATE} = -2: {RATE}: must be a finite"),
         (["sweep", RING, "--vary", "network.activation.rat=1"], "is not a key here"),
         (["sweep", RING, "--vary", f"{RATE}=1:5:1"], "must be START:STOP:COUNT"),
         (["sweep", RING, "--vary", f"{RATE}=a:b:3"], "must be START:STOP:COUNT"),
@@ -117,7 +118,7 @@ def test_grids_are_lists_ranges_tables_and_words():
         ),
         (
             ["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms<=1", "--runs", "3"],
-            "--runs: must be an integer of at least 16",
+            "--runs: must be an integer of at least 32",
         ),
         (
             ["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms<=1", "--confidence", "2"],
@@ -374,6 +375,31 @@ def test_intervals_hold_as_often_as_they_say():
         misses += not interval.low <= 1.0 <= interval.high
     assert misses <= scipy.stats.binom.ppf(0.999, 300, level)
     assert parse_target(" worst_rms <= 0.5 ") == Target("worst_rms", 0.5)
+
+
+def test_a_run_that_diverges_has_errors_without_end():
+    square = np.ones((20, 2))
+    diverged = np.zeros((20, 1))
+    figures = Figures(square, square, np.zeros((20, 4)), diverged)
+    assert by_simulation(figures, Target("worst_rms", 2.0), 0.05, None).high == 1.0
+    diverged[3] = 1
+    interval = by_simulation(figures, Target("worst_rms", 2.0), 0.05, None)
+    assert interval.low == interval.high == np.inf
+
+
+def test_errors_of_a_truth_that_nobody_knows_are_no_target(tmp_path):
+    readings = "".join(f"{k}.0,0,{k}.5\n" for k in range(7))
+    (tmp_path / "r.csv").write_text(f"t,node,y0\n{readings}")
+    plant = {"kind": "unknown", "F": [[1.0]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
+    sensor = {"kind": "recorded", "nodes": [0], "path": "r.csv", "H": [[1.0]], "R": [[0.5]]}
+    table = {"format": 1, "name": "real", **SCALAR, "plant": plant, "sensors": [sensor]}
+    table |= {"network": {"graph": {"kind": "path", "nodes": 2}}, "filter": {"kind": "local"}}
+    scenario = from_table({**table, "horizon": 6.0}, tmp_path)
+    with pytest.raises(ScenarioError, match="nobody knows the truth"):
+        size(scenario, "horizon", 2.0, 6.0, "worst_rms<=5")
+    table = sweep(scenario, {"horizon": [3.0, 6.0]}, workers=1)
+    assert table["worst_rms"].isna().all()
+    assert (table["mean_trace"] > 0.0).all()
 
 
 # Comparisons

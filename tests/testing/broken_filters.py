@@ -241,3 +241,10 @@ class Integers(Hybrid):
 @says("Unmade: could not be made with the settings")
 class Unmade(Hybrid):
     pass
+
+
+@says("Inverts.init: failed with LinAlgError: Singular matrix; set inverts = True", epsilon=0.3)
+class Inverts(Hybrid):
+    def init(self, model, mean, cov):
+        _ = np.linalg.inv(cov)
+        return super().init(model, mean, cov)

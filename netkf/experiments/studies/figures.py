@@ -82,7 +82,8 @@ class Estimate(NamedTuple):
 
 def over_runs(values: FloatArray) -> Estimate:
     """Of one value a run (R,)."""
-    spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+    with np.errstate(over="ignore", invalid="ignore"):
+        spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
     return Estimate(float(values.mean()), spread / math.sqrt(len(values)))
 
 

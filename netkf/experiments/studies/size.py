@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 REACHED, MISSED, UNDECIDED = "reached", "missed", "undecided"
 LOAD = "load it first: netkf.size(netkf.load(path), ...)"
-FIRST_BATCH = 16
+FIRST_BATCH = 32
 CLOSE = 1.25
 """Values whose ratio is below it are not told apart further once one of them is undecided."""
 MOST_PROBES = {"theory": 40, "simulation": 16}
@@ -125,6 +125,11 @@ def size(
         choice(*DIGITS)("--by", by)
     wanted, sure = parse_target(target), number(above=0.0, below=1.0)("--confidence", confidence)
     integer(low=FIRST_BATCH)("--runs", runs)
+    if wanted.of_errors and not scenario.plant.shown:
+        remedy = "ask for mean_trace or worst_trace"
+        raise ScenarioError(
+            "--target", "is about errors, and nobody knows the truth", target, remedy
+        )
     base = scenario if seed is None else scenario.replace({"seed": seed})
     whole = _checked_range(base, key, low, high)
     choose_engine(engine, base.replace({key: low}))

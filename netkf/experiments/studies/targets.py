@@ -106,10 +106,12 @@ def by_simulation(found: Figures, target: Target, level: float, central: float |
     all nodes where it is about the worst; ``central`` is the trace to divide by.
     """
     values = found.mean_square if target.of_errors else found.trace
+    values = np.where(found.diverged > 0, np.inf, values)
     columns = values if target.of_worst else values.mean(axis=1, keepdims=True)
     runs, count = columns.shape
-    mean = columns.mean(axis=0)
-    error = columns.std(axis=0, ddof=1) / math.sqrt(runs)
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = columns.mean(axis=0)
+        error = columns.std(axis=0, ddof=1) / math.sqrt(runs)
     width = float(scipy.special.stdtrit(runs - 1, 1.0 - level / (2.0 * count))) * error
     ends = np.array([mean.max(), (mean - width).max(), (mean + width).max()])
     if central is not None:

@@ -87,7 +87,15 @@ def cells(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[Cell]:
     places = [
         dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*values.values())
     ]
-    return [Cell(place, scenario.replace(place)) for place in places]
+    return [Cell(place, _changed(scenario, place)) for place in places]
+
+
+def _changed(scenario: Scenario, place: dict[str, Any]) -> Scenario:
+    try:
+        return scenario.replace(place)
+    except ScenarioError as error:
+        words = ", ".join(f"{key} = {toml_text(value)}" for key, value in place.items())
+        raise error.in_file(f"at {words}") from None
 
 
 def shown(value: Any) -> Any:
