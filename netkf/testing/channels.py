@@ -14,7 +14,7 @@ from netkf.network.graphs import Link
 from netkf.testing.generators import Told, spoken
 from netkf.testing.watching import Watched, demand, fail, global_randomness, made
 
-CHAINS, LENGTH, DRAWS = 2000, 50, 300
+CHAINS, LENGTH, DRAWS = 1000, 50, 200
 SURE = 5.0
 """Standard errors that count as different: a false alarm in about a million."""
 FEW = 12.0
@@ -27,7 +27,7 @@ def check_channel(channel: Any, /, **settings: Any) -> None:
     Chances are numbers from 0 to 1 (0 or 1 where ``certain``) and need no randomness; ``weather``
     and ``draw`` use nothing but the generator they are given, the same draws at each activation,
     and none where ``changing`` is False or the delay is ``fixed``; ``mean_delivery`` agrees with a
-    simulation of 100,000 activations, and so does ``independent``; delays are not negative and,
+    simulation of 50,000 activations, and so does ``independent``; delays are not negative and,
     where ``fixed``, as it says. Raises AssertionError with one line.
     """
     part = made(channel, (Channel, Loss, Delay), settings)

@@ -1,6 +1,8 @@
 """Sweeps, sizing and comparisons: against formulas, single runs and simulations of one's own."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -339,14 +341,13 @@ def test_theory_that_does_not_tell_is_refused_or_replaced(short):
 
 
 def test_a_quantity_that_is_not_monotone_is_told(monkeypatch, short):
-    from netkf.experiments.studies import size as module
-
     values = {1.0: 5.0, 4.0: 1.0, 2.0: 6.0}
-    monkeypatch.setattr(
-        "netkf.experiments.studies.size.by_theory",
-        lambda scenario, target: (values.get(scenario.network.activation.rate, 0.9), "made up"),
-    )
-    assert module
+
+    def made_up(scenario, target):
+        return values.get(scenario.network.activation.rate, 0.9), "made up"
+
+    for module in ("size", "search"):
+        monkeypatch.setattr(f"netkf.experiments.studies.{module}.by_theory", made_up)
     found = size(short, RATE, 1.0, 4.0, "mean_trace<=2")
     assert "NOT monotone between 1 and 2" in found.sure
 
@@ -405,9 +406,10 @@ def test_errors_of_a_truth_that_nobody_knows_are_no_target(tmp_path):
 # Comparisons
 
 
-@pytest.fixture
-def ensembles(tmp_path, capsys):
+@pytest.fixture(scope="module")
+def ensembles(tmp_path_factory):
     """Four directories: slow and fast links, fast ones without states, and one single run."""
+    folder = tmp_path_factory.mktemp("runs")
     common = ["--set", "horizon=3.0", "--no-plot", "--workers", "1"]
     for name, rate, more in (
         ("slow", 1.0, ["--runs", "8", "--trace", "full"]),
@@ -415,10 +417,9 @@ def ensembles(tmp_path, capsys):
         ("bare", 8.0, ["--runs", "8", "--trace", "none"]),
         ("single", 8.0, []),
     ):
-        arguments = ["run", RING, "--set", f"{RATE}={rate}", "--out", str(tmp_path / name)]
+        arguments = ["run", RING, "--set", f"{RATE}={rate}", "--out", str(folder / name)]
         assert main([*arguments, *common, *more]) == 0
-    capsys.readouterr()
-    return tmp_path
+    return folder
 
 
 def rows_of(found):
@@ -473,8 +474,8 @@ def test_the_command_compares(ensembles, capsys):
     assert len(found["rows"][0]["entries"]) == 3
 
 
-def test_unfinished_and_spoilt_directories_are_refused(ensembles, capsys):
-    folder = ensembles / "single"
+def test_unfinished_and_spoilt_directories_are_refused(ensembles, tmp_path, capsys):
+    folder = Path(shutil.copytree(ensembles / "single", tmp_path / "copy"))
     manifest = json.loads((folder / "manifest.json").read_text())
     (folder / "manifest.json").write_text(json.dumps({**manifest, "status": "interrupted"}))
     with pytest.raises(ScenarioError, match="did not finish"):

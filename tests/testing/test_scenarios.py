@@ -49,7 +49,35 @@ def test_the_promises_of_our_files_are_kept(path):
     scenario = netkf.load(path)
     if path.stem in SHORT:
         scenario = scenario.replace({"horizon": SHORT[path.stem], "probe": 4.0})
-    assert testing.assert_promises(scenario, runs=40, confidence=0.999) is None
+    assert testing.assert_promises(scenario, runs=20, confidence=0.999) is None
+
+
+@pytest.mark.parametrize("path", testing.scenario_files(SCENARIOS), ids=lambda path: path.stem)
+def test_the_parts_of_our_files_keep_their_contracts(path):
+    scenario = netkf.load(path)
+    testing.check_filter(scenario.filter.algorithm)
+    clock = scenario.network.activation
+    if isinstance(clock, netkf.parts.LinkClock):
+        testing.check_clock(clock, link=scenario.topology.links[0])
+
+
+def test_the_channels_of_our_files_keep_their_contracts():
+    channels = {}
+    for path in testing.scenario_files(SCENARIOS):
+        channel = netkf.load(path).network.channel
+        channels[repr((channel.loss, channel.delay))] = channel
+    assert len(channels) > 3
+    for channel in channels.values():
+        testing.check_channel(channel)
+
+
+def test_covariances_stay_above_the_exact_ones_of_the_errors(ring):
+    """H (10), given the events of one run, as an assertion of a test suite."""
+    run = netkf.simulate(ring.replace({"horizon": 4.0}))
+    exact = netkf.theory.error_covariance(ring, run)
+    assert testing.assert_dominated(exact, run.P) is None
+    with pytest.raises(AssertionError, match=r"P\[\d+, \d+\]: must stay below the bound"):
+        testing.assert_dominated(run.P, exact)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from netkf.experiments.studies.compare import Comparison, Entry
 from netkf.experiments.studies.consistency import Consistency
-from netkf.experiments.studies.size import Sizing
+from netkf.experiments.studies.search import Sizing
 from netkf.experiments.tables import number, table
 
 if TYPE_CHECKING:
