@@ -87,7 +87,7 @@ def _bands(
         colour = SENSING if sensing[k] else RELAY
         axes.fill_between(times, *ends, color=colour, alpha=0.2, lw=0)
     _promises(axes, times, promised)
-    _scale(axes, np.sqrt(trace))
+    _scale(axes, np.sqrt(trace + spread))
     _legend(axes)
 
 
