@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.stats
 
@@ -119,3 +120,17 @@ def test_bad_requests_are_refused(gossip, capsys):
         consistency(gossip, runs=3)
     assert main(["consistency", GOSSIP, "--confidence", "7"]) == 2
     assert capsys.readouterr().err.startswith("netkf: confidence: must be")
+
+
+def test_the_summary_of_many_runs_has_chi_square_bounds(tmp_path, capsys):
+    out = tmp_path / "o"
+    arguments = ["run", GOSSIP, "--set", "horizon=40.0", "--runs", "12", "--workers", "1"]
+    assert main([*arguments, "--no-plot", "--trace", "full", "--out", str(out)]) == 0
+    found = json.loads((out / "summary.json").read_text())["nees"]
+    low, high = scipy.stats.chi2.ppf([0.025, 0.975], 12 * 4) / 12
+    assert (found["low"], found["high"]) == pytest.approx((low, high))
+    states = pd.read_parquet(out / "states.parquet")
+    means = states[states.t > 0.0].groupby(["t", "node"])["nees"].mean()
+    assert found["inside"] == pytest.approx(((means >= low) & (means <= high)).mean())
+    words = f"95% in {low:.4g} .. {high:.4g} where P is exact, here {found['inside']:.0%}"
+    assert words in capsys.readouterr().out
