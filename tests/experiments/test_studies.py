@@ -403,6 +403,37 @@ def test_errors_of_a_truth_that_nobody_knows_are_no_target(tmp_path):
     assert (table["mean_trace"] > 0.0).all()
 
 
+@pytest.mark.slow
+def test_decisions_are_right_as_often_as_they_say(build):
+    """Filters that do not talk: the exact mean square error at every value is their P."""
+    scenario = build(filter={"kind": "local"}, horizon=2.0)
+    key, limit, wrong, answers = "sensors.0.R.0.0", 0.87, 0, 0
+    exact = {}
+    for seed in range(20):
+        found = size(
+            scenario,
+            key,
+            0.05,
+            5.0,
+            f"mean_rms<={limit}",
+            by="simulation",
+            runs=128,
+            seed=seed,
+            confidence=0.9,
+            workers=1,
+        )
+        answers += found.value is not None
+        for probe in found.probes:
+            if probe.value not in exact:
+                exact[probe.value] = (
+                    bound_traces(scenario.replace({key: probe.value})).mean() ** 0.5
+                )
+            wrong += (probe.target == "reached") and exact[probe.value] > limit
+            wrong += (probe.target == "missed") and exact[probe.value] <= limit
+    assert wrong <= 5  # of 20 searches, each right as a whole with probability 0.9
+    assert answers >= 5
+
+
 # Comparisons
 
 
