@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
 
 if TYPE_CHECKING:
-    from netkf import parts, theory
+    from netkf import parts, testing, theory
     from netkf.experiments.ensembles.monte_carlo import Ensemble, monte_carlo
     from netkf.experiments.run import save
     from netkf.experiments.simulate import simulate
+    from netkf.experiments.studies.compare import compare
+    from netkf.experiments.studies.consistency import consistency
+    from netkf.experiments.studies.size import size
+    from netkf.experiments.studies.sweep import sweep
     from netkf.scenario.reading import load
     from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
     from netkf.trace.run import Run, first_difference
@@ -25,6 +29,8 @@ _WHERE = {
     "Network": "netkf.scenario.scenario",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
+    "compare": "netkf.experiments.studies.compare",
+    "consistency": "netkf.experiments.studies.consistency",
     "first_difference": "netkf.trace.run",
     "load": "netkf.scenario.reading",
     "check": "netkf.experiments.checking.check",
@@ -32,10 +38,13 @@ _WHERE = {
     "parts": "netkf.parts",
     "save": "netkf.experiments.run",
     "simulate": "netkf.experiments.simulate",
+    "size": "netkf.experiments.studies.size",
+    "sweep": "netkf.experiments.studies.sweep",
+    "testing": "netkf.testing",
     "theory": "netkf.theory",
 }
 
-_MODULES = ("parts", "theory")
+_MODULES = ("parts", "testing", "theory")
 
 __all__ = [
     "Belief",
@@ -49,12 +58,17 @@ __all__ = [
     "ScenarioError",
     "TheoryError",
     "check",
+    "compare",
+    "consistency",
     "first_difference",
     "load",
     "monte_carlo",
     "parts",
     "save",
     "simulate",
+    "size",
+    "sweep",
+    "testing",
     "theory",
 ]
 

@@ -11,26 +11,25 @@ import signal
 import sys
 import threading
 import time
-import tomllib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import netkf
+from netkf.cli_studies import add_commands
 from netkf.core.errors import NetkfError, ScenarioError, quote
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
 NOT_KEPT, BAD_USAGE, INTERRUPTED = 1, 2, 130
-LONGEST_WORD = 1000
 MOST_NODES = 12
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status is 0 done, 2 bad usage or file or a failure that one
-    line tells, 130 interrupted.
+    """Run the command line; the exit status is 0 done, 1 a target is not reached, 2 bad usage
+    or file or a failure that one line tells, 130 interrupted.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -101,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--json", action="store_true", help="one JSON document, nothing else")
     theory = _command(commands, "theory", _theory, "what is promised; no simulation")
     theory.add_argument("--json", action="store_true", help="one JSON document, nothing else")
+    add_commands(commands, partial(_command, commands), _load, _count, _seed)
     return parser
 
 
@@ -142,30 +142,10 @@ def _count(text: str) -> int:
 
 def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
     """``key.path=value`` texts as a mapping; values are TOML, and bare words are strings."""
-    changes: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        key, text = key.strip(), text.strip()
-        if not equals or not key or not text:
-            remedy = "write it that way"
-            if equals and key:
-                remedy = f"give a value; an empty text is written {key}='\"\"'"
-            raise ScenarioError("--set", "must be KEY.PATH=VALUE", setting, remedy)
-        try:
-            value = tomllib.loads(f"value = {text}")
-            if list(value) != ["value"]:
-                raise ValueError
-            changes[key] = value["value"]
-        except (ValueError, RecursionError):
-            if text[0] in "[{\"'" or not text.isprintable() or len(text) > LONGEST_WORD:
-                raise ScenarioError(
-                    "--set",
-                    f"value of {key} is not valid TOML",
-                    text,
-                    "mend it; quote the argument for your shell",
-                ) from None
-            changes[key] = text
-    return changes
+    from netkf.scenario.values import split_setting, typed_value
+
+    pairs = [split_setting("--set", setting) for setting in settings]
+    return {key: typed_value("--set", key, text) for key, text in pairs}
 
 
 def _load(options: argparse.Namespace) -> Scenario:

@@ -9,7 +9,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
-from netkf.experiments.words import limit_words, mismatch_words
+from netkf.experiments.words import limit_words, mismatch_words, nees_words
 from netkf.scenario.scenario import Scenario
 from netkf.theory import central_covariance, covariance_bound, limit_covariance
 from netkf.theory.coupled import not_promised
@@ -89,7 +89,9 @@ def promise(scenario: Scenario, times: FloatArray) -> Promise:
         _trace(central_covariance, scenario),
         words or not_promised(scenario) or "",
         limit_words(scenario),
-        tuple(note for note in (_steady_note(scenario), mismatch_words(scenario)) if note),
+        tuple(
+            filter(None, (word(scenario) for word in (_steady_note, mismatch_words, nees_words)))
+        ),
     )
 
 

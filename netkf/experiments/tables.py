@@ -75,6 +75,13 @@ def summary_table(
     ]
     if references:
         lines.append("traces to compare: " + ", ".join(references))
+    if math.isfinite(summary.get("nees", {}).get("inside", math.nan)):
+        found = summary["nees"]
+        lines.append(
+            f"NEES of one sample, mean over the runs: {found['confidence']:.0%} in "
+            f"{number(found['low'])} .. {number(found['high'])} where P is exact, here "
+            f"{found['inside']:.0%}"
+        )
     if "conserved" in summary:
         lines.append("mass: " + _conserved(summary["conserved"]))
     lines.append(

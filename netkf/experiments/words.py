@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.hybrid import Hybrid
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import balanced
 
@@ -16,6 +18,18 @@ def without_delay(scenario: Scenario) -> str:
     """The limits leave delays out, and say so where there are any."""
     delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
     return ", if messages took no time" if delayed else ""
+
+
+def nees_words(scenario: Scenario) -> str:
+    """What NEES should be where P is conservative by design; empty where it should be near n."""
+    algorithm = scenario.filter.algorithm
+    cautious = isinstance(algorithm, (Hybrid, DiffusionFilter)) and scenario.topology.links
+    if not cautious or not scenario.filters_know_the_truth:
+        return ""
+    return (
+        f"this filter keeps P above the covariance of its error by design: NEES below n = "
+        f"{scenario.plant.n} is right, and netkf consistency says what it should be"
+    )
 
 
 def mismatch_words(scenario: Scenario) -> str:

@@ -96,13 +96,13 @@ def _plain(value: Any) -> Any:
 
 def to_toml(table: dict[str, Any]) -> str:
     """TOML text of nested tables of numbers, strings and lists; equal tables give equal text."""
-    lines = [f"{key} = {_value(v)}" for key, v in table.items() if not _is_section(v)]
+    lines = [f"{key} = {toml_text(v)}" for key, v in table.items() if not _is_section(v)]
     for key, value in table.items():
         if isinstance(value, dict):
-            lines += ["", f"[{key}]", *(f"{k} = {_value(v)}" for k, v in value.items())]
+            lines += ["", f"[{key}]", *(f"{k} = {toml_text(v)}" for k, v in value.items())]
         elif _is_section(value):
             for entry in value:
-                lines += ["", f"[[{key}]]", *(f"{k} = {_value(v)}" for k, v in entry.items())]
+                lines += ["", f"[[{key}]]", *(f"{k} = {toml_text(v)}" for k, v in entry.items())]
     return "\n".join(lines) + "\n"
 
 
@@ -111,11 +111,12 @@ def _is_section(value: Any) -> bool:
     return isinstance(value, dict) or tables
 
 
-def _value(value: Any) -> str:
+def toml_text(value: Any) -> str:
+    """One value as TOML."""
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{k} = {toml_text(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_value, value)) + "]"
+        return "[" + ", ".join(map(toml_text, value)) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, SourceFile):

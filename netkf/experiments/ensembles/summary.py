@@ -5,11 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from netkf.core.arrays import FloatArray
 from netkf.experiments.ensembles.tallies import MESSAGES, Tally
 from netkf.experiments.summary import Promise
 from netkf.scenario.scenario import Scenario
+
+CONFIDENCE = 0.95
 
 
 def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> dict[str, Any]:
@@ -34,12 +37,28 @@ def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> d
         "messages": dict(zip(MESSAGES, messages, strict=True)),
         "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
     }
+    if scenario.plant.shown:
+        summary["nees"] = _chi_square(scenario, tally)
     if tally.conserved:
         summary["conserved"] = {
             name: {"exact": sums.mean[0], "total": sums.mean[1], "drift": drift}
             for name, (sums, drift) in tally.conserved.items()
         }
     return summary
+
+
+def _chi_square(scenario: Scenario, tally: Tally) -> dict[str, float]:
+    """Bounds on the mean NEES of one sample over the runs that hold with ``confidence`` where P is
+    exact, since the sum is chi-square; over n they bound the ANEES. ``inside``: the share of all
+    samples after time 0 that every run has.
+    """
+    n, runs = scenario.plant.n, tally.runs
+    ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
+    low, high = (2.0 * float(gammaincinv(0.5 * runs * n, end)) / runs for end in ends)
+    kept = (scenario.times > 0.0) & (tally.samples.size[:, 0, 0] == runs)
+    means = tally.samples.mean[kept, :, -1]
+    inside = float(((means >= low) & (means <= high)).mean()) if means.size else np.nan
+    return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": inside}
 
 
 def _bounds(scenario: Scenario, promised: Promise) -> list[float | None]:

@@ -1,0 +1,1 @@
+"""Many scenarios: sweeps over keys, sizing for a target, finished runs side by side."""

@@ -1,0 +1,257 @@
+"""``netkf.consistency``: whether P says what the errors are, and whether it should.
+
+NEES e' P^-1 e and NIS v' S^-1 v are held against what they should be: given the events of a run the
+error covariance Sigma of each node is known exactly, so E[NEES] = tr(P^-1 Sigma) and E[NIS] =
+tr(S^-1 (H Sigma H' + R)). That is n, or the number p of readings, for filters whose P is exact, and
+less for those that are conservative by design, which are then not called wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import scipy.special
+
+from netkf.algorithms.slot import SlotFilter
+from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.core.errors import ScenarioError, TheoryError
+from netkf.core.fields import integer, number
+from netkf.core.streams import Streams
+from netkf.experiments.ensembles.replicas import replicate
+from netkf.experiments.simulate import choose_engine, simulate
+from netkf.scenario.scenario import Scenario
+from netkf.theory import error_covariance
+from netkf.trace.run import Run, errors
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LOAD = "load it first: netkf.consistency(netkf.load(path))"
+FEWEST = 10
+DESIGN = 0.02
+"""Relative distance of the expected value from n that counts as by design."""
+
+
+class Seen(NamedTuple):
+    """Of one run: ``samples`` (T, N) of NEES after time 0; means over them (N,) of NEES, of its
+    expected value, of NIS and of its expected value, nan where they do not exist.
+    """
+
+    samples: FloatArray
+    nees: FloatArray
+    expected: FloatArray
+    nis: FloatArray
+    expected_nis: FloatArray
+
+
+def one_run(scenario: Scenario, seed: int, replica: int, engine: str = "auto") -> Seen:
+    """What one replica says, for ``replicate``."""
+    run = simulate(scenario, seed, replica, engine)
+    _, nees = errors(run.x, run.xhat, run.P)
+    kept = np.flatnonzero(run.times > 0.0)
+    try:
+        sigma = error_covariance(scenario, run)
+    except TheoryError:
+        sigma = None
+    nis, expected_nis = _innovations(scenario, run, sigma)
+    return Seen(nees[kept], _mean(nees[kept]), _mean(_ratio(run.P, sigma)[kept]), nis, expected_nis)
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    return values.mean(axis=0) if len(values) else np.full(values.shape[1:], np.nan)
+
+
+def _ratio(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
+    """tr(P^-1 Sigma), (T, N); nan where Sigma is not known or P is singular."""
+    if sigma is None:
+        return np.full(P.shape[:2], np.nan)
+    found = np.full(P.shape[:2], np.nan)
+    for place in np.ndindex(*found.shape):
+        if np.isfinite(P[place]).all() and np.linalg.matrix_rank(P[place]) == P.shape[-1]:
+            found[place] = np.trace(np.linalg.solve(P[place], sigma[place]))
+    return found
+
+
+def _innovations(
+    scenario: Scenario, run: Run, sigma: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Mean NIS of each node's own readings and its expected value, (N,); in slots only, at slots
+    whose prediction is a sample or follows from the one before.
+    """
+    nothing = np.full(len(run.nodes), np.nan)
+    algorithm = scenario.filter.algorithm
+    if not isinstance(algorithm, SlotFilter):
+        return nothing, nothing
+    streams, found, should = Streams(run.seed, run.replica), nothing.copy(), nothing.copy()
+    steps = 0 if algorithm.predicts else 1
+    slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
+    places = [k for k in range(steps, len(slots)) if slots[k] - slots[k - steps] == steps]
+    places = [k for k in places if run.times[k] > 0.0]
+    for i, node in enumerate(run.nodes):
+        sensors = [scenario.slot_path(streams, node, p) for p in scenario.placed.get(node, ())]
+        if not sensors or not places:
+            continue
+        believed, true = (
+            block_diagonal([scenario.noise(p.entry, b) for p in scenario.placed[node]])
+            for b in (True, False)
+        )
+        pairs = []
+        for k in places:
+            H = np.concatenate([sensor.matrix(slots[k]) for sensor in sensors])
+            y = np.concatenate([sensor.reading(slots[k], run.x[k]) for sensor in sensors])
+            xhat, P, error = _predicted(scenario, run, sigma, k - steps, i, steps)
+            v, S = y - H @ xhat, H @ P @ H.T + believed
+            truly = (
+                np.nan if error is None else np.trace(np.linalg.solve(S, H @ error @ H.T + true))
+            )
+            pairs.append((v @ np.linalg.solve(S, v), truly))
+        found[i], should[i] = np.array(pairs).mean(axis=0)
+    return found, should
+
+
+def _predicted(
+    scenario: Scenario, run: Run, sigma: FloatArray | None, k: int, node: int, steps: int
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Prediction, its P and the covariance of its error from sample k, ``steps`` slots on."""
+    xhat, P = run.xhat[k, node], run.P[k, node]
+    error = None if sigma is None else sigma[k, node]
+    if not steps:
+        return xhat, P, error
+    F, Q = scenario.slot_belief
+    plant = scenario.slot_plant
+    if error is not None:
+        same = np.array_equal(F, plant.F)
+        error = plant.F @ error @ plant.F.T + plant.Q if same else None
+    return F @ xhat, F @ P @ F.T + Q, error
+
+
+@dataclass(frozen=True)
+class Row:
+    """Of one node: mean NEES over runs and samples with the half width of its interval, what it
+    should be (nan where that is not known), the share of samples whose mean over runs lies in the
+    chi-square bounds, NIS and what it should be, and the verdict in words.
+    """
+
+    node: int
+    nees: float
+    width: float
+    expected: float
+    inside: float
+    nis: float
+    expected_nis: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Rows by node; false where the errors of one are not what they should be.
+
+    ``low`` and ``high`` are the chi-square bounds on the mean NEES of one sample over the runs,
+    where P is exact, each side missing with (1 - confidence) / 2; over n they bound the ANEES.
+    """
+
+    scenario: str
+    n: int
+    runs: int
+    confidence: float
+    low: float
+    high: float
+    rows: tuple[Row, ...]
+
+    def __bool__(self) -> bool:
+        return not any(row.verdict.startswith("BROKEN") for row in self.rows)
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row a node."""
+        import pandas as pd
+
+        return pd.DataFrame([vars(row) for row in self.rows])
+
+
+def consistency(
+    scenario: Scenario,
+    runs: int = 50,
+    seed: int | None = None,
+    confidence: float = 0.95,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    engine: str = "auto",
+) -> Consistency:
+    """Hold NEES and, in slots, NIS against what they should be.
+
+    The verdicts compare the NEES of each run with its exact expected value given the events of the
+    run (run by run, Student's interval; all nodes together at ``confidence``), or with n where that
+    is not known (push-sum, a user's own filter). Raises ScenarioError for bad arguments and where
+    there is no truth.
+    """
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError("", "consistency takes a netkf.Scenario", scenario, LOAD)
+    if not scenario.drawn:
+        words, remedy = "has recorded states or readings", "nobody knows their errors' law"
+        raise ScenarioError("plant", words, None, remedy)
+    count = integer(low=FEWEST)("runs", runs)
+    sure = number(above=0.0, below=1.0)("confidence", confidence)
+    choose_engine(engine, scenario)
+    task = partial(one_run, engine=engine)
+    seen = replicate(
+        task, scenario, count, seed, workers=workers, executor=executor, scheduler=scheduler
+    )
+    return weighed(scenario, seen, sure)
+
+
+def weighed(scenario: Scenario, runs: Sequence[Seen], confidence: float) -> Consistency:
+    """The rows of what several runs say."""
+    n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
+    nees, expected, nis, expected_nis = (
+        np.array([run[k] for run in runs]) for k in range(1, len(Seen._fields))
+    )
+    low, high = (
+        2.0 * float(scipy.special.gammaincinv(0.5 * count * n, q)) / count
+        for q in (0.5 * level, 1.0 - 0.5 * level)
+    )
+    shortest = min(len(run.samples) for run in runs)
+    means = np.mean([run.samples[:shortest] for run in runs], axis=0)
+    inside = ((means >= low) & (means <= high)).mean(axis=0)
+    quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))
+    rows = []
+    for i, node in enumerate(scenario.nodes):
+        known = bool(np.isfinite(expected[:, i]).all())
+        gaps = nees[:, i] - (expected[:, i] if known else n)
+        width = quantile * float(gaps.std(ddof=1)) / math.sqrt(count)
+        should = float(expected[:, i].mean())
+        rows.append(
+            Row(
+                node,
+                float(nees[:, i].mean()),
+                width,
+                should,
+                float(inside[i]),
+                float(nis[:, i].mean()),
+                float(expected_nis[:, i].mean()),
+                _verdict(float(gaps.mean()), width, should, n, known),
+            )
+        )
+    return Consistency(scenario.name, n, count, confidence, low, high, tuple(rows))
+
+
+def _verdict(gap: float, width: float, should: float, n: int, known: bool) -> str:
+    if not math.isfinite(gap):
+        return "no NEES: P is singular or not finite"
+    if not known:
+        side = "near n" if abs(gap) <= width else "above n" if gap > 0.0 else "below n"
+        return f"{side}; what it should be is not known"
+    if abs(gap) > width:
+        return f"BROKEN: errors are {'larger' if gap > 0.0 else 'smaller'} than they should be"
+    if should < (1.0 - DESIGN) * n:
+        return "as it should be: P is conservative by design"
+    if should > (1.0 + DESIGN) * n:
+        return "as it should be: the filters' model makes P too small"
+    return "as it should be"

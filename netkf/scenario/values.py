@@ -1,0 +1,64 @@
+"""Values of scenario keys as they are typed on a command line: TOML, or bare words."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+from netkf.core.errors import ScenarioError
+
+LONGEST_WORD = 1000
+
+
+def split_setting(option: str, setting: str) -> tuple[str, str]:
+    """Key path and text of ``key.path=value``; raises ScenarioError at the ``option``."""
+    key, equals, text = (part.strip() for part in setting.partition("="))
+    if not equals or not key or not text:
+        remedy = "write it that way"
+        if equals and key:
+            remedy = f"give a value; an empty text is written {key}='\"\"'"
+        raise ScenarioError(option, "must be KEY.PATH=VALUE", setting, remedy)
+    return key, text
+
+
+def typed_value(option: str, key: str, text: str) -> Any:
+    """The value of a text: TOML, and bare words are strings."""
+    try:
+        return _toml(text)
+    except (ValueError, RecursionError):
+        if text[0] in "[{\"'" or not text.isprintable() or len(text) > LONGEST_WORD:
+            words = f"value of {key} is not valid TOML"
+            remedy = "mend it; quote the argument for your shell"
+            raise ScenarioError(option, words, text, remedy) from None
+        return text
+
+
+def typed_values(option: str, key: str, text: str) -> list[Any]:
+    """The values of ``v1,v2,...``; commas inside brackets and quotes belong to a value."""
+    try:
+        values = _toml(f"[{text}]")
+    except (ValueError, RecursionError):
+        return [typed_value(option, key, part.strip() or " ") for part in _parts(text)]
+    return list(values)
+
+
+def _toml(text: str) -> Any:
+    found = tomllib.loads(f"value = {text}")
+    if list(found) != ["value"]:
+        raise ValueError
+    return found["value"]
+
+
+def _parts(text: str) -> list[str]:
+    parts, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        depth += (letter in "[{") - (letter in "]}") if not quote else 0
+        if letter == "," and depth == 0 and not quote:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts

@@ -1,0 +1,43 @@
+"""Checkers for classes of your own and assertions for pytest: each raises AssertionError with one
+line (what, where, the value got, what to do) and returns None where all is well.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from netkf.testing.channels import check_channel
+    from netkf.testing.clocks import check_clock
+    from netkf.testing.filters import check_filter
+    from netkf.testing.matrices import assert_dominated
+    from netkf.testing.scenarios import assert_promises, scenario_files
+
+_WHERE = {
+    "assert_dominated": "matrices",
+    "assert_promises": "scenarios",
+    "check_channel": "channels",
+    "check_clock": "clocks",
+    "check_filter": "filters",
+    "scenario_files": "scenarios",
+}
+
+__all__ = [
+    "assert_dominated",
+    "assert_promises",
+    "check_channel",
+    "check_clock",
+    "check_filter",
+    "scenario_files",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'netkf.testing' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"netkf.testing.{_WHERE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

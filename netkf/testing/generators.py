@@ -1,0 +1,41 @@
+"""Generators that tell what was drawn from them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.core.streams import Streams
+
+Calls = list[tuple[str, int]]
+
+
+class Told(np.random.Generator):
+    """A generator that lists the draws made from it: method and number of values."""
+
+    def __init__(self, seed: int, *entity: int) -> None:
+        super().__init__(Streams(seed).generator("testing", *entity).bit_generator)
+        self.calls: Calls = []
+
+    def __getattribute__(self, name: str) -> Any:
+        found = super().__getattribute__(name)
+        if name.startswith("_") or name in ("calls", "taken", "bit_generator"):
+            return found
+
+        def drawing(*arguments: Any, **named: Any) -> Any:
+            values = found(*arguments, **named)
+            self.calls.append((name, int(np.size(values))))
+            return values
+
+        return drawing
+
+    def taken(self) -> Calls:
+        """The draws since this was last asked."""
+        calls, self.calls = self.calls, []
+        return calls
+
+
+def spoken(calls: Calls) -> str:
+    """Draws in words."""
+    return ", ".join(f"{count} x {name}" for name, count in calls) or "nothing"

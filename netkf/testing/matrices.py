@@ -1,0 +1,42 @@
+"""Matrices against matrices, as an assertion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.arrays import ArrayLike, symmetric
+from netkf.testing.watching import demand, fail
+
+
+def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) -> None:
+    """Assert ``P <= bound``: every eigenvalue of ``bound - P`` is at least ``-tolerance`` times the
+    largest entry of the bound at that place.
+
+    Both are (n, n), or stacks (..., n, n) that broadcast, such as (T, N, n, n). Raises
+    AssertionError that names the place where the least eigenvalue is furthest below.
+    """
+    lower, upper = (np.asarray(a, dtype=np.float64) for a in (P, bound))
+    for name, matrices in (("P", lower), ("bound", upper)):
+        square = matrices.ndim >= 2 and matrices.shape[-1] == matrices.shape[-2]
+        demand(square, name, "must be a square matrix or a stack of them", matrices.shape)
+        bad = np.argwhere(~np.isfinite(matrices).all(axis=(-2, -1)))
+        demand(not bad.size, name, "must be finite", f"nan or inf{_at(bad[0]) if bad.size else ''}")
+    try:
+        shape = np.broadcast_shapes(lower.shape, upper.shape)
+    except ValueError:
+        fail("bound", "must have the shape of P", f"{upper.shape} for {lower.shape}")
+    gap = symmetric(np.broadcast_to(upper, shape) - lower)
+    least = np.linalg.eigvalsh(gap)[..., 0]
+    size = np.maximum(np.abs(upper).max(axis=(-2, -1)), np.finfo(float).tiny)
+    relative = np.asarray(least / size)
+    if relative.size and float(relative.min()) < -tolerance:
+        place = np.unravel_index(int(np.argmin(relative)), relative.shape)
+        words = f"the least eigenvalue of bound - P is {float(least[place]):.4g}"
+        count = int((relative < -tolerance).sum())
+        many = f", one of {count} places of {relative.size}" if relative.size > 1 else ""
+        fail(f"P{_at(place)}", f"must stay below the bound; {words}{many}")
+
+
+def _at(place: object) -> str:
+    numbers = [int(k) for k in place]  # type: ignore[attr-defined]
+    return f"[{', '.join(map(str, numbers))}]" if numbers else ""

@@ -1,0 +1,50 @@
+"""Scenarios as parameters and promises as assertions of a pytest suite."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from netkf.core.errors import ScenarioError
+from netkf.scenario.reading import load
+from netkf.scenario.scenario import Scenario
+
+
+def scenario_files(folder: str | Path = "scenarios") -> list[Path]:
+    """The scenario files (``*.toml``) of a folder in order, for ``pytest.mark.parametrize``.
+
+    Raises ScenarioError where there is none: a test without parameters would pass unseen.
+    """
+    found = sorted(Path(folder).glob("*.toml"))
+    if not found:
+        words = "holds no scenario files" if Path(folder).is_dir() else "is not a folder"
+        raise ScenarioError("scenario_files", words, str(folder), "name a folder of .toml files")
+    return found
+
+
+def assert_promises(
+    scenario: Scenario | str | Path,
+    runs: int = 500,
+    seed: int | None = None,
+    confidence: float = 0.99,
+) -> None:
+    """Assert that no promise of a scenario (or of the file at a path) is broken in ``runs``
+    replicas; rows that are undecided or not promised pass.
+
+    Raises AssertionError whose text has a line for each broken promise, TheoryError where nothing
+    is promised of the filter, ScenarioError for a bad file or bad arguments.
+    """
+    from netkf.experiments.checking.check import check
+    from netkf.experiments.checking.evidence import BROKEN
+
+    chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
+    verdict = check(chosen, runs=runs, seed=seed, confidence=confidence)
+    broken = [row for row in verdict.rows if row.verdict == BROKEN]
+    if broken:
+        lines = [
+            f"  {row.promise} [{row.source}]: margin {row.margin:.3g} in [{row.low:.3g}, "
+            f"{row.high:.3g}]; {row.evidence}"
+            for row in broken
+        ]
+        head = f"{chosen.name}: {len(broken)} of {len(verdict.rows)} promises are broken"
+        setting = f"{verdict.runs} runs from seed {verdict.seed}, confidence {confidence:g}"
+        raise AssertionError("\n".join([f"{head} ({setting})", *lines]))

@@ -1,0 +1,219 @@
+"""Calls of a user's methods with everything around them watched."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import pickle
+import random
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any, NoReturn
+
+import numpy as np
+
+from netkf.core.errors import NetkfError, quote
+from netkf.core.fields import Part
+from netkf.scenario.plugins import in_words
+
+Leaves = dict[str, Any]
+
+
+def fail(where: str, rule: str, got: object = None, remedy: str = "") -> NoReturn:
+    """Raise AssertionError with one line."""
+    found = "" if got is None else f"; got {got if isinstance(got, str) else quote(got)}"
+    raise AssertionError(f"{where}: {rule}{found}{f'; {remedy}' if remedy else ''}")
+
+
+def demand(holds: object, where: str, rule: str, got: object = None, remedy: str = "") -> None:
+    """:func:`fail` unless it holds."""
+    if not holds:
+        fail(where, rule, got, remedy)
+
+
+def made(part: Any, contracts: tuple[type[Part], ...], settings: Mapping[str, Any]) -> Any:
+    """An object of a user's class: ``part`` itself, or the class made with ``settings``."""
+    cls = part if isinstance(part, type) else type(part)
+    name = cls.__name__
+    listed = " or ".join(contract.__name__ for contract in contracts)
+    demand(
+        issubclass(cls, contracts),
+        name,
+        f"must be derived from {listed} of netkf.parts, or be an object of such a class",
+    )
+    missing = [
+        attribute
+        for attribute in sorted(dir(cls))
+        if getattr(_static(cls, attribute), "__isabstractmethod__", False)
+    ]
+    demand(not missing, name, f"must define {', '.join(missing)}", None, "write what is missing")
+    if not isinstance(part, type):
+        demand(not settings, name, "settings go with a class", sorted(settings), "leave them out")
+        return part
+    try:
+        return cls(**settings)
+    except Exception as error:
+        words = f"could not be made with the settings {dict(settings)!r}"
+        remedy = "hand over an object, or the class with its settings as keywords"
+        fail(name, words, in_words(error), remedy)
+
+
+def leaves(value: Any, path: str = "", seen: frozenset[int] = frozenset()) -> Iterator[Any]:
+    """(path, copy) of every number, text and array that a value is made of."""
+    if isinstance(value, np.ndarray):
+        yield path, value.copy()
+    elif id(value) in seen or isinstance(value, np.random.Generator) or callable(value):
+        return
+    elif isinstance(value, (str, bytes, int, float, complex, np.generic)) or value is None:
+        yield path, value
+    else:
+        inside = seen | {id(value)}
+        for name, item in _items(value):
+            yield from leaves(item, f"{path}{name}", inside)
+
+
+def _items(value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        yield from ((f"[{key!r}]", item) for key, item in value.items())
+    elif hasattr(value, "_fields"):
+        yield from ((f".{name}", getattr(value, name)) for name in value._fields)
+    elif isinstance(value, (list, tuple)):
+        yield from ((f"[{k}]", item) for k, item in enumerate(value))
+    elif isinstance(value, (set, frozenset)):
+        yield from ((f"[{k}]", item) for k, item in enumerate(sorted(value, key=repr)))
+    elif dataclasses.is_dataclass(value):
+        yield from ((f".{f.name}", getattr(value, f.name)) for f in dataclasses.fields(value))
+    else:
+        yield from ((f".{name}", item) for name, item in getattr(value, "__dict__", {}).items())
+
+
+def difference(one: Leaves, other: Leaves) -> str | None:
+    """The path of the first leaf in which two values differ, None where all are equal."""
+    if one.keys() != other.keys():
+        return (
+            min(one.keys() ^ other.keys(), key=len, default="")
+            or "its shape changed from a number to parts"
+        )
+    for path, value in one.items():
+        array = np.asarray(value)
+        numeric = array.dtype.kind in "fc" and np.asarray(other[path]).dtype.kind in "fc"
+        if not np.array_equal(array, np.asarray(other[path]), equal_nan=numeric):
+            return path or "it"
+    return None
+
+
+def global_randomness() -> tuple[Any, Any]:
+    """The states of the generators that all of a process shares."""
+    kind, keys, *rest = np.random.get_state()  # noqa: NPY002
+    return random.getstate(), (kind, bytes(np.asarray(keys)), *rest)
+
+
+def _static(cls: type, name: str) -> Any:
+    return inspect.getattr_static(cls, name, None)
+
+
+class Watched:
+    """A part whose methods are called with everything around them watched.
+
+    What a method was given must be as before, also later; the part itself too; a second call must
+    give the same; numpy's and Python's global generators must not be used.
+    """
+
+    def __init__(self, part: Any) -> None:
+        self.part, self.name = part, type(part).__name__
+        self._kept: list[tuple[str, Any, Leaves]] = []
+
+    def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
+        """The result of a method; ``repeatable`` where it draws nothing."""
+        where = f"{self.name}.{method}"
+        before = [dict(leaves(argument)) for argument in arguments]
+        itself = self._attributes()
+        results = [self._result(where, method, arguments) for _ in range(1 + repeatable)]
+        for argument, old, name in zip(
+            arguments, before, self._names(method, len(arguments)), strict=True
+        ):
+            path = difference(old, dict(leaves(argument)))
+            if path is not None:
+                remedy = "return a new one; work on copies"
+                fail(
+                    where,
+                    f"must leave what it is given as it is, and changed {name}{path}",
+                    None,
+                    remedy,
+                )
+        path = difference(itself, self._attributes())
+        demand(
+            path is None,
+            where,
+            f"must not change its own object, and changed {path}",
+            None,
+            "keep what changes in the state that is handed in and returned",
+        )
+        found = [dict(leaves(result)) for result in results]
+        path = difference(found[0], found[-1])
+        demand(
+            path is None,
+            where,
+            "must give the same for the same arguments",
+            f"another {(path or '').lstrip('.') or 'value'} at the second call",
+            "use no randomness, clock or memory of earlier calls",
+        )
+        self._kept.append((where, results[0], found[0]))
+        return results[0]
+
+    def _attributes(self) -> Leaves:
+        """What the part has, but for properties that it caches."""
+        cls, own = type(self.part), vars(self.part)
+        kept = {k: v for k, v in own.items() if not isinstance(_static(cls, k), cached_property)}
+        return {path.strip("[]'"): leaf for path, leaf in leaves(kept)}
+
+    def _result(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
+        before = global_randomness()
+        try:
+            result = getattr(self.part, method)(*arguments)
+        except NetkfError as error:
+            fail(where, f"failed: {error}")
+        except Exception as error:
+            singular = isinstance(error, np.linalg.LinAlgError)
+            remedy = "; set inverts = True where covariances must not be singular"
+            words = f"{where}: failed with {in_words(error)}{remedy if singular else ''}"
+            raise AssertionError(words) from error
+        demand(
+            global_randomness() == before,
+            where,
+            "must not use or seed global generators (numpy.random.*, random.*)",
+            None,
+            "draw from the generator that is handed in",
+        )
+        return result
+
+    def _names(self, method: str, count: int) -> list[str]:
+        names = list(inspect.signature(getattr(self.part, method)).parameters)
+        return [*names, *["an argument"] * count][:count]
+
+    def finish(self) -> None:
+        """What was returned at any time is still what it was."""
+        for where, result, old in self._kept:
+            path = difference(old, dict(leaves(result)))
+            demand(
+                path is None,
+                where,
+                f"returned something that a later call changed ({(path or '').lstrip('.')})",
+                None,
+                "return copies, share no buffers",
+            )
+
+    def pickled(self) -> Any:
+        """A copy of the part that went through pickle, as one that goes to a worker process."""
+        try:
+            copy = pickle.loads(pickle.dumps(self.part))
+        except Exception as error:
+            fail(
+                self.name,
+                "must be picklable, for worker processes",
+                in_words(error),
+                "define the class at the top level of a module and keep no open files or lambdas",
+            )
+        path = difference(dict(leaves(self.part)), dict(leaves(copy)))
+        demand(path is None, self.name, f"must be itself after pickling, and lost {path}")
+        return copy

@@ -1,0 +1,107 @@
+"""check_channel and check_clock: our own parts pass, and each breach is named."""
+
+import pytest
+
+from netkf import parts
+from netkf.testing import check_channel, check_clock
+from tests.testing.broken_channels import CHANNELS, CLOCKS
+
+KINDS = parts.kinds()
+
+
+@pytest.fixture
+def tables(tmp_path):
+    from netkf.core.fields import SourceFile
+
+    (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n0,1,2,0\n0,1,3,1\n")
+    (tmp_path / "ticks.csv").write_text("t,node,peer\n0.5,0,1\n0.75,1,0\n0.75,1,2\n")
+    return {name: SourceFile(f"{name}.csv", tmp_path) for name in ("lost", "ticks")}
+
+
+def losses(tables):
+    return {
+        "none": [parts.NoLoss()],
+        "bernoulli": [parts.Bernoulli(0.7), parts.Bernoulli(1.0), parts.Bernoulli(0.0)],
+        "per-link": [parts.PerLink()],
+        "gilbert-elliott": [
+            parts.GilbertElliott(to_bad=0.1, to_good=0.3, deliver_bad=0.2),
+            parts.GilbertElliott(to_bad=0.3, to_good=0.7),
+            parts.GilbertElliott(mean_loss=0.1, mean_burst=50.0),
+        ],
+        "recorded": [parts.RecordedLoss(tables["lost"])],
+    }
+
+
+DELAYS = {
+    "none": [parts.NoDelay()],
+    "constant": [parts.ConstantDelay(0.2)],
+    "exponential": [parts.ExponentialDelay(0.3)],
+    "uniform": [parts.UniformDelay(0.0, 1.0)],
+    "lognormal": [parts.LognormalDelay(0.3, 0.5)],
+}
+
+
+def clocks(tables):
+    return {
+        "poisson": [parts.Poisson(rate=3.0), parts.Poisson(rates=[[1, 0, 5.0]])],
+        "renewal": [
+            parts.Renewal("gamma", mean=0.5, shape=1.0),
+            parts.Renewal("gamma", rate=2.0, shape=0.4),
+            parts.Renewal("weibull", scale=0.5, shape=2.0),
+            parts.Renewal("uniform", low=0.0, high=1.0),
+            parts.Renewal("constant", mean=0.1),
+        ],
+        "periodic": [
+            parts.Periodic(period=0.3),
+            parts.Periodic(period=0.3, phase="random", jitter=0.2),
+        ],
+        "recorded": [parts.RecordedClock(tables["ticks"])],
+    }
+
+
+def test_our_own_channels_keep_the_contract(tables):
+    ours = losses(tables)
+    assert set(ours) == set(KINDS["loss"])
+    assert set(DELAYS) == set(KINDS["delay"])
+    for part in [part for table in (ours, DELAYS) for listed in table.values() for part in listed]:
+        assert check_channel(part) is None
+    assert check_channel(parts.Channel(loss=parts.Bernoulli(0.5))) is None
+
+
+def test_our_own_clocks_keep_the_contract(tables):
+    ours = clocks(tables)
+    assert set(ours) == set(KINDS["activation"])
+    for part in [part for listed in ours.values() for part in listed]:
+        assert check_clock(part) is None
+    assert check_clock(parts.RecordedClock(tables["ticks"]), link=(1, 2)) is None
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_every_breach_of_a_channel_is_named(name):
+    refused(check_channel, *CHANNELS[name])
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_every_breach_of_a_clock_is_named(name):
+    refused(check_clock, *CLOCKS[name])
+
+
+def refused(checker, cls, settings, words):
+    with pytest.raises(AssertionError) as caught:
+        checker(cls, **settings)
+    text = str(caught.value)
+    assert text.startswith(words)
+    assert "\n" not in text
+
+
+def test_a_broken_part_of_a_channel_is_named():
+    cls, settings, words = CHANNELS["Backwards"]
+    with pytest.raises(AssertionError, match=words.partition(";")[0]):
+        check_channel(parts.Channel(delay=cls(**settings)))
+
+
+def test_what_is_no_channel_or_clock_is_told():
+    with pytest.raises(AssertionError, match="must be derived from Channel or Loss or Delay"):
+        check_channel(parts.Poisson(rate=1.0))
+    with pytest.raises(AssertionError, match="must be derived from LinkClock"):
+        check_clock(parts.Matching("maximal"))

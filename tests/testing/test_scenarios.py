@@ -1,0 +1,152 @@
+"""Scenario files as parameters, promises as assertions: on every file of ours that has some."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+import netkf
+from netkf import testing
+from netkf.core.errors import ScenarioError, TheoryError
+from netkf.experiments.checking.check import paper_of
+from tests.conftest import ROOT, SCENARIOS
+from tests.experiments.broken import Overconfident
+
+SHORT = {"gossip_copies": 48.0, "gossip_periodic": 40.0, "gossip_ring": 48.0}
+"""Horizons that keep these tests short."""
+
+
+def promising():
+    """The files with a filter of which something is promised that check knows."""
+    for path in testing.scenario_files(SCENARIOS):
+        try:
+            paper_of(netkf.load(path))
+        except TheoryError:
+            continue
+        yield path
+
+
+PROMISING = list(promising())
+
+
+def test_all_our_files_are_found():
+    found = testing.scenario_files(SCENARIOS)
+    assert found == sorted(SCENARIOS.glob("*.toml"))
+    assert testing.scenario_files(str(SCENARIOS)) == found
+    assert {"gossip_ring", "intermittent_scalar"} <= {path.stem for path in PROMISING}
+
+
+def test_a_folder_without_scenarios_is_no_empty_test(tmp_path):
+    with pytest.raises(ScenarioError, match="holds no scenario files"):
+        testing.scenario_files(tmp_path)
+    with pytest.raises(ScenarioError, match="is not a folder"):
+        testing.scenario_files(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("path", PROMISING, ids=lambda path: path.stem)
+def test_the_promises_of_our_files_are_kept(path):
+    scenario = netkf.load(path)
+    if path.stem in SHORT:
+        scenario = scenario.replace({"horizon": SHORT[path.stem], "probe": 4.0})
+    assert testing.assert_promises(scenario, runs=20, confidence=0.999) is None
+
+
+@pytest.mark.parametrize("path", testing.scenario_files(SCENARIOS), ids=lambda path: path.stem)
+def test_the_parts_of_our_files_keep_their_contracts(path):
+    scenario = netkf.load(path)
+    testing.check_filter(scenario.filter.algorithm)
+    clock = scenario.network.activation
+    if isinstance(clock, netkf.parts.LinkClock):
+        testing.check_clock(clock, link=scenario.topology.links[0])
+
+
+def test_the_channels_of_our_files_keep_their_contracts():
+    channels = {}
+    for path in testing.scenario_files(SCENARIOS):
+        channel = netkf.load(path).network.channel
+        channels[repr((channel.loss, channel.delay))] = channel
+    assert len(channels) > 3
+    for channel in channels.values():
+        testing.check_channel(channel)
+
+
+def test_covariances_stay_above_the_exact_ones_of_the_errors(ring):
+    """H (10), given the events of one run, as an assertion of a test suite."""
+    run = netkf.simulate(ring.replace({"horizon": 4.0}))
+    exact = netkf.theory.error_covariance(ring, run)
+    assert testing.assert_dominated(exact, run.P) is None
+    with pytest.raises(AssertionError, match=r"P\[\d+, \d+\]: must stay below the bound"):
+        testing.assert_dominated(run.P, exact)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", PROMISING, ids=lambda path: path.stem)
+def test_the_promises_of_our_files_are_kept_in_full(path):
+    testing.assert_promises(path, runs=500)
+
+
+def test_a_broken_promise_fails_with_its_row():
+    scenario = netkf.load(SCENARIOS / "intermittent_scalar.toml")
+    wrong = scenario.replace(
+        {"filter": {"kind": f"{Overconfident.__module__}:{Overconfident.__name__}"}}
+    )
+    with pytest.raises(AssertionError) as caught:
+        testing.assert_promises(wrong, runs=60)
+    head, *rows = str(caught.value).splitlines()
+    assert head.startswith("intermittent-scalar: ")
+    assert "promises are broken (60 runs from seed 1, confidence 0.99)" in head
+    assert len(rows) == int(head.split()[1])
+    assert all(" [R " in row and "margin" in row for row in rows)
+
+
+def test_where_nothing_is_promised_theory_says_so(build):
+    with pytest.raises(TheoryError):
+        testing.assert_promises(build(filter={"kind": "local"}))
+
+
+def test_the_names_are_public():
+    assert netkf.testing is testing
+    for name in testing.__all__:
+        assert callable(getattr(testing, name))
+    assert dir(testing) == sorted(testing.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'check_weather'"):
+        _ = testing.check_weather
+
+
+def test_the_ten_lines_of_the_reference_are_a_test_file(tmp_path):
+    """The example of a user's test file, run by pytest as a user would."""
+    text = (ROOT / "docs" / "scenario_files.md").read_text(encoding="utf-8")
+    listed = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    [example] = [snippet for snippet in listed if "import pytest" in snippet]
+    (tmp_path / "scenarios").mkdir()
+    source = (SCENARIOS / "gossip_ring.toml").read_text()
+    short = source.replace("horizon = 400.0", "horizon = 24.0")
+    assert short != source
+    (tmp_path / "scenarios" / "ring.toml").write_text(short)
+    (tmp_path / "test_mine.py").write_text(example)
+    (tmp_path / "fusion.py").write_text(FUSION)
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir=."],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "3 passed" in done.stdout, done.stdout + done.stderr
+
+
+FUSION = '''
+from dataclasses import dataclass
+
+from netkf.parts import ExponentialDelay, Hybrid
+
+
+@dataclass(frozen=True, eq=False)
+class MyFilter(Hybrid):
+    """One's own."""
+
+
+class MyDelay(ExponentialDelay):
+    """One's own."""
+'''
