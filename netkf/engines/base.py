@@ -13,9 +13,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from enum import IntEnum
 
+import numpy as np
+
+from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import Recorder
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
 
 
 class Rank(IntEnum):
@@ -31,6 +35,9 @@ class Rank(IntEnum):
     ABSORB = 4
     PROBE = 5
 
+
+SHORTEST_SHARE = 1e-9
+"""The least part of a gap whose readings are used at once, however short the stretch."""
 
 Progress = Callable[[float], None]
 """Called with the simulated time now and then."""
@@ -54,3 +61,21 @@ class Engine(ABC):
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns the status, complete or diverged."""
+
+
+def finite_or_recorded(
+    scenario: Scenario,
+    recorder: Recorder,
+    time: float,
+    x: FloatArray,
+    xhat: FloatArray,
+    P: FloatArray,
+) -> bool:
+    """Record a sample of the truth (n,) and of all nodes (N, n), (N, n, n); False where a node is
+    no longer finite, with an event for each of them.
+    """
+    recorder.sample(time, x, xhat, P)
+    broken = np.flatnonzero(~(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)))
+    for k in broken:
+        recorder.append((time, CODES["diverged"], scenario.nodes[k], -1, -1, -1, NAN))
+    return not broken.size

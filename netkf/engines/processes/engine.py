@@ -11,7 +11,7 @@ import simpy
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.engines.base import Engine, Progress, Rank
+from netkf.engines.base import Engine, Progress, Rank, finite_or_recorded
 from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
 from netkf.engines.processes.slots import SlotProcess
@@ -21,7 +21,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
-SENSE, DIVERGED = CODES["sense"], CODES["diverged"]
+SENSE = CODES["sense"]
 Processes = list[Generator[simpy.Event, Any, None]]
 
 
@@ -139,11 +139,7 @@ def _record(
     xhat: FloatArray,
     P: FloatArray,
 ) -> None:
-    recorder.sample(time, x, xhat, P)
-    recorder.flush_if_full()
     progress(time)
-    broken = np.flatnonzero(~(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)))
-    if broken.size:
-        for k in broken:
-            recorder.append((time, DIVERGED, scenario.nodes[k], -1, -1, -1, NAN))
+    recorder.flush_if_full()
+    if not finite_or_recorded(scenario, recorder, time, x, xhat, P):
         raise DivergedError
