@@ -20,7 +20,7 @@ from netkf.algorithms.riccati import exponential_series, hamiltonian
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.legendre import MOMENTS, backward_coefficients
-from netkf.core.small import applied, polynomial, product
+from netkf.core.small import added, applied, polynomial
 
 LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
 
@@ -85,4 +85,4 @@ def gain_update(
     U = values[: n * q].reshape(n, q)
     W = values[n * q : 2 * n * q].reshape(n, q)
     C = values[2 * n * q :].reshape(q, n)
-    return np.asarray(x + applied(U + product(P, W), moments - applied(C, x)))
+    return np.asarray(x + applied(added(U, P, W), moments - applied(C, x)))

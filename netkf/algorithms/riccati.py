@@ -17,7 +17,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.compiling import compilable
-from netkf.core.small import applied, polynomial, product, solution
+from netkf.core.small import added, applied, even, polynomial, product, solution
 
 TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
 
@@ -125,16 +125,14 @@ def riccati_step(
     while whole >> level:
         if whole >> level & 1:
             F = table.F[level]
-            middle = solution(np.eye(n) + product(P, table.G[level]), P)
-            P = table.Q[level] + product(product(F, middle), F.T)
-            P = 0.5 * (P + P.T)
+            middle = solution(added(np.eye(n), P, table.G[level]), P)
+            P = even(added(table.Q[level], product(F, middle), F.T))
             x = applied(table.jump[level], x)
         level += 1
     rest = gap - whole * table.unit
     if rest <= 0.0:
         return P, x
     E, transition = evaluate_hamiltonian(table, rest)
-    X = E[:n, :n] + product(E[:n, n:], P)
-    Y = E[n:, :n] + product(E[n:, n:], P)
-    P = solution(X.T, Y.T)
-    return 0.5 * (P + P.T), applied(transition, x)
+    X = added(E[:n, :n], E[:n, n:], P)
+    Y = added(E[n:, :n], E[n:, n:], P)
+    return even(solution(X.T, Y.T)), applied(transition, x)

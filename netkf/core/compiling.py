@@ -2,7 +2,7 @@
 
 A function marked with :func:`compilable` may be called by functions that are compiled; it stays
 what it is for Python. Where numpy is the way to say it in Python and loops are what a compiler
-wants (products of small matrices), the loops stand beside it: ``compilable(as_loops)``.
+wants (products of small matrices), the loops stand beside it: ``compilable_as(loops)``.
 """
 
 from __future__ import annotations
@@ -16,21 +16,24 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_OPTIONS = {"nogil": True, "error_model": "numpy"}
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy"}
 _marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
 _known: set[Callable[..., Any]] = set()
 
 
-def compilable(
-    function: Function | None = None, *, loops: Callable[..., Any] | None = None
-) -> Any:
-    """Mark a function that compiled ones may call; compiled, it is ``loops`` where that is given."""
+def compilable(function: Function) -> Function:
+    """Mark a function that compiled ones may call; what it calls must be marked too."""
+    return compilable_as(function)(function)
+
+
+def compilable_as(loops: Callable[..., Any]) -> Callable[[Function], Function]:
+    """The same for a function that is ``loops``, of the same parameters, where it is compiled."""
 
     def mark(function: Function) -> Function:
-        _marked.append((function, loops or function))
+        _marked.append((function, loops))
         return function
 
-    return mark if function is None else mark(function)
+    return mark
 
 
 @cache
@@ -45,13 +48,14 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
     except ImportError:
         return None
     _introduce()
-    before = numba.config.CACHE_DIR
+    config: Any = numba.config
+    before = config.CACHE_DIR
     # numba looks at the file of the function alone, and what it calls may have changed.
-    numba.config.CACHE_DIR = str(_folder(before))
+    config.CACHE_DIR = str(_folder(before))
     try:
         made: Callable[..., Any] = numba.njit(cache=True, **_OPTIONS)(function)
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before
     return made
 
 
@@ -84,7 +88,7 @@ def _always(loops: Callable[..., Any]) -> Callable[..., Any]:
     """What numba asks for an implementation; it must have the same signature."""
 
     @wraps(loops)
-    def choose(*types: Any) -> Callable[..., Any]:
+    def choose(*_types: Any) -> Callable[..., Any]:
         return loops
 
     return choose

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg.lapack import dgesv
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import compilable_as
 
 
 def _product_loops(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -21,10 +21,41 @@ def _product_loops(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-@compilable(loops=_product_loops)
+@compilable_as(_product_loops)
 def product(a: FloatArray, b: FloatArray) -> FloatArray:
     """``a b`` (r, c) of (r, m) and (m, c)."""
     return np.asarray(a @ b)
+
+
+def _added_loops(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    out = np.empty((a.shape[0], b.shape[1]))
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = c[i, j]
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+    return out
+
+
+@compilable_as(_added_loops)
+def added(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """``c + a b`` (r, s) of (r, s), (r, m) and (m, s)."""
+    return np.asarray(c + a @ b)
+
+
+def _even_loops(P: FloatArray) -> FloatArray:
+    out = np.empty(P.shape)
+    for i in range(P.shape[0]):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
+    return out
+
+
+@compilable_as(_even_loops)
+def even(P: FloatArray) -> FloatArray:
+    """The symmetric part of one matrix (n, n)."""
+    return np.asarray(0.5 * (P + P.T))
 
 
 def _applied_loops(a: FloatArray, x: FloatArray) -> FloatArray:
@@ -37,7 +68,7 @@ def _applied_loops(a: FloatArray, x: FloatArray) -> FloatArray:
     return out
 
 
-@compilable(loops=_applied_loops)
+@compilable_as(_applied_loops)
 def applied(a: FloatArray, x: FloatArray) -> FloatArray:
     """``a x`` (r,) of (r, m) and (m,)."""
     return np.asarray(a @ x)
@@ -45,7 +76,8 @@ def applied(a: FloatArray, x: FloatArray) -> FloatArray:
 
 def _polynomial_loops(series: FloatArray, gap: float) -> FloatArray:
     terms, size = series.shape
-    out, power = series[0].copy(), 1.0
+    out: FloatArray = series[0].copy()
+    power = 1.0
     for k in range(1, terms):
         power *= gap
         for j in range(size):
@@ -53,7 +85,7 @@ def _polynomial_loops(series: FloatArray, gap: float) -> FloatArray:
     return out
 
 
-@compilable(loops=_polynomial_loops)
+@compilable_as(_polynomial_loops)
 def polynomial(series: FloatArray, gap: float) -> FloatArray:
     """``sum_k gap^k series[k]`` (size,) of (terms, size)."""
     powers = np.empty(len(series))
@@ -62,7 +94,9 @@ def polynomial(series: FloatArray, gap: float) -> FloatArray:
     return np.asarray(np.multiply.accumulate(powers) @ series)
 
 
-def _solution_loops(left: FloatArray, right: FloatArray) -> FloatArray:
+def _solution_loops(  # noqa: PLR0912 - loops are what the compiler wants
+    left: FloatArray, right: FloatArray
+) -> FloatArray:
     # Gauss with the largest pivot of each column, as LAPACK does it.
     n, columns = left.shape[0], right.shape[1]
     L, out = left.copy(), right.copy()
@@ -93,7 +127,7 @@ def _solution_loops(left: FloatArray, right: FloatArray) -> FloatArray:
     return out
 
 
-@compilable(loops=_solution_loops)
+@compilable_as(_solution_loops)
 def solution(left: FloatArray, right: FloatArray) -> FloatArray:
     """``left^-1 right`` (n, c) of (n, n) and (n, c); nan where it overflows or is singular."""
     # LAPACK itself: numpy's wrapper takes longer than the arithmetic.

@@ -22,7 +22,9 @@ ENGINES = ("auto", "processes", "compiled")
 
 
 def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
-    """The engine of a name, auto the fastest that can; raises EngineError where it cannot run the scenario."""
+    """The engine of a name, ``auto`` the fastest that can; raises EngineError where it cannot run
+    the scenario.
+    """
     engine: Engine
     if isinstance(name, Engine):
         engine = name

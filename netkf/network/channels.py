@@ -409,6 +409,4 @@ def chances(loss: Loss, link: Link, first: int, bad: np.ndarray, measured: float
     """(count,) ``loss.chance`` of the messages from number ``first`` on, ``bad`` (count,)."""
     if type(loss) in (NoLoss, Bernoulli, PerLink):
         return np.full(len(bad), loss.chance(link, first, False, measured))
-    return np.array(
-        [loss.chance(link, first + k, b, measured) for k, b in enumerate(bad.tolist())]
-    )
+    return np.array([loss.chance(link, first + k, b, measured) for k, b in enumerate(bad.tolist())])

@@ -126,9 +126,7 @@ class DiffusionPath:
         self._used = 0
         start = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(self._n)
         self._index = -1
-        self._steps = [
-            Step(0.0, 0.0, start, start, np.zeros((2, self._n)), np.zeros((4, self._n)))
-        ]
+        self._steps = [Step(0.0, 0.0, start, start, np.zeros((2, self._n)), np.zeros((4, self._n)))]
 
     def grid(self, k: int) -> float:
         """Time of the k-th point of the sensing grid, rounded so that lattices of other periods
@@ -256,9 +254,7 @@ class DiffusionPath:
         noise = noise.reshape(3, n)
         self._steps += [
             Step(step.start, time, step.x_start, x, first, _cubic(left, noise[0], noise[1:])),
-            Step(
-                time, step.end, x, step.x_end, second, _cubic(length - left, later[0], later[1:])
-            ),
+            Step(time, step.end, x, step.x_end, second, _cubic(length - left, later[0], later[1:])),
         ]
 
 
@@ -305,7 +301,7 @@ def _legendre(u: FloatArray) -> FloatArray:
 
 @compilable
 def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray:
-    """(2, n) moments of x over ``[start, end]`` inside a step; ``series`` is that of the responses."""
+    """(2, n) moments of x over ``[start, end]`` inside a step; ``series`` is of the responses."""
     n = len(step.x_start)
     if start == step.start and end == step.end:
         return step.moments

@@ -26,7 +26,7 @@ from netkf.core.fields import (
     setting,
     several,
 )
-from netkf.core.small import product
+from netkf.core.small import added, product
 from netkf.plants.diffusion import BLOCK, DiffusionPath
 from netkf.plants.linear import Readings, SlotReadings
 
@@ -86,7 +86,8 @@ class SensorPath:
         random: np.random.Generator,
         cutting: np.random.Generator,
     ) -> None:
-        self.H, self._root = H, np.linalg.cholesky(R)
+        self.H = H
+        self._root: FloatArray = np.linalg.cholesky(R)
         self._random, self._cutting = random, cutting
         self._drawn = np.empty((0, 2, len(R)))
         self._used = 0
@@ -129,7 +130,7 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 @compilable
 def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
     """(2, p) moments of dy from those of x (2, n) and of unit white noise (2, p)."""
-    return product(seen, H.T) + product(noise, root.T)
+    return added(product(seen, H.T), noise, root.T)
 
 
 @compilable

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.compiled.replay import Stretch
 from netkf.engines.compiled.tables import Sensing
+from netkf.plants.diffusion import Step
 from netkf.plants.sensors import step_noise
 from netkf.scenario.scenario import Scenario
 
@@ -28,7 +28,9 @@ class Path:
 
     def following(self) -> Stretch:
         """The next stretch; the last one reaches beyond the horizon."""
-        first, pieces, steps = self._done, [], []
+        first = self._done
+        pieces: list[Step] = []
+        steps: list[int] = []
         while self._done < first + STEPS:
             parts = self._path.following()
             pieces += parts
@@ -38,10 +40,20 @@ class Path:
                 break
         ends = [self._path.grid(k) for k in range(first + 1, self._done + 1)]
         waking = [time for time in ends if time < self._horizon] if self._senses else []
-        columns = [np.array([piece[k] for piece in pieces]) for k in range(6)]
         order = np.array(steps, dtype=np.int64)
-        return Stretch(ends[-1], *columns, order, np.array(ends)[order], np.array(waking),
-                       self._series)
+        return Stretch(
+            end=ends[-1],
+            start=np.array([piece.start for piece in pieces]),
+            stop=np.array([piece.end for piece in pieces]),
+            x_start=np.array([piece.x_start for piece in pieces]),
+            x_stop=np.array([piece.x_end for piece in pieces]),
+            moments=np.array([piece.moments for piece in pieces]),
+            cubic=np.array([piece.cubic for piece in pieces]),
+            step=order,
+            last=np.array(ends)[order],
+            grid=np.array(waking),
+            series=self._series,
+        )
 
 
 class Noise:
@@ -53,6 +65,7 @@ class Noise:
         keys = [(node, place.ordinal) for node, place in placed]
         self._noise = [streams.generator("noise", *key) for key in keys]
         self._cuts = [streams.generator("cut", *key) for key in keys]
+        assert scenario.truth.sensing_period is not None
         self._period = scenario.truth.sensing_period
         n, count = scenario.plant.n, len(sensors)
         self._rows = [len(sensor.R) for sensor in sensors]

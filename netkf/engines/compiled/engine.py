@@ -14,13 +14,19 @@ from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core import compiling
 from netkf.core.arrays import FloatArray
+from netkf.core.fields import Part
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, finite_or_recorded
 from netkf.engines.compiled.draws import Noise, Path
 from netkf.engines.compiled.replay import (
     DONE,
+    GRID_AT,
     PLACES,
+    PROBE_AT,
+    ROW,
     SAMPLE,
+    STEP_AT,
+    TICK_AT,
     WANT_CUTS,
     WANT_MAIL,
     WANT_ROWS,
@@ -29,7 +35,6 @@ from netkf.engines.compiled.replay import (
     Cursor,
     replay,
 )
-from netkf.engines.compiled.replay import GRID_AT, PROBE_AT, ROW, STEP_AT, TICK_AT
 from netkf.engines.compiled.schedule import Schedule
 from netkf.engines.compiled.tables import empty_mail, host_tables, larger, link_tables
 from netkf.plants.diffusion import Diffusion
@@ -39,7 +44,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import EVENT
 
-FILTERS = (Hybrid, Local, Central)
+KNOWN = (Diffusion, LinearSensor, Hybrid, Local, Central)
 ROWS = 1 << 16
 FIRST_MAIL = 1024
 
@@ -58,11 +63,11 @@ class CompiledEngine(Engine):
         if not compiling.available():
             remedy = 'install it (pip install "netkf[fast]") or use engine="processes"'
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
-        parts = [("plant", scenario.plant, (Diffusion,))]
-        parts += [("sensor", sensor, (LinearSensor,)) for sensor in scenario.sensors]
-        parts += [("filter", scenario.filter.algorithm, FILTERS)]
-        for family, part, known in parts:
-            if type(part) not in known:
+        parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
+        parts += [("sensor", sensor) for sensor in scenario.sensors]
+        parts += [("filter", scenario.filter.algorithm)]
+        for family, part in parts:
+            if type(part) not in KNOWN:
                 kind = name_of(family, part)
                 return f'engine "compiled" cannot run the {family} {kind!r}; {remedy}'
         return None

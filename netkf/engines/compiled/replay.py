@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.flow import usable
+from netkf.algorithms.flow import Payload, usable
 from netkf.algorithms.gains import GainTable, gain_update
 from netkf.algorithms.hybrid import reset
 from netkf.algorithms.riccati import RiccatiTable, riccati_step
@@ -33,8 +33,8 @@ a larger pool of messages or room for rows; it is time for a sample; all is done
 """
 
 # Places in Cursor.place.
-TICK_AT, STEP_AT, GRID_AT, AWAKE, PROBE_AT, ROW, FREE, HEAP, WAITING, READY, SENT, HOST = range(12)
-PLACES = 12
+TICK_AT, STEP_AT, GRID_AT, AWAKE, PROBE_AT, ROW, FREE, HEAP, WAITING, READY, SENT = range(11)
+PLACES = 11
 MOST_ROWS = 5  # of one activation
 NEVER = math.inf
 
@@ -162,103 +162,89 @@ def advance(
 
 
 @compilable
-def sooner(mail: Mail, a: int, b: int) -> bool:
+def sooner(arrival: FloatArray, way: np.ndarray, order: np.ndarray, a: int, b: int) -> bool:
     """Whether message ``a`` arrives before message ``b``."""
-    if mail.arrival[a] != mail.arrival[b]:
-        return bool(mail.arrival[a] < mail.arrival[b])
-    if mail.way[a] != mail.way[b]:
-        return bool(mail.way[a] < mail.way[b])
-    return bool(mail.order[a] < mail.order[b])
+    if arrival[a] != arrival[b]:
+        return bool(arrival[a] < arrival[b])
+    if way[a] != way[b]:
+        return bool(way[a] < way[b])
+    return bool(order[a] < order[b])
 
 
 @compilable
 def push(mail: Mail, size: int, message: int) -> None:
     """Put a message on the heap of ``size``."""
-    k = size
-    while k > 0 and sooner(mail, message, mail.heap[(k - 1) // 2]):
-        mail.heap[k] = mail.heap[(k - 1) // 2]
+    heap, arrival, way, order, k = mail.heap, mail.arrival, mail.way, mail.order, size
+    while k > 0 and sooner(arrival, way, order, message, heap[(k - 1) // 2]):
+        heap[k] = heap[(k - 1) // 2]
         k = (k - 1) // 2
-    mail.heap[k] = message
+    heap[k] = message
 
 
 @compilable
 def pop(mail: Mail, size: int) -> int:
     """Take the next message off the heap of ``size``."""
-    top, moved, k = mail.heap[0], mail.heap[size - 1], 0
+    heap, arrival, way, order = mail.heap, mail.arrival, mail.way, mail.order
+    top, moved, k = heap[0], heap[size - 1], 0
     while 2 * k + 1 < size - 1:
         child = 2 * k + 1
-        if child + 1 < size - 1 and sooner(mail, mail.heap[child + 1], mail.heap[child]):
+        if child + 1 < size - 1 and sooner(arrival, way, order, heap[child + 1], heap[child]):
             child += 1
-        if not sooner(mail, mail.heap[child], moved):
+        if not sooner(arrival, way, order, heap[child], moved):
             break
-        mail.heap[k] = mail.heap[child]
+        heap[k] = heap[child]
         k = child
-    mail.heap[k] = moved
+    heap[k] = moved
     return int(top)
 
 
 @compilable
 def put(
-    hosts: Hosts, links: Links, mail: Mail, place: np.ndarray, h: int, message: int, now: float
+    inbox: np.ndarray,
+    waiting: np.ndarray,
+    ends: np.ndarray,
+    sent: FloatArray,
+    ways: np.ndarray,
+    following: np.ndarray,
+    place: np.ndarray,
+    h: int,
+    message: int,
+    now: float,
 ) -> None:
     """Put a message into an inbox, by peer; the newest of several from one peer counts."""
-    if hosts.inbox[h] == -1:
-        mail.waiting[place[WAITING]] = h
+    if inbox[h] == -1:
+        waiting[place[WAITING]] = h
         place[WAITING] += 1
-    way = mail.way[message]
-    peer = links.ends[way // 2, way % 2]
-    before, here = -1, hosts.inbox[h]
+    way = ways[message]
+    peer, other = ends[way // 2, way % 2], -1
+    before, here = -1, inbox[h]
     while here != -1:
-        other = links.ends[mail.way[here] // 2, mail.way[here] % 2]
+        other = ends[ways[here] // 2, ways[here] % 2]
         if other >= peer:
             break
-        before, here = here, mail.next[here]
+        before, here = here, following[here]
     gone = -1
     if here != -1 and other == peer:
-        if now - mail.sent[message] > now - mail.sent[here]:
+        if now - sent[message] > now - sent[here]:
             gone = message
         else:
-            gone, here = here, mail.next[here]
+            gone, here = here, following[here]
     if gone != message:
-        mail.next[message] = here
+        following[message] = here
         if before == -1:
-            hosts.inbox[h] = message
+            inbox[h] = message
         else:
-            mail.next[before] = message
+            following[before] = message
     if gone != -1:
-        mail.next[gone] = place[FREE]
+        following[gone] = place[FREE]
         place[FREE] = gone
 
 
 @compilable
-def absorb(
-    hosts: Hosts, models: Models, links: Links, mail: Mail, place: np.ndarray, h: int, now: float
-) -> float:
-    """Use all mail of a host in one reset; returns the age of the oldest message."""
-    own, message = 0.0, hosts.inbox[h]
-    while message != -1:
-        way = mail.way[message]
-        own += links.weight[way // 2, way % 2]
-        message = mail.next[message]
-    own = 1.0 - own
-    xhat, P = own * hosts.xhat[h], own * hosts.P[h]
-    oldest, message = 0.0, hosts.inbox[h]
-    prediction = len(models.unit) - 1
-    while message != -1:
-        way, age = mail.way[message], now - mail.sent[message]
-        other, other_P = mail.xhat[message], mail.P[message]
-        if age > 0.0:
-            other_P, other = riccati_step(flow_table(models, prediction), other_P, other, age)
-            oldest = max(oldest, age)
-        xhat, P = reset(xhat, P, links.weight[way // 2, way % 2], other, other_P)
-        following = mail.next[message]
-        mail.next[message] = place[FREE]
-        place[FREE] = message
-        message = following
-    hosts.xhat[h] = xhat
-    hosts.P[h] = P
-    hosts.inbox[h] = -1
-    return oldest
+def arrived(models: Models, xhat: FloatArray, P: FloatArray, age: float) -> Payload:
+    """What a message that took ``age`` seconds says now."""
+    other_P, other = riccati_step(flow_table(models, len(models.unit) - 1), P, xhat, age)
+    return Payload(other, other_P)
 
 
 @compilable
@@ -293,76 +279,109 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     rows: np.ndarray,
 ) -> int:
     """Go on until something is wanted; see the words above. Order is (time, rank, entity)."""
+    # Names of their own, because every look into a group counts references.
     place, mailed = cursor.place, cursor.mailed
+    model, nodes, xhats, Ps, reached = hosts.model, hosts.node, hosts.xhat, hosts.P, hosts.now
+    sensors, inbox, ends, weights = hosts.sensors, hosts.inbox, links.ends, links.weight
+    messages, ways, free = links.messages, links.ways, mail.next
+    mail_x, mail_P, sent, way_of = mail.xhat, mail.P, mail.sent, mail.way
+    numbers, arrivals, order, heap = mail.number, mail.arrival, mail.order, mail.heap
+    waiting, ticks, ticking, delays = mail.waiting, window.t, window.link, window.delay
+    grid, stop, awake, awake_node = path.grid, path.stop, sensing.host, sensing.node
+    unit, series, jump, F = models.unit, models.series, models.jump, models.F
+    G, Q, capacity = models.G, models.Q, len(mail.sent)
+    window_end, path_end = window.end, path.end
     while True:
         if place[ROW] + MOST_ROWS > len(rows):
             return WANT_ROWS
         sense = tick = deliver = ready = probe = NEVER
-        if place[GRID_AT] < len(path.grid):
-            sense = path.grid[place[GRID_AT]]
-        if place[TICK_AT] < len(window.t):
-            tick = window.t[place[TICK_AT]]
+        if place[GRID_AT] < len(grid):
+            sense = grid[place[GRID_AT]]
+        if place[TICK_AT] < len(ticks):
+            tick = ticks[place[TICK_AT]]
         if place[HEAP] > 0:
-            deliver = mail.arrival[mail.heap[0]]
+            deliver = arrivals[heap[0]]
         if place[WAITING] > 0:
             ready = mailed[0]
         if place[PROBE_AT] < len(probes):
             probe = probes[place[PROBE_AT]]
         now = min(sense, tick, deliver, ready, probe)
-        if now >= window.end and window.end < NEVER:
+        if now >= window_end and window_end < NEVER:
             return WANT_TICKS
-        if now > path.end and path.end < horizon:
+        if now > path_end and path_end < horizon:
             return WANT_STEPS
         if now == NEVER:
             return DONE
-        while path.stop[place[STEP_AT]] < now:
+        while stop[place[STEP_AT]] < now:
             place[STEP_AT] += 1
-        piece = place[STEP_AT]
+        # Who must be brought to this time before anything happens.
+        first, after = 0, len(reached)
+        link = i = j = -1
         if sense == now:
-            k = place[AWAKE]
-            if not advance(hosts, models, sensing, path, piece, sensing.host[k], now):
-                return WANT_CUTS
-            note(rows, place, now, SENSE, sensing.node[k], -1, -1, np.nan)
+            first = awake[place[AWAKE]]
+            after = first + 1
+        elif tick == now:
+            if place[FREE] >= capacity or free[place[FREE]] >= capacity:
+                return WANT_MAIL
+            link = ticking[place[TICK_AT]]
+            i, j = ends[link, 0], ends[link, 1]
+            first, after = 0, 2
+        elif deliver == now:
+            after = 0
+        elif ready == now:
+            if place[READY] == 0:
+                waiting[: place[WAITING]].sort()
+            first = waiting[place[READY]]
+            after = first + 1
+        for k in range(first, after):
+            h = k
+            if link >= 0:
+                h = i if k == 0 else j
+            if not reached[h] < now:
+                continue
+            if sensors[h] < sensors[h + 1]:
+                if not advance(hosts, models, sensing, path, place[STEP_AT], h, now):
+                    return WANT_CUTS
+            else:
+                m, gap = model[h], now - reached[h]
+                table = RiccatiTable(F.shape[2], unit[m], series[m], jump[m], F[m], G[m], Q[m])
+                P, xhat = riccati_step(table, Ps[h], xhats[h], gap)
+                xhats[h] = xhat
+                Ps[h] = P
+                reached[h] = now
+        if sense == now:
+            note(rows, place, now, SENSE, awake_node[place[AWAKE]], -1, -1, np.nan)
             place[AWAKE] += 1
-            if place[AWAKE] == len(sensing.host):
+            if place[AWAKE] == len(awake):
                 place[AWAKE] = 0
                 place[GRID_AT] += 1
         elif tick == now:
-            capacity = len(mail.sent)
-            if place[FREE] >= capacity or mail.next[place[FREE]] >= capacity:
-                return WANT_MAIL
-            link = window.link[place[TICK_AT]]
-            i, j = links.ends[link, 0], links.ends[link, 1]
-            if not advance(hosts, models, sensing, path, piece, i, now):
-                return WANT_CUTS
-            if not advance(hosts, models, sensing, path, piece, j, now):
-                return WANT_CUTS
-            note(rows, place, now, TICK, hosts.node[i], hosts.node[j], -1, np.nan)
-            number = links.messages[link]
-            links.messages[link] += 1
-            for way in range(links.ways):
+            note(rows, place, now, TICK, nodes[i], nodes[j], -1, np.nan)
+            number = messages[link]
+            messages[link] += 1
+            for way in range(ways):
                 sender, receiver = (i, j) if way == 0 else (j, i)
-                one, other = hosts.node[sender], hosts.node[receiver]
+                one, other = nodes[sender], nodes[receiver]
                 note(rows, place, now, SEND, one, other, number, np.nan)
-                delay = window.delay[place[TICK_AT], way]
+                delay = delays[place[TICK_AT], way]
                 arrival = now + delay
                 if delay < 0.0:
                     note(rows, place, now, LOST, one, other, number, np.nan)
                 elif delay == 0.0 or arrival < horizon:
                     message = place[FREE]
-                    place[FREE] = mail.next[message]
-                    mail.xhat[message] = hosts.xhat[sender]
-                    mail.P[message] = hosts.P[sender]
-                    mail.sent[message] = now
-                    mail.way[message] = 2 * link + way
-                    mail.number[message] = number
+                    place[FREE] = free[message]
+                    mail_x[message] = xhats[sender]
+                    mail_P[message] = Ps[sender]
+                    sent[message] = now
+                    way_of[message] = 2 * link + way
+                    numbers[message] = number
                     if delay == 0.0:
                         note(rows, place, now, DELIVER, other, one, number, 0.0)
-                        put(hosts, links, mail, place, receiver, message, now)
+                        put(inbox, waiting, ends, sent, way_of, free, place, receiver, message, now)
                         mailed[0] = now
                     else:
-                        mail.arrival[message] = arrival
-                        mail.order[message] = place[SENT]
+                        arrivals[message] = arrival
+                        order[message] = place[SENT]
                         place[SENT] += 1
                         push(mail, place[HEAP], message)
                         place[HEAP] += 1
@@ -370,28 +389,40 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
         elif deliver == now:
             message = pop(mail, place[HEAP])
             place[HEAP] -= 1
-            link, way = mail.way[message] // 2, mail.way[message] % 2
-            sender, receiver = links.ends[link, way], links.ends[link, 1 - way]
-            one, other, number = hosts.node[sender], hosts.node[receiver], mail.number[message]
-            note(rows, place, now, DELIVER, other, one, number, now - mail.sent[message])
-            put(hosts, links, mail, place, receiver, message, now)
+            came, way = way_of[message] // 2, way_of[message] % 2
+            sender, receiver = ends[came, way], ends[came, 1 - way]
+            one, other, number = nodes[sender], nodes[receiver], numbers[message]
+            note(rows, place, now, DELIVER, other, one, number, now - sent[message])
+            put(inbox, waiting, ends, sent, way_of, free, place, receiver, message, now)
             mailed[0] = now
         elif ready == now:
-            if place[READY] == 0:
-                mail.waiting[: place[WAITING]].sort()
-            h = mail.waiting[place[READY]]
-            if not advance(hosts, models, sensing, path, piece, h, now):
-                return WANT_CUTS
-            oldest = absorb(hosts, models, links, mail, place, h, now)
-            note(rows, place, now, ABSORB, hosts.node[h], -1, -1, oldest)
+            h = waiting[place[READY]]
+            own, message = 0.0, inbox[h]
+            while message != -1:
+                own += weights[way_of[message] // 2, way_of[message] % 2]
+                message = free[message]
+            own = 1.0 - own
+            xhat, P = own * xhats[h], own * Ps[h]
+            oldest, message = 0.0, inbox[h]
+            while message != -1:
+                age = now - sent[message]
+                weight = weights[way_of[message] // 2, way_of[message] % 2]
+                if age > 0.0:
+                    oldest = max(oldest, age)
+                    payload = arrived(models, mail_x[message], mail_P[message], age)
+                    xhat, P = reset(xhat, P, weight, payload.xhat, payload.P)
+                else:
+                    xhat, P = reset(xhat, P, weight, mail_x[message], mail_P[message])
+                gone, message = message, free[message]
+                free[gone] = place[FREE]
+                place[FREE] = gone
+            xhats[h] = xhat
+            Ps[h] = P
+            inbox[h] = -1
+            note(rows, place, now, ABSORB, nodes[h], -1, -1, oldest)
             place[READY] += 1
             if place[READY] == place[WAITING]:
                 place[READY] = place[WAITING] = 0
         else:
-            while place[HOST] < len(hosts.now):
-                if not advance(hosts, models, sensing, path, piece, place[HOST], now):
-                    return WANT_CUTS
-                place[HOST] += 1
-            place[HOST] = 0
             place[PROBE_AT] += 1
             return SAMPLE

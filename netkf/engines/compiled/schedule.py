@@ -127,5 +127,3 @@ class Schedule:
 
 def _stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:
     return streams.generator(purpose, *ends)
-
-

@@ -187,9 +187,8 @@ def empty_mail(hosts: Hosts, capacity: int) -> Mail:
 def larger(mail: Mail) -> Mail:
     """Twice the pool; the new messages are free, and the first of them is the list of free ones."""
     old = len(mail.sent)
-    grown = [np.concatenate([part, np.zeros_like(part)]) for part in mail[:-1]]
-    made = Mail(*grown, mail.waiting)
+    pool = {name: part for name, part in mail._asdict().items() if name != "waiting"}
+    grown = {name: np.concatenate([part, np.zeros_like(part)]) for name, part in pool.items()}
+    made = mail._replace(**grown)
     made.next[old:] = np.arange(old + 1, 2 * old + 1)
     return made
-
-
