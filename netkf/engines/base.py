@@ -18,8 +18,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.recorder import Recorder
 
 
 class Rank(IntEnum):
@@ -63,19 +62,7 @@ class Engine(ABC):
         """Simulate up to the horizon; returns the status, complete or diverged."""
 
 
-def finite_or_recorded(
-    scenario: Scenario,
-    recorder: Recorder,
-    time: float,
-    x: FloatArray,
-    xhat: FloatArray,
-    P: FloatArray,
-) -> bool:
-    """Record a sample of the truth (n,) and of all nodes (N, n), (N, n, n); False where a node is
-    no longer finite, with an event for each of them.
-    """
-    recorder.sample(time, x, xhat, P)
-    broken = np.flatnonzero(~(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)))
-    for k in broken:
-        recorder.append((time, CODES["diverged"], scenario.nodes[k], -1, -1, -1, NAN))
-    return not broken.size
+def broken(scenario: Scenario, xhat: FloatArray, P: FloatArray) -> list[int]:
+    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is no longer finite."""
+    finite = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)
+    return [scenario.nodes[k] for k in np.flatnonzero(~finite)]

@@ -16,7 +16,7 @@ from netkf.core import compiling
 from netkf.core.arrays import FloatArray
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
-from netkf.engines.base import Engine, Progress, finite_or_recorded
+from netkf.engines.base import Engine, Progress, broken
 from netkf.engines.compiled.draws import Noise, Path
 from netkf.engines.compiled.replay import (
     DONE,
@@ -41,10 +41,11 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.sensors import LinearSensor
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import Recorder
-from netkf.trace.schema import EVENT
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES, EVENT
 
 KNOWN = (Diffusion, LinearSensor, Hybrid, Local, Central)
+DIVERGED = CODES["diverged"]
 ROWS = 1 << 16
 FIRST_MAIL = 1024
 
@@ -151,8 +152,8 @@ class _Run:
 
     def _pass_rows_on(self) -> None:
         used = int(self._cursor.place[ROW])
-        self._recorder.extend(self._rows[:used].copy())
         self._cursor.place[ROW] = 0
+        self._recorder.extend(self._rows[:used].copy())
 
     def _sample(self) -> bool:
         place, hosts = self._cursor.place, self._hosts
@@ -162,9 +163,14 @@ class _Run:
         if self._scenario.filter.algorithm.pooled:
             count = len(self._scenario.nodes)
             xhat, P = np.repeat(xhat, count, axis=0), np.repeat(P, count, axis=0)
-        self._pass_rows_on()
+        self._recorder.sample(time, x, xhat, P)
         self._progress(time)
-        return finite_or_recorded(self._scenario, self._recorder, time, x, xhat, P)
+        nodes = broken(self._scenario, xhat, P)
+        if nodes:
+            self._pass_rows_on()
+        for node in nodes:
+            self._recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
+        return not nodes
 
     def _shown(self, time: float, piece: int) -> FloatArray:
         path = self._stretch

@@ -11,7 +11,7 @@ import simpy
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.engines.base import Engine, Progress, Rank, finite_or_recorded
+from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
 from netkf.engines.processes.slots import SlotProcess
@@ -21,7 +21,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
-SENSE = CODES["sense"]
+SENSE, DIVERGED = CODES["sense"], CODES["diverged"]
 Processes = list[Generator[simpy.Event, Any, None]]
 
 
@@ -139,7 +139,11 @@ def _record(
     xhat: FloatArray,
     P: FloatArray,
 ) -> None:
-    progress(time)
+    recorder.sample(time, x, xhat, P)
     recorder.flush_if_full()
-    if not finite_or_recorded(scenario, recorder, time, x, xhat, P):
+    progress(time)
+    nodes = broken(scenario, xhat, P)
+    for node in nodes:
+        recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
+    if nodes:
         raise DivergedError
