@@ -87,7 +87,7 @@ class SensorPath:
         cutting: np.random.Generator,
     ) -> None:
         self.H = H
-        self._root: FloatArray = np.linalg.cholesky(R)
+        self._root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
         self._random, self._cutting = random, cutting
         self._drawn = np.empty((0, 2, len(R)))
         self._used = 0
