@@ -27,7 +27,6 @@ from netkf.plants.plant import Plant
 
 BLOCK = 64  # steps drawn at once
 LONGEST_STEP = 8.0
-SLOWEST = 1e-12  # per second; what is slower stands still
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
@@ -86,7 +85,7 @@ def default_sensing_period(
     for G in informations:
         M = np.block([[-plant.A.T, G], [plant.Q, plant.A]])
         fastest = max(fastest, float(np.abs(np.linalg.eigvals(M)).max()))
-    wanted = min(0.5 / fastest if fastest > SLOWEST else 1.0, longest, plant.longest_period)
+    wanted = min(0.5 / fastest if fastest > 0.0 else 1.0, longest, plant.longest_period)
     power = 10.0 ** math.floor(math.log10(wanted))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= wanted * (1.0 + 1e-9))
     return float(f"{digit * power:.12g}")

@@ -17,4 +17,7 @@ def assert_agree(scenario, replica=0):
         one, other = getattr(fast, name), getattr(slow, name)
         size = np.nanmax(np.abs(other), initial=0.0, where=np.isfinite(other))
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10 * size, err_msg=name)
+    assert fast.sums.keys() == slow.sums.keys()
+    for name, pair in slow.sums.items():
+        np.testing.assert_allclose(fast.sums[name], pair, rtol=1e-10)
     return fast

@@ -5,15 +5,15 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 
 import netkf
+from netkf.algorithms import square_root
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core import compiling, small
-from netkf.core.errors import EngineError
+from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.streams import Streams
-from netkf.engines.compiled.engine import CompiledEngine
 from netkf.network.channels import Bernoulli, Fates
 from netkf.scenario.reading import from_table
 from netkf.trace.recorder import MemorySink, Recorder
@@ -22,22 +22,19 @@ from tests.conftest import SCENARIOS, scenario_files
 from tests.engines.agreement import assert_agree
 
 pytest.importorskip("numba")
-SHORT = {"intel_lab.toml": 1.5, "blind_unstable.toml": 10.0, "threshold.toml": 20.0}
+SHORT = {"intel_lab.toml": 1.5, "diffusion_regression.toml": 300.0}
 
 
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda file: file.stem)
-def test_every_scenario_that_it_runs_agrees(file):
+def test_every_scenario_agrees(file):
     scenario = netkf.load(file)
-    if CompiledEngine().refusal(scenario) is not None:
-        assert scenario.slotted
-        with pytest.raises(EngineError, match="linear"):
-            netkf.simulate(scenario, engine="compiled")
-        return
-    assert_agree(scenario.replace({"horizon": SHORT.get(file.name, 10.0)}))
+    horizon = min(scenario.horizon, SHORT.get(file.name, 40.0))
+    assert_agree(scenario.replace({"horizon": horizon}))
 
 
 def entries(rows, columns, size=1.0):
-    row = st.lists(st.floats(-size, size), min_size=columns, max_size=columns)
+    entry = st.floats(-size, size).map(lambda value: round(value, 2))
+    row = st.lists(entry, min_size=columns, max_size=columns)
     return st.lists(row, min_size=rows, max_size=rows)
 
 
@@ -130,6 +127,110 @@ def test_drawn_scenarios_agree(tables):
     assert_agree(from_table(tables, SCENARIOS))
 
 
+MATCHINGS = st.sampled_from(
+    [
+        {"protocol": "maximal"},
+        {"protocol": "one-edge", "lazy": 0.3},
+        {"protocol": "node-wakeup"},
+        {"protocol": "independent", "p": 0.4},
+    ]
+)
+SLOT_FILTERS = st.sampled_from(
+    [
+        {"kind": "gossip"},
+        {"kind": "intermittent"},
+        {"kind": "diffusion"},
+        {"kind": "diffusion", "on_loss": "keep-own", "model": {"R": [[2.0]]}},
+        {"kind": "push-sum", "gamma": 2, "delta": 4.0},
+        {"kind": "push-sum", "gamma": 3, "delta": 5.0, "links": "held"},
+        {"kind": "push-sum", "gamma": 1, "delta": 5.0, "asymptotic": True},
+        {"kind": "local"},
+        {"kind": "central"},
+    ]
+)
+
+
+@st.composite
+def slotted(draw):
+    n = draw(st.integers(1, 3))
+    F, H = np.array(draw(entries(n, n))), draw(entries(1, n))
+    start = draw(st.sampled_from([0.5, 1.0, 100.0]))
+    plant = {"kind": "linear", "F": (F + np.eye(n)).tolist(), "Q": np.eye(n).tolist()}
+    regressor = {"kind": "regressor", "nodes": [1], "A": [[0.5]], "B": [[1.0]], "R": [[0.3]]}
+    regressor |= {"C": np.ones((n, 1)).tolist(), "start": [1.0], "xi_cov": [[0.5]]}
+    sensors = [
+        {"nodes": [0], "H": H, "R": [[draw(st.floats(0.01, 1.0))]]},
+        draw(
+            st.sampled_from(
+                [regressor, {"nodes": [0, 1], "H": np.ones((1, n)).tolist(), "R": [[1.0]]}]
+            )
+        ),
+    ]
+    algorithm = draw(SLOT_FILTERS)
+    matched = algorithm["kind"] == "gossip"
+    activation = {"kind": "matching", **draw(MATCHINGS)} if matched else {"kind": "broadcast"}
+    channel = {"loss": draw(LOSSES), "delay": draw(DELAYS), "symmetric": draw(st.booleans())}
+    network = {"graph": draw(GRAPHS), "activation": activation, "channel": channel}
+    if algorithm["kind"] in {"local", "central"}:
+        network = {"graph": network["graph"]}
+    return {
+        "format": 1,
+        "name": "drawn",
+        "horizon": 8.0,
+        "seed": draw(st.integers(0, 2**20)),
+        "probe": draw(st.sampled_from([1.0, 3.0, [0.0, 5.0]])),
+        "plant": {**plant, "period": 1.0, "cov": (start * np.eye(n)).tolist()},
+        "sensors": sensors,
+        "network": network,
+        "filter": algorithm,
+    }
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(slotted())
+def test_drawn_scenarios_in_slots_agree(tables):
+    try:
+        scenario = from_table(tables, SCENARIOS)
+    except ScenarioError:
+        reject()
+    assert_agree(scenario)
+
+
+def test_recorded_slots_readings_and_late_messages_agree(tmp_path):
+    (tmp_path / "pairs.csv").write_text("slot,node,peer\n1,0,1\n1,2,3\n2,1,2\n4,4,0\n4,2,1\n")
+    ring = netkf.load(SCENARIOS / "gossip_ring.toml").replace({"horizon": 6.0, "probe": 1.0})
+    recorded = {"kind": "recorded", "path": tmp_path / "pairs.csv"}
+    run = assert_agree(ring.replace({"network.activation": recorded}))
+    assert run.count("tick") == 5
+    late = {"network.channel.delay": {"kind": "constant", "seconds": 0.6}}
+    run = assert_agree(ring.replace(late))
+    assert run.count("swap") == 0 < run.count("late")
+
+
+def test_push_sum_that_stops_is_refused_by_name():
+    planar = netkf.load(SCENARIOS / "push_sum_planar.toml")
+    with pytest.raises(EngineError, match=r'push-sum.*stop = "safe".*processes'):
+        netkf.simulate(planar.replace({"filter.stop": "safe"}), engine="compiled")
+
+
+def test_many_lots_of_slots_are_one_run(monkeypatch):
+    ring = netkf.load(SCENARIOS / "push_sum_planar.toml").replace({"horizon": 10.0})
+    whole = netkf.simulate(ring, engine="compiled")
+    monkeypatch.setattr("netkf.engines.compiled.exchanges.MOST_ROWS", 100)
+    pieces = netkf.simulate(ring, engine="compiled")
+    assert pieces.fingerprint == whole.fingerprint
+    assert pieces.sums == whole.sums
+    np.testing.assert_array_equal(pieces.P, whole.P)
+
+
+def test_growth_in_slots_is_reported_alike(build):
+    grown = netkf.load(SCENARIOS / "gossip_ring.toml").replace(
+        {"horizon": 9000.0, "probe": 500.0, "filter": {"kind": "local"}}
+    )
+    run = assert_agree(grown)
+    assert run.status == "diverged"
+
+
 def test_recorded_ticks_and_losses_agree(ring, tmp_path):
     (tmp_path / "ticks.csv").write_text("t,node,peer\n0.5,0,1\n0.5,2,1\n0.75,5,0\n9.5,3,4\n")
     (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n0,1,0,0\n5,0,0,0\n")
@@ -216,6 +317,24 @@ def test_the_first_start_says_on_a_terminal_that_it_compiles(ring, monkeypatch, 
     monkeypatch.setattr(compiling, "_kept", lambda made: False)
     netkf.simulate(ring, engine="compiled")
     assert "compiling" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+@pytest.mark.parametrize("p", [1, 3])
+def test_square_roots_in_loops_are_those_of_stacks(n, p):
+    draw = np.random.default_rng([n, p]).standard_normal
+    S, F, root_Q, H = draw((n, n)), draw((n, n)), draw((n, n)), draw((p, n))
+    root_R = np.linalg.cholesky(np.eye(p) + 0.1)
+    L = square_root._triangular_loops(np.concatenate([S, F], axis=1))
+    np.testing.assert_allclose(L @ L.T, S @ S.T + F @ F.T, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(L, np.tril(L))
+    ahead, plain = (f(S, F, root_Q) for f in (square_root._predict_loops, square_root.predict_root))
+    np.testing.assert_allclose(ahead @ ahead.T, plain @ plain.T, rtol=1e-12, atol=1e-12)
+    (one, K), (other, G) = (
+        f(S, F, root_Q, H, root_R) for f in (square_root._update_loops, square_root.update_root)
+    )
+    np.testing.assert_allclose(one @ one.T, other @ other.T, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(K, G, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

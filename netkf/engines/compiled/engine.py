@@ -12,6 +12,7 @@ import numpy as np
 
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.core import compiling
 from netkf.core.arrays import FloatArray
 from netkf.core.fields import Part
@@ -36,15 +37,23 @@ from netkf.engines.compiled.replay import (
     replay,
 )
 from netkf.engines.compiled.schedule import Schedule
+from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.engines.compiled.tables import empty_mail, host_tables, larger, link_tables
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.linear import LinearPlant
+from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES, EVENT
 
-KNOWN = (Diffusion, LinearSensor, Hybrid, Local, Central)
+KNOWN = (
+    *(Diffusion, LinearPlant, RecordedPlant, UnknownPlant),
+    *(LinearSensor, RegressorSensor, RecordedSensor),
+    *(Hybrid, Local, Central, *KERNELS),
+)
 DIVERGED = CODES["diverged"]
 ROWS = 1 << 16
 FIRST_MAIL = 1024
@@ -52,8 +61,9 @@ FIRST_MAIL = 1024
 
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
-    """Runs hybrid, local and central filters in continuous time; clocks and channels may be
-    anybody's, since schedules are made in Python.
+    """Runs all built-in plants, sensors and filters but covariance intersection in continuous time
+    and push-sum that stops; clocks and channels may be anybody's, since schedules are made in
+    Python.
     """
 
     name = "compiled"
@@ -64,19 +74,26 @@ class CompiledEngine(Engine):
         if not compiling.available():
             remedy = 'install it (pip install "netkf[fast]") or use engine="processes"'
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
+        algorithm = scenario.filter.algorithm
         parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
-        parts += [("filter", scenario.filter.algorithm)]
+        parts += [("filter", algorithm)]
         for family, part in parts:
             if type(part) not in KNOWN:
-                kind = name_of(family, part)
-                return f'engine "compiled" cannot run the {family} {kind!r}; {remedy}'
+                return (
+                    f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
+                )
+        if isinstance(algorithm, PushSum) and algorithm.stop != "never":
+            words = f'the filter "push-sum" with stop = "{algorithm.stop}"'
+            return f'engine "compiled" cannot run {words}; {remedy}'
         return None
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
+        if scenario.slotted:
+            return SlotRun(scenario, streams, recorder, progress).to_the_end()
         return _Run(scenario, streams, recorder, progress).to_the_end()
 
 
