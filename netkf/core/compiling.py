@@ -15,6 +15,9 @@ from functools import cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
+ROOMS = ("core", "algorithms", "plants", "trace", "engines")
+"""Whose code and numbers compiled functions may hold."""
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy"}
 _marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
@@ -99,7 +102,8 @@ def _folder(chosen: str) -> Path:
     """Where compiled code is kept: a folder for each state of the sources."""
     root = Path(__file__).parents[1]
     sources = hashlib.sha256()
-    for file in sorted(root.rglob("*.py")):
+    files = [file for room in ROOMS for file in (root / room).rglob("*.py")]
+    for file in sorted(files):
         sources.update(file.read_bytes())
     name = f"netkf-{sources.hexdigest()[:16]}"
     if chosen:

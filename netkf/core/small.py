@@ -133,3 +133,27 @@ def solution(left: FloatArray, right: FloatArray) -> FloatArray:
     # LAPACK itself: numpy's wrapper takes longer than the arithmetic.
     _, _, solved, info = dgesv(left, right)
     return np.full_like(right, np.nan) if info else np.asarray(solved)
+
+
+def _fill_loops(target: FloatArray, source: FloatArray) -> None:
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@compilable_as(_fill_loops)
+def fill(target: FloatArray, source: FloatArray) -> None:
+    """Write a vector into another of its size."""
+    # An assignment of arrays, compiled, brings words about shapes with it: seconds of compiling.
+    target[:] = source
+
+
+def _fill_square_loops(target: FloatArray, source: FloatArray) -> None:
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@compilable_as(_fill_square_loops)
+def fill_square(target: FloatArray, source: FloatArray) -> None:
+    """Write a matrix into another of its size."""
+    target[:] = source

@@ -295,8 +295,12 @@ def _cubic(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
 
 @compilable
 def _legendre(u: FloatArray) -> FloatArray:
-    z = 2.0 * u - 1.0
-    return np.stack((np.ones_like(z), z, 1.5 * z * z - 0.5, (2.5 * z * z - 1.5) * z), axis=1)
+    values = np.empty((len(u), 4))
+    for k in range(len(u)):
+        z = 2.0 * u[k] - 1.0
+        values[k, 0], values[k, 1] = 1.0, z
+        values[k, 2], values[k, 3] = 1.5 * z * z - 0.5, (2.5 * z * z - 1.5) * z
+    return values
 
 
 @compilable

@@ -17,6 +17,7 @@ from netkf.algorithms.hybrid import reset
 from netkf.algorithms.riccati import RiccatiTable, riccati_step
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
+from netkf.core.small import fill, fill_square
 from netkf.engines.base import SHORTEST_SHARE
 from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Sensing
@@ -81,13 +82,13 @@ def read(
     for s in range(first, after):
         if sensing.step[s] != step:
             sensing.step[s] = step
-            sensing.rest[s] = sensing.noise[s, step]
+            fill_square(sensing.rest[s], sensing.noise[s, step])
         noise = sensing.rest[s].copy()
         if u >= 0.0:
             normals = sensing.normals[s, sensing.used[s]]
             sensing.used[s] += 1
             noise, rest = cut(noise, normals, u, length)
-            sensing.rest[s] = rest
+            fill_square(sensing.rest[s], rest)
         y = reading(x, sensing.H[s], noise, sensing.root[s])
         for i in range(sensing.rows[s]):
             out[row] = y[0, i]
@@ -155,8 +156,8 @@ def advance(
             moments = read(sensing, first, after, x, path.step[piece], share, last - now)
             xhat = gain_update(gains_of(models, k), P, xhat, moments, end - now)
         now = end
-    hosts.xhat[h] = xhat
-    hosts.P[h] = P
+    fill(hosts.xhat[h], xhat)
+    fill_square(hosts.P[h], P)
     hosts.now[h] = now
     return enough
 
@@ -346,8 +347,8 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 m, gap = model[h], now - reached[h]
                 table = RiccatiTable(F.shape[2], unit[m], series[m], jump[m], F[m], G[m], Q[m])
                 P, xhat = riccati_step(table, Ps[h], xhats[h], gap)
-                xhats[h] = xhat
-                Ps[h] = P
+                fill(xhats[h], xhat)
+                fill_square(Ps[h], P)
                 reached[h] = now
         if sense == now:
             note(rows, place, now, SENSE, awake_node[place[AWAKE]], -1, -1, np.nan)
@@ -370,8 +371,8 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 elif delay == 0.0 or arrival < horizon:
                     message = place[FREE]
                     place[FREE] = free[message]
-                    mail_x[message] = xhats[sender]
-                    mail_P[message] = Ps[sender]
+                    fill(mail_x[message], xhats[sender])
+                    fill_square(mail_P[message], Ps[sender])
                     sent[message] = now
                     way_of[message] = 2 * link + way
                     numbers[message] = number
@@ -416,8 +417,8 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 gone, message = message, free[message]
                 free[gone] = place[FREE]
                 place[FREE] = gone
-            xhats[h] = xhat
-            Ps[h] = P
+            fill(xhats[h], xhat)
+            fill_square(Ps[h], P)
             inbox[h] = -1
             note(rows, place, now, ABSORB, nodes[h], -1, -1, oldest)
             place[READY] += 1
