@@ -18,6 +18,7 @@ from netkf.algorithms.slot import (
     update_and_predict,
 )
 from netkf.core.arrays import FloatArray, square_root
+from netkf.core.compiling import compilable
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, either, nested, setting, square
 
@@ -119,7 +120,15 @@ class DiffusionFilter(SlotFilter):
         """The own weight and those of the messages that arrived, which sum to 1, from the nominal
         ones.
         """
-        total = own + sum(arrived)
-        if self.on_loss == "keep-own" or total == 0.0:
-            return max(0.0, 1.0 - sum(arrived)), arrived
-        return own / total, [weight / total for weight in arrived]
+        kept, heard = shares(own, np.array(arrived), self.on_loss == "keep-own")
+        return float(kept), heard.tolist()
+
+
+@compilable
+def shares(own: float, arrived: FloatArray, keep_own: bool) -> tuple[float, FloatArray]:
+    """The weights that sum to 1 from the nominal ones, see ``DiffusionFilter.on_loss``."""
+    heard = arrived.sum()
+    total = own + heard
+    if keep_own or total == 0.0:
+        return max(0.0, 1.0 - heard), arrived
+    return own / total, arrived / total

@@ -19,6 +19,7 @@ import numpy as np
 from netkf.algorithms.gains import GainTable, gain_table, gain_update
 from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
 from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
 from netkf.core.fields import Part
 
 STRETCH = 1.0
@@ -121,8 +122,7 @@ class FlowFilter(Part):
         A large covariance shrinks fast, and the weights of readings change as fast: on the time
         scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
         """
-        rate = float((state.P * state.model.information).sum())
-        return STRETCH / rate if rate > 0.0 else math.inf
+        return usable(state.P, state.model.information)
 
     def emit(self, state: Any) -> Any:
         """What the node sends now."""
@@ -145,6 +145,13 @@ class FlowFilter(Part):
     def largest_degree(self) -> float:
         """The largest number of links a node may have for the weights to make sense."""
         return np.inf
+
+
+@compilable
+def usable(P: FloatArray, information: FloatArray) -> float:
+    """Seconds of readings that may be used at once from P on, see FlowFilter.stretch."""
+    rate = float((P * information).sum())
+    return STRETCH / rate if rate > 0.0 else math.inf
 
 
 def predict(model: FlowModel, payload: Payload, age: float) -> Payload:

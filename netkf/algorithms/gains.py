@@ -18,7 +18,9 @@ import numpy as np
 
 from netkf.algorithms.riccati import exponential_series, hamiltonian
 from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
 from netkf.core.legendre import MOMENTS, backward_coefficients
+from netkf.core.small import added, applied, polynomial
 
 LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
 
@@ -73,16 +75,14 @@ def _terms(size: float) -> int:
     return terms
 
 
+@compilable
 def gain_update(
     table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
     """``xhat(b)`` (n,) from the open-loop prediction ``x``, ``P = P(b)`` and the moments (2p,)."""
     n, q = table.n, table.moments
-    powers = np.empty(len(table.series))
-    powers[0] = 1.0
-    powers[1:] = gap
-    values = np.multiply.accumulate(powers) @ table.series
+    values = polynomial(table.series, gap)
     U = values[: n * q].reshape(n, q)
     W = values[n * q : 2 * n * q].reshape(n, q)
     C = values[2 * n * q :].reshape(q, n)
-    return np.asarray(x + (U + P @ W) @ (moments - C @ x))
+    return np.asarray(x + applied(added(U, P, W), moments - applied(C, x)))

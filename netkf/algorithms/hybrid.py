@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from netkf.algorithms.flow import FlowFilter, FlowState, Payload, predict
+from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
 from netkf.core.fields import number, setting
 
 
@@ -26,9 +28,7 @@ class Hybrid(FlowFilter):
         own = 1.0 - sum(weight for weight, _, _ in messages)
         xhat, P = own * state.xhat, own * state.P
         for weight, payload, age in messages:
-            arrived = predict(state.model, payload, age)
-            xhat = xhat + weight * arrived.xhat
-            P = P + weight * arrived.P
+            xhat, P = reset(xhat, P, weight, *predict(state.model, payload, age))
         return state._replace(xhat=xhat, P=P)
 
     def weight(self, degree: int, peer_degree: int) -> float:
@@ -38,3 +38,11 @@ class Hybrid(FlowFilter):
     def largest_degree(self) -> float:
         """``1 / epsilon``: beyond it a node's own weight would be negative."""
         return (1.0 + 1e-12) / self.epsilon
+
+
+@compilable
+def reset(
+    xhat: FloatArray, P: FloatArray, weight: float, other: FloatArray, other_P: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """A partial sum of H (7) and (9) with one more neighbour in it."""
+    return xhat + weight * other, P + weight * other_P

@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg.lapack import dgesv
 
+from netkf.algorithms.square_root import lower_triangular
 from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
+from netkf.core.small import applied, solution
 
 
 def intersection(
@@ -23,18 +25,24 @@ def intersection(
     As a least-squares problem in the inverse roots, solved by one orthogonal triangularisation: no
     covariance is inverted and nothing is subtracted but the means.
     """
-    n, first = len(parts[0][1]), parts[0][1]
-    rows = []
-    for weight, mean, root in parts:
-        if weight > 0.0:
-            whitened = np.sqrt(weight) * _inverse(root)
-            rows.append(np.concatenate([whitened, (whitened @ (mean - first))[:, None]], axis=1))
-    R = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
-    combined = _inverse(R[:n, :n])
-    return first + combined @ R[:n, n], combined
+    weights = np.array([weight for weight, _, _ in parts])
+    means, roots = (np.stack([part[k] for part in parts]) for k in (1, 2))
+    return intersected(weights, means, roots)
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    # LAPACK itself: what overflowed gives nan, and the run says that it diverged.
-    _, _, solution, info = dgesv(matrix, np.eye(len(matrix)))
-    return np.full_like(matrix, np.nan) if info else np.asarray(solution)
+@compilable
+def intersected(
+    weights: FloatArray, means: FloatArray, roots: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The same of arrays (k,), (k, n) and (k, n, n)."""
+    k, n = means.shape
+    rows = np.zeros((max(k * n, n + 1), n + 1))
+    for m in range(k):
+        if weights[m] > 0.0:
+            whitened = np.sqrt(weights[m]) * solution(roots[m], np.eye(n))
+            rows[m * n : (m + 1) * n, :n] = whitened
+            rows[m * n : (m + 1) * n, n] = applied(whitened, means[m] - means[0])
+    L = lower_triangular(rows.T)
+    # What overflowed gives nan, and the run says that it diverged.
+    combined = solution(L[:n, :n].T, np.eye(n))
+    return means[0] + applied(combined, L[n, :n]), combined

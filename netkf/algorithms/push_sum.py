@@ -17,7 +17,9 @@ import numpy as np
 from netkf.algorithms.slot import Messages, Reading, Role, SlotFilter, SlotModel
 from netkf.algorithms.square_root import lower_triangular, predict_root
 from netkf.core.arrays import FloatArray, square_root, symmetric
+from netkf.core.compiling import compilable
 from netkf.core.fields import boolean, choice, integer, number, positive, setting
+from netkf.core.small import applied, even, product, solution
 
 MASS, AVERAGE = 0, 1
 """The two exchanges of a slot."""
@@ -141,12 +143,8 @@ class PushSum(SlotFilter):
         if root is None:
             ahead = predict_root(state.root, model.F, model.root_Q)
             root = corrected_root(ahead, state.network.information)
-        predicted = model.F @ state.xhat
-        y, H, R = reading
-        if not len(y):
-            return state._replace(xhat=predicted, root=root)
-        gain = state.network.number * (root @ (root.T @ np.linalg.solve(R, H).T))
-        return state._replace(xhat=predicted + gain @ (y - H @ predicted), root=root)
+        xhat = corrected(model.F @ state.xhat, root, state.network.number, *reading)
+        return state._replace(xhat=xhat, root=root)
 
     def stopped(self, state: PushSumState) -> bool:
         """Whether G^(i) and N^(i) are frozen."""
@@ -157,6 +155,25 @@ class PushSum(SlotFilter):
         return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
 
 
+@compilable
+def corrected(
+    predicted: FloatArray,
+    root: FloatArray,
+    number: float,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+) -> FloatArray:
+    """P (8): the prediction (n,) and ``number`` times the gain of the reading, which may have no
+    rows.
+    """
+    if not len(y):
+        return predicted
+    gain = number * product(root, product(root.T, solution(R, H).T))
+    return predicted + applied(gain, y - applied(H, predicted))
+
+
+@compilable
 def share(mass: FloatArray, degree: int) -> FloatArray:
     """What a node of ``degree`` neighbours sends to each of them: its mass over degree + 1."""
     return mass / (degree + 1)
@@ -168,16 +185,28 @@ def mixed(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> Floa
 
     ``mass`` and shares (m,), or stacks of them.
     """
-    kept = (degree + 1 - len(received)) * share(mass, degree)
-    return kept + sum(received) if received else kept
+    own = kept(mass, len(received), degree)
+    return own + sum(received) if received else own
+
+
+@compilable
+def kept(mass: FloatArray, received: int, degree: int) -> FloatArray:
+    """The node's own share, once for itself and once for each of its links that failed."""
+    return (degree + 1 - received) * share(mass, degree)
 
 
 def network(mass: FloatArray, model: SlotModel) -> Network:
     """P (6): C~ / w and n~ / w, or what the node knows of itself while its weight is exactly 0."""
-    weight, n = float(mass[0]), len(model.F)
+    return Network(*understood(mass, model.information))
+
+
+@compilable
+def understood(mass: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
+    """P (6) from the mass and the node's own information."""
+    weight, n = mass[0], len(information)
     if weight == 0.0:
-        return Network(model.information, 1.0)
-    return Network(symmetric(mass[2:].reshape(n, n) / weight), float(mass[1]) / weight)
+        return information, 1.0
+    return even(mass[2:].reshape(n, n) / weight), mass[1] / weight
 
 
 def _settled(new: Network, old: Network, tolerance: float) -> bool:
@@ -187,15 +216,17 @@ def _settled(new: Network, old: Network, tolerance: float) -> bool:
     )
 
 
+@compilable
 def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
     """Root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for ``P = root root'``, possibly singular,
     and the information G (n, n).
 
     ``root L^-T`` with ``L L' = I + root' G root``, triangular by reflections: nothing is inverted.
     """
-    seen = root.T @ square_root(information)
-    L = lower_triangular(np.concatenate([seen, np.eye(len(root))], axis=1))
-    return np.asarray(np.linalg.solve(L, root.T).T)
+    n = len(root)
+    work = np.empty((n, 2 * n))
+    work[:, :n], work[:, n:] = product(root.T, square_root(information)), np.eye(n)
+    return solution(lower_triangular(work), root.T).T.copy()
 
 
 def averaged(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:

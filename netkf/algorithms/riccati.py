@@ -14,9 +14,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgesv
 
 from netkf.core.arrays import FloatArray, symmetric
+from netkf.core.compiling import compilable
+from netkf.core.small import added, applied, even, polynomial, product, solution
 
 TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
 
@@ -107,16 +108,14 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return inverse
 
 
+@compilable
 def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, FloatArray]:
     """``exp(M gap)`` (2n, 2n) and ``exp(A gap)`` (n, n) for a gap of at most one unit."""
-    series, n = table.series, table.n
-    powers = np.empty(len(series))
-    powers[0] = 1.0
-    powers[1:] = gap
-    values = np.multiply.accumulate(powers) @ series
+    n, values = table.n, polynomial(table.series, gap)
     return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
 
 
+@compilable
 def riccati_step(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -126,22 +125,14 @@ def riccati_step(
     while whole >> level:
         if whole >> level & 1:
             F = table.F[level]
-            middle = _solve(np.eye(n) + P @ table.G[level], P)
-            P = table.Q[level] + F @ middle @ F.T
-            P = 0.5 * (P + P.T)
-            x = table.jump[level] @ x
+            middle = solution(added(np.eye(n), P, table.G[level]), P)
+            P = even(added(table.Q[level], product(F, middle), F.T))
+            x = applied(table.jump[level], x)
         level += 1
     rest = gap - whole * table.unit
     if rest <= 0.0:
         return P, x
     E, transition = evaluate_hamiltonian(table, rest)
-    X = E[:n, :n] + E[:n, n:] @ P
-    Y = E[n:, :n] + E[n:, n:] @ P
-    P = _solve(X.T, Y.T)
-    return 0.5 * (P + P.T), transition @ x
-
-
-def _solve(left: FloatArray, right: FloatArray) -> FloatArray:
-    # LAPACK itself: numpy's wrapper takes longer than the arithmetic. Overflow gives nan.
-    _, _, solution, info = dgesv(left, right)
-    return np.full_like(right, np.nan) if info else np.asarray(solution)
+    X = added(E[:n, :n], E[:n, n:], P)
+    Y = added(E[n:, :n], E[n:, n:], P)
+    return even(solution(X.T, Y.T)), applied(transition, x)

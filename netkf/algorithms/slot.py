@@ -19,7 +19,9 @@ import numpy as np
 
 from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
 from netkf.core.arrays import FloatArray, block_diagonal, square_root, symmetric
+from netkf.core.compiling import compilable
 from netkf.core.fields import Part
+from netkf.core.small import applied, product, solution
 
 Messages = Sequence[tuple[float, Any, float]]
 
@@ -166,11 +168,46 @@ def update_and_predict(
     xhat: FloatArray, root: FloatArray, model: SlotModel, reading: Reading
 ) -> tuple[FloatArray, FloatArray]:
     """The next prediction and the root of its covariance from a prediction and a reading."""
-    if not len(reading.y):
-        return model.F @ xhat, predict_root(root, model.F, model.root_Q)
-    noise = np.asarray(np.linalg.cholesky(reading.R), dtype=np.float64)
-    following, gain = update_root(root, model.F, model.root_Q, reading.H, noise)
-    return model.F @ xhat + gain @ (reading.y - reading.H @ xhat), following
+    return adapted(xhat, root, model.F, model.root_Q, *reading)
+
+
+@compilable
+def adapted(
+    xhat: FloatArray,
+    root: FloatArray,
+    F: FloatArray,
+    root_Q: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Update with a reading, which may have no rows, and predict."""
+    if not len(y):
+        return applied(F, xhat), predict_root(root, F, root_Q)
+    following, gain = update_root(root, F, root_Q, H, np.linalg.cholesky(R))
+    return applied(F, xhat) + applied(gain, y - applied(H, xhat)), following
+
+
+@compilable
+def filtered(
+    xhat: FloatArray,
+    root: FloatArray,
+    F: FloatArray,
+    root_Q: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Predict, and update with a reading, which may have no rows."""
+    xhat, root = applied(F, xhat), predict_root(root, F, root_Q)
+    if not len(y):
+        return xhat, root
+    p, n = H.shape
+    work = np.zeros((p + n, n + p))
+    work[:p, :n], work[:p, n:], work[p:, :n] = product(H, root), np.linalg.cholesky(R), root
+    L = lower_triangular(work)
+    gain = solution(L[:p, :p].T, L[p:, :p].T).T
+    return xhat + applied(gain, y - applied(H, xhat)), L[p:, p:].copy()
 
 
 class Pair(NamedTuple):
@@ -249,17 +286,9 @@ class SlotLocal(SlotFilter):
 
     def sense(self, state: SlotState, reading: Reading) -> SlotState:
         """Predict from the slot before, then update; called from slot 1 on."""
-        model, (y, H, R) = state.model, reading
-        xhat, root = model.F @ state.xhat, predict_root(state.root, model.F, model.root_Q)
-        if not len(y):
-            return state._replace(xhat=xhat, root=root)
-        p, n = H.shape
-        top = np.concatenate([H @ root, np.linalg.cholesky(R)], axis=1)
-        L = lower_triangular(
-            np.concatenate([top, np.concatenate([root, np.zeros((n, p))], axis=1)])
-        )
-        gain = np.linalg.solve(L[:p, :p].T, L[p:, :p].T).T
-        return state._replace(xhat=xhat + gain @ (y - H @ xhat), root=L[p:, p:])
+        model = state.model
+        xhat, root = filtered(state.xhat, state.root, model.F, model.root_Q, *reading)
+        return state._replace(xhat=xhat, root=root)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,20 +4,62 @@ For ``P = S S'`` one orthogonal triangularisation of ``[[H S, root(R), 0], [F S,
 gives the innovation's root, the gain and the root of the next covariance: nothing is subtracted, so
 nothing cancels after an outage, where covariance forms lose eps * P (Kailath, Sayed and Hassibi,
 Linear Estimation, section 12.3).
+
+numpy works on stacks of them, and a compiler on one after the other: each stands here twice.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable_as
+from netkf.core.small import product, solution
 
 
+def _triangular_loops(array: FloatArray) -> FloatArray:
+    # Householder's reflections of the columns, row by row.
+    work = array.copy()
+    rows, columns = work.shape
+    for i in range(rows):
+        size = 0.0
+        for j in range(i, columns):
+            size += work[i, j] * work[i, j]
+        if size == 0.0:
+            continue
+        pivot = -math.copysign(math.sqrt(size), work[i, i])
+        scale = size - work[i, i] * pivot
+        work[i, i] -= pivot
+        for r in range(i + 1, rows):
+            total = 0.0
+            for j in range(i, columns):
+                total += work[i, j] * work[r, j]
+            total /= scale
+            for j in range(i, columns):
+                work[r, j] -= total * work[i, j]
+        work[i, i] = pivot
+        for j in range(i + 1, columns):
+            work[i, j] = 0.0
+    return work[:, :rows].copy()
+
+
+@compilable_as(_triangular_loops)
 def lower_triangular(array: FloatArray) -> FloatArray:
     """L (..., r, r), lower triangular with ``L L' = array array'`` for stacks of (r, c), c >= r."""
     return np.asarray(np.swapaxes(np.linalg.qr(np.swapaxes(array, -1, -2), mode="r"), -1, -2))
 
 
+def _predict_loops(S: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
+    n = len(F)
+    work = np.empty((n, 2 * n))
+    work[:, :n] = product(F, S)
+    work[:, n:] = root_Q
+    return lower_triangular(work)
+
+
+@compilable_as(_predict_loops)
 def predict_root(S: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
     """Root of ``F P F' + Q`` (..., n, n)."""
     moved = F @ S
@@ -25,6 +67,19 @@ def predict_root(S: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray
     return lower_triangular(np.concatenate([moved, noise], axis=-1))
 
 
+def _update_loops(
+    S: FloatArray, F: FloatArray, root_Q: FloatArray, H: FloatArray, root_R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    p, n = H.shape
+    work = np.zeros((p + n, 2 * n + p))
+    work[:p, :n], work[:p, n : n + p] = product(H, S), root_R
+    work[p:, :n], work[p:, n + p :] = product(F, S), root_Q
+    L = lower_triangular(work)
+    gain = solution(L[:p, :p].T, L[p:, :p].T).T
+    return L[p:, p:].copy(), gain.copy()
+
+
+@compilable_as(_update_loops)
 def update_root(
     S: FloatArray, F: FloatArray, root_Q: FloatArray, H: FloatArray, root_R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

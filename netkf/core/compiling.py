@@ -1,22 +1,123 @@
-"""Loops compiled on request by numba (extra ``fast``), and only then imported."""
+"""Loops compiled on request by numba (extra ``fast``), and only then imported.
+
+A function marked with :func:`compilable` may be called by functions that are compiled; it stays
+what it is for Python. Where numpy is the way to say it in Python and loops are what a compiler
+wants (products of small matrices), the loops stand beside it: ``compilable_as(loops)``.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import sys
 from collections.abc import Callable
-from functools import cache
-from typing import Any
+from functools import cache, wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+ROOMS = ("core", "algorithms", "plants", "trace", "engines")
+"""Whose code and numbers compiled functions may hold."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy"}
+_marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
+_known: set[Callable[..., Any]] = set()
+
+
+def compilable(function: Function) -> Function:
+    """Mark a function that compiled ones may call; what it calls must be marked too."""
+    return compilable_as(function)(function)
+
+
+def compilable_as(loops: Callable[..., Any]) -> Callable[[Function], Function]:
+    """The same for a function that is ``loops``, of the same parameters, where it is compiled."""
+
+    def mark(function: Function) -> Function:
+        _marked.append((function, loops))
+        return function
+
+    return mark
 
 
 @cache
 def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
-    """The compiled form of a function that is made of loops, or None where numba is missing.
+    """The compiled form of a function that is made of loops and of compilable functions, or None
+    where numba is missing.
 
-    Kept on disk beside the module, so that the next process starts at once. It runs without the
-    interpreter's lock.
+    Kept on disk, so that the next process starts at once. It runs without the interpreter's lock.
     """
     try:
         import numba
     except ImportError:
         return None
-    made: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    _introduce()
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    # numba looks at the file of the function alone, and what it calls may have changed.
+    config.CACHE_DIR = str(_folder(before))
+    try:
+        made: Callable[..., Any] = numba.njit(cache=True, **_OPTIONS)(function)
+    finally:
+        config.CACHE_DIR = before
     return made
+
+
+def announced(function: Callable[..., Any]) -> Callable[..., Any] | None:
+    """``compiled``, with a word on the terminal where that will take a while."""
+    made = compiled(function)
+    if made is not None and sys.stderr.isatty() and not _kept(made):
+        words = "netkf: compiling, once after an installation (some 30 s) ..."
+        print(words, file=sys.stderr, flush=True)
+    return made
+
+
+def available() -> bool:
+    """Whether numba is installed."""
+    from importlib.util import find_spec
+
+    return find_spec("numba") is not None
+
+
+def _introduce() -> None:
+    from numba.extending import overload
+
+    for function, loops in _marked:
+        if function not in _known:
+            _known.add(function)
+            overload(function, jit_options=_OPTIONS)(_always(loops))
+
+
+def _always(loops: Callable[..., Any]) -> Callable[..., Any]:
+    """What numba asks for an implementation; it must have the same signature."""
+
+    @wraps(loops)
+    def choose(*_types: Any) -> Callable[..., Any]:
+        return loops
+
+    return choose
+
+
+@cache
+def _folder(chosen: str) -> Path:
+    """Where compiled code is kept: a folder for each state of the sources."""
+    root = Path(__file__).parents[1]
+    sources = hashlib.sha256()
+    files = [file for room in ROOMS for file in (root / room).rglob("*.py")]
+    for file in sorted(files):
+        sources.update(file.read_bytes())
+    name = f"netkf-{sources.hexdigest()[:16]}"
+    if chosen:
+        return Path(chosen) / name
+    beside = root / "__pycache__"
+    try:
+        beside.mkdir(exist_ok=True)
+        writable = os.access(beside, os.W_OK)
+    except OSError:
+        writable = False
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return (beside if writable else home / "netkf") / name
+
+
+def _kept(made: Any) -> bool:
+    folder = Path(made.stats.cache_path)
+    return any(folder.glob(f"*{made.py_func.__name__}*.nbi"))

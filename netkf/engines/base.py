@@ -13,6 +13,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from enum import IntEnum
 
+import numpy as np
+
+from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
@@ -31,6 +34,9 @@ class Rank(IntEnum):
     ABSORB = 4
     PROBE = 5
 
+
+SHORTEST_SHARE = 1e-9
+"""The least part of a gap whose readings are used at once, however short the stretch."""
 
 Progress = Callable[[float], None]
 """Called with the simulated time now and then."""
@@ -54,3 +60,9 @@ class Engine(ABC):
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns the status, complete or diverged."""
+
+
+def broken(scenario: Scenario, xhat: FloatArray, P: FloatArray) -> list[int]:
+    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is no longer finite."""
+    finite = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)
+    return [scenario.nodes[k] for k in np.flatnonzero(~finite)]

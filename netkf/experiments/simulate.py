@@ -10,6 +10,7 @@ from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, silent
+from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.processes.engine import ProcessesEngine
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder, Sink
@@ -21,13 +22,20 @@ ENGINES = ("auto", "processes", "compiled")
 
 
 def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
-    """The engine of a name; raises EngineError where it cannot run the scenario."""
+    """The engine of a name, ``auto`` the fastest that can; raises EngineError where it cannot run
+    the scenario.
+    """
+    engine: Engine
     if isinstance(name, Engine):
         engine = name
-    elif name in ("auto", "processes"):
+    elif name == "auto":
+        engine = CompiledEngine()
+        if engine.refusal(scenario) is not None:
+            engine = ProcessesEngine()
+    elif name == "processes":
         engine = ProcessesEngine()
     elif name == "compiled":
-        raise EngineError('engine "compiled" is not part of this version; use engine="processes"')
+        engine = CompiledEngine()
     else:
         raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name!r}")
     refusal = engine.refusal(scenario)

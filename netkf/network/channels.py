@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Part,
@@ -380,3 +381,32 @@ class Fates:
             assert self._post is not None
             delay = self._delay.draw(self._post)
         return luck, bad, delay
+
+    def draws(self, count: int) -> tuple[FloatArray, np.ndarray, FloatArray]:
+        """The next ``count`` draws at once, (count,) each; the same numbers."""
+        luck, bad = np.zeros(count), np.zeros(count, dtype=bool)
+        if self._luck is not None:
+            luck = self._luck.random(count)
+        if self._sky is not None:
+            for k in range(count):
+                self._bad = bad[k] = self._loss.weather(self._bad, self._sky)
+        if self._post is None:
+            return luck, bad, np.full(count, self._fixed)
+        return luck, bad, delays(self._delay, self._post, count)
+
+
+def delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
+    """(count,) seconds, the same as that many calls of ``delay.draw``."""
+    # By exact type: a class derived from one of these may draw in its own way.
+    if type(delay) is ExponentialDelay:
+        return delay.mean * random.standard_exponential(count)
+    if type(delay) is UniformDelay:
+        return delay.low + (delay.high - delay.low) * random.random(count)
+    return np.array([delay.draw(random) for _ in range(count)])
+
+
+def chances(loss: Loss, link: Link, first: int, bad: np.ndarray, measured: float) -> FloatArray:
+    """(count,) ``loss.chance`` of the messages from number ``first`` on, ``bad`` (count,)."""
+    if type(loss) in (NoLoss, Bernoulli, PerLink):
+        return np.full(len(bad), loss.chance(link, first, False, measured))
+    return np.array([loss.chance(link, first + k, b, measured) for k, b in enumerate(bad.tolist())])

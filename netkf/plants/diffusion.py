@@ -19,8 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray, square_root
+from netkf.core.compiling import compilable
 from netkf.core.fields import matrix, positive, setting, square
 from netkf.core.legendre import forward_coefficients
+from netkf.core.small import applied, polynomial, product
 from netkf.plants.plant import Plant
 
 BLOCK = 64  # steps drawn at once
@@ -29,6 +31,7 @@ MOST_SPLITS = 256  # kept laws of a state shown inside a step
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
+_THREE_MOMENTS = np.stack([_THREE_WEIGHTS, _THREE_WEIGHTS * _THREE])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +91,7 @@ def default_sensing_period(
     return float(f"{digit * power:.12g}")
 
 
-class _Step(NamedTuple):
+class Step(NamedTuple):
     """One stretch of the path: times, states at its ends, (2, n) moments and the cubic's (4, n)
     Legendre coefficients of what noise added.
     """
@@ -123,9 +126,7 @@ class DiffusionPath:
         self._used = 0
         start = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(self._n)
         self._index = -1
-        self._steps = [
-            _Step(0.0, 0.0, start, start, np.zeros((2, self._n)), np.zeros((4, self._n)))
-        ]
+        self._steps = [Step(0.0, 0.0, start, start, np.zeros((2, self._n)), np.zeros((4, self._n)))]
 
     def grid(self, k: int) -> float:
         """Time of the k-th point of the sensing grid, rounded so that lattices of other periods
@@ -135,11 +136,7 @@ class DiffusionPath:
 
     def responses(self, gap: float) -> FloatArray:
         """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""
-        powers = np.empty(len(self._series))
-        powers[0] = 1.0
-        powers[1:] = gap
-        values = np.multiply.accumulate(powers) @ self._series
-        return np.asarray(values.reshape(3, self._n, self._n))
+        return np.asarray(polynomial(self._series, gap).reshape(3, self._n, self._n))
 
     def _noise(self, gap: float) -> FloatArray:
         """(3 n, 20 m): responses of the end and the moments to noise at the quadrature nodes."""
@@ -175,13 +172,23 @@ class DiffusionPath:
         values = self._response @ before.x_end + noise
         start, end = self.grid(self._index), self.grid(self._index + 1)
         cubic = _cubic(self.period, noise[0], noise[1:])
-        self._steps = [_Step(start, end, before.x_end, values[0], values[1:], cubic)]
+        self._steps = [Step(start, end, before.x_end, values[0], values[1:], cubic)]
         first, last = np.searchsorted(self._shown, [start, end], side="right")
         for time in self._shown[first:last].tolist():
             if time < end:
                 self._split(self._steps.pop(), time)
 
-    def _at(self, time: float) -> _Step:
+    def following(self) -> tuple[Step, ...]:
+        """The next step of the sensing grid, cut at the times shown inside it."""
+        self._next_step()
+        return tuple(self._steps)
+
+    @property
+    def series(self) -> FloatArray:
+        """(terms, 3 n n) power series of the responses in the gap."""
+        return self._series
+
+    def _at(self, time: float) -> Step:
         while self._steps[-1].end < time:
             self._next_step()
         return next(step for step in self._steps if time <= step.end)
@@ -195,16 +202,7 @@ class DiffusionPath:
         never decreases from call to call.
         """
         step = self._at(end)
-        if start == step.start and end == step.end:
-            return step.moments
-        length, gap = step.end - step.start, end - start
-        places = (start + 0.5 * gap * (1.0 + _THREE) - step.start) / length
-        noise = _legendre(places) @ step.cubic
-        from_noise = 0.5 * gap * (np.stack([_THREE_WEIGHTS, _THREE_WEIGHTS * _THREE]) @ noise)
-        x = step.x_start
-        if start > step.start:
-            x = self.responses(start - step.start)[0] @ x
-        return np.asarray(self.responses(gap)[1:] @ x + from_noise)
+        return seen(self._series, step, start, end)
 
     def state(self, time: float) -> FloatArray:
         """x(time) on the sensing grid or at a time shown, not before the last one asked for."""
@@ -230,7 +228,7 @@ class DiffusionPath:
         gain = cross @ np.linalg.pinv(known, rcond=1e-13, hermitian=True)
         return gain, square_root(asked - gain @ cross.T)
 
-    def _split(self, step: _Step, time: float) -> None:
+    def _split(self, step: Step, time: float) -> None:
         """Draw the path at ``time`` given the whole step, and put two steps in its place."""
         n, length, left = self._n, step.end - step.start, time - step.start
         key = round(length, 12), round(left, 12)
@@ -255,10 +253,8 @@ class DiffusionPath:
         later = np.concatenate([step.x_end[None], second]) - rest
         noise = noise.reshape(3, n)
         self._steps += [
-            _Step(step.start, time, step.x_start, x, first, _cubic(left, noise[0], noise[1:])),
-            _Step(
-                time, step.end, x, step.x_end, second, _cubic(length - left, later[0], later[1:])
-            ),
+            Step(step.start, time, step.x_start, x, first, _cubic(left, noise[0], noise[1:])),
+            Step(time, step.end, x, step.x_end, second, _cubic(length - left, later[0], later[1:])),
         ]
 
 
@@ -297,6 +293,28 @@ def _cubic(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
     return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope])
 
 
+@compilable
 def _legendre(u: FloatArray) -> FloatArray:
-    z = 2.0 * u - 1.0
-    return np.stack([np.ones_like(z), z, 1.5 * z * z - 0.5, (2.5 * z * z - 1.5) * z], axis=1)
+    values = np.empty((len(u), 4))
+    for k in range(len(u)):
+        z = 2.0 * u[k] - 1.0
+        values[k, 0], values[k, 1] = 1.0, z
+        values[k, 2], values[k, 3] = 1.5 * z * z - 0.5, (2.5 * z * z - 1.5) * z
+    return values
+
+
+@compilable
+def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray:
+    """(2, n) moments of x over ``[start, end]`` inside a step; ``series`` is of the responses."""
+    n = len(step.x_start)
+    if start == step.start and end == step.end:
+        return step.moments
+    length, gap = step.end - step.start, end - start
+    places = (start + 0.5 * gap * (1.0 + _THREE) - step.start) / length
+    noise = product(_legendre(places), step.cubic)
+    from_noise = 0.5 * gap * product(_THREE_MOMENTS, noise)
+    x = step.x_start
+    if start > step.start:
+        x = applied(polynomial(series, start - step.start)[: n * n].reshape(n, n), x)
+    response = polynomial(series, gap)[n * n :].reshape(2 * n, n)
+    return applied(response, x).reshape(2, n) + from_noise

@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
 from netkf.core.fields import (
     Part,
     definite_covariance,
@@ -25,6 +26,7 @@ from netkf.core.fields import (
     setting,
     several,
 )
+from netkf.core.small import added, product
 from netkf.plants.diffusion import BLOCK, DiffusionPath
 from netkf.plants.linear import Readings, SlotReadings
 
@@ -84,7 +86,8 @@ class SensorPath:
         random: np.random.Generator,
         cutting: np.random.Generator,
     ) -> None:
-        self.H, self._root = H, np.linalg.cholesky(R)
+        self.H = H
+        self._root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
         self._random, self._cutting = random, cutting
         self._drawn = np.empty((0, 2, len(R)))
         self._used = 0
@@ -101,10 +104,12 @@ class SensorPath:
         if last != self._end:
             self._rest, self._end = self._draw(truth.period), last
         if end < last:
-            noise, self._rest = self._cut((end - start) / (last - start), last - start)
+            normals = self._cutting.standard_normal(self._rest.shape)
+            length = last - start
+            noise, self._rest = cut(self._rest, normals, (end - start) / length, length)
         else:
             noise = self._rest
-        return np.asarray(seen @ self.H.T + noise @ self._root.T)
+        return reading(seen, self.H, noise, self._root)
 
     def _draw(self, period: float) -> FloatArray:
         if self._used == len(self._drawn):
@@ -112,22 +117,40 @@ class SensorPath:
             self._used = 0
         normals = self._drawn[self._used]
         self._used += 1
-        # The moments of white noise are independent with variances g and g / 3.
-        return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
+        return step_noise(normals, period)
 
-    def _cut(self, u: float, length: float) -> tuple[FloatArray, FloatArray]:
-        """Moments of the first share u of an interval and of the rest, given those of the whole."""
-        whole, tilted = self._rest
-        normals = self._cutting.standard_normal(self._rest.shape)
-        # Exact conditional law of four independent moments (variances g, g/3 on each part) given
-        # their two sums; written so that nothing cancels when a part is short.
-        w = 1.0 - u
-        spread = 1.0 - 3.0 * u * w
-        first = math.sqrt(u * w * spread * length) * normals[0]
-        slope = math.sqrt(u * w / spread * length) * normals[0]
-        other = math.sqrt(u * w / (3.0 * spread) * length) * normals[1]
-        left = u * whole - 3.0 * u * w * tilted + first
-        left_tilted = u * u * (tilted + slope) + w * other
-        right = w * whole + 3.0 * u * w * tilted - first
-        right_tilted = w * w * (tilted + slope) - u * other
-        return np.stack([left, left_tilted]), np.stack([right, right_tilted])
+
+def step_noise(normals: FloatArray, period: float) -> FloatArray:
+    """Moments (..., 2, p) of unit white noise over ``period`` seconds: independent, with variances
+    g and g / 3.
+    """
+    return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
+
+
+@compilable
+def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
+    """(2, p) moments of dy from those of x (2, n) and of unit white noise (2, p)."""
+    return added(product(seen, H.T), noise, root.T)
+
+
+@compilable
+def cut(
+    rest: FloatArray, normals: FloatArray, u: float, length: float
+) -> tuple[FloatArray, FloatArray]:
+    """Moments (2, p) of the first share ``u`` of an interval of ``length`` seconds and of what is
+    left, given those of the whole, from standard ``normals`` (2, p).
+
+    Exact conditional law of four independent moments (variances g, g/3 on each part) given their
+    two sums; written so that nothing cancels when a part is short.
+    """
+    whole, tilted = rest[0], rest[1]
+    w = 1.0 - u
+    spread = 1.0 - 3.0 * u * w
+    first = math.sqrt(u * w * spread * length) * normals[0]
+    slope = math.sqrt(u * w / spread * length) * normals[0]
+    other = math.sqrt(u * w / (3.0 * spread) * length) * normals[1]
+    left = u * whole - 3.0 * u * w * tilted + first
+    left_tilted = u * u * (tilted + slope) + w * other
+    right = w * whole + 3.0 * u * w * tilted - first
+    right_tilted = w * w * (tilted + slope) - u * other
+    return np.stack((left, left_tilted)), np.stack((right, right_tilted))

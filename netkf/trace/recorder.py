@@ -85,7 +85,16 @@ class Recorder:
             return
         rows = np.array(self._rows, dtype=EVENT)
         self._rows.clear()
-        self._hash.update(rows.tobytes())
+        self._pass_on(rows)
+
+    def extend(self, rows: np.ndarray) -> None:
+        """Record a block of EVENT rows; the array is the recorder's from then on."""
+        self.flush()
+        if len(rows):
+            self._pass_on(rows)
+
+    def _pass_on(self, rows: np.ndarray) -> None:
+        self._hash.update(rows.data)
         self._counts += np.bincount(rows["kind"], minlength=len(KINDS))
         for sink in self._sinks:
             sink.events(rows)

@@ -59,7 +59,8 @@ def test_order_in_which_processes_start_does_not_matter(ring, seed):
         return random.Random(seed).sample(processes, len(processes))
 
     scenario = busy(ring)
-    same(netkf.simulate(scenario), netkf.simulate(scenario, engine=ProcessesEngine(shuffled)))
+    plain = netkf.simulate(scenario, engine="processes")
+    same(plain, netkf.simulate(scenario, engine=ProcessesEngine(shuffled)))
 
 
 def test_simultaneous_events_have_their_order(ring):

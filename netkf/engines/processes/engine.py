@@ -11,7 +11,7 @@ import simpy
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.engines.base import Engine, Progress, Rank
+from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
 from netkf.engines.processes.slots import SlotProcess
@@ -142,8 +142,8 @@ def _record(
     recorder.sample(time, x, xhat, P)
     recorder.flush_if_full()
     progress(time)
-    broken = np.flatnonzero(~(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)))
-    if broken.size:
-        for k in broken:
-            recorder.append((time, DIVERGED, scenario.nodes[k], -1, -1, -1, NAN))
+    nodes = broken(scenario, xhat, P)
+    for node in nodes:
+        recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
+    if nodes:
         raise DivergedError

@@ -9,7 +9,7 @@ import numpy as np
 from netkf.algorithms.flow import FlowFilter, FlowModel, Reading
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.engines.base import Rank
+from netkf.engines.base import SHORTEST_SHARE, Rank
 from netkf.engines.processes.timeline import Timeline
 from netkf.plants.diffusion import DiffusionPath
 from netkf.plants.sensors import LinearSensor, SensorPath
@@ -18,7 +18,6 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.schema import CODES
 
 ABSORB = CODES["absorb"]
-SHORTEST_SHARE = 1e-9
 
 
 class Host:

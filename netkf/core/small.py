@@ -1,0 +1,159 @@
+"""Products of small matrices: numpy in Python, loops without a call where they are compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dgesv
+
+from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable_as
+
+
+def _product_loops(a: FloatArray, b: FloatArray) -> FloatArray:
+    rows, inner, columns = a.shape[0], a.shape[1], b.shape[1]
+    out = np.empty((rows, columns))
+    for i in range(rows):
+        for j in range(columns):
+            total = 0.0
+            for k in range(inner):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+    return out
+
+
+@compilable_as(_product_loops)
+def product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a b`` (r, c) of (r, m) and (m, c)."""
+    return np.asarray(a @ b)
+
+
+def _added_loops(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    out = np.empty((a.shape[0], b.shape[1]))
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = c[i, j]
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+    return out
+
+
+@compilable_as(_added_loops)
+def added(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """``c + a b`` (r, s) of (r, s), (r, m) and (m, s)."""
+    return np.asarray(c + a @ b)
+
+
+def _even_loops(P: FloatArray) -> FloatArray:
+    out = np.empty(P.shape)
+    for i in range(P.shape[0]):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
+    return out
+
+
+@compilable_as(_even_loops)
+def even(P: FloatArray) -> FloatArray:
+    """The symmetric part of one matrix (n, n)."""
+    return np.asarray(0.5 * (P + P.T))
+
+
+def _applied_loops(a: FloatArray, x: FloatArray) -> FloatArray:
+    out = np.empty(a.shape[0])
+    for i in range(a.shape[0]):
+        total = 0.0
+        for k in range(a.shape[1]):
+            total += a[i, k] * x[k]
+        out[i] = total
+    return out
+
+
+@compilable_as(_applied_loops)
+def applied(a: FloatArray, x: FloatArray) -> FloatArray:
+    """``a x`` (r,) of (r, m) and (m,)."""
+    return np.asarray(a @ x)
+
+
+def _polynomial_loops(series: FloatArray, gap: float) -> FloatArray:
+    terms, size = series.shape
+    out: FloatArray = series[0].copy()
+    power = 1.0
+    for k in range(1, terms):
+        power *= gap
+        for j in range(size):
+            out[j] += power * series[k, j]
+    return out
+
+
+@compilable_as(_polynomial_loops)
+def polynomial(series: FloatArray, gap: float) -> FloatArray:
+    """``sum_k gap^k series[k]`` (size,) of (terms, size)."""
+    powers = np.empty(len(series))
+    powers[0] = 1.0
+    powers[1:] = gap
+    return np.asarray(np.multiply.accumulate(powers) @ series)
+
+
+def _solution_loops(  # noqa: PLR0912 - loops are what the compiler wants
+    left: FloatArray, right: FloatArray
+) -> FloatArray:
+    # Gauss with the largest pivot of each column, as LAPACK does it.
+    n, columns = left.shape[0], right.shape[1]
+    L, out = left.copy(), right.copy()
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(L[i, k]) > abs(L[best, k]):
+                best = i
+        if L[best, k] == 0.0:
+            return np.full_like(out, np.nan)
+        if best != k:
+            for j in range(k, n):
+                L[k, j], L[best, j] = L[best, j], L[k, j]
+            for j in range(columns):
+                out[k, j], out[best, j] = out[best, j], out[k, j]
+        for i in range(k + 1, n):
+            factor = L[i, k] / L[k, k]
+            for j in range(k + 1, n):
+                L[i, j] -= factor * L[k, j]
+            for j in range(columns):
+                out[i, j] -= factor * out[k, j]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            for j in range(columns):
+                out[i, j] -= L[i, k] * out[k, j]
+        for j in range(columns):
+            out[i, j] /= L[i, i]
+    return out
+
+
+@compilable_as(_solution_loops)
+def solution(left: FloatArray, right: FloatArray) -> FloatArray:
+    """``left^-1 right`` (n, c) of (n, n) and (n, c); nan where it overflows or is singular."""
+    # LAPACK itself: numpy's wrapper takes longer than the arithmetic.
+    _, _, solved, info = dgesv(left, right)
+    return np.full_like(right, np.nan) if info else np.asarray(solved)
+
+
+def _fill_loops(target: FloatArray, source: FloatArray) -> None:
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@compilable_as(_fill_loops)
+def fill(target: FloatArray, source: FloatArray) -> None:
+    """Write a vector into another of its size."""
+    # An assignment of arrays, compiled, brings words about shapes with it: seconds of compiling.
+    target[:] = source
+
+
+def _fill_square_loops(target: FloatArray, source: FloatArray) -> None:
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@compilable_as(_fill_square_loops)
+def fill_square(target: FloatArray, source: FloatArray) -> None:
+    """Write a matrix into another of its size."""
+    target[:] = source

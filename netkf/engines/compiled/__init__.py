@@ -1,0 +1,1 @@
+"""The fast engine: numba, an optional extra; same events, same states."""

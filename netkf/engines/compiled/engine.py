@@ -1,0 +1,195 @@
+"""The compiled engine: schedules made beforehand, and one compiled replay that carries the states.
+
+Python draws - ticks, fates, the path, the noise - in blocks from the streams that the processes
+engine uses, and the replay does everything that happens an event at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
+from netkf.core import compiling
+from netkf.core.arrays import FloatArray
+from netkf.core.fields import Part
+from netkf.core.streams import Streams
+from netkf.engines.base import Engine, Progress, broken
+from netkf.engines.compiled.draws import Noise, Path
+from netkf.engines.compiled.replay import (
+    DONE,
+    GRID_AT,
+    PLACES,
+    PROBE_AT,
+    ROW,
+    SAMPLE,
+    STEP_AT,
+    TICK_AT,
+    WANT_CUTS,
+    WANT_MAIL,
+    WANT_ROWS,
+    WANT_STEPS,
+    WANT_TICKS,
+    Cursor,
+    replay,
+)
+from netkf.engines.compiled.schedule import Schedule
+from netkf.engines.compiled.slotted import KERNELS, SlotRun
+from netkf.engines.compiled.tables import empty_mail, host_tables, larger, link_tables
+from netkf.plants.diffusion import Diffusion
+from netkf.plants.linear import LinearPlant
+from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sensors import LinearSensor
+from netkf.scenario.registry import name_of
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES, EVENT
+
+KNOWN = (
+    *(Diffusion, LinearPlant, RecordedPlant, UnknownPlant),
+    *(LinearSensor, RegressorSensor, RecordedSensor),
+    *(Hybrid, Local, Central, *KERNELS),
+)
+DIVERGED = CODES["diverged"]
+ROWS = 1 << 16
+FIRST_MAIL = 1024
+
+
+@dataclass(frozen=True)
+class CompiledEngine(Engine):
+    """Runs all built-in plants, sensors and filters but covariance intersection in continuous time
+    and push-sum that stops; clocks and channels may be anybody's, since schedules are made in
+    Python.
+    """
+
+    name = "compiled"
+
+    def refusal(self, scenario: Scenario) -> str | None:
+        """Why this engine cannot run the scenario, with the remedy; None where it can."""
+        remedy = 'use engine="processes", or "auto", which chooses'
+        if not compiling.available():
+            remedy = 'install it (pip install "netkf[fast]") or use engine="processes"'
+            return f'engine "compiled" needs numba, which is not installed; {remedy}'
+        algorithm = scenario.filter.algorithm
+        parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
+        parts += [("sensor", sensor) for sensor in scenario.sensors]
+        parts += [("filter", algorithm)]
+        for family, part in parts:
+            if type(part) not in KNOWN:
+                return (
+                    f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
+                )
+        if isinstance(algorithm, PushSum) and algorithm.stop != "never":
+            words = f'the filter "push-sum" with stop = "{algorithm.stop}"'
+            return f'engine "compiled" cannot run {words}; {remedy}'
+        return None
+
+    def run(
+        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+    ) -> str:
+        """Simulate up to the horizon; returns complete or diverged."""
+        if scenario.slotted:
+            return SlotRun(scenario, streams, recorder, progress).to_the_end()
+        return _Run(scenario, streams, recorder, progress).to_the_end()
+
+
+class _Run:
+    """One run: what the replay works on, and what it is given when it stops."""
+
+    def __init__(
+        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+    ) -> None:
+        self._scenario, self._recorder, self._progress = scenario, recorder, progress
+        self._replay = compiling.announced(replay)
+        assert self._replay is not None
+        self._hosts, self._models = host_tables(scenario)
+        self._links, self._mail = link_tables(scenario), empty_mail(self._hosts, FIRST_MAIL)
+        self._cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
+        self._schedule, self._path = Schedule(scenario, streams), Path(scenario, streams)
+        self._noise = Noise(scenario, streams)
+        self._window = self._schedule.following()
+        self._stretch = self._path.following()
+        self._noise.following()
+        self._rows = np.empty(ROWS, dtype=EVENT)
+        self._probes = np.array(scenario.times, dtype=np.float64)
+
+    def to_the_end(self) -> str:
+        """Simulate up to the horizon; returns complete or diverged."""
+        status = "complete"
+        try:
+            while (wanted := self._go_on()) != DONE:
+                if wanted == SAMPLE:
+                    if not self._sample():
+                        status = "diverged"
+                        break
+                else:
+                    self._give(wanted)
+        finally:
+            self._pass_rows_on()
+            self._recorder.flush()
+        return status
+
+    def _go_on(self) -> int:
+        assert self._replay is not None
+        return int(
+            self._replay(
+                self._hosts,
+                self._models,
+                self._noise.sensing,
+                self._links,
+                self._mail,
+                self._cursor,
+                self._window,
+                self._stretch,
+                self._probes,
+                float(self._scenario.horizon),
+                self._rows,
+            )
+        )
+
+    def _give(self, wanted: int) -> None:
+        place = self._cursor.place
+        if wanted == WANT_TICKS:
+            self._window, place[TICK_AT] = self._schedule.following(), 0
+        elif wanted == WANT_STEPS:
+            self._stretch = self._path.following()
+            place[STEP_AT] = place[GRID_AT] = 0
+            self._noise.following()
+        elif wanted == WANT_CUTS:
+            self._noise.more_cuts()
+        elif wanted == WANT_MAIL:
+            self._mail = larger(self._mail)
+        else:
+            assert wanted == WANT_ROWS
+            self._pass_rows_on()
+
+    def _pass_rows_on(self) -> None:
+        used = int(self._cursor.place[ROW])
+        self._cursor.place[ROW] = 0
+        self._recorder.extend(self._rows[:used].copy())
+
+    def _sample(self) -> bool:
+        place, hosts = self._cursor.place, self._hosts
+        time = float(self._probes[place[PROBE_AT] - 1])
+        x = self._shown(time, int(place[STEP_AT]))
+        xhat, P = hosts.xhat.copy(), hosts.P.copy()
+        if self._scenario.filter.algorithm.pooled:
+            count = len(self._scenario.nodes)
+            xhat, P = np.repeat(xhat, count, axis=0), np.repeat(P, count, axis=0)
+        self._recorder.sample(time, x, xhat, P)
+        self._progress(time)
+        nodes = broken(self._scenario, xhat, P)
+        if nodes:
+            self._pass_rows_on()
+        for node in nodes:
+            self._recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
+        return not nodes
+
+    def _shown(self, time: float, piece: int) -> FloatArray:
+        path = self._stretch
+        x = path.x_stop[piece] if time == path.stop[piece] else path.x_start[piece]
+        return np.array(x)

@@ -1,0 +1,429 @@
+"""The replay: what happens in one run, event after event, as one compiled function.
+
+It stops and says why where Python has something to do: draw more, pass rows on, take a sample.
+Every state of it is in arrays, so that it goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.flow import Payload, usable
+from netkf.algorithms.gains import GainTable, gain_update
+from netkf.algorithms.hybrid import reset
+from netkf.algorithms.riccati import RiccatiTable, riccati_step
+from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
+from netkf.core.small import fill, fill_square
+from netkf.engines.base import SHORTEST_SHARE
+from netkf.engines.compiled.schedule import Window
+from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Sensing
+from netkf.plants.diffusion import Step, seen
+from netkf.plants.sensors import cut, reading
+from netkf.trace.schema import CODES
+
+SENSE, TICK, SEND, DELIVER, LOST, ABSORB = (
+    CODES[kind] for kind in ("sense", "tick", "send", "deliver", "lost", "absorb")
+)
+WANT_TICKS, WANT_STEPS, WANT_CUTS, WANT_MAIL, WANT_ROWS, SAMPLE, DONE = range(7)
+"""Why the replay stopped: it needs the next window, the next steps of the path, normals for cuts,
+a larger pool of messages or room for rows; it is time for a sample; all is done.
+"""
+
+# Places in Cursor.place.
+TICK_AT, STEP_AT, GRID_AT, AWAKE, PROBE_AT, ROW, FREE, HEAP, WAITING, READY, SENT = range(11)
+PLACES = 11
+MOST_ROWS = 5  # of one activation
+NEVER = math.inf
+
+
+class Cursor(NamedTuple):
+    """Where a run stands: ``place`` (PLACES,) in all that is gone through in order."""
+
+    place: np.ndarray
+    mailed: FloatArray
+
+
+class Stretch(NamedTuple):
+    """Some steps of the sensing grid, the last of which ends at ``end``.
+
+    K pieces (a step is cut where a state is shown): start, stop (K,), x at both (K, n), moments
+    (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid`` holds the
+    times at which sensors wake; ``series`` as of the path.
+    """
+
+    end: float
+    start: FloatArray
+    stop: FloatArray
+    x_start: FloatArray
+    x_stop: FloatArray
+    moments: FloatArray
+    cubic: FloatArray
+    step: np.ndarray
+    last: FloatArray
+    grid: FloatArray
+    series: FloatArray
+
+
+@compilable
+def read(
+    sensing: Sensing, first: int, after: int, x: FloatArray, step: int, u: float, length: float
+) -> FloatArray:
+    """(2 p,) moments of the readings of sensors ``first`` to ``after``, where x has the moments
+    ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1: all of it).
+    """
+    total = 0
+    for s in range(first, after):
+        total += sensing.rows[s]
+    out, row = np.empty(2 * total), 0
+    for s in range(first, after):
+        if sensing.step[s] != step:
+            sensing.step[s] = step
+            fill_square(sensing.rest[s], sensing.noise[s, step])
+        noise = sensing.rest[s].copy()
+        if u >= 0.0:
+            normals = sensing.normals[s, sensing.used[s]]
+            sensing.used[s] += 1
+            noise, rest = cut(noise, normals, u, length)
+            fill_square(sensing.rest[s], rest)
+        y = reading(x, sensing.H[s], noise, sensing.root[s])
+        for i in range(sensing.rows[s]):
+            out[row] = y[0, i]
+            out[total + row] = y[1, i]
+            row += 1
+    return out
+
+
+@compilable
+def flow_table(models: Models, k: int) -> RiccatiTable:
+    """The table of one model."""
+    n = models.F.shape[2]
+    return RiccatiTable(
+        n, models.unit[k], models.series[k], models.jump[k], models.F[k], models.G[k], models.Q[k]
+    )
+
+
+@compilable
+def gains_of(models: Models, k: int) -> GainTable:
+    """The gains of one model."""
+    terms, width, first = models.shape[k, 1], models.shape[k, 2], models.first[k]
+    series = models.gains[first : first + terms * width].reshape(terms, width)
+    return GainTable(models.F.shape[2], models.shape[k, 0], series)
+
+
+@compilable
+def advance(
+    hosts: Hosts, models: Models, sensing: Sensing, path: Stretch, piece: int, h: int, time: float
+) -> bool:
+    """Bring host ``h`` to ``time`` as a Host of the processes does; False where it needs more
+    normals for cuts first, and then goes on where it stopped.
+    """
+    now = hosts.now[h]
+    if not now < time:
+        return True
+    first, after, k = hosts.sensors[h], hosts.sensors[h + 1], hosts.model[h]
+    table = flow_table(models, k)
+    xhat, P = hosts.xhat[h].copy(), hosts.P[h].copy()
+    senses, enough = after > first, True
+    while now < time:
+        end = time
+        if senses:
+            stretch = usable(P, models.information[k])
+            if stretch < time - now:
+                end = now + max(stretch, SHORTEST_SHARE * (time - now))
+            last = path.last[piece]
+            if end < last:
+                for s in range(first, after):
+                    if sensing.used[s] == sensing.normals.shape[1]:
+                        enough = False
+                if not enough:
+                    break
+        P, xhat = riccati_step(table, P, xhat, end - now)
+        if senses:
+            step = Step(
+                path.start[piece],
+                path.stop[piece],
+                path.x_start[piece],
+                path.x_stop[piece],
+                path.moments[piece],
+                path.cubic[piece],
+            )
+            x = seen(path.series, step, now, end)
+            share = (end - now) / (last - now) if end < last else -1.0
+            moments = read(sensing, first, after, x, path.step[piece], share, last - now)
+            xhat = gain_update(gains_of(models, k), P, xhat, moments, end - now)
+        now = end
+    fill(hosts.xhat[h], xhat)
+    fill_square(hosts.P[h], P)
+    hosts.now[h] = now
+    return enough
+
+
+@compilable
+def sooner(arrival: FloatArray, way: np.ndarray, order: np.ndarray, a: int, b: int) -> bool:
+    """Whether message ``a`` arrives before message ``b``."""
+    if arrival[a] != arrival[b]:
+        return bool(arrival[a] < arrival[b])
+    if way[a] != way[b]:
+        return bool(way[a] < way[b])
+    return bool(order[a] < order[b])
+
+
+@compilable
+def push(mail: Mail, size: int, message: int) -> None:
+    """Put a message on the heap of ``size``."""
+    heap, arrival, way, order, k = mail.heap, mail.arrival, mail.way, mail.order, size
+    while k > 0 and sooner(arrival, way, order, message, heap[(k - 1) // 2]):
+        heap[k] = heap[(k - 1) // 2]
+        k = (k - 1) // 2
+    heap[k] = message
+
+
+@compilable
+def pop(mail: Mail, size: int) -> int:
+    """Take the next message off the heap of ``size``."""
+    heap, arrival, way, order = mail.heap, mail.arrival, mail.way, mail.order
+    top, moved, k = heap[0], heap[size - 1], 0
+    while 2 * k + 1 < size - 1:
+        child = 2 * k + 1
+        if child + 1 < size - 1 and sooner(arrival, way, order, heap[child + 1], heap[child]):
+            child += 1
+        if not sooner(arrival, way, order, heap[child], moved):
+            break
+        heap[k] = heap[child]
+        k = child
+    heap[k] = moved
+    return int(top)
+
+
+@compilable
+def put(
+    inbox: np.ndarray,
+    waiting: np.ndarray,
+    ends: np.ndarray,
+    sent: FloatArray,
+    ways: np.ndarray,
+    following: np.ndarray,
+    place: np.ndarray,
+    h: int,
+    message: int,
+    now: float,
+) -> None:
+    """Put a message into an inbox, by peer; the newest of several from one peer counts."""
+    if inbox[h] == -1:
+        waiting[place[WAITING]] = h
+        place[WAITING] += 1
+    way = ways[message]
+    peer, other = ends[way // 2, way % 2], -1
+    before, here = -1, inbox[h]
+    while here != -1:
+        other = ends[ways[here] // 2, ways[here] % 2]
+        if other >= peer:
+            break
+        before, here = here, following[here]
+    gone = -1
+    if here != -1 and other == peer:
+        if now - sent[message] > now - sent[here]:
+            gone = message
+        else:
+            gone, here = here, following[here]
+    if gone != message:
+        following[message] = here
+        if before == -1:
+            inbox[h] = message
+        else:
+            following[before] = message
+    if gone != -1:
+        following[gone] = place[FREE]
+        place[FREE] = gone
+
+
+@compilable
+def arrived(models: Models, xhat: FloatArray, P: FloatArray, age: float) -> Payload:
+    """What a message that took ``age`` seconds says now."""
+    other_P, other = riccati_step(flow_table(models, len(models.unit) - 1), P, xhat, age)
+    return Payload(other, other_P)
+
+
+@compilable
+def note(
+    rows: np.ndarray,
+    place: np.ndarray,
+    t: float,
+    kind: int,
+    node: int,
+    peer: int,
+    message: int,
+    age: float,
+) -> None:
+    """Write one row of the events."""
+    row = rows[place[ROW]]
+    row.t, row.kind, row.node, row.peer = t, kind, node, peer
+    row.message, row.phase, row.age = message, -1, age
+    place[ROW] += 1
+
+
+def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function, and it stops often
+    hosts: Hosts,
+    models: Models,
+    sensing: Sensing,
+    links: Links,
+    mail: Mail,
+    cursor: Cursor,
+    window: Window,
+    path: Stretch,
+    probes: FloatArray,
+    horizon: float,
+    rows: np.ndarray,
+) -> int:
+    """Go on until something is wanted; see the words above. Order is (time, rank, entity)."""
+    # Names of their own, because every look into a group counts references.
+    place, mailed = cursor.place, cursor.mailed
+    model, nodes, xhats, Ps, reached = hosts.model, hosts.node, hosts.xhat, hosts.P, hosts.now
+    sensors, inbox, ends, weights = hosts.sensors, hosts.inbox, links.ends, links.weight
+    messages, ways, free = links.messages, links.ways, mail.next
+    mail_x, mail_P, sent, way_of = mail.xhat, mail.P, mail.sent, mail.way
+    numbers, arrivals, order, heap = mail.number, mail.arrival, mail.order, mail.heap
+    waiting, ticks, ticking, delays = mail.waiting, window.t, window.link, window.delay
+    grid, stop, awake, awake_node = path.grid, path.stop, sensing.host, sensing.node
+    unit, series, jump, F = models.unit, models.series, models.jump, models.F
+    G, Q, capacity = models.G, models.Q, len(mail.sent)
+    window_end, path_end = window.end, path.end
+    while True:
+        if place[ROW] + MOST_ROWS > len(rows):
+            return WANT_ROWS
+        sense = tick = deliver = ready = probe = NEVER
+        if place[GRID_AT] < len(grid):
+            sense = grid[place[GRID_AT]]
+        if place[TICK_AT] < len(ticks):
+            tick = ticks[place[TICK_AT]]
+        if place[HEAP] > 0:
+            deliver = arrivals[heap[0]]
+        if place[WAITING] > 0:
+            ready = mailed[0]
+        if place[PROBE_AT] < len(probes):
+            probe = probes[place[PROBE_AT]]
+        now = min(sense, tick, deliver, ready, probe)
+        if now >= window_end and window_end < NEVER:
+            return WANT_TICKS
+        if now > path_end and path_end < horizon:
+            return WANT_STEPS
+        if now == NEVER:
+            return DONE
+        while stop[place[STEP_AT]] < now:
+            place[STEP_AT] += 1
+        # Who must be brought to this time before anything happens.
+        first, after = 0, len(reached)
+        link = i = j = -1
+        if sense == now:
+            first = awake[place[AWAKE]]
+            after = first + 1
+        elif tick == now:
+            if place[FREE] >= capacity or free[place[FREE]] >= capacity:
+                return WANT_MAIL
+            link = ticking[place[TICK_AT]]
+            i, j = ends[link, 0], ends[link, 1]
+            first, after = 0, 2
+        elif deliver == now:
+            after = 0
+        elif ready == now:
+            if place[READY] == 0:
+                waiting[: place[WAITING]].sort()
+            first = waiting[place[READY]]
+            after = first + 1
+        for k in range(first, after):
+            h = k
+            if link >= 0:
+                h = i if k == 0 else j
+            if not reached[h] < now:
+                continue
+            if sensors[h] < sensors[h + 1]:
+                if not advance(hosts, models, sensing, path, place[STEP_AT], h, now):
+                    return WANT_CUTS
+            else:
+                m, gap = model[h], now - reached[h]
+                table = RiccatiTable(F.shape[2], unit[m], series[m], jump[m], F[m], G[m], Q[m])
+                P, xhat = riccati_step(table, Ps[h], xhats[h], gap)
+                fill(xhats[h], xhat)
+                fill_square(Ps[h], P)
+                reached[h] = now
+        if sense == now:
+            note(rows, place, now, SENSE, awake_node[place[AWAKE]], -1, -1, np.nan)
+            place[AWAKE] += 1
+            if place[AWAKE] == len(awake):
+                place[AWAKE] = 0
+                place[GRID_AT] += 1
+        elif tick == now:
+            note(rows, place, now, TICK, nodes[i], nodes[j], -1, np.nan)
+            number = messages[link]
+            messages[link] += 1
+            for way in range(ways):
+                sender, receiver = (i, j) if way == 0 else (j, i)
+                one, other = nodes[sender], nodes[receiver]
+                note(rows, place, now, SEND, one, other, number, np.nan)
+                delay = delays[place[TICK_AT], way]
+                arrival = now + delay
+                if delay < 0.0:
+                    note(rows, place, now, LOST, one, other, number, np.nan)
+                elif delay == 0.0 or arrival < horizon:
+                    message = place[FREE]
+                    place[FREE] = free[message]
+                    fill(mail_x[message], xhats[sender])
+                    fill_square(mail_P[message], Ps[sender])
+                    sent[message] = now
+                    way_of[message] = 2 * link + way
+                    numbers[message] = number
+                    if delay == 0.0:
+                        note(rows, place, now, DELIVER, other, one, number, 0.0)
+                        put(inbox, waiting, ends, sent, way_of, free, place, receiver, message, now)
+                        mailed[0] = now
+                    else:
+                        arrivals[message] = arrival
+                        order[message] = place[SENT]
+                        place[SENT] += 1
+                        push(mail, place[HEAP], message)
+                        place[HEAP] += 1
+            place[TICK_AT] += 1
+        elif deliver == now:
+            message = pop(mail, place[HEAP])
+            place[HEAP] -= 1
+            came, way = way_of[message] // 2, way_of[message] % 2
+            sender, receiver = ends[came, way], ends[came, 1 - way]
+            one, other, number = nodes[sender], nodes[receiver], numbers[message]
+            note(rows, place, now, DELIVER, other, one, number, now - sent[message])
+            put(inbox, waiting, ends, sent, way_of, free, place, receiver, message, now)
+            mailed[0] = now
+        elif ready == now:
+            h = waiting[place[READY]]
+            own, message = 0.0, inbox[h]
+            while message != -1:
+                own += weights[way_of[message] // 2, way_of[message] % 2]
+                message = free[message]
+            own = 1.0 - own
+            xhat, P = own * xhats[h], own * Ps[h]
+            oldest, message = 0.0, inbox[h]
+            while message != -1:
+                age = now - sent[message]
+                weight = weights[way_of[message] // 2, way_of[message] % 2]
+                if age > 0.0:
+                    oldest = max(oldest, age)
+                    payload = arrived(models, mail_x[message], mail_P[message], age)
+                    xhat, P = reset(xhat, P, weight, payload.xhat, payload.P)
+                else:
+                    xhat, P = reset(xhat, P, weight, mail_x[message], mail_P[message])
+                gone, message = message, free[message]
+                free[gone] = place[FREE]
+                place[FREE] = gone
+            fill(xhats[h], xhat)
+            fill_square(Ps[h], P)
+            inbox[h] = -1
+            note(rows, place, now, ABSORB, nodes[h], -1, -1, oldest)
+            place[READY] += 1
+            if place[READY] == place[WAITING]:
+                place[READY] = place[WAITING] = 0
+        else:
+            place[PROBE_AT] += 1
+            return SAMPLE

@@ -1,0 +1,172 @@
+"""One run in slots: the slots made, the readings drawn, the estimates carried by compiled code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.push_sum import PushSum
+from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
+from netkf.core import compiling
+from netkf.core.arrays import FloatArray, square_root
+from netkf.core.streams import Streams
+from netkf.engines.base import Progress, broken
+from netkf.engines.compiled.exchanges import SENSING, Exchanges, Slots
+from netkf.engines.compiled.slots import (
+    Nodes,
+    Readings,
+    Shown,
+    Steps,
+    diffusion,
+    gossip,
+    intermittent,
+    local,
+    push_sum,
+)
+from netkf.plants.linear import Truth
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES, EVENT
+
+KERNELS: dict[type[SlotFilter], Callable[..., None]] = {
+    Gossip: gossip,
+    Intermittent: intermittent,
+    DiffusionFilter: diffusion,
+    PushSum: push_sum,
+    SlotLocal: local,
+    SlotCentral: local,
+}
+
+
+class SlotRun:
+    """What one run in slots carries from one lot of slots to the next."""
+
+    def __init__(
+        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+    ) -> None:
+        self._scenario, self._recorder, self._progress = scenario, recorder, progress
+        algorithm = scenario.filter.algorithm
+        assert isinstance(algorithm, SlotFilter)
+        kernel = compiling.announced(KERNELS[type(algorithm)])
+        assert kernel is not None
+        self._kernel, self._pooled = kernel, algorithm.pooled
+        self._exchanges = Exchanges(scenario, streams)
+        self._truth: Truth = scenario.slot_plant.truth(streams.generator("plant"))
+        paths = {
+            node: [scenario.slot_path(streams, node, p) for p in scenario.placed[node]]
+            for node in scenario.sensing
+        }
+        nodes = scenario.nodes
+        self._paths = [[path for some in paths.values() for path in some]]
+        if not self._pooled:
+            self._paths = [paths.get(node, []) for node in nodes]
+        self._nodes = _nodes(scenario, self._pooled)
+        self._extra, self._mass = _extra(scenario)
+
+    def to_the_end(self) -> str:
+        """Simulate up to the horizon; returns complete or diverged."""
+        try:
+            while (slots := self._exchanges.following()) is not None:
+                if not self._lot(slots):
+                    return "diverged"
+        finally:
+            self._recorder.flush()
+        return "complete"
+
+    def _lot(self, slots: Slots) -> bool:
+        count, (size, n) = len(slots.samples), self._nodes.xhat.shape
+        shown = Shown(
+            np.zeros((count, size, n)), np.zeros((count, size, n, n)), np.zeros((count, size, 2))
+        )
+        began = self._mass[:, :2].copy()
+        # States first: the truth is asked for in the order of the slots.
+        states = {slot: self._truth.state(slot) for slot in slots.slots}
+        readings = self._readings(slots, states)
+        self._kernel(self._nodes, readings, Steps(*slots[:7]), shown, *self._extra)
+        rows, passed = np.array(slots.rows, dtype=EVENT), 0
+        first = self._recorder.sums
+        for k, (slot, time, before) in enumerate(slots.samples):
+            self._recorder.extend(rows[passed:before].copy())
+            passed = before
+            if len(self._mass):
+                started = first or {name: (math.fsum(began[:, j]), 0.0) for j, name in SUMS}
+                now = {name: math.fsum(shown.mass[k, :, j]) for j, name in SUMS}
+                self._recorder.sums = {name: (started[name][0], now[name]) for name in now}
+            if not self._sample(time, states[slot], shown.xhat[k], shown.root[k]):
+                return False
+        self._recorder.extend(rows[passed:].copy())
+        return True
+
+    def _readings(self, slots: Slots, states: dict[int, FloatArray]) -> Readings:
+        size, n = self._nodes.xhat.shape
+        most = self._nodes.R.shape[1]
+        y = np.zeros((len(slots.slots), size, most))
+        H = np.zeros((len(slots.slots), size, most, n))
+        for k in slots.number[slots.kind == SENSING].tolist():
+            slot = slots.slots[k]
+            for h, paths in enumerate(self._paths):
+                row = 0
+                for path in paths:
+                    value = path.reading(slot, states[slot])
+                    after = row + len(value)
+                    y[k, h, row:after], H[k, h, row:after] = value, path.matrix(slot)
+                    row = after
+        return Readings(y, H)
+
+    def _sample(self, time: float, x: FloatArray, xhat: FloatArray, root: FloatArray) -> bool:
+        scenario, recorder = self._scenario, self._recorder
+        P = root @ np.swapaxes(root, -1, -2)
+        if self._pooled:
+            count = len(scenario.nodes)
+            xhat, P = np.repeat(xhat, count, axis=0), np.repeat(P, count, axis=0)
+        recorder.sample(time, x, xhat, P)
+        self._progress(time)
+        nodes = broken(scenario, xhat, P)
+        for node in nodes:
+            recorder.append((time, CODES["diverged"], node, -1, -1, -1, NAN))
+        return not nodes
+
+
+SUMS = ((0, "weight"), (1, "number"))
+
+
+def _nodes(scenario: Scenario, pooled: bool) -> Nodes:
+    models = [scenario.pooled_slot_model] if pooled else list(scenario.slot_models)
+    most = max(len(model.R) for model in models)
+    R = np.zeros((len(models), most, most))
+    for k, model in enumerate(models):
+        R[k, : len(model.R), : len(model.R)] = model.R
+    starts = [scenario.start(node) for node in scenario.nodes[: len(models)]]
+    return Nodes(
+        xhat=np.stack([mean for mean, _ in starts]),
+        root=np.stack([square_root(cov) for _, cov in starts]),
+        F=np.array(models[0].F),
+        root_Q=np.ascontiguousarray(models[0].root_Q),
+        rows=np.array([len(model.R) for model in models], dtype=np.int64),
+        R=R,
+    )
+
+
+def _extra(scenario: Scenario) -> tuple[tuple[Any, ...], FloatArray]:
+    """What the function of this filter is given besides, and the mass of the nodes."""
+    algorithm, roles, n = scenario.filter.algorithm, scenario.roles, scenario.plant.n
+    if isinstance(algorithm, DiffusionFilter):
+        own = np.array([role.own for role in roles], dtype=np.float64)
+        return (own, algorithm.on_loss == "keep-own"), np.empty((0, 2))
+    if not isinstance(algorithm, PushSum):
+        return (), np.empty((0, 2))
+    states = [
+        algorithm.place(algorithm.init(model, *scenario.start(role.node)), role)
+        for role, model in zip(roles, scenario.slot_models, strict=True)
+    ]
+    mass = np.stack([state.mass for state in states])
+    known = states[0].network
+    limit = np.zeros((n, n)) if known.root is None else np.ascontiguousarray(known.root)
+    degree = np.array([role.neighbours for role in roles], dtype=np.int64)
+    information = np.stack([model.information for model in scenario.slot_models])
+    more = (limit, algorithm.asymptotic, float(known.number), algorithm.delta)
+    return (mass, degree, information, *more), mass

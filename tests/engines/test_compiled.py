@@ -1,0 +1,402 @@
+"""The compiled engine: the events and states of the processes engine, and words where it cannot."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, reject, settings
+from hypothesis import strategies as st
+
+import netkf
+from netkf.algorithms import square_root
+from netkf.algorithms.hybrid import Hybrid
+from netkf.core import compiling, small
+from netkf.core.errors import EngineError, ScenarioError
+from netkf.core.streams import Streams
+from netkf.network.channels import Bernoulli, Fates
+from netkf.scenario.reading import from_table
+from netkf.trace.recorder import MemorySink, Recorder
+from netkf.trace.schema import EVENT
+from tests.conftest import SCENARIOS, scenario_files
+from tests.engines.agreement import assert_agree
+
+pytest.importorskip("numba")
+SHORT = {"intel_lab.toml": 1.5, "diffusion_regression.toml": 300.0}
+
+
+@pytest.mark.parametrize("file", scenario_files(), ids=lambda file: file.stem)
+def test_every_scenario_agrees(file):
+    scenario = netkf.load(file)
+    horizon = min(scenario.horizon, SHORT.get(file.name, 40.0))
+    assert_agree(scenario.replace({"horizon": horizon}))
+
+
+def entries(rows, columns, size=1.0):
+    entry = st.floats(-size, size).map(lambda value: round(value, 2))
+    row = st.lists(entry, min_size=columns, max_size=columns)
+    return st.lists(row, min_size=rows, max_size=rows)
+
+
+CLOCKS = st.sampled_from(
+    [
+        {"kind": "poisson", "rate": 3.0},
+        {"kind": "poisson", "rate": 1.0, "rates": [[0, 1, 9.0]]},
+        {"kind": "renewal", "distribution": "gamma", "shape": 3.0, "mean": 0.3},
+        {"kind": "renewal", "distribution": "weibull", "shape": 0.8, "rate": 3.0},
+        {"kind": "renewal", "distribution": "uniform", "low": 0.1, "high": 0.5},
+        {"kind": "renewal", "distribution": "constant", "mean": 0.25},
+        {"kind": "periodic", "period": 0.25},
+        {"kind": "periodic", "period": 0.2, "phase": "random", "jitter": 0.1},
+    ]
+)
+LOSSES = st.sampled_from(
+    [
+        {"kind": "none"},
+        {"kind": "bernoulli", "delivery": 0.6},
+        {"kind": "gilbert-elliott", "mean_loss": 0.3, "mean_burst": 2.5},
+    ]
+)
+DELAYS = st.sampled_from(
+    [
+        {"kind": "none"},
+        {"kind": "constant", "seconds": 0.25},
+        {"kind": "exponential", "mean": 0.3},
+        {"kind": "uniform", "low": 0.0, "high": 0.6},
+        {"kind": "lognormal", "mean": 0.2, "sigma": 1.0},
+    ]
+)
+GRAPHS = st.sampled_from(
+    [
+        {"kind": "path", "nodes": 2},
+        {"kind": "cycle", "nodes": 4},
+        {"kind": "complete", "nodes": 4},
+        {"kind": "edges", "edges": [[0, 1], [1, 7], [7, 9], [0, 9], [0, 7]]},
+    ]
+)
+FILTERS = st.sampled_from(
+    [
+        {"kind": "hybrid", "epsilon": 0.25},
+        {"kind": "hybrid", "epsilon": 0.25, "model": {"R": [[3.0]]}},
+        {"kind": "local"},
+        {"kind": "central"},
+    ]
+)
+PROBES = st.sampled_from([0.5, 0.37, [0.0, 0.111, 0.112, 1.9], [3.0]])
+
+
+@st.composite
+def scenarios(draw):
+    n = draw(st.integers(1, 3))
+    sensors = [
+        {"nodes": nodes, "H": draw(entries(1, n)), "R": [[draw(st.floats(0.01, 1.0))]]}
+        for nodes in ([0], [0, 1])
+    ]
+    start = np.eye(n) * draw(st.sampled_from([0.0, 1.0, 100.0]))
+    plant = {"kind": "diffusion", "A": draw(entries(n, n)), "B": np.eye(n).tolist()}
+    return {
+        "format": 1,
+        "name": "drawn",
+        "horizon": 3.0,
+        "seed": draw(st.integers(0, 2**20)),
+        "probe": draw(PROBES),
+        "plant": {**plant, "cov": start.tolist()},
+        "sensors": sensors[: draw(st.integers(0, 2))],
+        "network": {
+            "graph": draw(GRAPHS),
+            "activation": draw(CLOCKS),
+            "channel": {
+                "loss": draw(LOSSES),
+                "delay": draw(DELAYS),
+                "symmetric": draw(st.booleans()),
+            },
+        },
+        "filter": draw(FILTERS),
+    }
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@given(scenarios())
+def test_drawn_scenarios_agree(tables):
+    if tables["filter"]["kind"] in {"local", "central"}:
+        del tables["network"]["activation"], tables["network"]["channel"]
+    if tables["network"]["graph"].get("edges") and "rates" in tables["network"].get(
+        "activation", {}
+    ):
+        tables["network"]["activation"] = {"kind": "poisson", "rate": 2.0}
+    assert_agree(from_table(tables, SCENARIOS))
+
+
+MATCHINGS = st.sampled_from(
+    [
+        {"protocol": "maximal"},
+        {"protocol": "one-edge", "lazy": 0.3},
+        {"protocol": "node-wakeup"},
+        {"protocol": "independent", "p": 0.4},
+    ]
+)
+SLOT_FILTERS = st.sampled_from(
+    [
+        {"kind": "gossip"},
+        {"kind": "intermittent"},
+        {"kind": "diffusion"},
+        {"kind": "diffusion", "on_loss": "keep-own", "model": {"R": [[2.0]]}},
+        {"kind": "push-sum", "gamma": 2, "delta": 4.0},
+        {"kind": "push-sum", "gamma": 3, "delta": 5.0, "links": "held"},
+        {"kind": "push-sum", "gamma": 1, "delta": 5.0, "asymptotic": True},
+        {"kind": "local"},
+        {"kind": "central"},
+    ]
+)
+
+
+@st.composite
+def slotted(draw):
+    n = draw(st.integers(1, 3))
+    F, H = np.array(draw(entries(n, n))), draw(entries(1, n))
+    start = draw(st.sampled_from([0.5, 1.0, 100.0]))
+    plant = {"kind": "linear", "F": (F + np.eye(n)).tolist(), "Q": np.eye(n).tolist()}
+    regressor = {"kind": "regressor", "nodes": [1], "A": [[0.5]], "B": [[1.0]], "R": [[0.3]]}
+    regressor |= {"C": np.ones((n, 1)).tolist(), "start": [1.0], "xi_cov": [[0.5]]}
+    sensors = [
+        {"nodes": [0], "H": H, "R": [[draw(st.floats(0.01, 1.0))]]},
+        draw(
+            st.sampled_from(
+                [regressor, {"nodes": [0, 1], "H": np.ones((1, n)).tolist(), "R": [[1.0]]}]
+            )
+        ),
+    ]
+    algorithm = draw(SLOT_FILTERS)
+    matched = algorithm["kind"] == "gossip"
+    activation = {"kind": "matching", **draw(MATCHINGS)} if matched else {"kind": "broadcast"}
+    channel = {"loss": draw(LOSSES), "delay": draw(DELAYS), "symmetric": draw(st.booleans())}
+    network = {"graph": draw(GRAPHS), "activation": activation, "channel": channel}
+    if algorithm["kind"] in {"local", "central"}:
+        network = {"graph": network["graph"]}
+    return {
+        "format": 1,
+        "name": "drawn",
+        "horizon": 8.0,
+        "seed": draw(st.integers(0, 2**20)),
+        "probe": draw(st.sampled_from([1.0, 3.0, [0.0, 5.0]])),
+        "plant": {**plant, "period": 1.0, "cov": (start * np.eye(n)).tolist()},
+        "sensors": sensors,
+        "network": network,
+        "filter": algorithm,
+    }
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(slotted())
+def test_drawn_scenarios_in_slots_agree(tables):
+    try:
+        scenario = from_table(tables, SCENARIOS)
+    except ScenarioError:
+        reject()
+    assert_agree(scenario)
+
+
+def test_recorded_slots_readings_and_late_messages_agree(tmp_path):
+    (tmp_path / "pairs.csv").write_text("slot,node,peer\n1,0,1\n1,2,3\n2,1,2\n4,4,0\n4,2,1\n")
+    ring = netkf.load(SCENARIOS / "gossip_ring.toml").replace({"horizon": 6.0, "probe": 1.0})
+    recorded = {"kind": "recorded", "path": tmp_path / "pairs.csv"}
+    run = assert_agree(ring.replace({"network.activation": recorded}))
+    assert run.count("tick") == 5
+    late = {"network.channel.delay": {"kind": "constant", "seconds": 0.6}}
+    run = assert_agree(ring.replace(late))
+    assert run.count("swap") == 0 < run.count("late")
+
+
+def test_push_sum_that_stops_is_refused_by_name():
+    planar = netkf.load(SCENARIOS / "push_sum_planar.toml")
+    with pytest.raises(EngineError, match=r'push-sum.*stop = "safe".*processes'):
+        netkf.simulate(planar.replace({"filter.stop": "safe"}), engine="compiled")
+
+
+def test_many_lots_of_slots_are_one_run(monkeypatch):
+    ring = netkf.load(SCENARIOS / "push_sum_planar.toml").replace({"horizon": 10.0})
+    whole = netkf.simulate(ring, engine="compiled")
+    monkeypatch.setattr("netkf.engines.compiled.exchanges.MOST_ROWS", 100)
+    pieces = netkf.simulate(ring, engine="compiled")
+    assert pieces.fingerprint == whole.fingerprint
+    assert pieces.sums == whole.sums
+    np.testing.assert_array_equal(pieces.P, whole.P)
+
+
+def test_growth_in_slots_is_reported_alike(build):
+    plant = {"kind": "linear", "F": [[3.0]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
+    network = {"graph": {"kind": "path", "nodes": 2}}
+    grown = build(
+        horizon=900.0,
+        probe=50.0,
+        plant=plant,
+        network=network,
+        filter={"kind": "local"},
+        sensors=[{"nodes": [0], "H": [[1.0]], "R": [[0.5]]}],
+    )
+    assert assert_agree(grown).status == "diverged"
+
+
+def test_recorded_ticks_and_losses_agree(ring, tmp_path):
+    (tmp_path / "ticks.csv").write_text("t,node,peer\n0.5,0,1\n0.5,2,1\n0.75,5,0\n9.5,3,4\n")
+    (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n0,1,0,0\n5,0,0,0\n")
+    changes = {
+        "network.activation": {"kind": "recorded", "path": tmp_path / "ticks.csv"},
+        "network.channel.loss": {"kind": "recorded", "path": tmp_path / "lost.csv"},
+    }
+    run = assert_agree(ring.replace(changes))
+    assert run.count("lost") == 2
+    assert run.count("tick") == 4
+
+
+def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
+    """Whatever is handed over in blocks, the run does not change."""
+    busy = ring.replace(
+        {
+            "horizon": 4.0,
+            "network.activation.rate": 40.0,
+            "network.channel.delay": {"kind": "exponential", "mean": 2.0},
+            "network.channel.symmetric": False,
+        }
+    )
+    whole = netkf.simulate(busy, engine="compiled")
+    module = "netkf.engines.compiled"
+    monkeypatch.setattr(f"{module}.engine.ROWS", 7)
+    monkeypatch.setattr(f"{module}.engine.FIRST_MAIL", 2)
+    monkeypatch.setattr(f"{module}.draws.STEPS", 3)
+    monkeypatch.setattr(f"{module}.draws.CUTS", 1)
+    monkeypatch.setattr(f"{module}.schedule.LEAST_TICKS", 5)
+    monkeypatch.setattr(f"{module}.schedule.TICKS_A_LINK", 1)
+    pieces = netkf.simulate(busy, engine="compiled")
+    assert pieces.fingerprint == whole.fingerprint
+    np.testing.assert_array_equal(pieces.P, whole.P)
+    np.testing.assert_array_equal(pieces.xhat, whole.xhat)
+
+
+def test_growth_beyond_numbers_is_reported_alike(build):
+    plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
+    grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"}, sensors=[])
+    assert assert_agree(grown).status == "diverged"
+
+
+class Cautious(Hybrid):
+    """A user's filter that is the hybrid one."""
+
+
+class Halved(Bernoulli):
+    """A user's loss: half of what it says."""
+
+    def chance(self, link, message, bad, measured):
+        return 0.5 * self.delivery
+
+
+def test_a_filter_of_ones_own_is_refused_by_name_and_auto_takes_the_other(ring):
+    algorithm = Cautious(epsilon=0.3)
+    own = dataclasses.replace(ring, filter=dataclasses.replace(ring.filter, algorithm=algorithm))
+    with pytest.raises(EngineError, match=r'filter .*Cautious.*; use engine="processes"'):
+        netkf.simulate(own, engine="compiled")
+    run = netkf.simulate(own)
+    assert run.engine == "processes"
+    assert run.fingerprint == netkf.simulate(ring, engine="compiled").fingerprint
+
+
+def test_a_loss_of_ones_own_runs_in_both(ring):
+    channel = dataclasses.replace(ring.network.channel, loss=Halved(delivery=0.8))
+    network = dataclasses.replace(ring.network, channel=channel)
+    assert assert_agree(dataclasses.replace(ring, network=network)).count("lost") > 100
+
+
+def test_auto_is_compiled_and_without_numba_processes(ring, monkeypatch):
+    assert netkf.simulate(ring).engine == "compiled"
+    monkeypatch.setattr(compiling, "available", lambda: False)
+    assert netkf.simulate(ring).engine == "processes"
+    with pytest.raises(EngineError, match=r"needs numba.*pip install"):
+        netkf.simulate(ring, engine="compiled")
+
+
+def test_the_first_start_says_on_a_terminal_that_it_compiles(ring, monkeypatch, capsys):
+    netkf.simulate(ring, engine="compiled")
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    netkf.simulate(ring, engine="compiled")
+    assert capsys.readouterr().err == ""  # what is kept on disk is not compiled again
+    monkeypatch.setattr(compiling, "_kept", lambda made: False)
+    netkf.simulate(ring, engine="compiled")
+    assert "compiling" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+@pytest.mark.parametrize("p", [1, 3])
+def test_square_roots_in_loops_are_those_of_stacks(n, p):
+    draw = np.random.default_rng([n, p]).standard_normal
+    S, F, root_Q, H = draw((n, n)), draw((n, n)), draw((n, n)), draw((p, n))
+    root_R = np.linalg.cholesky(np.eye(p) + 0.1)
+    L = square_root._triangular_loops(np.concatenate([S, F], axis=1))
+    np.testing.assert_allclose(L @ L.T, S @ S.T + F @ F.T, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(L, np.tril(L))
+    ahead, plain = (f(S, F, root_Q) for f in (square_root._predict_loops, square_root.predict_root))
+    np.testing.assert_allclose(ahead @ ahead.T, plain @ plain.T, rtol=1e-12, atol=1e-12)
+    (one, K), (other, G) = (
+        f(S, F, root_Q, H, root_R) for f in (square_root._update_loops, square_root.update_root)
+    )
+    np.testing.assert_allclose(one @ one.T, other @ other.T, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(K, G, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+@pytest.mark.parametrize("seed", range(3))
+def test_loops_are_what_numpy_says(n, seed):
+    """The one place where a formula stands twice."""
+    draw = np.random.default_rng([seed, n]).standard_normal
+    a, b, c, x = draw((n, n)), draw((n, n)), draw((n, n)), draw(n)
+    close = {"rtol": 1e-12, "atol": 1e-12}
+    np.testing.assert_allclose(small._product_loops(a, b), a @ b, **close)
+    np.testing.assert_allclose(small._added_loops(c, a, b), c + a @ b, **close)
+    np.testing.assert_allclose(small._applied_loops(a, x), a @ x, **close)
+    np.testing.assert_allclose(small._even_loops(a), 0.5 * (a + a.T), **close)
+    solved = np.linalg.solve(a, b)
+    scale = np.linalg.cond(a)
+    np.testing.assert_allclose(small._solution_loops(a, b), solved, rtol=1e-12 * scale)
+    np.testing.assert_allclose(small.solution(a, b), solved, rtol=1e-12 * scale)
+    series = draw((7, 4))
+    sums = sum(0.3**k * row for k, row in enumerate(series))
+    np.testing.assert_allclose(small._polynomial_loops(series, 0.3), sums, **close)
+    np.testing.assert_allclose(small.polynomial(series, 0.3), sums, **close)
+
+
+def test_a_singular_matrix_gives_nan_in_both():
+    singular, right = np.array([[1.0, 2.0], [2.0, 4.0]]), np.eye(2)
+    assert np.isnan(small._solution_loops(singular, right)).all()
+    assert np.isnan(small.solution(singular, right)).all()
+
+
+def test_fates_drawn_at_once_are_those_drawn_one_by_one():
+    for loss in ({"kind": "bernoulli", "delivery": 0.5}, {"kind": "gilbert-elliott", **BURSTS}):
+        for delay in ({"kind": "lognormal", "mean": 1.0, "sigma": 0.5}, {"kind": "none"}):
+            scenario = netkf.load(SCENARIOS / "poisson_ring.toml").replace(
+                {"network.channel": {"loss": loss, "delay": delay}}
+            )
+            one, other = (
+                Fates(scenario.network.channel, lambda p: Streams(1).generator(p, 0, 1))
+                for _ in range(2)
+            )
+            singles = [one.draw() for _ in range(100)]
+            for many, column in zip(other.draws(100), zip(*singles, strict=True), strict=True):
+                assert many.tolist() == list(column)
+
+
+BURSTS = {"mean_loss": 0.3, "mean_burst": 3.0}
+
+
+def test_a_block_of_rows_is_recorded_like_one_row_after_the_other():
+    rows = [(0.5 * k, k % 3, k, -1, -1, -1, np.nan) for k in range(10)]
+    one, other = (Recorder([MemorySink()]) for _ in range(2))
+    for row in rows:
+        one.append(row)
+    one.flush()
+    for row in rows[:2]:
+        other.append(row)
+    other.extend(np.array(rows[2:7], dtype=EVENT))
+    other.extend(np.array(rows[7:], dtype=EVENT))
+    assert one.fingerprint == other.fingerprint
+    assert one.total == other.total == 10
