@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.interrupts import undisturbed
 from netkf.trace.schema import CODES, EVENT, KINDS
 
 BLOCK = 1 << 16
@@ -84,14 +85,16 @@ class Recorder:
         if not self._rows:
             return
         rows = np.array(self._rows, dtype=EVENT)
-        self._rows.clear()
-        self._pass_on(rows)
+        with undisturbed():  # what is counted is also kept
+            self._rows.clear()
+            self._pass_on(rows)
 
     def extend(self, rows: np.ndarray) -> None:
         """Record a block of EVENT rows; the array is the recorder's from then on."""
         self.flush()
         if len(rows):
-            self._pass_on(rows)
+            with undisturbed():
+                self._pass_on(rows)
 
     def _pass_on(self, rows: np.ndarray) -> None:
         self._hash.update(rows.data)

@@ -1,0 +1,38 @@
+"""Stretches of code that are done whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+WAITING = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Ctrl-C and the request to end wait until the block is left.
+
+    In other threads than the main one nothing is changed: Python delivers signals to that one.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[tuple[int, Any]] = []
+    before = {number: signal.getsignal(number) for number in WAITING}
+    for number in WAITING:
+        signal.signal(number, lambda number, frame: came.append((number, frame)))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for received, frame in came:
+            handler = before[signal.Signals(received)]
+            if callable(handler):
+                handler(received, frame)
+            elif handler == signal.SIG_DFL:
+                os.kill(os.getpid(), received)

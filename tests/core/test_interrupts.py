@@ -1,0 +1,37 @@
+"""Signals wait for what must be done whole."""
+
+import os
+import signal
+import threading
+
+import pytest
+
+from netkf.core.interrupts import undisturbed
+
+
+def test_a_signal_waits_until_the_block_is_left():
+    done = []
+
+    def work():
+        with undisturbed():
+            os.kill(os.getpid(), signal.SIGINT)
+            done.append("whole")
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done == ["whole"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_other_threads_go_on_as_they_are():
+    seen = []
+
+    def work():
+        with undisturbed():
+            seen.append("done")
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == ["done"]
