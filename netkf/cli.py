@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import json
 import os
 import signal
@@ -251,7 +252,7 @@ def _divergence(finished: Any) -> str:
 
 def _picture(scenario: Scenario, name: str, finished: Any) -> None:
     try:
-        from netkf.experiments import plots
+        plots = importlib.import_module("netkf.experiments.plots")
     except ImportError:
         print("no picture: matplotlib is missing (pip install matplotlib)", file=sys.stderr)
         return

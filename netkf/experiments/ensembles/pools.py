@@ -21,6 +21,9 @@ from netkf.scenario.scenario import Scenario
 AHEAD = 1024
 """Most blocks that are handed out and not yet back."""
 
+PATIENCE = 10
+"""Seconds to wait for a scheduler."""
+
 ONE_THREAD = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -92,7 +95,7 @@ class Cluster(Pool):
             raise EngineError(words) from None
         connect: Any = distributed.Client
         try:
-            self._client = connect(address, timeout=10, set_as_default=False)
+            self._client = connect(address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise ScenarioError(
                 "scheduler",

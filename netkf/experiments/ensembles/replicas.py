@@ -21,7 +21,7 @@ from netkf.scenario.scenario import Scenario
 
 LARGEST_BLOCK = 64
 MOST_BLOCKS = 4096
-ROUNDS = 8
+ROUNDS = 16
 
 Progress = Callable[[int, int], None]
 """Called with the runs done and wanted."""
