@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 WORST, MEAN, PROMISE, CENTRAL = "#c1440e", "#3b6ea5", "#222222", "#777777"
 MOST_LINES = 9
 LONGEST_LABEL = 34
+MOST_LETTERS = 90
 SPREAD = 20.0
 
 
@@ -34,17 +35,21 @@ def sweep_picture(title: str, swept: Swept) -> bool:
         figure = Figure(figsize=(7.2, 4.6), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        places = _places(axes, table[keys[0]])
+        table = table.assign(place=_places(axes, table[keys[0]])).sort_values("place")
+        joined = all(map(_is_number, table[keys[0]]))
         if len(keys) == 1:
-            _one_key(axes, places, table)
+            _one_key(axes, table, joined)
         else:
-            _two_keys(axes, places, table, keys[1])
+            _two_keys(axes, table, keys[1], joined)
         axes.set_xlabel(keys[0])
+        axes.set_ylabel("RMS error, units of the state")
         axes.set_ylim(bottom=0.0)
-        axes.margins(x=0.04)
+        axes.margins(x=0.04 if joined else 0.15)
         axes.legend(frameon=False, fontsize=8)
-        bars = "; bars: two standard errors, shared draws" if table["runs"].max() > 1 else ""
-        axes.set_ylabel(f"RMS error, units of the state{bars}", fontsize=8)
+        bars = "bars: two standard errors; all on the same draws" if table["runs"].max() > 1 else ""
+        which = "node with the largest error" if len(keys) == 2 else ""
+        words = "; ".join(filter(None, (which, bars)))
+        axes.set_title(words, fontsize=8, loc="right", color=CENTRAL)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         path = swept.directory / "sweep.png"
         part = path.with_name("sweep.png.part")
@@ -53,10 +58,13 @@ def sweep_picture(title: str, swept: Swept) -> bool:
     return True
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _places(axes: Any, values: pd.Series[Any]) -> FloatArray:
     """Where the values stand: numbers on a scale, others side by side."""
-    numbers = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
-    if numbers:
+    if all(map(_is_number, values)):
         places = values.to_numpy(dtype=np.float64)
         if places.min() > 0.0 and places.max() > SPREAD * places.min():
             axes.set_xscale("log")
@@ -66,44 +74,47 @@ def _places(axes: Any, values: pd.Series[Any]) -> FloatArray:
         return places
     texts = values.astype(str)
     names = list(dict.fromkeys(texts))
-    labels = [n if len(n) <= LONGEST_LABEL else n[: LONGEST_LABEL - 3] + "..." for n in names]
-    axes.set_xticks(range(len(names)), labels, rotation=20 if max(map(len, labels)) > 10 else 0)
+    labels = [_short(name) for name in names]
+    axes.set_xticks(range(len(names)), labels, fontsize=8)
+    if sum(map(len, labels)) > MOST_LETTERS:
+        axes.tick_params(axis="x", rotation=20)
     return np.array([names.index(text) for text in texts], dtype=np.float64)
 
 
-def _one_key(axes: Any, places: FloatArray, table: pd.DataFrame) -> None:
-    for name, words, colour in (
-        ("worst_rms", "node with the largest", WORST),
-        ("mean_rms", "all nodes", MEAN),
-    ):
-        _line(axes, places, table, name, words, colour)
+def _short(name: str) -> str:
+    return name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 3] + "..."
+
+
+def _one_key(axes: Any, table: pd.DataFrame, joined: bool) -> None:
+    _line(axes, table, "worst_rms", "node with the largest", WORST, joined)
+    _line(axes, table, "mean_rms", "all nodes", MEAN, joined)
     for name, words, colour, style in (
         ("bound", "root of the bound on trace P", PROMISE, "--"),
         ("central", "centralised filter", CENTRAL, ":"),
     ):
         if table[name].notna().any():
-            order = np.argsort(places, kind="stable")
             roots = np.sqrt(table[name].to_numpy(dtype=np.float64))
-            axes.plot(places[order], roots[order], style, color=colour, label=words)
+            look = {"ls": style} if joined else {"ls": "", "marker": "_", "ms": 26}
+            axes.plot(table["place"], roots, color=colour, label=words, **look)
 
 
-def _two_keys(axes: Any, places: FloatArray, table: pd.DataFrame, key: str) -> None:
+def _two_keys(axes: Any, table: pd.DataFrame, key: str, joined: bool) -> None:
     texts = table[key].astype(str)
     names = list(dict.fromkeys(texts))
     for k, name in enumerate(names):
-        chosen = (texts == name).to_numpy()
         colour = mpl.colormaps["viridis"](k / max(1, len(names) - 1) * 0.85)
-        words = name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 3] + "..."
-        _line(axes, places[chosen], table[chosen], "worst_rms", f"{key} = {words}", colour)
-    axes.set_title("node with the largest error", fontsize=9, loc="right")
+        _line(axes, table[texts == name], "worst_rms", f"{key} = {_short(name)}", colour, joined)
 
 
-def _line(
-    axes: Any, places: FloatArray, table: pd.DataFrame, name: str, words: str, colour: Any
-) -> None:
-    order = np.argsort(places, kind="stable")
-    values = table[name].to_numpy(dtype=np.float64)[order]
-    errors = 2.0 * np.nan_to_num(table[f"{name}_se"].to_numpy(dtype=np.float64))[order]
+def _line(axes: Any, table: pd.DataFrame, name: str, words: str, colour: Any, joined: bool) -> None:
     axes.errorbar(
-        places[order], values, yerr=errors, marker="o", ms=4, capsize=2, color=colour, label=words
+        table["place"],
+        table[name],
+        yerr=2.0 * table[f"{name}_se"].fillna(0.0),
+        marker="o",
+        ms=4,
+        capsize=2,
+        ls="-" if joined else "",
+        color=colour,
+        label=words,
     )
