@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -83,6 +84,18 @@ OWN = (
     "run.png",
 )
 """What a run directory holds."""
+
+
+def remove_own(directory: Path, scenario: Scenario) -> None:
+    """Remove what a run of this scenario left in its directory, and nothing else."""
+    modules = [file.name for file in module_files(scenario).values() if file is not None]
+    names = [*OWN, *modules, *(source.name for source in source_files(scenario))]
+    for name in names:
+        for file in (directory / name, directory / f"{name}.part"):
+            file.unlink(missing_ok=True)
+        for folder in Path(name).parents[:-1]:
+            with contextlib.suppress(OSError):  # there may be more in it, or it may be gone
+                (directory / folder).rmdir()
 
 
 def check_sources(scenario: Scenario) -> None:

@@ -330,6 +330,9 @@ def test_a_single_run_that_was_killed_is_done_again(tmp_path):
     manifest = tmp_path / "cut" / "manifest.json"
     manifest.write_text(manifest.read_text().replace("complete", "interrupted"))
     (tmp_path / "cut" / "states.parquet").unlink()
+    (tmp_path / "cut" / "notes.txt").touch()
+    assert run(tmp_path, "cut", "--resume") == 2
+    (tmp_path / "cut" / "notes.txt").unlink()
     assert run(tmp_path, "cut", "--resume") == 0
     assert files(tmp_path / "cut") == files(tmp_path / "whole")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -26,6 +25,7 @@ from netkf.experiments.files import (
     TraceTables,
     check_sources,
     new_directory,
+    remove_own,
     scenario_digest,
     write_json,
     write_scenario,
@@ -245,7 +245,7 @@ def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
         raise ScenarioError("--resume", rule, scenario.name, remedy)
     if is_finished(directory):
         return False
-    shutil.rmtree(directory)
+    remove_own(directory, scenario)
     return True
 
 
