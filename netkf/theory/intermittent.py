@@ -20,7 +20,7 @@ from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
 from netkf.theory.matrices import RESIDUAL, as_covariance, as_square
 
-DEEPEST = 22
+DEEPEST, MOST_POLICIES = 22, 40
 COALESCED = 1e-9
 FIRST_PAST, LONGEST_PAST = 32, 100_000
 BLOCK = 20_000  # draws at once
@@ -180,8 +180,15 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> Critical:
     def radius(g: float) -> float:
         return search.best((1.0 - g, g))[0]
 
-    if radius(0.0) <= 1.0 or radius(lower) <= 1.0 + 1e-13:
+    if alpha <= 1.0:
         upper = lower
+    elif np.linalg.matrix_rank(observation) == 1:
+        growing = np.maximum(np.abs(np.linalg.eigvals(transition)), 1.0)
+        upper = float(-np.expm1(-2.0 * np.log(growing).sum()))  # R (32) in closed form
+    elif radius(lower) <= 1.0 + 1e-13:
+        upper = lower
+    elif not radius(1.0) < 1.0:
+        raise TheoryError("R (32) was not found: the system is too close to an undetectable one")
     else:
         upper = float(scipy.optimize.brentq(lambda g: np.log(radius(g)), lower, 1.0, xtol=1e-14))
     above, below = min(1.0, upper + 1e-6), max(0.0, upper - 1e-6)
@@ -215,8 +222,8 @@ class _Contraction:
     def best(self, chances: Sequence[float]) -> tuple[float, list[FloatArray], FloatArray]:
         """The least spectral radius, the gains that reach it and the Perron matrix."""
         n = len(self._F)
-        start = [np.zeros((n, len(H))) for H in self._readings]
-        gains = self._improved(start, np.eye(n))
+        gains = self._improved([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
+        gains = self._lowered(chances, gains)
         best, X = self._perron(chances, gains)
         for _ in range(500):
             following = self._improved(gains, X)
@@ -225,6 +232,39 @@ class _Contraction:
                 break
             best, X, gains = rho, X_new, following
         return best, gains, X
+
+    def _lowered(self, chances: Sequence[float], gains: list[FloatArray]) -> list[FloatArray]:
+        """Gains near the best ones, whatever the first: policy iteration with the resolvent
+        ``X = (s - L)^-1 I`` at s above the radius of L in place of its Perron matrix, which may be
+        singular and say nothing about a direction. X > 0, so each step lowers the radius below s.
+        """
+        best = self._perron(chances, gains)[0]
+        for excess in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8):
+            for _ in range(MOST_POLICIES):
+                X = self._resolvent(chances, gains, best * (1.0 + excess) + 1e-300)
+                if X is None:
+                    break
+                following = self._improved(gains, X)
+                rho = self._perron(chances, following)[0]
+                if not rho < best:
+                    break
+                gains, before, best = following, best, rho
+                if best > before * (1.0 - 0.01 * excess):
+                    break
+        return gains
+
+    def _resolvent(
+        self, chances: Sequence[float], gains: list[FloatArray], s: float
+    ) -> FloatArray | None:
+        n, whole = len(self._F), self._operator(chances, gains)
+        identity = np.eye(n).reshape(-1)[self._pick]
+        try:
+            X = self._expand @ np.linalg.solve(s * np.eye(len(whole)) - whole, identity)
+        except np.linalg.LinAlgError:
+            return None
+        matrix = symmetric(X.reshape(n, n))
+        positive = np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0.0
+        return matrix if positive else None
 
     def _improved(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
         # Where X says nothing about a direction, what is known of it is kept.
@@ -235,14 +275,17 @@ class _Contraction:
             found.append(np.asarray(K + wanted @ np.linalg.pinv(S, rcond=1e-13, hermitian=True)))
         return found
 
-    def _perron(
-        self, chances: Sequence[float], gains: list[FloatArray]
-    ) -> tuple[float, FloatArray]:
+    def _operator(self, chances: Sequence[float], gains: list[FloatArray]) -> FloatArray:
         whole = np.zeros((len(self._F) ** 2,) * 2)
         for p, K, H in zip(chances, gains, self._readings, strict=True):
             closed = self._F + K @ H
             whole += p * np.kron(closed, closed)
-        values, vectors = np.linalg.eig(whole[self._pick] @ self._expand)
+        return np.asarray(whole[self._pick] @ self._expand)
+
+    def _perron(
+        self, chances: Sequence[float], gains: list[FloatArray]
+    ) -> tuple[float, FloatArray]:
+        values, vectors = np.linalg.eig(self._operator(chances, gains))
         k = int(np.argmax(values.real))
         vector = (self._expand @ vectors[:, k]).real
         X = symmetric(vector.reshape(self._F.shape))
