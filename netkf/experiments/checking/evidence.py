@@ -36,11 +36,14 @@ class Evidence:
 
 
 class Finding(NamedTuple):
-    """A margin (value, low, high), how much below 0 is tolerable, and words about it."""
+    """A margin (value, low, high), how much below 0 is tolerable, and words about it; ``early``
+    where the promise is about a limit and the horizon is too short to tell.
+    """
 
     margin: tuple[float, float, float]
     tolerance: float
     words: str
+    early: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,16 +92,18 @@ def _needed(promise: Promise, row: Row) -> bool:
 
 
 def _weighed(promise: Promise, finding: Finding, runs: int) -> Evidence:
-    (margin, low, high), tolerance, words = finding
+    (margin, low, high), tolerance, words, early = finding
     needed = None
-    if not high >= 0.0:  # also where nothing but nan was seen
+    if early:
+        verdict, words = UNDECIDED, f"{words}; the horizon is too short to tell, lengthen it"
+    elif not high >= 0.0:  # also where nothing but nan was seen
         verdict = BROKEN
     elif low >= -tolerance:
         verdict = HOLDS
     else:
         verdict = UNDECIDED
-        room = max(tolerance + min(margin, 0.0), 0.1 * tolerance)
-        needed = math.ceil(1.1 * runs * max(1.0, (margin - low) / room) ** 2)
+        room = max(tolerance + min(margin, 0.0), 0.1 * tolerance, 1e-300)
+        needed = math.ceil(min(1.1 * runs * max(1.0, (margin - low) / room) ** 2, 1e12))
     return Evidence(
         promise.words,
         promise.source,

@@ -21,7 +21,7 @@ class Pair(NamedTuple):
     """Two samples of covariances (S, n, n) and (S', n, n) that should have one law.
 
     They may depend on each other. ``known`` (n,) is how far apart their laws are known to be,
-    because the promise is about later times.
+    because the promise is about later times; it is taken off.
     """
 
     words: str
@@ -48,9 +48,11 @@ def same_laws(pairs: Sequence[Pair], level: float) -> Finding:
         for k in range(pair.one.shape[-1]):
             apart = distance(pair.one[:, k, k], pair.other[:, k, k], share)
             if pair.known is not None:
-                apart = apart._replace(low=max(0.0, apart.low - pair.known[k]))
+                value, low, high = (max(0.0, end - float(pair.known[k])) for end in apart)
+                apart = Interval(value, low, high)
             found.append((apart, f"at {pair.words}, entry {k}"))
-    return worst(found, LAW, "largest distance of distribution functions")
+    early = any(pair.known is not None and pair.known.max() > LAW for pair in pairs)
+    return worst(found, LAW, "largest distance of distribution functions")._replace(early=early)
 
 
 def distances(one: FloatArray, other: FloatArray) -> FloatArray:
