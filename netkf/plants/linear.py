@@ -38,6 +38,10 @@ class LinearPlant(Plant):
         """Seconds; rounded so that lattices of other periods meet it."""
         return float(round(k * self.period, 12))
 
+    def over(self, slot: int, horizon: float) -> bool:
+        """Whether a slot begins at the horizon or later; 3 * 0.1 is 0.3."""
+        return self.slot_time(slot) >= horizon - 1e-9 * self.period
+
     def truth(self, random: np.random.Generator) -> Truth:
         """The truth of one run."""
         return LinearPath(self, random)

@@ -64,7 +64,7 @@ def _sensed(scenario: Scenario) -> range:
     plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
     assert isinstance(algorithm, SlotFilter)
     end = max(int(scenario.horizon / plant.period) - 1, 0)
-    while plant.slot_time(end) < scenario.horizon:
+    while not plant.over(end, scenario.horizon):
         end += 1
     if algorithm.predicts:
         return range(end)

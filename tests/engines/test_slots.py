@@ -180,6 +180,30 @@ def test_what_arrives_after_the_inbox_closed_is_late_and_lost(tmp_path):
         np.testing.assert_allclose(run.P[k + 1, 1], expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize("slots", [3, 6, 7, 12])
+def test_a_horizon_that_is_a_product_of_floats_has_no_slot_too_many(slots, tmp_path):
+    """3 * 0.1 is 0.30000000000000004: slot 3 begins at the horizon, not before."""
+    plant = {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 0.1, "cov": [[1.0]]}
+    network = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}}
+    scenario = slotted(
+        tmp_path,
+        slots,
+        [[0.9]],
+        [[1.0]],
+        [[1.0]],
+        [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}],
+        network,
+        "intermittent",
+        plant=plant,
+        horizon=slots * 0.1,
+        probe=0.1,
+    )
+    for engine in ("processes", "auto"):
+        run = netkf.simulate(scenario, engine=engine)
+        assert run.count("sense") == slots
+        assert len(run.times) == slots + 1
+
+
 def test_symmetric_loss_swaps_or_not_and_directions_copy():
     """With symmetric loss tokens stay a permutation; per direction some pair is copied."""
     scenario = netkf.load(SCENARIOS / "gossip_copies.toml")

@@ -127,7 +127,7 @@ class Exchanges:
     def _one_slot(self) -> None:
         scenario, algorithm, slot = self._scenario, self._algorithm, self._slot
         start = scenario.slot_plant.slot_time(slot)
-        last = start >= scenario.horizon
+        last = scenario.slot_plant.over(slot, scenario.horizon)
         if last and slot not in self._samples:
             self._over = True
             return

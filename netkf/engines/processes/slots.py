@@ -134,7 +134,7 @@ class SlotProcess:
         slot, horizon = 0, self._scenario.horizon
         while True:
             start = self._plant.slot_time(slot)
-            last = start >= horizon
+            last = self._plant.over(slot, horizon)
             if last and slot not in self._samples:
                 return
             yield self._timeline.at(start, Rank.PROBE, 0)

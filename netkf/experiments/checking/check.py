@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +25,10 @@ from netkf.experiments.checking.evidence import (
     NOT_PROMISED,
     VERDICTS,
     Evidence,
+    Finding,
+    Promise,
     Row,
+    identity,
     judge,
 )
 from netkf.experiments.checking.exact import promised_filter, stand_in
@@ -47,7 +51,7 @@ PAPERS: tuple[tuple[type, ModuleType], ...] = (
     (DiffusionFilter, diffusion),
     (PushSum, push_sum),
 )
-FEWEST = 10
+FEWEST, TWINS, SAME = 10, 10, 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,25 +95,60 @@ def watched(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, probe=np.array(times(scenario)))
 
 
-def witness(scenario: Scenario, seed: int, replica: int) -> Any:
-    """What one replica of a watched scenario says."""
-    return paper_of(scenario).witness(scenario, simulate(scenario, seed, replica))
+class Told(NamedTuple):
+    """What one replica says: to the paper, and how far the estimates are from those of the filter
+    that a user's class should be, on the same readings and messages; nan where none was asked.
+    """
+
+    paper: Any
+    apart: float
 
 
-def verdict(scenario: Scenario, witnesses: Iterable[Any], seed: int, confidence: float) -> Verdict:
-    """The verdict on a watched scenario from what its runs say."""
-    paper, listed = paper_of(scenario), list(witnesses)
-    stacked = paper.Witness(*map(np.array, zip(*listed, strict=True)))
+def witness(scenario: Scenario, seed: int, replica: int) -> Told:
+    """One replica of a watched scenario."""
+    run, promised = simulate(scenario, seed, replica), stand_in(scenario)
+    apart = math.nan
+    if promised is not scenario and replica < TWINS:
+        twin = simulate(promised, seed, replica)
+        both = min(len(run.times), len(twin.times))
+        size = np.sqrt(np.trace(twin.P[:both], axis1=-2, axis2=-1))[..., None]
+        gap = np.abs(run.xhat[:both] - twin.xhat[:both]) / np.maximum(size, 1e-300)
+        apart = float(np.nan_to_num(gap, nan=np.inf).max())
+    return Told(paper_of(scenario).witness(scenario, run), apart)
+
+
+def _twin(told: list[Told], level: float) -> Finding:
+    """The first replicas against the filter that the class should be."""
+    apart = max(one.apart for one in told[:TWINS])
+    words = f"{min(TWINS, len(told))} runs beside those of the filter that it should be"
+    return identity(apart, SAME, words)
+
+
+TWIN = Promise(
+    "its estimates are those of the filter that it derives from, on the same readings",
+    "the class itself",
+    (),
+    _twin,
+    exact=True,
+)
+
+
+def verdict(scenario: Scenario, witnesses: Iterable[Told], seed: int, confidence: float) -> Verdict:
+    """The verdict on a watched scenario from what its runs say, in the order of replicas."""
+    paper, told = paper_of(scenario), list(witnesses)
+    stacked = paper.Witness(*map(np.array, zip(*(one.paper for one in told), strict=True)))
     seen = paper.Observed(scenario, stacked, seed)
     table = [Row(*row) for row in assumptions(stand_in(scenario)).itertuples(index=False)]
     found = judge(
         paper.promises(scenario),
         seen,
         [*table, *paper.rows(scenario)],
-        len(listed),
+        len(told),
         1.0 - confidence,
     )
-    return Verdict(scenario.name, len(listed), seed, confidence, tuple(found))
+    if stand_in(scenario) is not scenario:
+        found = [*judge([TWIN], told, [], len(told), 1.0), *found]
+    return Verdict(scenario.name, len(told), seed, confidence, tuple(found))
 
 
 def check(

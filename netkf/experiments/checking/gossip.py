@@ -12,6 +12,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
+from netkf.experiments.checking.exact import as_computed, exact
 from netkf.experiments.checking.laws import (
     Pair,
     distances,
@@ -32,7 +33,7 @@ from netkf.experiments.checking.words import (
 )
 from netkf.scenario.scenario import Scenario
 from netkf.theory.gossip import effective_matching
-from netkf.trace.run import Run, errors
+from netkf.trace.run import Run
 
 WINDOW = 40
 HUGE = 1e9  # root of a covariance that every other one is below
@@ -45,6 +46,7 @@ class Witness(NamedTuple):
     """What one run says; K slots are looked at.
 
     P, nees  : (K, N, n, n), (K, N) at the slots
+    e, Sigma, whole : as in :class:`Exact`
     replayed : (K, N, n, n) what G (10) makes of the run's swaps
     restarted: (N, n, n) the same at the last slot from another start
     bounds   : (K, N, n, n) what the last readings of each pair allow, whatever was before
@@ -55,6 +57,9 @@ class Witness(NamedTuple):
 
     P: FloatArray
     nees: FloatArray
+    e: FloatArray
+    Sigma: FloatArray
+    whole: FloatArray
     replayed: FloatArray
     restarted: FloatArray
     bounds: FloatArray
@@ -81,10 +86,13 @@ def witness(scenario: Scenario, run: Run) -> Witness:
     pairs = np.zeros((len(starts), len(starts)), dtype=int)
     for t in range(1, slots[-1]):
         pairs[np.arange(len(starts)), came[t]] += 1
-    _, nees = errors(run.x, run.xhat, run.P)
+    seen = exact(scenario, run)
     return Witness(
         run.P,
-        nees,
+        seen.nees,
+        seen.e,
+        seen.Sigma,
+        seen.whole,
         np.array(replayed),
         restarted,
         np.array(bounds),
@@ -276,6 +284,12 @@ PROMISES = (
         bounded,
     ),
     Promise("the law in the end does not depend on the start", "G Theorem 8", ERGODIC, forgotten),
+    Promise(
+        "errors have the covariance that swaps and readings give them",
+        "G (8), (10), derived",
+        ("the filters start",),
+        as_computed,
+    ),
     Promise(
         "errors are as large as P says: the mean NEES is n",
         "G (9)",

@@ -12,6 +12,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
+from netkf.experiments.checking.exact import as_computed, exact
 from netkf.experiments.checking.laws import (
     Pair,
     distances,
@@ -39,7 +40,7 @@ from netkf.experiments.checking.words import (
 from netkf.scenario.scenario import Scenario
 from netkf.theory.intermittent import steady_covariance
 from netkf.theory.scalar_law import ScalarLaw, scalar_law
-from netkf.trace.run import Run, errors
+from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 FAR = 30.0  # factor of the other start's root
@@ -52,6 +53,7 @@ class Witness(NamedTuple):
     """What one run says; K slots are looked at, D directions can carry readings.
 
     P, nees  : (K, N, n, n), (K, N) at the slots
+    e, Sigma, whole : as in :class:`Exact`
     replayed : (K, N, n, n) what R (15)-(18) makes of the run's arrivals
     restarted: (N, n, n) the same at the last slot from another start
     in_support: (N, n, n) the same at the last slot from P* of each node
@@ -60,6 +62,9 @@ class Witness(NamedTuple):
 
     P: FloatArray
     nees: FloatArray
+    e: FloatArray
+    Sigma: FloatArray
+    whole: FloatArray
     replayed: FloatArray
     restarted: FloatArray
     in_support: FloatArray
@@ -102,8 +107,19 @@ def witness(scenario: Scenario, run: Run) -> Witness:
         kind: _count(scenario, run, kind, "node" if kind == "send" else "peer", slots[-1])
         for kind in ("send", "deliver")
     }
-    _, nees = errors(run.x, run.xhat, run.P)
-    return Witness(run.P, nees, replayed, restarted, in_support, counts["send"], counts["deliver"])
+    errors = exact(scenario, run)
+    return Witness(
+        run.P,
+        errors.nees,
+        errors.e,
+        errors.Sigma,
+        errors.whole,
+        replayed,
+        restarted,
+        in_support,
+        counts["send"],
+        counts["deliver"],
+    )
 
 
 def _count(scenario: Scenario, run: Run, kind: str, sender: str, slots: int) -> np.ndarray:
@@ -275,11 +291,11 @@ def listeners(scenario: Scenario) -> dict[int, ScalarLaw]:
 def cells(seen: Observed, level: float) -> Finding:
     """Counts of P between the holes of the support; an outage of k slots has g (1 - g)^k."""
     laws, found = listeners(seen.scenario), []
-    for k, exact in laws.items():
-        edges = outage_edges(exact)
+    for k, known in laws.items():
+        edges = outage_edges(known)
         seen_cells = np.searchsorted(edges, seen.runs.P[:, -1, k, 0, 0])
         counts = np.bincount(seen_cells, minlength=CELLS + 1)
-        g = exact.delivery
+        g = known.delivery
         chances = np.append(g * (1.0 - g) ** np.arange(CELLS), (1.0 - g) ** CELLS)
         p, used = chi_square(counts, chances)
         found.append((p, used, counts, chances, seen.scenario.nodes[k]))
@@ -294,13 +310,13 @@ def cells(seen: Observed, level: float) -> Finding:
     return Finding((-largest, -widest, low), SHARE * 2, words)
 
 
-def outage_edges(exact: ScalarLaw) -> FloatArray:
+def outage_edges(law: ScalarLaw) -> FloatArray:
     """(CELLS,) the middles of the holes above outages of 0, 1, 2, ... slots."""
-    edge = np.array(0.5 * sum(exact.hole))
+    edge = np.array(0.5 * sum(law.hole))
     edges = []
     for _ in range(CELLS):
         edges.append(float(edge))
-        edge = exact.without(edge)
+        edge = law.without(edge)
     return np.array(edges)
 
 
@@ -309,10 +325,10 @@ def scalar(seen: Observed, level: float) -> Finding:
     laws = listeners(seen.scenario)
     found = [
         (
-            distance_to(exact.cdf, seen.runs.P[:, -1, k, 0, 0], level / len(laws)),
+            distance_to(known.cdf, seen.runs.P[:, -1, k, 0, 0], level / len(laws)),
             f"at node {seen.scenario.nodes[k]}",
         )
-        for k, exact in laws.items()
+        for k, known in laws.items()
     ]
     return worst(found, LAW, "distance from the exact distribution function")
 
@@ -346,6 +362,12 @@ PROMISES = (
         bounded,
     ),
     Promise("the law in the end does not depend on the start", "R Theorem 9 [i]", LIMIT, forgotten),
+    Promise(
+        "errors have the covariance that the readings give them",
+        "R (15)-(18), derived",
+        ("the filters start",),
+        as_computed,
+    ),
     Promise(
         "errors are as large as P says: the mean NEES is n", "R (15)", KNOWN, nees_is_chi_squared
     ),

@@ -112,12 +112,13 @@ def mean_ratio(total: float, freedom: float, level: float) -> Interval:
 
 def mean_of(values: FloatArray, level: float) -> Interval:
     """Of the mean of positive values with a variance: their sum is taken for a scaled chi-square
-    variable, whose skewness a normal one lacks.
+    variable, whose skewness a normal one lacks, with at most one degree of freedom for each value,
+    because a small sample does not show its tail.
     """
     mean, variance = float(values.mean()), float(values.var(ddof=1)) if len(values) > 1 else 0.0
     if variance <= 0.0 or not mean > 0.0:
         return Interval(mean, mean, mean)
-    freedom = 2.0 * len(values) * mean * mean / variance
+    freedom = len(values) * min(1.0, 2.0 * mean * mean / variance)
     ratio = mean_ratio(freedom, freedom, level)
     return Interval(mean, mean * ratio.low, mean * ratio.high)
 
