@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -277,6 +278,16 @@ def test_growth_beyond_numbers_is_reported_alike(build):
     plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
     grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"}, sensors=[])
     assert assert_agree(grown).status == "diverged"
+
+
+def test_replicas_side_by_side_are_those_one_after_the_other(ring):
+    with ThreadPoolExecutor(2) as pool:
+        jobs = [pool.submit(netkf.simulate, ring, replica=k, engine="compiled") for k in range(4)]
+        beside = [job.result() for job in jobs]
+    for k, run in enumerate(beside):
+        alone = netkf.simulate(ring, replica=k, engine="compiled")
+        assert run.fingerprint == alone.fingerprint
+        np.testing.assert_array_equal(run.P, alone.P)
 
 
 class Cautious(Hybrid):

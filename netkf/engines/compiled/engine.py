@@ -92,9 +92,9 @@ class CompiledEngine(Engine):
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
-        if scenario.slotted:
-            return SlotRun(scenario, streams, recorder, progress).to_the_end()
-        return _Run(scenario, streams, recorder, progress).to_the_end()
+        run = SlotRun if scenario.slotted else _Run
+        with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
+            return run(scenario, streams, recorder, progress).to_the_end()
 
 
 class _Run:
