@@ -264,6 +264,7 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     module = "netkf.engines.compiled"
     monkeypatch.setattr(f"{module}.engine.ROWS", 7)
     monkeypatch.setattr(f"{module}.engine.FIRST_MAIL", 2)
+    monkeypatch.setattr(f"{module}.engine.MOST_SAMPLES", 2)
     monkeypatch.setattr(f"{module}.draws.STEPS", 3)
     monkeypatch.setattr(f"{module}.draws.CUTS", 1)
     monkeypatch.setattr(f"{module}.schedule.LEAST_TICKS", 5)
@@ -276,7 +277,7 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
 
 def test_growth_beyond_numbers_is_reported_alike(build):
     plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
-    grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"}, sensors=[])
+    grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"})
     assert assert_agree(grown).status == "diverged"
 
 
