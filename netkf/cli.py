@@ -193,7 +193,8 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
         meter.close()
     _told(scenario, finished)
     rate = finished.events / max(finished.seconds, 1e-9)
-    print(f"events: {finished.events:,} in {finished.seconds:.2f} s, {rate:,.0f} per second")
+    took = f"{finished.seconds:.2f} s, {rate:,.0f} per second, engine {finished.engine}"
+    print(f"events: {finished.events:,} in {took}")
     if finished.status != "complete":
         words = _divergence(finished)
         print(f"status: {words}")

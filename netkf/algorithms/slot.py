@@ -184,7 +184,8 @@ def adapted(
     """Update with a reading, which may have no rows, and predict."""
     if not len(y):
         return applied(F, xhat), predict_root(root, F, root_Q)
-    following, gain = update_root(root, F, root_Q, H, np.linalg.cholesky(R))
+    noise: FloatArray = np.asarray(np.linalg.cholesky(R))
+    following, gain = update_root(root, F, root_Q, H, noise)
     return applied(F, xhat) + applied(gain, y - applied(H, xhat)), following
 
 

@@ -7,10 +7,13 @@ because a stream depends on nothing but the seed, the replica and its own name.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cache
+from typing import Any
 
 import numpy as np
+from numpy.random.bit_generator import ISeedSequence
 
 
 @dataclass(frozen=True)
@@ -27,9 +30,92 @@ class Streams:
         """The generator of ``purpose`` for ``entity`` (node ids, a link's two ends,
         ...: integers that are not negative).
         """
+        return np.random.Generator(np.random.PCG64DXSM(self._sequence(purpose, *entity)))
+
+    def _sequence(self, purpose: str, *entity: int) -> Any:
         key = (self.replica, _code(purpose), *entity)
-        sequence = np.random.SeedSequence(entropy=self.seed, spawn_key=key)
-        return np.random.Generator(np.random.PCG64DXSM(sequence))
+        return np.random.SeedSequence(entropy=self.seed, spawn_key=key)
+
+    def seeded(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
+        """The same streams, with the seeds of these purposes and entities made all at once: numpy
+        takes some 30 microseconds for one. Entities have as many numbers each.
+        """
+        made: dict[tuple[str, tuple[int, ...]], _Words] = {}
+        if entities and max(max(entity) for entity in entities) < WORD:
+            for purpose in purposes:
+                start = (self.replica, _code(purpose))
+                words = _all_words(self.seed, start, np.array(entities, dtype=np.uint32))
+                made |= {(purpose, e): _Words(w) for e, w in zip(entities, words, strict=True)}
+        return _Seeded(self.seed, self.replica, made)
+
+
+@dataclass(frozen=True)
+class _Seeded(Streams):
+    made: dict[tuple[str, tuple[int, ...]], _Words] = field(default_factory=dict)
+
+    def _sequence(self, purpose: str, *entity: int) -> Any:
+        known = self.made.get((purpose, entity))
+        return super()._sequence(purpose, *entity) if known is None else known
+
+
+class _Words(ISeedSequence):
+    """Four words of seed that are known already."""
+
+    def __init__(self, words: np.ndarray) -> None:
+        self._words = words
+
+    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> np.ndarray:
+        assert (n_words, np.dtype(dtype)) == (4, np.uint64)
+        return self._words
+
+
+POOL, WORD, MASK = 4, 1 << 32, (1 << 32) - 1
+
+
+def _all_words(seed: int, start: tuple[int, ...], entities: np.ndarray) -> np.ndarray:
+    """(N, 4) what SeedSequence(seed, spawn_key=(*start, *entity)) gives PCG64DXSM for all entities
+    (N, k): numpy's algorithm, which its policy keeps as it is (M. E. O'Neill's seed_seq_fe).
+    """
+    root = _words_of(seed)
+    root += [0] * (POOL - len(root))
+    fixed = root + [word for number in start for word in _words_of(number)]
+    columns = [np.full(len(entities), word, dtype=np.uint32) for word in fixed]
+    columns += list(entities.T.copy())
+    constant = 0x43B0D7E5
+
+    def hashed(value: np.ndarray) -> np.ndarray:
+        nonlocal constant
+        value = value ^ np.uint32(constant)
+        constant = constant * 0x931E8875 & MASK
+        value = value * np.uint32(constant)
+        return np.asarray(value ^ (value >> np.uint32(16)))
+
+    def mixed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        value: Any = np.uint32(0xCA01F9DD) * x - np.uint32(0x4973F715) * y
+        return np.asarray(value ^ (value >> np.uint32(16)))
+
+    pool = [hashed(column) for column in columns[:POOL]]
+    for source in range(POOL):
+        for target in range(POOL):
+            if source != target:
+                pool[target] = mixed(pool[target], hashed(pool[source]))
+    for column in columns[POOL:]:
+        for target in range(POOL):
+            pool[target] = mixed(pool[target], hashed(column))
+    out, constant = np.empty((len(entities), 2 * POOL), dtype=np.uint32), 0x8B51F9DD
+    for k in range(2 * POOL):
+        value = pool[k % POOL] ^ np.uint32(constant)
+        constant = constant * 0x58F38DED & MASK
+        value = value * np.uint32(constant)
+        out[:, k] = value ^ (value >> np.uint32(16))
+    return out.astype("<u4").view("<u8").astype(np.uint64)
+
+
+def _words_of(number: int) -> list[int]:
+    words = [number & MASK]
+    while number := number >> 32:
+        words.append(number & MASK)
+    return words
 
 
 @cache

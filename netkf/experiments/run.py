@@ -43,6 +43,7 @@ class Finished:
     promised: Promise
     events: int
     seconds: float
+    engine: str
 
 
 def run_to_directory(
@@ -78,7 +79,9 @@ def run_to_directory(
         tables.close()
         promised = promise(scenario, np.array(samples.times))
         summary = _summary(directory, scenario, samples, promised, recorder.count, recorder.sums)
-        finished = Finished(directory, status, summary, samples, promised, recorder.total, seconds)
+        finished = Finished(
+            directory, status, summary, samples, promised, recorder.total, seconds, chosen.name
+        )
         if finish is not None:
             finish(finished)
     except BaseException as error:

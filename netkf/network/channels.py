@@ -362,13 +362,9 @@ class Fates:
         self._loss, self._delay = channel.loss, channel.delay
         self._fixed = channel.delay.fixed
         self._bad: bool | None = None
-        self._luck = self._sky = self._post = None
-        if not self._loss.certain:
-            self._luck = generator("loss")
-        if self._loss.changing:
-            self._sky = generator("weather")
-        if self._fixed is None:
-            self._post = generator("delay")
+        made = {purpose: generator(purpose) for purpose in needed(channel)}
+        self._luck, self._sky = made.get("loss"), made.get("weather")
+        self._post = made.get("delay")
 
     def draw(self) -> tuple[float, bool, float]:
         """A uniform number, whether the link is in its bad state, and a delay in seconds."""
@@ -393,6 +389,18 @@ class Fates:
         if self._post is None:
             return luck, bad, np.full(count, self._fixed)
         return luck, bad, delays(self._delay, self._post, count)
+
+
+def needed(channel: Channel) -> tuple[str, ...]:
+    """The purposes for which Fates asks for a stream."""
+    asked: list[str] = []
+    if not channel.loss.certain:
+        asked.append("loss")
+    if channel.loss.changing:
+        asked.append("weather")
+    if channel.delay.fixed is None:
+        asked.append("delay")
+    return tuple(asked)
 
 
 def delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:

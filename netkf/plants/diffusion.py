@@ -55,6 +55,11 @@ class Diffusion(Plant):
         """``B B'`` (n, n)."""
         return np.asarray(self.B @ self.B.T)
 
+    @cached_property
+    def laws(self) -> Laws:
+        """What all paths of this plant share."""
+        return Laws({}, {})
+
     @property
     def longest_period(self) -> float:
         """Seconds; the longest sensing period for which the path is exact."""
@@ -68,6 +73,15 @@ class Diffusion(Plant):
         ``shown`` (increasing); ``probing`` is used only for those off the grid.
         """
         return DiffusionPath(self, random, probing, shown)
+
+
+class Laws(NamedTuple):
+    """``spread`` of the noise of a step of the sensing grid by its length, and gain and spread of a
+    state shown inside a step by (length, left); filled as they are asked for.
+    """
+
+    spread: dict[float, FloatArray]
+    split: dict[tuple[float, float], tuple[FloatArray, FloatArray]]
 
 
 def default_sensing_period(
@@ -119,9 +133,12 @@ class DiffusionPath:
         self._A, self._B, self._n = plant.A, plant.B, plant.n
         self._random, self._probing, self._shown = random, probing, shown
         self._series = _response_series(plant.A, self.period)
-        self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
+        self._laws = plant.laws
         self._response = self.responses(self.period)
-        self._spread = _factor(self._noise(self.period))
+        spread = self._laws.spread.get(self.period)
+        if spread is None:
+            spread = self._laws.spread[self.period] = _factor(self._noise(self.period))
+        self._spread = spread
         self._normals = np.empty((0, 3 * self._n))
         self._used = 0
         start = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(self._n)
@@ -232,11 +249,12 @@ class DiffusionPath:
         """Draw the path at ``time`` given the whole step, and put two steps in its place."""
         n, length, left = self._n, step.end - step.start, time - step.start
         key = round(length, 12), round(left, 12)
-        if key not in self._splits:
-            if len(self._splits) >= MOST_SPLITS:
-                self._splits.clear()
-            self._splits[key] = self._conditional(length, left)
-        gain, spread = self._splits[key]
+        law = self._laws.split.get(key)
+        if law is None:
+            if len(self._laws.split) >= MOST_SPLITS:
+                self._laws.split.clear()
+            law = self._laws.split[key] = self._conditional(length, left)
+        gain, spread = law
         residual = np.concatenate([step.x_end, *step.moments]) - (
             self.responses(length) @ step.x_start
         ).reshape(-1)

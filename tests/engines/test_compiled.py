@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -263,6 +264,7 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     module = "netkf.engines.compiled"
     monkeypatch.setattr(f"{module}.engine.ROWS", 7)
     monkeypatch.setattr(f"{module}.engine.FIRST_MAIL", 2)
+    monkeypatch.setattr(f"{module}.engine.MOST_SAMPLES", 2)
     monkeypatch.setattr(f"{module}.draws.STEPS", 3)
     monkeypatch.setattr(f"{module}.draws.CUTS", 1)
     monkeypatch.setattr(f"{module}.schedule.LEAST_TICKS", 5)
@@ -275,8 +277,18 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
 
 def test_growth_beyond_numbers_is_reported_alike(build):
     plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
-    grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"}, sensors=[])
+    grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"})
     assert assert_agree(grown).status == "diverged"
+
+
+def test_replicas_side_by_side_are_those_one_after_the_other(ring):
+    with ThreadPoolExecutor(2) as pool:
+        jobs = [pool.submit(netkf.simulate, ring, replica=k, engine="compiled") for k in range(4)]
+        beside = [job.result() for job in jobs]
+    for k, run in enumerate(beside):
+        alone = netkf.simulate(ring, replica=k, engine="compiled")
+        assert run.fingerprint == alone.fingerprint
+        np.testing.assert_array_equal(run.P, alone.P)
 
 
 class Cautious(Hybrid):

@@ -14,7 +14,6 @@ from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.push_sum import PushSum
 from netkf.core import compiling
-from netkf.core.arrays import FloatArray
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, broken
@@ -25,7 +24,7 @@ from netkf.engines.compiled.replay import (
     PLACES,
     PROBE_AT,
     ROW,
-    SAMPLE,
+    SHOWN,
     STEP_AT,
     TICK_AT,
     WANT_CUTS,
@@ -34,6 +33,7 @@ from netkf.engines.compiled.replay import (
     WANT_STEPS,
     WANT_TICKS,
     Cursor,
+    Samples,
     replay,
 )
 from netkf.engines.compiled.schedule import Schedule
@@ -57,6 +57,7 @@ KNOWN = (
 DIVERGED = CODES["diverged"]
 ROWS = 1 << 16
 FIRST_MAIL = 1024
+MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,9 @@ class CompiledEngine(Engine):
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
-        if scenario.slotted:
-            return SlotRun(scenario, streams, recorder, progress).to_the_end()
-        return _Run(scenario, streams, recorder, progress).to_the_end()
+        run = SlotRun if scenario.slotted else _Run
+        with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
+            return run(scenario, streams, recorder, progress).to_the_end()
 
 
 class _Run:
@@ -116,22 +117,28 @@ class _Run:
         self._noise.following()
         self._rows = np.empty(ROWS, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
+        size, n = self._hosts.xhat.shape
+        room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
+        self._samples = Samples(
+            xhat=np.zeros((room, size, n)),
+            P=np.zeros((room, size, n, n)),
+            rows=np.zeros(room, dtype=np.int64),
+            piece=np.zeros(room, dtype=np.int64),
+        )
 
     def to_the_end(self) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
-        status = "complete"
         try:
-            while (wanted := self._go_on()) != DONE:
-                if wanted == SAMPLE:
-                    if not self._sample():
-                        status = "diverged"
-                        break
-                else:
-                    self._give(wanted)
+            wanted = WANT_ROWS
+            while wanted != DONE:
+                wanted = self._go_on()
+                if not self._take_samples():
+                    return "diverged"
+                self._give(wanted)
         finally:
-            self._pass_rows_on()
+            self._pass_rows_on(int(self._cursor.place[ROW]))
             self._recorder.flush()
-        return status
+        return "complete"
 
     def _go_on(self) -> int:
         assert self._replay is not None
@@ -146,6 +153,7 @@ class _Run:
                 self._window,
                 self._stretch,
                 self._probes,
+                self._samples,
                 float(self._scenario.horizon),
                 self._rows,
             )
@@ -163,33 +171,33 @@ class _Run:
             self._noise.more_cuts()
         elif wanted == WANT_MAIL:
             self._mail = larger(self._mail)
-        else:
-            assert wanted == WANT_ROWS
-            self._pass_rows_on()
+        elif wanted == WANT_ROWS:
+            self._pass_rows_on(int(place[ROW]))
 
-    def _pass_rows_on(self) -> None:
-        used = int(self._cursor.place[ROW])
+    def _pass_rows_on(self, used: int) -> None:
         self._cursor.place[ROW] = 0
         self._recorder.extend(self._rows[:used].copy())
 
-    def _sample(self) -> bool:
-        place, hosts = self._cursor.place, self._hosts
-        time = float(self._probes[place[PROBE_AT] - 1])
-        x = self._shown(time, int(place[STEP_AT]))
-        xhat, P = hosts.xhat.copy(), hosts.P.copy()
+    def _take_samples(self) -> bool:
+        """Record the samples that are there; False where one of them is no longer finite."""
+        place = self._cursor.place
+        count, place[SHOWN] = int(place[SHOWN]), 0
+        times = self._probes[place[PROBE_AT] - count : place[PROBE_AT]].tolist()
+        return all(self._sample(time, k) for k, time in enumerate(times))
+
+    def _sample(self, time: float, k: int) -> bool:
+        path, piece = self._stretch, int(self._samples.piece[k])
+        x = path.x_stop[piece] if time == path.stop[piece] else path.x_start[piece]
+        xhat, P = self._samples.xhat[k].copy(), self._samples.P[k].copy()
         if self._scenario.filter.algorithm.pooled:
             count = len(self._scenario.nodes)
             xhat, P = np.repeat(xhat, count, axis=0), np.repeat(P, count, axis=0)
-        self._recorder.sample(time, x, xhat, P)
+        self._recorder.sample(time, x.copy(), xhat, P)
         self._progress(time)
         nodes = broken(self._scenario, xhat, P)
         if nodes:
-            self._pass_rows_on()
+            # What happened after this sample did not happen.
+            self._pass_rows_on(int(self._samples.rows[k]))
         for node in nodes:
             self._recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
         return not nodes
-
-    def _shown(self, time: float, piece: int) -> FloatArray:
-        path = self._stretch
-        x = path.x_stop[piece] if time == path.stop[piece] else path.x_start[piece]
-        return np.array(x)

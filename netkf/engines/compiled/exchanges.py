@@ -112,10 +112,12 @@ class Exchanges:
         self._messages: list[tuple[int, int, float]] = []
         self._slots: list[int] = []
         self._sampled: list[tuple[int, float, int]] = []
-        while not self._over and len(self._rows) + len(self._messages) < MOST_ROWS:
-            self._one_slot()
-        if self._over:
+        over = False
+        while not over and len(self._rows) + len(self._messages) < MOST_ROWS:
+            over = self._one_slot()
+        if over:
             self._arrivals(np.inf)
+        self._over = over
         kind, number, first, after = np.array(self._done, dtype=np.int64).reshape(-1, 4).T.copy()
         places = np.array([m[:2] for m in self._messages], dtype=np.int64).reshape(-1, 2).T.copy()
         weight = np.array([m[2] for m in self._messages], dtype=np.float64)
@@ -124,13 +126,13 @@ class Exchanges:
             self._slots, self._sampled, self._rows,
         )  # fmt: skip
 
-    def _one_slot(self) -> None:
+    def _one_slot(self) -> bool:
+        """Make one slot; True when nothing comes after it."""
         scenario, algorithm, slot = self._scenario, self._algorithm, self._slot
         start = scenario.slot_plant.slot_time(slot)
         last = scenario.slot_plant.over(slot, scenario.horizon)
         if last and slot not in self._samples:
-            self._over = True
-            return
+            return True
         self._arrivals(start)
         self._slots.append(slot)
         if algorithm.predicts:
@@ -141,8 +143,8 @@ class Exchanges:
             self._noted = True
             if not algorithm.predicts:
                 self._sample(slot, start)
-        self._over = last
         self._slot += 1
+        return last
 
     def _programme(self, slot: int, start: float) -> None:
         algorithm, phase, now = self._algorithm, 0, start

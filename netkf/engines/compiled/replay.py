@@ -28,14 +28,14 @@ from netkf.trace.schema import CODES
 SENSE, TICK, SEND, DELIVER, LOST, ABSORB = (
     CODES[kind] for kind in ("sense", "tick", "send", "deliver", "lost", "absorb")
 )
-WANT_TICKS, WANT_STEPS, WANT_CUTS, WANT_MAIL, WANT_ROWS, SAMPLE, DONE = range(7)
+WANT_TICKS, WANT_STEPS, WANT_CUTS, WANT_MAIL, WANT_ROWS, WANT_SAMPLES, DONE = range(7)
 """Why the replay stopped: it needs the next window, the next steps of the path, normals for cuts,
-a larger pool of messages or room for rows; it is time for a sample; all is done.
+a larger pool of messages, room for rows or for samples; all is done.
 """
 
 # Places in Cursor.place.
-TICK_AT, STEP_AT, GRID_AT, AWAKE, PROBE_AT, ROW, FREE, HEAP, WAITING, READY, SENT = range(11)
-PLACES = 11
+TICK_AT, STEP_AT, GRID_AT, AWAKE, PROBE_AT, ROW, FREE, HEAP, WAITING, READY, SENT, SHOWN = range(12)
+PLACES = 12
 MOST_ROWS = 5  # of one activation
 NEVER = math.inf
 
@@ -45,6 +45,18 @@ class Cursor(NamedTuple):
 
     place: np.ndarray
     mailed: FloatArray
+
+
+class Samples(NamedTuple):
+    """Room for B samples of all hosts: xhat (B, H, n), P (B, H, n, n), how many ``rows`` (B,) came
+    before and in which ``piece`` (B,) of the path it is. Samples are taken from it in lots, because
+    a call of the replay costs more than a sample.
+    """
+
+    xhat: FloatArray
+    P: FloatArray
+    rows: np.ndarray
+    piece: np.ndarray
 
 
 class Stretch(NamedTuple):
@@ -276,6 +288,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     window: Window,
     path: Stretch,
     probes: FloatArray,
+    samples: Samples,
     horizon: float,
     rows: np.ndarray,
 ) -> int:
@@ -425,5 +438,13 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
             if place[READY] == place[WAITING]:
                 place[READY] = place[WAITING] = 0
         else:
+            taken = place[SHOWN]
+            for h in range(len(reached)):
+                fill(samples.xhat[taken, h], xhats[h])
+                fill_square(samples.P[taken, h], Ps[h])
+            samples.rows[taken] = place[ROW]
+            samples.piece[taken] = place[STEP_AT]
             place[PROBE_AT] += 1
-            return SAMPLE
+            place[SHOWN] += 1
+            if place[SHOWN] == len(samples.rows):
+                return WANT_SAMPLES

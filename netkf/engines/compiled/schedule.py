@@ -15,7 +15,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.network.channels import Fates, chances
+from netkf.network.channels import Fates, chances, needed
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
@@ -102,6 +102,9 @@ class Schedule:
         links = scenario.topology.links if talks else ()
         wanted = min(max(TICKS_A_LINK * len(links), LEAST_TICKS), MOST_TICKS)
         longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(len(links), 1)))
+        channel = scenario.network.channel
+        ways = [*links] if channel.symmetric else [*links, *((j, i) for i, j in links)]
+        streams = streams.seeded(("clock", *needed(channel)), ways)
         self._links = [LinkDraws(scenario, streams, link, longest) for link in links]
         self._horizon, self._end = scenario.horizon, 0.0
         for link in self._links:

@@ -1,0 +1,83 @@
+"""What an event costs as the network grows, and how long a run takes to start.
+
+    python -m tests.benchmarks.scale [--events 1000000] [--links 100 1000 10000] [--plot FILE]
+
+Hybrid filters on regular graphs of degree 8, the compiled engine, every row to Parquet. A line a
+size: seconds until the first event (draws of all links, tables of all nodes), nanoseconds an event
+from then on, bytes a row, and the peak memory of the process so far, by the operating system.
+"""
+
+import argparse
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+import netkf
+from netkf.core.streams import Streams
+from netkf.engines.compiled.engine import CompiledEngine
+from netkf.experiments.files import ParquetSink
+from netkf.trace.recorder import Recorder
+from tests.benchmarks.engine import RING
+
+ROWS_A_TICK = 6.4
+
+
+def scenario(links, events):
+    graph = {"kind": "regular", "nodes": links // 4, "degree": 8, "seed": 1, "connected": False}
+    rate = 2.0
+    horizon = events / (ROWS_A_TICK * rate * links)
+    changes = {"network.graph": graph, "filter.epsilon": 0.1, "horizon": horizon, "probe": horizon}
+    return netkf.load(RING).replace({**changes, "network.activation.rate": rate})
+
+
+def measured(case):
+    """Seconds until time 0 is shown, nanoseconds an event, events, bytes a row."""
+    started = []
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        sink = ParquetSink(Path(folder), case, 0, True)
+        recorder = Recorder([sink])
+
+        def progress(now):
+            started.append(time.perf_counter())
+
+        CompiledEngine().run(case, Streams(case.seed), recorder, progress)
+        sink.close()
+        ended = time.perf_counter()
+        size = (Path(folder) / "events.parquet").stat().st_size
+    events = recorder.total
+    assert recorder.count("send") == 2 * recorder.count("tick") > 0, "both ends send"
+    return started[0] - began, 1e9 * (ended - started[0]) / events, events, size / events
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--events", type=int, default=1_000_000)
+    parser.add_argument("--links", type=int, nargs="+", default=[100, 1000, 10_000, 100_000])
+    parser.add_argument("--plot", type=Path, help="a picture of cost against size")
+    options = parser.parse_args()
+    measured(scenario(100, 1000))  # loads what is compiled
+    print(
+        f"{'links':>8} {'events':>12} {'start, s':>9} {'ns/event':>9} {'bytes/row':>10} {'MiB':>6}"
+    )
+    costs = []
+    for links in options.links:
+        start, cost, events, size = measured(scenario(links, options.events))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        costs.append(cost)
+        print(f"{links:8,} {events:12,} {start:9.2f} {cost:9.0f} {size:10.1f} {peak:6.0f}")
+    if options.plot:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(5.0, 3.5), layout="constrained")
+        axes = figure.subplots()
+        axes.loglog(options.links, costs, "o-")
+        axes.set(
+            xlabel="links", ylabel="nanoseconds an event", ylim=(min(costs) / 4, 4 * max(costs))
+        )
+        figure.savefig(options.plot)
+
+
+if __name__ == "__main__":
+    main()
