@@ -20,11 +20,13 @@ from netkf.algorithms.baselines import Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.riccati import evaluate_hamiltonian
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import own_steps
+from netkf.theory.push_sum_errors import stacked_push_sum_errors
 from netkf.theory.slot_errors import stacked_slot_errors
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
@@ -40,8 +42,8 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     With ``stacked``, (T, N n, N n): the errors of all nodes together. H (10) says that each block
     stays below P_i, which this shows without Monte Carlo. With delays, losses and models that
     differ from the truth; where states or readings are recorded, as if they had the law that the
-    scenario gives them. Raises TheoryError for the push-sum filter, and for a user's subclass that
-    does more than choose its weights.
+    scenario gives them. Raises TheoryError for a user's subclass that does more than choose its
+    weights, and for the push-sum filter with frozen or asymptotic gains.
     """
     whole, _ = _replayed(scenario, run)
     nodes, n = len(scenario.nodes), scenario.plant.n
@@ -69,11 +71,23 @@ def _replayed(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     flow = not scenario.slotted
-    whole, P = _stacked_errors(scenario, run) if flow else stacked_slot_errors(scenario, run)
+    if isinstance(scenario.filter.algorithm, PushSum):
+        own_kind(scenario.filter.algorithm, PushSum)
+        whole, P = stacked_push_sum_errors(scenario, run)
+    else:
+        whole, P = _stacked_errors(scenario, run) if flow else stacked_slot_errors(scenario, run)
     nodes, n = len(scenario.nodes), scenario.plant.n
     if whole.shape[-1] < nodes * n:
         whole, P = np.tile(whole, (1, nodes, nodes)), np.tile(P, (1, nodes, 1, 1))
     return whole, P
+
+
+def own_kind(algorithm: object, known: type) -> None:
+    """Raise TheoryError where a user's subclass defines steps itself."""
+    own = own_steps(algorithm, known)
+    if own:
+        words = f"{type(algorithm).__name__} defines {own[0]} itself"
+        raise TheoryError(f"the exact error covariance is not known: {words}")
 
 
 def _stacked_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
@@ -82,10 +96,7 @@ def _stacked_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArra
         raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
     intersects = isinstance(algorithm, CovarianceIntersection)
     known = CovarianceIntersection if intersects else Hybrid if algorithm.talks else Local
-    own = own_steps(algorithm, known)
-    if own:
-        words = f"{type(algorithm).__name__} defines {own[0]} itself"
-        raise TheoryError(f"the exact error covariance is not known: {words}")
+    own_kind(algorithm, known)
     errors = _Errors(scenario)
     hosts = errors.hosts
     whole = np.empty((len(run.times), hosts * n, hosts * n))

@@ -19,6 +19,7 @@ from netkf.core.streams import Streams
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
 from netkf.scenario.scenario import Scenario
+from netkf.theory.matrices import as_whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,10 +55,8 @@ def information_level(
     """
     import pandas as pd
 
-    if runs < 2:
-        raise TheoryError(f"runs must be at least 2, got {runs!r}")
-    if window is not None and window < 1:
-        raise TheoryError(f"window must be at least 1 slot, got {window!r}")
+    runs, seed = as_whole("runs", runs, 2), as_whole("seed", seed, 0)
+    window = None if window is None else as_whole("window", window, 1)
     sources = _sources(scenario)
     past = _pasts(scenario, sources, runs, Streams(seed).generator("past"))
     whole = (-1, sources, past)

@@ -18,7 +18,7 @@ from netkf.algorithms.square_root import predict_root, update_root
 from netkf.core.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
-from netkf.theory.matrices import RESIDUAL, as_covariance, as_square
+from netkf.theory.matrices import RESIDUAL, as_covariance, as_numbers, as_square, as_whole
 
 DEEPEST, MOST_POLICIES = 22, 40
 COALESCED = 1e-9
@@ -47,9 +47,7 @@ def checked_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Sy
 
 
 def _observation(H: ArrayLike, n: int) -> FloatArray:
-    array: FloatArray = np.asarray(H, dtype=np.float64)
-    if array.ndim == 0:
-        array = array.reshape(1, 1)
+    array = as_numbers("H", H)
     if array.ndim != 2 or array.shape[1] != n or not np.isfinite(array).all():
         raise TheoryError(f"H must be a finite matrix of {n} columns, its shape is {array.shape}")
     return array
@@ -98,11 +96,11 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
         P = np.zeros_like(F)  # without readings the step below finds all
         if len(H):
             P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
+        # One step of Newton's method takes what is left of the residual away.
+        K = _gain(P, F, H, R)
+        P = symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(F - K @ H, Q + K @ R @ K.T)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising fixed point of f_1: {error}") from None
-    # One step of Newton's method takes what is left of the residual away.
-    K = _gain(P, F, H, R)
-    P = symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(F - K @ H, Q + K @ R @ K.T)))
     residual = np.abs(riccati_step(P, F, Q, H, R) - P).max()
     if not residual <= RESIDUAL * np.abs(P).max():
         raise TheoryError(f"P* was solved to {residual:.1e} only")
@@ -300,8 +298,7 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     invariant law; f_1(P*) = P*, so each depth holds the ones before. Raises TheoryError for a depth
     outside 0 .. 22 and where P* does not exist.
     """
-    if int(depth) != depth or not 0 <= depth <= DEEPEST:
-        raise TheoryError(f"depth must be an integer from 0 to {DEEPEST}, got {depth!r}")
+    depth = as_whole("depth", depth, 0, DEEPEST)
     F, Q, H, R = checked_system(F, Q, H, R)
     roots = _root(steady_covariance(F, Q, H, R))[None]
     root_Q, root_R = square_root(Q), _root(R)
@@ -331,10 +328,9 @@ def invariant_samples(
     invariant law exists or that does not happen. Much faster with the extra ``fast``.
     """
     F, Q, H, R = checked_system(F, Q, H, R)
-    if not 0.0 < delivery <= 1.0:
+    if as_numbers("delivery", delivery).size != 1 or not 0.0 < delivery <= 1.0:
         raise TheoryError(f"delivery must lie in (0, 1], got {delivery!r}")
-    if int(samples) != samples or samples < 1:
-        raise TheoryError(f"samples must be a positive integer, got {samples!r}")
+    samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)
     n, P = len(F), steady_covariance(F, Q, H, R)
     random = Streams(seed).generator("arrivals")
     letters = alphabet([(H[:0], R[:0, :0]), (H, R)], n)

@@ -12,11 +12,31 @@ from netkf.core.errors import TheoryError
 RESIDUAL = 1e-9
 
 
+def as_numbers(name: str, value: ArrayLike) -> FloatArray:
+    """Real numbers as an array, one number as 1 x 1; raises TheoryError otherwise."""
+    try:
+        if np.iscomplexobj(value):
+            raise TypeError
+        array: FloatArray = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        words = "must be a matrix of real numbers, rows of equal length"
+        raise TheoryError(f"{name} {words}, got a {type(value).__name__}") from None
+    return array.reshape(1, 1) if array.ndim == 0 else array
+
+
+def as_whole(name: str, value: object, least: int, most: float = np.inf) -> int:
+    """A whole number in range; raises TheoryError otherwise."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TheoryError(f"{name} must be an integer, got {value!r}")
+    if not least <= value <= most:
+        bound = f"at least {least}" if most == np.inf else f"an integer from {least} to {most:g}"
+        raise TheoryError(f"{name} must be {bound}, got {value!r}")
+    return int(value)
+
+
 def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
     """A finite (n, n) float array, from a number where n is 1; raises TheoryError otherwise."""
-    array: FloatArray = np.asarray(value, dtype=np.float64)
-    if array.ndim == 0:
-        array = array.reshape(1, 1)
+    array = as_numbers(name, value)
     wanted = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
         raise TheoryError(f"{name} must be a {wanted} matrix, its shape is {array.shape}")

@@ -9,21 +9,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-from netkf.algorithms.push_sum import PushSum
-from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
-from netkf.experiments.checking.exact import (
-    EXACT,
-    as_computed,
-    blocks,
-    stand_in,
-    whitened,
-)
+from netkf.experiments.checking.exact import as_computed, exact, stand_in
 from netkf.experiments.checking.laws import exact_start, worst
 from netkf.experiments.checking.seen import Seen, relative, replay
 from netkf.experiments.checking.statistics import Interval, mean_of
-from netkf.experiments.checking.words import look_at, slots_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
     exact_minimum_gamma,
@@ -32,8 +24,7 @@ from netkf.theory import (
     push_sum_limits,
     push_sum_radius,
 )
-from netkf.trace.run import Run, errors
-from netkf.trace.schema import CODES
+from netkf.trace.run import Run
 
 MASS, CLOSE = 1e-9, 0.01
 SQUARE, BIAS = 0.3, 0.2  # tolerances: relative mean square, squared bias
@@ -42,14 +33,8 @@ MOST_CERTIFIED = 20
 
 
 class Witness(NamedTuple):
-    """What one run says at K slots.
-
-    P, e     : (K, N, n, n), (K, N, n) covariances and errors
-    nees     : (K, N) e' P^-1 e
-    replayed : (K, N, n, n) what steps 2, 3 and (7) make of the links that were up
-    Sigma    : (K, N, n, n) covariance of the errors given the links
-    whole    : (K, 2) as in :class:`Exact`
-    drift    : (2,) relative drift of the totals of weight and number
+    """What one run says at K slots: as :class:`Exact`, and ``drift`` (2,), the relative drift of
+    the totals of weight and number.
     """
 
     P: FloatArray
@@ -64,107 +49,7 @@ class Witness(NamedTuple):
 def witness(scenario: Scenario, run: Run) -> Witness:
     """Reduce a run whose samples are those of ``look_at``."""
     drift = np.array([(total - exact) / exact for exact, total in run.sums.values()])
-    if not len(drift):
-        drift = np.full(2, np.nan)
-    replayed, stacked = _Plain(scenario, run).upto(look_at(scenario))
-    e = run.x[:, None] - run.xhat
-    _, nees = errors(run.x, run.xhat, run.P)
-    return Witness(
-        run.P,
-        e,
-        nees,
-        replayed,
-        blocks(stacked, *e.shape[1:]),
-        whitened(e, stacked, EXACT),
-        drift,
-    )
-
-
-class _Plain:
-    """P Fig. 1 written plainly, with the corrected update of the mass, along the links of a run:
-    P of every node, and the covariance of the errors of all nodes together.
-    """
-
-    def __init__(self, scenario: Scenario, run: Run) -> None:
-        promised = stand_in(scenario).filter.algorithm
-        assert isinstance(promised, PushSum)
-        self._scenario, self._filter = scenario, promised
-        self._n, self._N = scenario.plant.n, len(scenario.nodes)
-        self._models = scenario.slot_models
-        self._nu = np.array([scenario.topology.degrees[node] + 1 for node in scenario.nodes])
-        self._up = _arrived(scenario, run, promised.gamma)
-
-    def _received(self, slot: int, phase: int, step: int) -> FloatArray:
-        """(N, N): 1 where what j sent in a step reached i in time."""
-        return self._up.get((slot, phase, step), np.zeros((self._N, self._N)))
-
-    def upto(self, slots: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-        """(K, N, n, n) and (K, N n, N n) at some slots."""
-        n, N, scenario = self._n, self._N, self._scenario
-        own = np.array([m.H.T @ np.linalg.solve(m.R, m.H) for m in self._models])
-        z = np.concatenate([np.zeros((N, 1)), np.ones((N, 1)), own.reshape(N, -1)], axis=1)
-        z[scenario.topology.index[self._filter.leader], 0] = 1.0
-        P = np.array([scenario.start(node)[1] for node in scenario.nodes])
-        Sigma = np.tile(scenario.plant.start_cov, (N, N))
-        F, Q = scenario.slot_belief
-        found = []
-        for slot in range(1, slots[-1] + 1):
-            received = self._received(slot, 0, 0)
-            shares = z / self._nu[:, None]
-            z = (self._nu - received.sum(axis=1))[:, None] * shares + received @ shares
-            heard, weight = z[:, 0] > 0.0, np.where(z[:, 0] > 0.0, z[:, 0], 1.0)
-            G = np.where(
-                heard[:, None, None], z[:, 2:].reshape(N, n, n) / weight[:, None, None], own
-            )
-            number = np.where(heard, z[:, 1] / weight, 1.0)
-            ahead = F @ P @ F.T + Q
-            P = np.linalg.solve(np.eye(n) + ahead @ G, ahead)
-            P = 0.5 * (P + np.swapaxes(P, -1, -2))
-            Sigma = self._averaged(slot, self._sensed(Sigma, P, number))
-            if slot in slots:
-                found.append((P, Sigma))
-        return np.array([P for P, _ in found]), np.array([Sigma for _, Sigma in found])
-
-    def _sensed(self, Sigma: FloatArray, P: FloatArray, number: FloatArray) -> FloatArray:
-        """Step 4: x - xhat after the reading of a slot."""
-        n, plant, scenario = self._n, self._scenario.slot_plant, self._scenario
-        moves, noise = [], []
-        for i, model in enumerate(self._models):
-            gain = number[i] * P[i] @ np.linalg.solve(model.R, model.H).T
-            moves.append(np.eye(n) - gain @ model.H)
-            true = scenario.observation(scenario.nodes[i])[1]
-            noise.append(gain @ true @ gain.T)
-        closed = block_diagonal(moves)
-        ahead = np.kron(np.eye(self._N), plant.F)
-        moved = ahead @ Sigma @ ahead.T + np.tile(plant.Q, (self._N, self._N))
-        return np.asarray(closed @ moved @ closed.T + block_diagonal(noise))
-
-    def _averaged(self, slot: int, Sigma: FloatArray) -> FloatArray:
-        """Step 5: gamma averaging steps."""
-        for step in range(self._filter.gamma):
-            received = self._received(slot, 1, step)
-            mixing = (
-                np.eye(self._N) + (received - np.diag(received.sum(axis=1))) / self._filter.delta
-            )
-            whole = np.kron(mixing, np.eye(self._n))
-            Sigma = whole @ Sigma @ whole.T
-        return Sigma
-
-
-def _arrived(scenario: Scenario, run: Run, gamma: int) -> dict[tuple[int, int, int], FloatArray]:
-    """By slot, phase and step."""
-    index, size = scenario.topology.index, len(scenario.nodes)
-    rows = run.log[run.log["kind"] == CODES["deliver"]]
-    sent = rows["t"] - rows["age"]
-    slot, length = slots_of(scenario, sent), scenario.phase_length
-    since = sent - slot * scenario.slot_plant.period - rows["phase"] * length
-    step = np.where(rows["phase"] == 0, 0, np.round(since / (length / gamma))).astype(int)
-    up: dict[tuple[int, int, int], FloatArray] = {}
-    columns = (slot, rows["phase"], step, rows["node"], rows["peer"])
-    for t, phase, k, node, peer in zip(*(c.tolist() for c in columns), strict=True):
-        matrix = up.setdefault((t, phase, k), np.zeros((size, size)))
-        matrix[index[node], index[peer]] = 1.0
-    return up
+    return Witness(*exact(scenario, run), drift if len(drift) else np.full(2, np.nan))
 
 
 @dataclass(frozen=True)
@@ -185,6 +70,11 @@ def rows(scenario: Scenario) -> list[Row]:
     algorithm = stand_in(scenario).filter.algorithm
     plain = algorithm.stop == "never" and not algorithm.asymptotic  # type: ignore[union-attr]
     words = "exchanged for ever" if plain else "gains are frozen or taken from the limit"
+    plant = scenario.slot_plant
+    if not np.array_equal(scenario.slot_belief[0], plant.F):
+        plain, words = False, "exchanged, but the filters' F is not the plant's"
+    if any(sensor.varying for sensor in scenario.sensors):
+        plain, words = False, "exchanged, but H differs from slot to slot"
     try:
         radius = push_sum_radius(stand_in(scenario))
         light, why = radius <= HEAVY, f"mean-square radius {radius:.4g}, light tails below {HEAVY}"

@@ -1,0 +1,62 @@
+"""The push-sum filter's exact errors given the links, against many noises on one set of links."""
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf import theory
+from netkf.scenario.reading import from_table
+
+TABLE = {
+    "format": 1,
+    "name": "four",
+    "horizon": 8.0,
+    "probe": [2.0, 7.0],
+    "plant": {
+        "kind": "linear",
+        "F": [[1.0, 0.2], [-0.1, 1.0]],
+        "Q": [[0.3, 0.0], [0.0, 0.2]],
+        "period": 1.0,
+        "cov": [[1.0, 0.0], [0.0, 1.0]],
+    },
+    "sensors": [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.5]]},
+        {"nodes": [2], "H": [[0.0, 1.0]], "R": [[0.5]]},
+    ],
+    "network": {
+        "graph": {"kind": "path", "nodes": 3},
+        "activation": {"kind": "broadcast"},
+        "channel": {"loss": {"kind": "bernoulli", "delivery": 0.7}},
+    },
+    "filter": {"kind": "push-sum", "gamma": 2, "delta": 3.2},
+}
+
+
+def test_errors_on_recorded_links_have_the_exact_covariance(tmp_path):
+    scenario = from_table(TABLE, tmp_path)
+    first = netkf.simulate(scenario)
+    sent = first.events[first.events.kind == "lost"]
+    rows = "".join(f"{a},{b},{m},0\n" for a, b, m in zip(sent.node, sent.peer, sent.message))  # noqa: B905
+    (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n" + rows)
+    fixed = scenario.replace({"network.channel.loss": {"kind": "recorded", "path": "lost.csv"}})
+    stacked = theory.error_covariance(fixed, netkf.simulate(fixed), stacked=True)
+    np.testing.assert_allclose(
+        stacked, theory.error_covariance(scenario, first, stacked=True), rtol=1e-12
+    )
+    runs = [netkf.simulate(fixed, replica=r) for r in range(120)]
+    e = np.array([(run.x[:, None] - run.xhat).reshape(2, -1) for run in runs])
+    for k in range(2):
+        kept = np.linalg.eigvalsh(stacked[k])[0] > 1e-8
+        assert kept
+        whitened = np.einsum("ra,ab,rb->r", e[:, k], np.linalg.inv(stacked[k]), e[:, k]) / 6.0
+        # 720 degrees of freedom: one standard error is 5.3 %
+        assert whitened.mean() == pytest.approx(1.0, abs=0.24)
+
+
+def test_what_is_not_known_is_refused(tmp_path):
+    frozen = from_table({**TABLE, "filter": {**TABLE["filter"], "stop": "safe"}}, tmp_path)
+    with pytest.raises(netkf.TheoryError, match="mass is exchanged in every slot"):
+        theory.error_covariance(frozen, netkf.simulate(frozen))
+    late = from_table({**TABLE, "probe": [8.0]}, tmp_path)
+    with pytest.raises(netkf.TheoryError, match="sample before it"):
+        theory.error_covariance(late, netkf.simulate(late))
