@@ -262,7 +262,7 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     )
     whole = netkf.simulate(busy, engine="compiled")
     module = "netkf.engines.compiled"
-    monkeypatch.setattr(f"{module}.engine.ROWS", 7)
+    monkeypatch.setattr("netkf.trace.recorder.BLOCK", 7)
     monkeypatch.setattr(f"{module}.engine.FIRST_MAIL", 2)
     monkeypatch.setattr(f"{module}.engine.MOST_SAMPLES", 2)
     monkeypatch.setattr(f"{module}.draws.STEPS", 3)

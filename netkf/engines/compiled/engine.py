@@ -46,6 +46,7 @@ from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
+from netkf.trace import recorder as recording
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES, EVENT
 
@@ -55,7 +56,6 @@ KNOWN = (
     *(Hybrid, Local, Central, *KERNELS),
 )
 DIVERGED = CODES["diverged"]
-ROWS = 1 << 16
 FIRST_MAIL = 1024
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 
@@ -115,7 +115,7 @@ class _Run:
         self._window = self._schedule.following()
         self._stretch = self._path.following()
         self._noise.following()
-        self._rows = np.empty(ROWS, dtype=EVENT)
+        self._rows = np.empty(recording.BLOCK, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
         size, n = self._hosts.xhat.shape
         room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
