@@ -15,6 +15,7 @@ from netkf.algorithms.hybrid import Hybrid
 from netkf.core import compiling, small
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.streams import Streams
+from netkf.experiments import simulate
 from netkf.network.channels import Bernoulli, Fates
 from netkf.scenario.reading import from_table
 from netkf.trace.recorder import MemorySink, Recorder
@@ -318,7 +319,11 @@ def test_a_loss_of_ones_own_runs_in_both(ring):
     assert assert_agree(dataclasses.replace(ring, network=network)).count("lost") > 100
 
 
-def test_auto_is_compiled_and_without_numba_processes(ring, monkeypatch):
+def test_auto_is_compiled_for_long_runs_and_without_numba_processes(ring, monkeypatch):
+    assert netkf.simulate(ring).engine == "processes"
+    events = len(netkf.simulate(ring).log)
+    assert 0.5 * events < simulate.expected_events(ring) < 2.0 * events
+    monkeypatch.setattr(simulate, "WORTH", events / 2)
     assert netkf.simulate(ring).engine == "compiled"
     monkeypatch.setattr(compiling, "available", lambda: False)
     assert netkf.simulate(ring).engine == "processes"
