@@ -369,13 +369,6 @@ def test_theory_that_needs_a_fixed_H_says_so():
     assert netkf.simulate(gossip).status == "complete"
     with pytest.raises(netkf.TheoryError, match="whose H is random"):
         theory.detecting_walk(gossip)
-    push_sum = section_vi(
-        network__graph__directed=False,
-        filter={"kind": "push-sum", "gamma": 1, "delta": 9.0},
-        sensors=[],
-    )
-    with pytest.raises(netkf.TheoryError, match="no exact error covariance for PushSum"):
-        theory.error_covariance(push_sum, netkf.simulate(push_sum))
 
 
 @pytest.mark.slow

@@ -894,7 +894,6 @@ USAGE = [
     ("seed-long", ["run", "{file}", "--seed", "1" * 5000], "--seed"),
     ("seed-nothing", ["run", "{file}", "--seed"], "--seed"),
     ("engine", ["run", "{file}", "--engine", "foo"], "invalid choice: 'foo'"),
-    ("engine-absent", ["run", "{file}", "--engine", "compiled"], '"compiled" is not part of'),
     ("trace", ["run", "{file}", "--trace", "some"], "invalid choice: 'some'"),
     ("set-nothing", ["run", "{file}", "--set"], "--set"),
     ("theory-out", ["theory", "{file}", "--out", "x"], "--out"),
@@ -935,7 +934,7 @@ def test_a_directory_that_cannot_be_used_is_refused(out, write, refusal, tmp_pat
 
 def test_a_note_does_not_stand_beside_a_refusal(write, refusal, tmp_path):
     path = write(listed("island.csv", "minimum = 0.5") | {"sensors.nodes": "[0]"})
-    refusal("run", path, "--engine", "compiled", "--out", tmp_path / "out")
+    refusal("run", path, "--scheduler", "tcp://localhost:1", "--out", tmp_path / "out")
 
 
 # A graph that is connected or not as the seed will have it.

@@ -224,6 +224,6 @@ def _settles(scenario: Scenario) -> None:
 
 
 def _limits(scenario: Scenario) -> None:
-    if len(scenario.nodes) == 1:
-        raise TheoryError("a single node has no links")
+    if len(scenario.nodes) == 1 or scenario.network.channel.delay.fixed != 0.0:
+        raise TheoryError("S is the limit for links that take no time")
     steady_covariance_bound(_faster(scenario, 10.0 * _fast(scenario)))
