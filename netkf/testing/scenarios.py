@@ -26,6 +26,7 @@ def assert_promises(
     runs: int = 500,
     seed: int | None = None,
     confidence: float = 0.99,
+    workers: int | None = None,
 ) -> None:
     """Assert that no promise of a scenario (or of the file at a path) is broken in ``runs``
     replicas; rows that are undecided or not promised pass.
@@ -37,7 +38,7 @@ def assert_promises(
     from netkf.experiments.checking.evidence import BROKEN
 
     chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
-    verdict = check(chosen, runs=runs, seed=seed, confidence=confidence)
+    verdict = check(chosen, runs, seed, confidence, workers)
     broken = [row for row in verdict.rows if row.verdict == BROKEN]
     if broken:
         lines = [

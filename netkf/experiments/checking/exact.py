@@ -14,7 +14,7 @@ from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.fields import Part
-from netkf.experiments.checking.evidence import Finding, identity
+from netkf.experiments.checking.evidence import Finding, Row, identity
 from netkf.experiments.checking.laws import NEES, chi_squared, worst
 from netkf.experiments.checking.statistics import Interval, mean_ratio
 from netkf.scenario.registry import KINDS
@@ -25,6 +25,7 @@ from netkf.trace.run import Run, errors
 
 MOST = 1000
 """Replicas whose exact covariances are computed; the others show their errors only."""
+LARGEST = 64
 SAMPLED, EXACT = 0.02, 1e-8
 """Relative variances that are looked at: where readings are integrated over steps, an error of
 1e-3 of the largest ones is allowed for; in slots there is none.
@@ -56,7 +57,7 @@ def exact(scenario: Scenario, run: Run) -> Exact:
     e = run.x[:, None] - run.xhat
     replayed = Sigma = np.full(run.P.shape, np.nan)
     whole = np.full((len(run.times), 2), np.nan)
-    if run.replica < MOST:
+    if run.replica < MOST and within_reach(scenario).holds:
         try:
             replayed, stacked = replayed_covariances(stand_in(scenario), run)
         except TheoryError:  # rows about them are not promised then
@@ -64,6 +65,13 @@ def exact(scenario: Scenario, run: Run) -> Exact:
         Sigma = blocks(stacked, *e.shape[1:])
         whole = whitened(e, stacked, EXACT if scenario.slotted else SAMPLED)
     return Exact(run.P, e, nees, replayed, Sigma, whole)
+
+
+def within_reach(scenario: Scenario) -> Row:
+    """Whether the errors of all nodes together are few enough for their exact covariance."""
+    size = len(scenario.nodes) * scenario.plant.n
+    words = f"{size} errors of all nodes together, at most {LARGEST}"
+    return Row("exact errors are within reach", "netkf", size <= LARGEST, words)
 
 
 def blocks(stacked: FloatArray, nodes: int, n: int) -> FloatArray:

@@ -12,7 +12,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
-from netkf.experiments.checking.exact import as_computed, exact
+from netkf.experiments.checking.exact import as_computed, exact, within_reach
 from netkf.experiments.checking.laws import (
     Pair,
     distances,
@@ -155,6 +155,7 @@ def rows(scenario: Scenario) -> list[Row]:
     return [
         Row("slots are independent and Abar is known", "G II-A", known, words),
         exact_start(scenario),
+        within_reach(scenario),
     ]
 
 
@@ -287,7 +288,7 @@ PROMISES = (
     Promise(
         "errors have the covariance that swaps and readings give them",
         "G (8), (10), derived",
-        ("the filters start",),
+        ("the filters start", "exact errors are within reach"),
         as_computed,
     ),
     Promise(

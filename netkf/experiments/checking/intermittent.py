@@ -12,7 +12,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
-from netkf.experiments.checking.exact import as_computed, exact
+from netkf.experiments.checking.exact import as_computed, exact, within_reach
 from netkf.experiments.checking.laws import (
     Pair,
     distances,
@@ -197,6 +197,7 @@ def rows(scenario: Scenario) -> list[Row]:
     return [
         Row("readings arrive independently, as often as stated", "R (12)", known, words),
         exact_start(scenario),
+        within_reach(scenario),
     ]
 
 
@@ -365,7 +366,7 @@ PROMISES = (
     Promise(
         "errors have the covariance that the readings give them",
         "R (15)-(18), derived",
-        ("the filters start",),
+        ("the filters start", "exact errors are within reach"),
         as_computed,
     ),
     Promise(

@@ -12,7 +12,7 @@ import scipy.special
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
-from netkf.experiments.checking.exact import as_computed, exact, stand_in
+from netkf.experiments.checking.exact import as_computed, exact, stand_in, within_reach
 from netkf.experiments.checking.laws import exact_start, worst
 from netkf.experiments.checking.seen import Seen, relative, replay
 from netkf.experiments.checking.statistics import Interval, mean_of
@@ -84,6 +84,7 @@ def rows(scenario: Scenario) -> list[Row]:
         Row("mass is exchanged in every slot", "P step 2", plain, words),
         Row("mean squares have a variance", "derived", light, why),
         exact_start(scenario),
+        within_reach(scenario),
     ]
 
 
@@ -160,20 +161,25 @@ PROMISES = (
     Promise(
         "P follows steps 2 and 3 with the links that were up",
         "P (3)-(7)",
-        ("mass is exchanged in every slot",),
+        ("mass is exchanged in every slot", "exact errors are within reach"),
         replay,
         exact=True,
     ),
     Promise(
         "errors have the covariance that the steps give them",
         "P (7)-(9), derived",
-        ("mass is exchanged in every slot", "the filters know", "the filters start"),
+        (
+            "mass is exchanged in every slot",
+            "the filters know",
+            "the filters start",
+            "exact errors are within reach",
+        ),
         as_computed,
     ),
     Promise(
         "every node comes to the covariance P_inf",
         "P Lemmas 3, 4, Theorems 1, 2",
-        LAWS,
+        (*LAWS, "mass is exchanged in every slot", "exact errors are within reach"),
         settled,
         exact=True,
     ),
