@@ -275,7 +275,7 @@ def test_broken_intermittent_filters_are_caught(kind, source, tmp_path):
 
 
 def test_correct_filters_hold_with_enough_runs(tmp_path):
-    found = check(scenario_of(SCALAR, tmp_path), runs=1000)
+    found = check(scenario_of(SCALAR, tmp_path), runs=1000, workers=1)
     assert found
     table = found.table
     assert (table.verdict == "holds").sum() >= 8
@@ -296,9 +296,10 @@ def test_what_is_not_promised_says_why():
 
 
 def test_undecided_says_how_many_runs_would_do(tmp_path):
-    few = rows_of(check(scenario_of(SCALAR, tmp_path), runs=20))["R (15)"]
+    few = rows_of(check(scenario_of(SCALAR, tmp_path), runs=12, workers=1))["R (12)"]
     assert few.verdict == "undecided"
-    enough = rows_of(check(scenario_of(SCALAR, tmp_path), runs=few.needed))["R (15)"]
+    assert 12 < few.needed < 600
+    enough = rows_of(check(scenario_of(SCALAR, tmp_path), runs=few.needed, workers=1))["R (12)"]
     assert enough.verdict == "holds"
 
 
@@ -341,10 +342,10 @@ def test_mean_ratio_covers():
 
 
 def test_chi_square_is_pearsons():
-    counts, chances = np.array([50, 30, 15, 4, 1]), np.array([0.5, 0.25, 0.125, 0.0625, 0.0625])
+    counts, chances = np.array([30, 18, 9, 2, 1]), np.array([0.5, 0.25, 0.125, 0.0625, 0.0625])
     p, cells = statistics.chi_square(counts, chances)
-    pooled = scipy.stats.chisquare([50, 30, 15, 5], [50, 25, 12.5, 12.5])
-    assert cells == 4
+    pooled = scipy.stats.chisquare([30, 18, 12], [30, 15, 15])  # cells below 5 go to the last one
+    assert cells == 3
     assert p == pytest.approx(pooled.pvalue)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not promised"
+MOST_RUNS = 1e9
 VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
 
 
@@ -102,8 +103,9 @@ def _weighed(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict = HOLDS
     else:
         verdict = UNDECIDED
-        room = max(tolerance + min(margin, 0.0), 0.1 * tolerance, 1e-300)
-        needed = math.ceil(min(1.1 * runs * max(1.0, (margin - low) / room) ** 2, 1e12))
+        # Where the promise holds, what is seen below 0 is chance and shrinks as 1 / sqrt(runs).
+        wanted = 1.1 * runs * (-low / tolerance) ** 2 if tolerance > 0.0 else math.inf
+        needed = math.ceil(wanted) if wanted < MOST_RUNS else None
     return Evidence(
         promise.words,
         promise.source,
