@@ -38,6 +38,10 @@ class LinearPlant(Plant):
         """Seconds; rounded so that lattices of other periods meet it."""
         return float(round(k * self.period, 12))
 
+    def slots_of(self, times: FloatArray) -> np.ndarray:
+        """The slot in which each time falls; one that rounding puts just before a slot is in it."""
+        return np.asarray(np.floor(times / self.period + 1e-9).astype(int))
+
     def over(self, slot: int, horizon: float) -> bool:
         """Whether a slot begins at the horizon or later; 3 * 0.1 is 0.3."""
         return self.slot_time(slot) >= horizon - 1e-9 * self.period

@@ -46,10 +46,13 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     weights, and for the push-sum filter with frozen or asymptotic gains.
     """
     whole, _ = _replayed(scenario, run)
-    nodes, n = len(scenario.nodes), scenario.plant.n
-    if stacked:
-        return whole
-    blocks = whole.reshape(len(whole), nodes, n, nodes, n)
+    return whole if stacked else diagonal_blocks(whole, len(scenario.nodes))
+
+
+def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
+    """(T, N, n, n) of (T, N n, N n)."""
+    n = stacked.shape[-1] // nodes
+    blocks = stacked.reshape(len(stacked), nodes, n, nodes, n)
     return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
 
 

@@ -44,7 +44,7 @@ def _arrived(scenario: Scenario, run: Run, gamma: int) -> Up:
     index, size, period = scenario.topology.index, len(scenario.nodes), scenario.slot_plant.period
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     sent, length = rows["t"] - rows["age"], scenario.phase_length
-    slot = np.floor(sent / period + 1e-9).astype(int)
+    slot = scenario.slot_plant.slots_of(sent)
     since = sent - slot * period - rows["phase"] * length
     step = np.where(rows["phase"] == 0, 0, np.round(since / (length / gamma))).astype(int)
     up: Up = {}

@@ -68,7 +68,7 @@ def stacked_slot_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, Float
 def _arrived(scenario: Scenario, run: Run) -> dict[int, Arrived]:
     """For each slot and receiver, the senders whose messages were in time."""
     log = run.log[run.log["kind"] == CODES["deliver"]]
-    slots = np.floor(log["t"] / scenario.slot_plant.period + 1e-9).astype(int)
+    slots = scenario.slot_plant.slots_of(log["t"])
     found: dict[int, Arrived] = {}
     for slot, node, peer in zip(
         slots.tolist(), log["node"].tolist(), log["peer"].tolist(), strict=True

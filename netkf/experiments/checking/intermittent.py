@@ -34,7 +34,6 @@ from netkf.experiments.checking.words import (
     look_at,
     peers_of,
     reference_size,
-    slots_of,
     start_roots,
 )
 from netkf.scenario.scenario import Scenario
@@ -125,7 +124,7 @@ def witness(scenario: Scenario, run: Run) -> Witness:
 def _count(scenario: Scenario, run: Run, kind: str, sender: str, slots: int) -> np.ndarray:
     receiver = "peer" if sender == "node" else "node"
     rows = run.log[run.log["kind"] == CODES[kind]]
-    rows = rows[slots_of(scenario, rows["t"]) < slots]
+    rows = rows[scenario.slot_plant.slots_of(rows["t"]) < slots]
     return np.array(
         [((rows[sender] == i) & (rows[receiver] == j)).sum() for i, j in directions(scenario)],
         dtype=int,

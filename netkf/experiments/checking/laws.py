@@ -9,7 +9,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.experiments.checking.evidence import Finding, Row
-from netkf.experiments.checking.statistics import Interval, distance, excess, mean_ratio
+from netkf.experiments.checking.statistics import Interval, distance, excess, mean_ratio, off_by
 from netkf.scenario.scenario import Scenario
 
 LAW, NEES = 0.2, 0.25
@@ -91,9 +91,7 @@ def chi_squared(
     for k in kept.tolist():
         total = float(ratios[:, k].mean()) * freedom[k]
         ratio = mean_ratio(total, freedom[k], level / len(kept))
-        ends = sorted((abs(ratio.low - 1.0), abs(ratio.high - 1.0)))
-        least = 0.0 if ratio.low <= 1.0 <= ratio.high else ends[0]
-        found.append((Interval(abs(ratio.value - 1.0), least, ends[1]), f"at {places[k]}"))
+        found.append((off_by(1.0, ratio), f"at {places[k]}"))
     return worst(found, NEES, f"largest relative difference of the mean {words} from its freedom")
 
 

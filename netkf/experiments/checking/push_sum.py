@@ -15,7 +15,7 @@ from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
 from netkf.experiments.checking.exact import as_computed, exact, stand_in, within_reach
 from netkf.experiments.checking.laws import exact_start, worst
 from netkf.experiments.checking.seen import Seen, relative, replay
-from netkf.experiments.checking.statistics import Interval, mean_of
+from netkf.experiments.checking.statistics import Interval, mean_of, off_by
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
     exact_minimum_gamma,
@@ -134,9 +134,7 @@ def mean_square(seen: Observed, level: float) -> Finding:
     found = []
     for i, node in enumerate(nodes):
         ratio = mean_of((seen.whitened[:, i] ** 2).sum(axis=1) / n, level / len(nodes))
-        ends = sorted((abs(ratio.low - 1.0), abs(ratio.high - 1.0)))
-        least = 0.0 if ratio.low <= 1.0 <= ratio.high else ends[0]
-        found.append((Interval(abs(ratio.value - 1.0), least, ends[1]), f"at node {node}"))
+        found.append((off_by(1.0, ratio), f"at node {node}"))
     return worst(found, SQUARE, "largest relative difference of mean squares from the exact ones")
 
 

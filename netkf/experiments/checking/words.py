@@ -80,17 +80,12 @@ def handed_over(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
     index = scenario.topology.index
     came = np.tile(np.arange(len(index)), (slots, 1))
     swaps = run.log[run.log["kind"] == CODES["swap"]]
-    slot = slots_of(scenario, swaps["t"])
+    slot = scenario.slot_plant.slots_of(swaps["t"])
     kept = slot < slots
     nodes, peers = (np.array([index[k] for k in swaps[name].tolist()]) for name in ("node", "peer"))
     if kept.any():
         came[slot[kept], nodes[kept]] = peers[kept]
     return came
-
-
-def slots_of(scenario: Scenario, times: FloatArray) -> np.ndarray:
-    """The slot in which each time falls."""
-    return np.floor(times / scenario.slot_plant.period + 1e-9).astype(int)
 
 
 def lineage(came: np.ndarray, slot: int) -> Lineage:
@@ -155,7 +150,7 @@ def intermittent_book(scenario: Scenario, sets: list[tuple[int, ...]]) -> Book:
 def arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
     """The readings that were used along a run, from the deliveries in its trace."""
     got = run.log[run.log["kind"] == CODES["deliver"]]
-    slot = slots_of(scenario, got["t"] - np.nan_to_num(got["age"]))
+    slot = scenario.slot_plant.slots_of(got["t"] - np.nan_to_num(got["age"]))
     used: dict[tuple[int, int], list[int]] = {}
     for t, node, peer in zip(
         slot.tolist(), got["node"].tolist(), got["peer"].tolist(), strict=True
