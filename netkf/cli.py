@@ -163,15 +163,18 @@ def _notes(scenario: Scenario) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    many = (options.runs or 1) > 1
+    if many and options.workers != 1 and options.scheduler is None:
+        from netkf.experiments.ensembles.starting import start_early
+
+        start_early()
     scenario = _load(options)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
-    if (options.runs or 1) == 1:
-        return _run_once(scenario, options)
-    return _run_many(scenario, options)
+    return _run_many(scenario, options) if many else _run_once(scenario, options)
 
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
@@ -208,6 +211,8 @@ def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
 
     meter = _Countdown()
     picture = None if options.no_plot else partial(_picture, scenario, "ensemble_picture")
+    if picture is not None:  # loaded while workers work
+        threading.Thread(target=_plots, daemon=True).start()
     try:
         finished = runs_to_directory(
             scenario,
@@ -267,12 +272,19 @@ def _divergence(finished: Any) -> str:
 
 
 def _picture(scenario: Scenario, name: str, finished: Any) -> None:
-    try:
-        plots = importlib.import_module("netkf.experiments.plots")
-    except ImportError:
+    plots = _plots()
+    if plots is None:
         print("no picture: matplotlib is missing (pip install matplotlib)", file=sys.stderr)
         return
     getattr(plots, name)(scenario, finished)
+
+
+def _plots() -> Any:
+    """The module that draws, or None without matplotlib."""
+    try:
+        return importlib.import_module("netkf.experiments.plots")
+    except ImportError:
+        return None
 
 
 class _Meter:

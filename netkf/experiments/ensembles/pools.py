@@ -5,17 +5,16 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.experiments.ensembles.blocks import Job, block_result, work
+from netkf.experiments.ensembles.starting import context, main_hidden, one_blas_thread
 from netkf.scenario.scenario import Scenario
 
 AHEAD = 1024
@@ -23,15 +22,6 @@ AHEAD = 1024
 
 PATIENCE = 10
 """Seconds to wait for a scheduler."""
-
-ONE_THREAD = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "BLIS_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
-PRELOADED = ["netkf.experiments.ensembles.tallies"]
 
 
 class Pool(ABC):
@@ -126,11 +116,11 @@ class Processes(Pool):
         self._open()
 
     def _open(self) -> None:
-        self._executor = ProcessPoolExecutor(self.width, _context(), initializer=_prepare)
+        self._executor = ProcessPoolExecutor(self.width, context(), initializer=_prepare)
 
     def submit(self, job: Job) -> Future[Any]:
         """Workers are started as they are needed."""
-        with _one_blas_thread(), _main_hidden(b"__main__" not in job.payload):
+        with one_blas_thread(), main_hidden(b"__main__" not in job.payload):
             return self._executor.submit(work, job)
 
     def renew(self) -> bool:
@@ -186,15 +176,6 @@ def make_pool(
     return Here(scenario) if count == 1 else Processes(count)
 
 
-def _context() -> Any:
-    """Processes that begin without this one's threads and memory; quickly where they can."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
-    return context
-
-
 def _prepare() -> None:
     """In a worker: the parent deals with Ctrl-C, and a worker without a parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -207,34 +188,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """Numerical libraries read these when a process loads them."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def _main_hidden(hide: bool) -> Iterator[None]:
-    """Keep new processes from running the user's script once more."""
-    main = sys.modules["__main__"]
-    kept = {name: main.__dict__[name] for name in ("__file__", "__spec__") if name in main.__dict__}
-    if not hide:
-        kept = {}
-    for name in kept:
-        setattr(main, name, None)
-    try:
-        yield
-    finally:
-        for name, value in kept.items():
-            setattr(main, name, value)
