@@ -27,8 +27,8 @@ from netkf.core.fields import (
     several,
 )
 from netkf.core.small import added, product
-from netkf.plants.diffusion import BLOCK, DiffusionPath
 from netkf.plants.linear import Readings, SlotReadings
+from netkf.plants.paths import BLOCK, DiffusionPath
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from netkf.algorithms import flow
-from netkf.plants import diffusion, sensors
+from netkf.plants import paths, sensors
 from netkf.theory import error_covariance
 
 from .linearity import engine_covariance
@@ -14,7 +14,7 @@ STATED = 1e-3  # the docs promise this much at the default sensing period
 
 @pytest.fixture(autouse=True)
 def few_draws(monkeypatch):
-    monkeypatch.setattr(diffusion, "BLOCK", 1)
+    monkeypatch.setattr(paths, "BLOCK", 1)
     monkeypatch.setattr(sensors, "BLOCK", 1)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from netkf.plants import diffusion, sensors
+from netkf.plants import paths, sensors
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.sensors import LinearSensor
 from tests.engines.linearity import Unit
@@ -18,7 +18,7 @@ COV = np.array([[2.0, 0.5], [0.5, 1.0]])
 
 @pytest.fixture(autouse=True)
 def few_draws(monkeypatch):
-    monkeypatch.setattr(diffusion, "BLOCK", 1)
+    monkeypatch.setattr(paths, "BLOCK", 1)
     monkeypatch.setattr(sensors, "BLOCK", 1)
 
 

@@ -7,52 +7,38 @@ import numpy as np
 from netkf.core.streams import Streams
 from netkf.engines.compiled.replay import Stretch
 from netkf.engines.compiled.tables import Sensing
-from netkf.plants.diffusion import Step
+from netkf.plants.paths import BLOCK
 from netkf.plants.sensors import step_noise
 from netkf.scenario.scenario import Scenario
 
-STEPS = 64  # of the sensing grid at once
 CUTS = 64  # normals that a sensor has ready
 
 
 class Path:
-    """The path of one run as stretches of ``STEPS`` steps."""
+    """The path of one run as stretches of BLOCK steps."""
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
         self._path = scenario.truth.path(
             streams.generator("plant"), streams.generator("probe"), scenario.times
         )
-        self._senses = bool(scenario.sensing)
-        self._horizon, self._done = scenario.horizon, 0
-        self._series = np.array(self._path.series)
+        self._senses, self._horizon = bool(scenario.sensing), scenario.horizon
 
     def following(self) -> Stretch:
         """The next stretch; the last one reaches beyond the horizon."""
-        first = self._done
-        pieces: list[Step] = []
-        steps: list[int] = []
-        while self._done < first + STEPS:
-            parts = self._path.following()
-            pieces += parts
-            steps += [self._done - first] * len(parts)
-            self._done += 1
-            if pieces[-1].end >= self._horizon:
-                break
-        ends = [self._path.grid(k) for k in range(first + 1, self._done + 1)]
-        waking = [time for time in ends if time < self._horizon] if self._senses else []
-        order = np.array(steps, dtype=np.int64)
+        block = self._path.following()
+        waking = block.ends[block.ends < self._horizon] if self._senses else np.empty(0)
         return Stretch(
-            end=ends[-1],
-            start=np.array([piece.start for piece in pieces]),
-            stop=np.array([piece.end for piece in pieces]),
-            x_start=np.array([piece.x_start for piece in pieces]),
-            x_stop=np.array([piece.x_end for piece in pieces]),
-            moments=np.array([piece.moments for piece in pieces]),
-            cubic=np.array([piece.cubic for piece in pieces]),
-            step=order,
-            last=np.array(ends)[order],
-            grid=np.array(waking),
-            series=self._series,
+            end=float(block.ends[-1]),
+            start=block.start,
+            stop=block.end,
+            x_start=block.x_start,
+            x_stop=block.x_end,
+            moments=block.moments,
+            cubic=block.cubic,
+            step=block.step,
+            last=block.ends[block.step],
+            grid=waking,
+            series=self._path.series,
         )
 
 
@@ -82,7 +68,7 @@ class Noise:
             root=root,
             rest=np.zeros((count, 2, most)),
             step=np.full(count, -1, dtype=np.int64),
-            noise=np.zeros((count, STEPS, 2, most)),
+            noise=np.zeros((count, BLOCK, 2, most)),
             normals=np.zeros((count, CUTS, 2, most)),
             used=np.full(count, CUTS, dtype=np.int64),
             host=np.array(hosts, dtype=np.int64),
@@ -93,7 +79,7 @@ class Noise:
         """Draw the noise of the next stretch."""
         sensing = self.sensing
         for k, (random, p) in enumerate(zip(self._noise, self._rows, strict=True)):
-            sensing.noise[k, :, :, :p] = random.standard_normal((STEPS, 2, p))
+            sensing.noise[k, :, :, :p] = random.standard_normal((BLOCK, 2, p))
         sensing.noise[:] = step_noise(sensing.noise, self._period)
         sensing.step[:] = -1
 

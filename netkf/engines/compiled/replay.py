@@ -21,7 +21,7 @@ from netkf.core.small import fill, fill_square
 from netkf.engines.base import SHORTEST_SHARE
 from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Sensing
-from netkf.plants.diffusion import Step, seen
+from netkf.plants.paths import Step, seen
 from netkf.plants.sensors import cut, reading
 from netkf.trace.schema import CODES
 

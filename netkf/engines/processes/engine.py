@@ -16,7 +16,7 @@ from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
 from netkf.engines.processes.slots import SlotProcess
 from netkf.engines.processes.timeline import Timeline
-from netkf.plants.diffusion import DiffusionPath
+from netkf.plants.paths import DiffusionPath
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES

@@ -11,7 +11,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import SHORTEST_SHARE, Rank
 from netkf.engines.processes.timeline import Timeline
-from netkf.plants.diffusion import DiffusionPath
+from netkf.plants.paths import DiffusionPath
 from netkf.plants.sensors import LinearSensor, SensorPath
 from netkf.scenario.scenario import Placed, Scenario
 from netkf.trace.recorder import Recorder

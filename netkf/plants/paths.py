@@ -1,0 +1,329 @@
+"""The path of a diffusion in one run, drawn block by block of steps of the sensing grid.
+
+The path is drawn exactly on the sensing grid ``t_k = k h``: each step gives ``x(t_{k+1})`` and the
+two moments of x over the step (core/legendre), all from one stream and whatever the network does.
+Between grid points, filters that are woken by the network need part of a step. There the path is
+the response to the state at the grid point plus the cubic that agrees with the step's end and with
+its two moments; what that leaves out of a reading is of third order in h and less than 1e-4 h^3 of
+the noise intensity. Where a state is to be *shown* off the grid, the step is cut there beforehand:
+state and moments are drawn from their exact law given the step, from a second stream.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray, square_root
+from netkf.core.compiling import compilable
+from netkf.core.legendre import forward_coefficients
+from netkf.core.small import applied, polynomial, product
+
+BLOCK = 64  # steps drawn at once
+MOST_SPLITS = 256  # kept laws of a state shown inside a step
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
+_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+_THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
+_THREE_MOMENTS = np.stack([_THREE_WEIGHTS, _THREE_WEIGHTS * _THREE])
+
+
+class Laws:
+    """What all paths of ``dx = A x dt + B dw`` on the grid of one ``period`` share; the laws of
+    states shown inside a step are worked out as they are asked for.
+    """
+
+    def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
+        self.n, self.period = len(A), period
+        self._B = B
+        self.series = _response_series(A, period)
+        self.response = self.responses(period)
+        self.spread = _factor(self._noise(period))
+        self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
+
+    def responses(self, gap: float) -> FloatArray:
+        """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""
+        return np.asarray(polynomial(self.series, gap).reshape(3, self.n, self.n))
+
+    def _noise(self, gap: float) -> FloatArray:
+        """(3 n, 20 m): responses of the end and the moments to noise at the quadrature nodes."""
+        columns = [
+            self._impulse(gap, 0.0, gap, s) * np.sqrt(w * gap)
+            for s, w in zip(_NODES * gap, _WEIGHTS, strict=True)
+        ]
+        return np.concatenate(columns, axis=1)
+
+    def _impulse(self, gap: float, start: float, end: float, s: float) -> FloatArray:
+        """(3 n, m): what dw at time s adds to x(end) and to the moments over [start, end] of
+        length ``gap``.
+        """
+        if s >= end:
+            return np.zeros((3 * self.n, self._B.shape[1]))
+        since = max(s, start)
+        entry = self.responses(since - s)[0] @ self._B
+        rest = end - since
+        to_end, plain, tilted = self.responses(rest)
+        share = rest / gap  # P_1 of the whole interval is (1 - share) + share P_1 of the rest
+        return np.asarray(
+            np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted]) @ entry
+        )
+
+    def split(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
+        """Gain and root (3 n, 3 n) of the law of state and moments at ``left`` seconds given those
+        of a whole step of ``length``.
+        """
+        key = round(length, 12), round(left, 12)
+        law = self._splits.get(key)
+        if law is None:
+            if len(self._splits) >= MOST_SPLITS:
+                self._splits.clear()
+            law = self._splits[key] = self._conditional(length, left)
+        return law
+
+    def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
+        n = self.n
+        places = np.concatenate([_NODES * left, left + _NODES * (length - left)])
+        weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])
+        columns = [
+            np.concatenate([self._impulse(length, 0, length, s), self._impulse(left, 0, left, s)])
+            * np.sqrt(w)
+            for s, w in zip(places, weights, strict=True)
+        ]
+        factor = np.concatenate(columns, axis=1)
+        C = factor @ factor.T
+        known, asked, cross = C[: 3 * n, : 3 * n], C[3 * n :, 3 * n :], C[3 * n :, : 3 * n]
+        gain = cross @ np.linalg.pinv(known, rcond=1e-13, hermitian=True)
+        return gain, square_root(asked - gain @ cross.T)
+
+
+class Step(NamedTuple):
+    """One stretch of the path: times, states at its ends, (2, n) moments and the cubic's (4, n)
+    Legendre coefficients of what noise added.
+    """
+
+    start: float
+    end: float
+    x_start: FloatArray
+    x_end: FloatArray
+    moments: FloatArray
+    cubic: FloatArray
+
+
+class Block(NamedTuple):
+    """BLOCK steps as K pieces, since a step is cut where a state is shown: ``start, end`` (K,), x
+    at both (K, n), ``moments`` (K, 2, n), ``cubic`` (K, 4, n) and whose ``step`` (K,) each is;
+    ``ends`` (BLOCK,) of the steps.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    x_start: FloatArray
+    x_end: FloatArray
+    moments: FloatArray
+    cubic: FloatArray
+    step: np.ndarray
+    ends: FloatArray
+
+
+class DiffusionPath:
+    """The path of one run; ``shown`` are the times (increasing) at which its state is shown."""
+
+    def __init__(
+        self,
+        laws: Laws,
+        start: FloatArray,
+        random: np.random.Generator,
+        probing: np.random.Generator,
+        shown: FloatArray,
+    ) -> None:
+        self.laws, self.period = laws, laws.period
+        self._random, self._probing, self._shown = random, probing, shown
+        self._x, self._drawn = start, 0
+        self._block: Block | None = None
+        self._first = self._piece = 0  # of the present step, and the one last asked for
+        self._step, self._step_end = Step(0.0, 0.0, *[start] * 4), 0.0
+
+    def grid(self, k: int) -> float:
+        """Time of the k-th point of the sensing grid, rounded so that lattices of other periods
+        meet it.
+        """
+        return float(round(k * self.period, 12))
+
+    def following(self) -> Block:
+        """The next steps of the sensing grid."""
+        n, laws = self.laws.n, self.laws
+        normals = self._random.standard_normal((BLOCK, 3 * n))
+        noise = (normals @ laws.spread.T).reshape(BLOCK, 3, n)
+        x = np.empty((BLOCK + 1, n))
+        x[0] = self._x
+        for k in range(BLOCK):
+            x[k + 1] = laws.response[0] @ x[k] + noise[k, 0]
+        self._x = x[BLOCK]
+        moments = np.ascontiguousarray(
+            np.einsum("mij,kj->kmi", laws.response[1:], x[:-1]) + noise[:, 1:]
+        )
+        times = np.array([self.grid(self._drawn + k) for k in range(BLOCK + 1)])
+        self._drawn += BLOCK
+        cubic = _cubics(self.period, noise[:, 0], noise[:, 1:])
+        steps = np.arange(BLOCK)
+        whole = Block(times[:-1], times[1:], x[:-1], x[1:], moments, cubic, steps, times[1:])
+        first, last = np.searchsorted(self._shown, times[[0, -1]], side="right")
+        shown = self._shown[first:last]
+        inside = shown[~np.isin(shown, whole.ends)]
+        return self._cut(whole, inside) if len(inside) else whole
+
+    def _cut(self, block: Block, shown: FloatArray) -> Block:
+        """The block with pieces that end at the times ``shown``, which are inside its steps."""
+        steps = np.searchsorted(block.ends, shown)
+        normals = self._probing.standard_normal((len(shown), 3 * self.laws.n))
+        counts = 1 + np.bincount(steps, minlength=len(block.ends))
+        # A step that is cut twice is cut at the first time, and what is left of it at the second.
+        turn = np.arange(len(shown)) - np.searchsorted(steps, steps)
+        repeated = [np.repeat(part, counts, axis=0) for part in block[:-1]]
+        pieces = Block._make([*repeated, block.ends])
+        rows = (np.cumsum(counts) - counts)[steps] + turn
+        for k in range(int(turn.max()) + 1):
+            chosen = turn == k
+            lengths = np.round(pieces.end[rows[chosen]] - pieces.start[rows[chosen]], 12)
+            lefts = np.round(shown[chosen] - pieces.start[rows[chosen]], 12)
+            laws = np.unique(np.stack([lengths, lefts]), axis=1, return_inverse=True)[1].ravel()
+            for law in range(int(laws.max()) + 1):
+                same = np.flatnonzero(chosen)[laws == law]
+                self._split(pieces, rows[same], shown[same], normals[same])
+        return pieces
+
+    def _split(
+        self,
+        pieces: Block,
+        rows: np.ndarray,
+        times: FloatArray,
+        normals: FloatArray,
+    ) -> None:
+        """Draw the path at ``times`` given the pieces in ``rows``, all of one length and cut at
+        the same place, and divide each with all rows of its step that come after it.
+        """
+        n, laws = self.laws.n, self.laws
+        length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
+        left = float(times[0] - pieces.start[rows[0]])
+        gain, spread = laws.split(length, left)
+        x, end = pieces.x_start[rows], pieces.x_end[rows]
+        known = np.concatenate([end[:, None], pieces.moments[rows]], axis=1)
+        residual = known - np.einsum("mij,kj->kmi", laws.responses(length), x)
+        noise = (residual.reshape(-1, 3 * n) @ gain.T + normals @ spread.T).reshape(-1, 3, n)
+        values = np.einsum("mij,kj->kmi", laws.responses(left), x) + noise
+        middle, first = values[:, 0], values[:, 1:]
+        share = left / length
+        # Moments of the rest: the whole's P_1 is (share - 1) + share P_1 on the left part and
+        # share + (1 - share) P_1 on the right one.
+        plain = known[:, 1] - first[:, 0]
+        tilted = known[:, 2] - (share - 1.0) * first[:, 0] - share * first[:, 1] - share * plain
+        second = np.stack([plain, tilted / (1.0 - share)], axis=1)
+        later = np.concatenate([end[:, None], second], axis=1)
+        later -= np.einsum("mij,kj->kmi", laws.responses(length - left), middle)
+        cubics = _cubics(left, noise[:, 0], noise[:, 1:])
+        rest = _cubics(length - left, later[:, 0], later[:, 1:])
+        pieces.end[rows], pieces.x_end[rows] = times, middle
+        pieces.moments[rows], pieces.cubic[rows] = first, cubics
+        stops = np.searchsorted(pieces.step, pieces.step[rows], side="right")
+        for k, (row, stop) in enumerate(zip(rows.tolist(), stops.tolist(), strict=True)):
+            after = slice(row + 1, stop)
+            pieces.start[after], pieces.x_start[after] = times[k], middle[k]
+            pieces.moments[after], pieces.cubic[after] = second[k], rest[k]
+
+    @property
+    def series(self) -> FloatArray:
+        """(terms, 3 n n) power series of the responses in the gap."""
+        return self.laws.series
+
+    def _at(self, time: float) -> Step:
+        """The piece that ``time`` is in; it may lie before the last one asked for, in its step."""
+        while self._block is None or time > self._block.ends[-1]:
+            self._block, self._first, self._piece = self.following(), 0, -1
+        block, k = self._block, self._first
+        while block.end[k] < time:
+            k += 1
+        if k != self._piece:
+            self._piece = k
+            self._step = Step(*(part[k] for part in block[:6]))
+            self._step_end = float(block.ends[block.step[k]])
+            self._first = int(np.searchsorted(block.step, block.step[k]))
+        return self._step
+
+    def step_end(self) -> float:
+        """Where the sensing step that was last asked for ends."""
+        return self._step_end
+
+    def moments(self, start: float, end: float) -> FloatArray:
+        """(2, n) moments of x over ``[start, end]``, which lies inside one sensing step and not in
+        one before the last one asked for.
+        """
+        step = self._at(end)
+        return seen(self.laws.series, step, start, end)
+
+    def state(self, time: float) -> FloatArray:
+        """x(time) on the sensing grid or at a time shown, not before the last one asked for."""
+        step = self._at(time)
+        assert time in (step.start, step.end), f"{time} is neither on the grid nor shown"
+        return step.x_end if time == step.end else step.x_start
+
+
+def _response_series(A: FloatArray, longest: float) -> FloatArray:
+    """(terms, 3 n n): power series in the gap of ``exp(A g)`` and of its two moments."""
+    n, size = len(A), float(np.abs(A).sum(axis=0).max()) * longest
+    terms, last = 1, 1.0
+    while last > 1e-18 or terms < 8:
+        last *= size / terms
+        terms += 1
+    exponential = [np.eye(n)]
+    for k in range(1, terms):
+        exponential.append(exponential[-1] @ A / k)
+    powers = np.stack(exponential)
+    series = np.zeros((terms + 1, 3, n, n))
+    series[:-1, 0] = powers
+    series[1:, 1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), powers)
+    return series.reshape(terms + 1, -1)
+
+
+def _factor(noise: FloatArray) -> FloatArray:
+    """A square lower triangular S with ``S S' = noise noise'``, accurate where that is singular."""
+    R = np.linalg.qr(noise.T, mode="r")
+    size = len(noise)
+    square = np.zeros((size, size))
+    square[: len(R)] = R
+    signs = np.where(np.diag(square) < 0.0, -1.0, 1.0)
+    return np.asarray((signs[:, None] * square).T)
+
+
+def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
+    """(K, 4, n) Legendre coefficients of the cubics on [0, 1] that start at 0, end at ``end``
+    (K, n) and have these moments (K, 2, n).
+    """
+    mean, slope = moments[:, 0] / length, 3.0 * moments[:, 1] / length
+    return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=1)
+
+
+@compilable
+def _legendre(u: FloatArray) -> FloatArray:
+    values = np.empty((len(u), 4))
+    for k in range(len(u)):
+        z = 2.0 * u[k] - 1.0
+        values[k, 0], values[k, 1] = 1.0, z
+        values[k, 2], values[k, 3] = 1.5 * z * z - 0.5, (2.5 * z * z - 1.5) * z
+    return values
+
+
+@compilable
+def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray:
+    """(2, n) moments of x over ``[start, end]`` inside a step; ``series`` is of the responses."""
+    n = len(step.x_start)
+    if start == step.start and end == step.end:
+        return step.moments
+    length, gap = step.end - step.start, end - start
+    places = (start + 0.5 * gap * (1.0 + _THREE) - step.start) / length
+    noise = product(_legendre(places), step.cubic)
+    from_noise = 0.5 * gap * product(_THREE_MOMENTS, noise)
+    x = step.x_start
+    if start > step.start:
+        x = applied(polynomial(series, start - step.start)[: n * n].reshape(n, n), x)
+    response = polynomial(series, gap)[n * n :].reshape(2 * n, n)
+    return applied(response, x).reshape(2, n) + from_noise
