@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from netkf.algorithms.slot import SlotFilter
+from netkf.core import compiling
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.core.streams import Streams
@@ -21,22 +22,24 @@ from netkf.trace.schema import EVENT
 
 LOAD = "load it first: netkf.simulate(netkf.load(path))"
 ENGINES = ("auto", "processes", "compiled")
-WORTH = 2e6  # events from which compiling pays
+WORTH = 5e5  # events from which compiling pays, even the first time
 
 
-def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
-    """The engine of a name; ``auto`` is compiled for runs that are long enough to repay the time
-    that compiling takes, and processes else. Raises EngineError where it cannot run the scenario.
+def choose_engine(name: str | Engine, scenario: Scenario, runs: int = 1) -> Engine:
+    """The engine of a name; ``auto`` is compiled where ``runs`` runs together are long enough to
+    repay the time that compiling takes, and processes else. Raises EngineError where it cannot run
+    the scenario.
     """
     engine: Engine
     if isinstance(name, Engine):
         engine = name
     elif name == "auto":
         engine = CompiledEngine()
-        if expected_events(scenario) < WORTH or engine.refusal(scenario) is not None:
+        worth = runs * expected_events(scenario) >= WORTH
+        if not worth or engine.refusal(scenario) is not None:
             engine = ProcessesEngine()
     elif name == "processes":
-        engine = ProcessesEngine()
+        engine = ProcessesEngine(compiled=compiling.available())
     elif name == "compiled":
         engine = CompiledEngine()
     else:

@@ -3,13 +3,14 @@
 import numpy as np
 
 import netkf
+from netkf.engines.processes.engine import ProcessesEngine
 
 
-def assert_agree(scenario, replica=0):
-    """Run both engines; returns the compiled engine's run."""
-    fast = netkf.simulate(scenario, replica=replica, engine="compiled")
-    slow = netkf.simulate(scenario, replica=replica, engine="processes")
-    assert (fast.engine, slow.engine) == ("compiled", "processes")
+def assert_agree(scenario, replica=0, engine="compiled"):
+    """Run an engine and SimPy with nothing compiled; returns the run of the former."""
+    fast = netkf.simulate(scenario, replica=replica, engine=engine)
+    slow = netkf.simulate(scenario, replica=replica, engine=ProcessesEngine())
+    assert (fast.engine, slow.engine) == (engine, "processes")
     assert netkf.first_difference(fast, slow) is None
     assert fast.fingerprint == slow.fingerprint
     assert fast.status == slow.status

@@ -59,7 +59,7 @@ def test_order_in_which_processes_start_does_not_matter(ring, seed):
         return random.Random(seed).sample(processes, len(processes))
 
     scenario = busy(ring)
-    plain = netkf.simulate(scenario, engine="processes")
+    plain = netkf.simulate(scenario, engine=ProcessesEngine())
     same(plain, netkf.simulate(scenario, engine=ProcessesEngine(shuffled)))
 
 

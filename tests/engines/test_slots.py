@@ -198,7 +198,7 @@ def test_a_horizon_that_is_a_product_of_floats_has_no_slot_too_many(slots, tmp_p
         horizon=slots * 0.1,
         probe=0.1,
     )
-    for engine in ("processes", "auto"):
+    for engine in ("processes", "compiled"):
         run = netkf.simulate(scenario, engine=engine)
         assert run.count("sense") == slots
         assert len(run.times) == slots + 1

@@ -7,6 +7,7 @@ engine uses, and the replay does everything that happens an event at a time.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from netkf.engines.compiled.replay import (
     Samples,
     replay,
 )
-from netkf.engines.compiled.schedule import Schedule
+from netkf.engines.compiled.schedule import Schedule, Window
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.engines.compiled.tables import empty_mail, host_tables, larger, link_tables
 from netkf.plants.diffusion import Diffusion
@@ -93,16 +94,28 @@ class CompiledEngine(Engine):
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
-        run = SlotRun if scenario.slotted else _Run
+        run = SlotRun if scenario.slotted else FlowRun
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             return run(scenario, streams, recorder, progress).to_the_end()
 
 
-class _Run:
-    """One run: what the replay works on, and what it is given when it stops."""
+class Windows(Protocol):
+    """Where a run gets its ticks from."""
+
+    def following(self) -> Window:
+        """The next window; its end is infinite where nothing comes after it."""
+
+
+class FlowRun:
+    """One run in continuous time: what the replay works on, and what it is given when it stops."""
 
     def __init__(
-        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+        self,
+        scenario: Scenario,
+        streams: Streams,
+        recorder: Recorder,
+        progress: Progress,
+        schedule: Windows | None = None,
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         self._replay = compiling.announced(replay)
@@ -110,7 +123,8 @@ class _Run:
         self._hosts, self._models = host_tables(scenario)
         self._links, self._mail = link_tables(scenario), empty_mail(self._hosts, FIRST_MAIL)
         self._cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
-        self._schedule, self._path = Schedule(scenario, streams), Path(scenario, streams)
+        self._schedule = schedule or Schedule(scenario, streams)
+        self._path = Path(scenario, streams)
         self._noise = Noise(scenario, streams)
         self._window = self._schedule.following()
         self._stretch = self._path.following()

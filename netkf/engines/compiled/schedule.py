@@ -59,19 +59,20 @@ class LinkDraws:
     def until(self, end: float) -> None:
         """Draw until all ticks before ``end`` are known; ``last`` is the last one known."""
         while self.last < end:
-            t = self._clock.ticks(
-                self._link, self._origin, self.drawn, self.last, self._random, self._count
-            )
-            if not len(t):
-                self.last = math.inf
-                return
-            # The horizon is half open; later ticks, and there may be many, are not kept.
-            kept = int(np.searchsorted(t, self._horizon, side="left"))
-            delay = self._fate(kept)
-            self._ticks.append((t[:kept], delay))
-            self.drawn += len(t)
-            self.last = float(t[-1]) if kept == len(t) else math.inf
-            self._count = min(2 * self._count, self._longest)
+            self._ticks.append(self.block())
+
+    def block(self) -> tuple[FloatArray, FloatArray]:
+        """Draw some more: times and delays; ``last`` is infinite after the last ones."""
+        t = self._clock.ticks(
+            self._link, self._origin, self.drawn, self.last, self._random, self._count
+        )
+        # The horizon is half open; later ticks, and there may be many, are not kept.
+        kept = int(np.searchsorted(t, self._horizon, side="left"))
+        delay = self._fate(kept)
+        self.drawn += len(t)
+        self.last = float(t[-1]) if 0 < len(t) == kept else math.inf
+        self._count = min(2 * self._count, self._longest)
+        return t[:kept], delay
 
     def _fate(self, count: int) -> FloatArray:
         drawn = [fates.draws(count) for fates in self._fates]
@@ -94,18 +95,22 @@ class LinkDraws:
         return t[:cut], delay[:cut]
 
 
+def link_draws(scenario: Scenario, streams: Streams) -> list[LinkDraws]:
+    """What every link draws, in the order of links; nothing where the filter does not talk."""
+    links = scenario.topology.links if scenario.filter.algorithm.talks else ()
+    longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(len(links), 1)))
+    channel = scenario.network.channel
+    ways = [*links] if channel.symmetric else [*links, *((j, i) for i, j in links)]
+    seeded = streams.seeded(("clock", *needed(channel)), ways)
+    return [LinkDraws(scenario, seeded, link, longest) for link in links]
+
+
 class Schedule:
     """The windows of one run, one after the other."""
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        talks = scenario.filter.algorithm.talks
-        links = scenario.topology.links if talks else ()
-        wanted = min(max(TICKS_A_LINK * len(links), LEAST_TICKS), MOST_TICKS)
-        longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(len(links), 1)))
-        channel = scenario.network.channel
-        ways = [*links] if channel.symmetric else [*links, *((j, i) for i, j in links)]
-        streams = streams.seeded(("clock", *needed(channel)), ways)
-        self._links = [LinkDraws(scenario, streams, link, longest) for link in links]
+        self._links = link_draws(scenario, streams)
+        wanted = min(max(TICKS_A_LINK * len(self._links), LEAST_TICKS), MOST_TICKS)
         self._horizon, self._end = scenario.horizon, 0.0
         for link in self._links:
             link.until(math.ulp(0.0))

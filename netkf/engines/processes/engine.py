@@ -12,9 +12,11 @@ import simpy
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, Rank, broken
+from netkf.engines.compiled.engine import CompiledEngine, FlowRun
 from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
 from netkf.engines.processes.slots import SlotProcess
+from netkf.engines.processes.ticking import TickingLinks
 from netkf.engines.processes.timeline import Timeline
 from netkf.plants.paths import DiffusionPath
 from netkf.scenario.scenario import Scenario
@@ -32,10 +34,12 @@ class DivergedError(Exception):
 @dataclass
 class ProcessesEngine(Engine):
     """Runs every scenario. ``arrange`` may reorder the processes before they start; nothing that
-    happens depends on it.
+    happens depends on it. ``compiled``: built-in filters in continuous time are compiled, and what
+    the clocks of their links do reaches them in blocks.
     """
 
     arrange: Callable[[Processes], Processes] = list
+    compiled: bool = False
     name = "processes"
 
     def refusal(self, scenario: Scenario) -> str | None:
@@ -46,6 +50,10 @@ class ProcessesEngine(Engine):
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
+        if self.compiled and not scenario.slotted and CompiledEngine().refusal(scenario) is None:
+            links = TickingLinks(scenario, streams)
+            with np.errstate(over="ignore", invalid="ignore"):
+                return FlowRun(scenario, streams, recorder, progress, links).to_the_end()
         timeline = Timeline()
         make = _in_slots if scenario.slotted else _in_continuous_time
         processes = make(scenario, streams, timeline, recorder, progress)

@@ -8,6 +8,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
+from functools import partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +20,8 @@ from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
+from netkf.engines.base import Engine
+from netkf.engines.processes.engine import ProcessesEngine
 from netkf.experiments.checking import diffusion, gossip, hybrid, intermittent, push_sum
 from netkf.experiments.checking.evidence import (
     BROKEN,
@@ -36,7 +39,7 @@ from netkf.experiments.checking.seen import times
 from netkf.experiments.checking.words import look_at
 from netkf.experiments.ensembles.replicas import replicate
 from netkf.experiments.files import finite
-from netkf.experiments.simulate import LOAD, simulate
+from netkf.experiments.simulate import LOAD, choose_engine, simulate
 from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
@@ -104,12 +107,12 @@ class Told(NamedTuple):
     apart: float
 
 
-def witness(scenario: Scenario, seed: int, replica: int) -> Told:
+def witness(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Told:
     """One replica of a watched scenario."""
-    run, promised = simulate(scenario, seed, replica), stand_in(scenario)
+    run, promised = simulate(scenario, seed, replica, engine), stand_in(scenario)
     apart = math.nan
     if promised is not scenario and replica < TWINS:
-        twin = simulate(promised, seed, replica)
+        twin = simulate(promised, seed, replica, ProcessesEngine())
         both = min(len(run.times), len(twin.times))
         size = np.sqrt(np.trace(twin.P[:both], axis1=-2, axis2=-1))[..., None]
         gap = np.abs(run.xhat[:both] - twin.xhat[:both]) / np.maximum(size, 1e-300)
@@ -182,7 +185,7 @@ def check(
         raise ScenarioError("horizon", words, scenario.horizon, "lengthen it")
     chosen = watched(scenario)
     seen = replicate(
-        witness,
+        partial(witness, engine=choose_engine("auto", chosen, count)),
         chosen,
         count,
         root,

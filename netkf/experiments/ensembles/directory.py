@@ -92,9 +92,11 @@ def runs_to_directory(
     ScenarioError and EngineError before anything is written, InterruptedRunError (a
     KeyboardInterrupt) when interrupted, and EngineError where a plugged-in class fails.
     """
-    chosen, began = choose_engine(engine, scenario).name, time.perf_counter()
-    check_sources(scenario)
+    began = time.perf_counter()
     runs, trace = integer(low=1)("runs", runs), choice(*TRACES)("trace", trace)
+    engine_used = choose_engine(engine, scenario, runs)
+    chosen = engine_used.name
+    check_sources(scenario)
     pool = make_pool(scenario, runs, workers, executor, scheduler)
     size = block_size(runs, pool.width)
     size = min(size, LARGEST_TRACED) if trace == "full" else size
@@ -112,7 +114,7 @@ def runs_to_directory(
             write_scenario(directory, scenario)
         traces = {"full": runs, "first": 1, "none": 0}[trace]
         whole = replicate(
-            partial(reduced_run, engine=engine, traces=traces),
+            partial(reduced_run, engine=engine_used, traces=traces),
             scenario,
             runs,
             merge=merge,

@@ -11,6 +11,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import integer
 from netkf.experiments.ensembles.replicas import Progress, replicate
 from netkf.experiments.ensembles.tallies import MESSAGES, Tally, merge, reduced_run
 from netkf.experiments.simulate import choose_engine
@@ -93,10 +94,10 @@ def monte_carlo(
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)
-    chosen = choose_engine(engine, scenario).name
+    chosen = choose_engine(engine, scenario, integer(low=1)("runs", runs))
     seed = scenario.seed if seed is None else seed
     whole = replicate(
-        partial(reduced_run, engine=engine),
+        partial(reduced_run, engine=chosen),
         scenario,
         runs,
         seed,
@@ -106,7 +107,7 @@ def monte_carlo(
         scheduler=scheduler,
         progress=progress,
     )
-    return ensemble_of(scenario, whole, seed, chosen)
+    return ensemble_of(scenario, whole, seed, chosen.name)
 
 
 def ensemble_of(scenario: Scenario, tally: Tally, seed: int, engine: str) -> Ensemble:

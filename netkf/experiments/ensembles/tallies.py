@@ -8,7 +8,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.engines.base import silent
+from netkf.engines.base import Engine, silent
 from netkf.experiments.ensembles.moments import Moments, merge_moments, single
 from netkf.experiments.simulate import choose_engine, collect
 from netkf.scenario.scenario import Scenario
@@ -90,7 +90,7 @@ class _Samples(MemorySink):
 
 
 def reduced_run(
-    scenario: Scenario, seed: int, replica: int, engine: str = "auto", traces: int = 0
+    scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto", traces: int = 0
 ) -> Tally:
     """Simulate one replica and reduce it; the first ``traces`` replicas keep everything too."""
     traced = replica < traces

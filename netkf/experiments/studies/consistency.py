@@ -23,6 +23,7 @@ from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
 from netkf.core.streams import Streams
+from netkf.engines.base import Engine
 from netkf.experiments.ensembles.replicas import replicate
 from netkf.experiments.simulate import choose_engine, simulate
 from netkf.scenario.scenario import Scenario
@@ -50,7 +51,7 @@ class Seen(NamedTuple):
     expected_nis: FloatArray
 
 
-def one_run(scenario: Scenario, seed: int, replica: int, engine: str = "auto") -> Seen:
+def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Seen:
     """What one replica says, for ``replicate``."""
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.x, run.xhat, run.P)
@@ -199,8 +200,7 @@ def consistency(
         raise ScenarioError("plant", words, None, remedy)
     count = integer(low=FEWEST)("runs", runs)
     sure = number(above=0.0, below=1.0)("confidence", confidence)
-    choose_engine(engine, scenario)
-    task = partial(one_run, engine=engine)
+    task = partial(one_run, engine=choose_engine(engine, scenario, count))
     seen = replicate(
         task, scenario, count, seed, workers=workers, executor=executor, scheduler=scheduler
     )

@@ -13,6 +13,7 @@ from netkf.algorithms.baselines import Central
 from netkf.algorithms.slot import SlotCentral, SlotModel
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
+from netkf.engines.base import Engine
 from netkf.experiments.ensembles.tallies import reduced_run
 from netkf.experiments.simulate import simulate
 from netkf.scenario.scenario import Filtering, Scenario
@@ -32,7 +33,7 @@ class Figures(NamedTuple):
     diverged: FloatArray
 
 
-def one_run(scenario: Scenario, seed: int, replica: int, engine: str = "auto") -> Figures:
+def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Figures:
     """The figures of one replica, for ``replicate``."""
     tally = reduced_run(scenario, seed, replica, engine)
     averages = tally.averages.mean[:-1]
@@ -44,7 +45,9 @@ def together(runs: Sequence[Figures]) -> Figures:
     return Figures(*(np.stack(values) for values in zip(*runs, strict=True)))
 
 
-def one_expected_run(scenario: Scenario, seed: int, replica: int, engine: str = "auto") -> Figures:
+def one_expected_run(
+    scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
+) -> Figures:
     """As ``one_run``, with the expected square of the error given the events of the run: what luck
     with noise adds is left out, and far fewer runs are enough.
     """

@@ -64,7 +64,7 @@ def size(
         )
     base = scenario if seed is None else scenario.replace({"seed": seed})
     whole = _checked_range(base, key, low, high)
-    choose_engine(engine, base.replace({key: low}))
+    used = choose_engine(engine, base.replace({key: low}), runs)
     chosen = by or ("theory" if _theory_tells(base, key, (low, high), wanted) else "simulation")
     if chosen == "theory":
         search = Search(base, key, wanted, whole, "theory")
@@ -74,7 +74,7 @@ def size(
         search = Search(base, key, wanted, whole, "simulation", progress)
         level = (1.0 - sure) / (MOST_PROBES["simulation"] * _looks(runs))
         exact = wanted.of_errors and expected_errors_known(base.replace({key: low}))
-        task = partial(one_expected_run if exact else one_run, engine=engine)
+        task = partial(one_expected_run if exact else one_run, engine=used)
         decide = partial(search.simulation, task=task, runs=runs, level=level, handed=handed)
         words = f"{QUANTITIES[wanted.quantity]}, over the runs"
         if exact:

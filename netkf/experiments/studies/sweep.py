@@ -101,7 +101,8 @@ def _rows(
     with shared_pool(places[0].scenario, runs, *pool) as handed:
         for k, place in enumerate(places):
             try:
-                found = replicate(partial(one_run, engine=engine), place.scenario, runs, **handed)
+                task = partial(one_run, engine=choose_engine(engine, place.scenario, runs))
+                found = replicate(task, place.scenario, runs, **handed)
             except Exception as error:
                 reason = told(place.scenario, error)
                 if reason is error:
