@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.push_sum import PushSum
 from netkf.core import compiling
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
@@ -38,7 +38,14 @@ from netkf.engines.compiled.replay import (
 )
 from netkf.engines.compiled.schedule import Schedule
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
-from netkf.engines.compiled.tables import empty_mail, host_tables, larger, link_tables
+from netkf.engines.compiled.tables import (
+    Parts,
+    empty_mail,
+    host_tables,
+    larger,
+    link_tables,
+    room_for_parts,
+)
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
@@ -53,7 +60,7 @@ from netkf.trace.schema import CODES, EVENT
 KNOWN = (
     *(Diffusion, LinearPlant, RecordedPlant, UnknownPlant),
     *(LinearSensor, RegressorSensor, RecordedSensor),
-    *(Hybrid, Local, Central, *KERNELS),
+    *(Hybrid, CovarianceIntersection, Local, Central, *KERNELS),
 )
 DIVERGED = CODES["diverged"]
 FIRST_MAIL = 1024
@@ -62,9 +69,8 @@ MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
-    """Runs all built-in plants, sensors and filters but covariance intersection in continuous time
-    and push-sum that stops; clocks and channels may be anybody's, since schedules are made in
-    Python.
+    """Runs all built-in plants, sensors and filters; clocks and channels may be anybody's, since
+    schedules are made in Python.
     """
 
     name = "compiled"
@@ -75,18 +81,14 @@ class CompiledEngine(Engine):
         if not compiling.available():
             remedy = 'install it (pip install "netkf[fast]") or use engine="processes"'
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
-        algorithm = scenario.filter.algorithm
         parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
-        parts += [("filter", algorithm)]
+        parts += [("filter", scenario.filter.algorithm)]
         for family, part in parts:
             if type(part) not in KNOWN:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
-        if isinstance(algorithm, PushSum) and algorithm.stop != "never":
-            words = f'the filter "push-sum" with stop = "{algorithm.stop}"'
-            return f'engine "compiled" cannot run {words}; {remedy}'
         return None
 
     def run(
@@ -109,6 +111,9 @@ class _Run:
         assert self._replay is not None
         self._hosts, self._models = host_tables(scenario)
         self._links, self._mail = link_tables(scenario), empty_mail(self._hosts, FIRST_MAIL)
+        self._parts: Parts | None = None
+        if isinstance(scenario.filter.algorithm, CovarianceIntersection):
+            self._parts = room_for_parts(self._links, self._hosts)
         self._cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
         self._schedule, self._path = Schedule(scenario, streams), Path(scenario, streams)
         self._noise = Noise(scenario, streams)
@@ -156,6 +161,7 @@ class _Run:
                 self._samples,
                 float(self._scenario.horizon),
                 self._rows,
+                self._parts,
             )
         )
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.covariance_intersection import intersected_pairs
 from netkf.algorithms.flow import Payload, usable
 from netkf.algorithms.gains import GainTable, gain_update
 from netkf.algorithms.hybrid import reset
@@ -20,7 +21,7 @@ from netkf.core.compiling import compilable
 from netkf.core.small import fill, fill_square
 from netkf.engines.base import SHORTEST_SHARE
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Sensing
+from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Parts, Sensing
 from netkf.plants.diffusion import Step, seen
 from netkf.plants.sensors import cut, reading
 from netkf.trace.schema import CODES
@@ -278,6 +279,15 @@ def note(
     place[ROW] += 1
 
 
+@compilable
+def add_part(parts: Parts, count: int, weight: float, xhat: FloatArray, P: FloatArray) -> int:
+    """Put one more pair behind ``count`` others; returns how many there are now."""
+    parts.weight[count] = weight
+    fill(parts.xhat[count], xhat)
+    fill_square(parts.P[count], P)
+    return count + 1
+
+
 def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function, and it stops often
     hosts: Hosts,
     models: Models,
@@ -291,8 +301,12 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     samples: Samples,
     horizon: float,
     rows: np.ndarray,
+    parts: Parts | None,
 ) -> int:
-    """Go on until something is wanted; see the words above. Order is (time, rank, entity)."""
+    """Go on until something is wanted; see the words above. Order is (time, rank, entity).
+
+    Resets are convex where ``parts`` is None; what is for the other kind is compiled with it alone.
+    """
     # Names of their own, because every look into a group counts references.
     place, mailed = cursor.place, cursor.mailed
     model, nodes, xhats, Ps, reached = hosts.model, hosts.node, hosts.xhat, hosts.P, hosts.now
@@ -417,6 +431,9 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 message = free[message]
             own = 1.0 - own
             xhat, P = own * xhats[h], own * Ps[h]
+            count = 0
+            if parts is not None:
+                count = add_part(parts, count, max(own, 0.0), xhats[h], Ps[h])
             oldest, message = 0.0, inbox[h]
             while message != -1:
                 age = now - sent[message]
@@ -424,12 +441,20 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 if age > 0.0:
                     oldest = max(oldest, age)
                     payload = arrived(models, mail_x[message], mail_P[message], age)
-                    xhat, P = reset(xhat, P, weight, payload.xhat, payload.P)
+                    other, other_P = payload.xhat, payload.P
                 else:
-                    xhat, P = reset(xhat, P, weight, mail_x[message], mail_P[message])
+                    other, other_P = mail_x[message], mail_P[message]
+                if parts is None:
+                    xhat, P = reset(xhat, P, weight, other, other_P)
+                else:
+                    count = add_part(parts, count, weight, other, other_P)
                 gone, message = message, free[message]
                 free[gone] = place[FREE]
                 place[FREE] = gone
+            if parts is not None:
+                xhat, P = intersected_pairs(
+                    parts.weight[:count], parts.xhat[:count], parts.P[:count]
+                )
             fill(xhats[h], xhat)
             fill_square(Ps[h], P)
             inbox[h] = -1
