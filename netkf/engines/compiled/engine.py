@@ -34,12 +34,12 @@ from netkf.engines.compiled.replay import (
     WANT_TICKS,
     Cursor,
     Samples,
-    replay,
+    convex,
+    intersecting,
 )
 from netkf.engines.compiled.schedule import Schedule
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.engines.compiled.tables import (
-    Parts,
     empty_mail,
     host_tables,
     larger,
@@ -107,13 +107,12 @@ class _Run:
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
-        self._replay = compiling.announced(replay)
+        intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
+        self._replay = compiling.announced(intersecting if intersects else convex)
         assert self._replay is not None
         self._hosts, self._models = host_tables(scenario)
         self._links, self._mail = link_tables(scenario), empty_mail(self._hosts, FIRST_MAIL)
-        self._parts: Parts | None = None
-        if isinstance(scenario.filter.algorithm, CovarianceIntersection):
-            self._parts = room_for_parts(self._links, self._hosts)
+        self._parts = room_for_parts(self._links, self._hosts) if intersects else None
         self._cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
         self._schedule, self._path = Schedule(scenario, streams), Path(scenario, streams)
         self._noise = Noise(scenario, streams)

@@ -7,7 +7,7 @@ Every state of it is in arrays, so that it goes on where it stopped.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -288,6 +288,7 @@ def add_part(parts: Parts, count: int, weight: float, xhat: FloatArray, P: Float
     return count + 1
 
 
+@compilable
 def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function, and it stops often
     hosts: Hosts,
     models: Models,
@@ -473,3 +474,16 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
             place[SHOWN] += 1
             if place[SHOWN] == len(samples.rows):
                 return WANT_SAMPLES
+
+
+def convex(*given: Any) -> int:
+    """The replay of convex resets (``parts`` None): what the other needs is not compiled with it.
+
+    A name for each, so that the first run of each kind says that it compiles.
+    """
+    return replay(*given)
+
+
+def intersecting(*given: Any) -> int:
+    """The replay of covariance intersection."""
+    return replay(*given)
