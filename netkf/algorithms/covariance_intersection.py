@@ -10,10 +10,13 @@ import numpy as np
 
 from netkf.algorithms.flow import FlowState, Payload, predict
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.intersection import intersection
+from netkf.algorithms.intersection import intersected
 from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
+from netkf.core.small import fill_square, product
 
 SINGULAR = 1e-15  # least eigenvalue that counts, relative to the largest
+TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,21 +35,39 @@ class CovarianceIntersection(Hybrid):
     ) -> FlowState:
         """D (8) and (9) with values from before the reset."""
         own = 1.0 - sum(weight for weight, _, _ in messages)
-        parts = [(max(own, 0.0), state.xhat, _root(state.P))]
-        for weight, payload, age in messages:
-            arrived = predict(state.model, payload, age)
-            parts.append((weight, arrived.xhat, _root(arrived.P)))
-        xhat, root = intersection(parts)
-        return state._replace(xhat=xhat, P=root @ root.T)
+        parts = [Payload(state.xhat, state.P)]
+        parts += [predict(state.model, payload, age) for _, payload, age in messages]
+        xhat, P = intersected_pairs(
+            np.array([max(own, 0.0), *(weight for weight, _, _ in messages)]),
+            np.stack([part.xhat for part in parts]),
+            np.stack([part.P for part in parts]),
+        )
+        return state._replace(xhat=xhat, P=P)
 
 
-def _root(P: FloatArray) -> FloatArray:
+@compilable
+def intersected_pairs(
+    weights: FloatArray, means: FloatArray, P: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """D (8) and (9) of weights (k,), estimates (k, n) and their covariances (k, n, n): ``xhat``
+    (n,) and P (n, n).
+    """
+    roots = np.empty(P.shape)
+    for m in range(len(P)):
+        fill_square(roots[m], invertible_root(P[m]))
+    xhat, root = intersected(weights, means, roots)
+    return xhat, product(root, root.T)
+
+
+@compilable
+def invertible_root(P: FloatArray) -> FloatArray:
     """A root that can be inverted: soon after a start from 0 the noise has reached some
-    combinations of states only to rounding.
+    combinations of states only to rounding. Nan where P is not finite.
     """
     if not np.isfinite(P).all():
-        return np.full_like(P, np.nan)
-    scale = np.sqrt(np.maximum(np.diagonal(P), np.finfo(float).tiny))
+        return np.full(P.shape, np.nan)
+    n = len(P)
+    scale = np.sqrt(np.maximum(np.diag(P), TINY))
     values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
-    floor = SINGULAR * max(values[-1], np.finfo(float).tiny)
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, floor)))
+    floor = SINGULAR * max(values[n - 1], TINY)
+    return np.asarray(scale.reshape(n, 1) * vectors * np.sqrt(np.maximum(values, floor)))

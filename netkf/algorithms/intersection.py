@@ -14,7 +14,7 @@ import numpy as np
 from netkf.algorithms.square_root import lower_triangular
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
-from netkf.core.small import applied, solution
+from netkf.core.small import applied, fill, fill_square, solution
 
 
 def intersection(
@@ -36,13 +36,14 @@ def intersected(
 ) -> tuple[FloatArray, FloatArray]:
     """The same of arrays (k,), (k, n) and (k, n, n)."""
     k, n = means.shape
-    rows = np.zeros((max(k * n, n + 1), n + 1))
+    # Its rows side by side, and no assignment of arrays: that takes seconds more of compiling.
+    whole, unit = np.zeros((n + 1, max(k * n, n + 1))), np.eye(n)
     for m in range(k):
         if weights[m] > 0.0:
-            whitened = np.sqrt(weights[m]) * solution(roots[m], np.eye(n))
-            rows[m * n : (m + 1) * n, :n] = whitened
-            rows[m * n : (m + 1) * n, n] = applied(whitened, means[m] - means[0])
-    L = lower_triangular(rows.T)
+            whitened = np.sqrt(weights[m]) * solution(roots[m], unit)
+            fill_square(whole[:n, m * n : (m + 1) * n], whitened.T)
+            fill(whole[n, m * n : (m + 1) * n], applied(whitened, means[m] - means[0]))
+    L = lower_triangular(whole)
     # What overflowed gives nan, and the run says that it diverged.
-    combined = solution(L[:n, :n].T, np.eye(n))
+    combined = solution(L[:n, :n].T.copy(), unit)
     return means[0] + applied(combined, L[n, :n]), combined

@@ -16,6 +16,7 @@ import numpy as np
 
 from netkf.algorithms.slot import Messages, Reading, Role, SlotFilter, SlotModel
 from netkf.algorithms.square_root import lower_triangular, predict_root
+from netkf.algorithms.stopping import RULES, stops
 from netkf.core.arrays import FloatArray, square_root, symmetric
 from netkf.core.compiling import compilable
 from netkf.core.fields import boolean, choice, integer, number, positive, setting
@@ -73,7 +74,7 @@ class PushSum(SlotFilter):
     leader: int = setting(integer(low=0), default=0)
     asymptotic: bool = setting(boolean, default=False)
     links: str = setting(choice("fresh", "held"), default="fresh")
-    stop: str = setting(choice("never", "safe", "paper"), default="never")
+    stop: str = setting(choice(*RULES), default="never")
     tolerance: float = setting(number(low=0.0), default=1e-6)
 
     programme: ClassVar[tuple[str, ...]] = ("exchange", "sense", "exchange")
@@ -127,14 +128,9 @@ class PushSum(SlotFilter):
         if state.stopped:
             return state
         found = network(state.mass, state.model)
-        stopped = False
-        if self.stop == "paper":
-            n = len(state.xhat)
-            now, then = state.mass[2:].reshape(n, n), before[2:].reshape(n, n)
-            stopped = bool(now.any() and np.linalg.norm(now - then, 2) < self.tolerance)
-        elif self.stop == "safe":
-            settled = _settled(found, state.network, self.tolerance)
-            stopped = bool(whole and state.mass[0] > 0.0 and settled)
+        told = (*found[:2], *state.network[:2])
+        rule = RULES.index(self.stop)
+        stopped = stops(rule, self.tolerance, state.mass, before, whole, *told)
         return state._replace(network=found, stopped=stopped)
 
     def sense(self, state: PushSumState, reading: Reading) -> PushSumState:
@@ -207,13 +203,6 @@ def understood(mass: FloatArray, information: FloatArray) -> tuple[FloatArray, f
     if weight == 0.0:
         return information, 1.0
     return even(mass[2:].reshape(n, n) / weight), mass[1] / weight
-
-
-def _settled(new: Network, old: Network, tolerance: float) -> bool:
-    moved = float(np.linalg.norm(new.information - old.information))
-    return abs(new.number - old.number) < tolerance * new.number and moved <= tolerance * float(
-        np.linalg.norm(new.information)
-    )
 
 
 @compilable

@@ -18,6 +18,7 @@ from netkf.algorithms.push_sum import (
     share,
 )
 from netkf.algorithms.slot import Role, SlotModel
+from netkf.algorithms.stopping import settled, within
 
 EDGES = ((0, 1), (1, 2), (0, 2), (2, 3), (3, 4))
 T1 = (
@@ -185,6 +186,38 @@ def test_the_stop_rule_of_the_paper_breaks_and_the_safe_one_does_not(delivery, w
         found, states = numbers("safe", delivery, 300, seed)
         assert all(state.stopped for state in states)
         np.testing.assert_allclose(found, 10.0, rtol=1e-4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 7])
+def test_the_spectral_norm_is_held_against_the_tolerance(n):
+    random = np.random.default_rng(n)
+    for scale in (1e-150, 1e-9, 1.0, 1e9):
+        for _ in range(50):
+            D = scale * random.standard_normal((n, n))
+            D += D.T
+            norm = np.linalg.norm(D, 2)
+            assert within(D, norm * (1.0 + 1e-12))
+            assert not within(D, norm * (1.0 - 1e-12))
+    flat = np.outer(np.ones(n), np.ones(n))  # as far beyond its entries as can be
+    for sign in (1.0, -1.0):
+        assert within(sign * flat, n + 1e-12)
+        assert not within(sign * flat, n - 1e-12)
+    for tolerance in (0.0, 1e-300, 1.0):
+        assert within(np.zeros((n, n)), tolerance) == (tolerance > 0.0)
+        assert not within(np.full((n, n), np.nan), tolerance)
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_settled_means_less_than_the_tolerance_relative(n):
+    random = np.random.default_rng(n)
+    new, step = random.standard_normal((2, n, n))
+    step *= np.linalg.norm(new) / np.linalg.norm(step)
+    for tolerance in (1e-9, 1e-3):
+        near, far = (new - tolerance * share * step for share in (0.999, 1.001))
+        assert settled(new, 10.0, near, 10.0 * (1.0 - 0.999 * tolerance), tolerance)
+        assert not settled(new, 10.0, far, 10.0, tolerance)
+        assert not settled(new, 10.0, near, 10.0 * (1.0 + 1.001 * tolerance), tolerance)
+    assert not settled(new, 10.0, new, 10.0, 0.0)
 
 
 def test_the_safe_rule_waits_for_mass():

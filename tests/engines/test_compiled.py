@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import netkf
 from netkf.algorithms import square_root
+from netkf.algorithms.covariance_intersection import intersected_pairs
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core import compiling, small
 from netkf.core.errors import EngineError, ScenarioError
@@ -45,6 +46,30 @@ def test_clocks_of_processes_with_compiled_filters_agree(ring, monkeypatch):
         {"network.activation.rate": 1e-9},
     ):
         assert_agree(ring.replace({"horizon": 4.0, **changes}), engine="processes")
+
+
+@pytest.mark.parametrize(
+    "file",
+    [file for file in scenario_files() if '"hybrid"' in file.read_text()],
+    ids=lambda file: file.stem,
+)
+def test_every_scenario_in_continuous_time_agrees_with_covariance_intersection(file):
+    scenario = netkf.load(file).replace({"filter.kind": "covariance-intersection"})
+    horizon = min(scenario.horizon, SHORT.get(file.name, 20.0))
+    assert assert_agree(scenario.replace({"horizon": horizon})).count("absorb") > 50
+
+
+@pytest.mark.parametrize("stop", ["safe", "paper"])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-16, 0.0])
+@pytest.mark.parametrize("links", ["fresh", "held"])
+def test_push_sum_stops_in_the_same_slots(stop, tolerance, links):
+    """1e-16 is where rounding decides."""
+    planar = netkf.load(SCENARIOS / "push_sum_planar.toml")
+    rule = {"filter.stop": stop, "filter.tolerance": tolerance, "filter.links": links}
+    ways = {"network.channel.symmetric": links == "fresh"}
+    run = assert_agree(planar.replace({"horizon": 15.0, **rule, **ways}))
+    stops = tolerance >= 1e-6 or (stop == "paper" and tolerance > 0.0)
+    assert run.count("stop") == (10 if stops else 0)
 
 
 def entries(rows, columns, size=1.0):
@@ -93,6 +118,8 @@ FILTERS = st.sampled_from(
     [
         {"kind": "hybrid", "epsilon": 0.25},
         {"kind": "hybrid", "epsilon": 0.25, "model": {"R": [[3.0]]}},
+        {"kind": "covariance-intersection", "epsilon": 0.25},
+        {"kind": "covariance-intersection", "epsilon": 0.3, "model": {"R": [[3.0]]}},
         {"kind": "local"},
         {"kind": "central"},
     ]
@@ -130,7 +157,7 @@ def scenarios(draw):
     }
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(scenarios())
 def test_drawn_scenarios_agree(tables):
     if tables["filter"]["kind"] in {"local", "central"}:
@@ -164,24 +191,36 @@ SLOT_FILTERS = st.sampled_from(
     ]
 )
 
+STOPS = st.fixed_dictionaries(
+    {
+        "kind": st.just("push-sum"),
+        "gamma": st.integers(1, 2),
+        "delta": st.just(5.0),
+        "stop": st.sampled_from(["safe", "paper"]),
+        "tolerance": st.sampled_from([0.5, 0.1, 1e-3, 1e-16]),
+        "links": st.sampled_from(["fresh", "held"]),
+        "leader": st.integers(0, 1),
+        "asymptotic": st.sampled_from([False, False, False, True]),
+    }
+)
+
 
 @st.composite
-def slotted(draw):
+def slotted(draw, filters=SLOT_FILTERS):
     n = draw(st.integers(1, 3))
     F, H = np.array(draw(entries(n, n))), draw(entries(1, n))
     start = draw(st.sampled_from([0.5, 1.0, 100.0]))
     plant = {"kind": "linear", "F": (F + np.eye(n)).tolist(), "Q": np.eye(n).tolist()}
     regressor = {"kind": "regressor", "nodes": [1], "A": [[0.5]], "B": [[1.0]], "R": [[0.3]]}
     regressor |= {"C": np.ones((n, 1)).tolist(), "start": [1.0], "xi_cov": [[0.5]]}
+    algorithm = draw(filters)
+    others = [{"nodes": [0, 1], "H": np.ones((1, n)).tolist(), "R": [[1.0]]}]
+    if algorithm["kind"] != "push-sum":  # which wants H to be fixed
+        others.append(regressor)
     sensors = [
         {"nodes": [0], "H": H, "R": [[draw(st.floats(0.01, 1.0))]]},
-        draw(
-            st.sampled_from(
-                [regressor, {"nodes": [0, 1], "H": np.ones((1, n)).tolist(), "R": [[1.0]]}]
-            )
-        ),
+        draw(st.sampled_from(others)),
     ]
-    algorithm = draw(SLOT_FILTERS)
     matched = algorithm["kind"] == "gossip"
     activation = {"kind": "matching", **draw(MATCHINGS)} if matched else {"kind": "broadcast"}
     channel = {"loss": draw(LOSSES), "delay": draw(DELAYS), "symmetric": draw(st.booleans())}
@@ -211,6 +250,17 @@ def test_drawn_scenarios_in_slots_agree(tables):
     assert_agree(scenario)
 
 
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(slotted(STOPS))
+def test_drawn_push_sum_that_stops_agrees(tables):
+    try:
+        scenario = from_table(tables, SCENARIOS)
+    except ScenarioError:
+        reject()
+    run = assert_agree(scenario)
+    assert run.count("stop") == 0 or not tables["filter"]["asymptotic"]
+
+
 def test_recorded_slots_readings_and_late_messages_agree(tmp_path):
     (tmp_path / "pairs.csv").write_text("slot,node,peer\n1,0,1\n1,2,3\n2,1,2\n4,4,0\n4,2,1\n")
     ring = netkf.load(SCENARIOS / "gossip_ring.toml").replace({"horizon": 6.0, "probe": 1.0})
@@ -222,14 +272,10 @@ def test_recorded_slots_readings_and_late_messages_agree(tmp_path):
     assert run.count("swap") == 0 < run.count("late")
 
 
-def test_push_sum_that_stops_is_refused_by_name():
-    planar = netkf.load(SCENARIOS / "push_sum_planar.toml")
-    with pytest.raises(EngineError, match=r'push-sum.*stop = "safe".*processes'):
-        netkf.simulate(planar.replace({"filter.stop": "safe"}), engine="compiled")
-
-
-def test_many_lots_of_slots_are_one_run(monkeypatch):
+@pytest.mark.parametrize("stop", ["never", "safe", "paper"])
+def test_many_lots_of_slots_are_one_run(monkeypatch, stop):
     ring = netkf.load(SCENARIOS / "push_sum_planar.toml").replace({"horizon": 10.0})
+    ring = ring.replace({"filter.stop": stop, "filter.tolerance": 1e-3})
     whole = netkf.simulate(ring, engine="compiled")
     monkeypatch.setattr("netkf.engines.compiled.exchanges.MOST_ROWS", 100)
     pieces = netkf.simulate(ring, engine="compiled")
@@ -372,6 +418,21 @@ def test_square_roots_in_loops_are_those_of_stacks(n, p):
     )
     np.testing.assert_allclose(one @ one.T, other @ other.T, rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(K, G, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_covariance_intersection_compiled_is_that_of_python(n):
+    draw = np.random.default_rng(n).standard_normal
+    roots, means, weights = draw((3, n, n)), draw((3, n)), np.array([0.5, 0.5, 0.0])
+    P = roots @ roots.swapaxes(1, 2)
+    fast = compiling.compiled(intersected_pairs)
+    for one, other in zip(
+        fast(weights, means, P), intersected_pairs(weights, means, P), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-10)
+    P[1, 0, 0] = np.inf
+    for value in (*fast(weights, means, P), *intersected_pairs(weights, means, P)):
+        assert np.isnan(value).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

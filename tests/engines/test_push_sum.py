@@ -67,9 +67,12 @@ def written(case, folder):
     return folder / "case.toml"
 
 
+@pytest.mark.parametrize("engine", ["processes", "compiled"])
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c["name"])
-def test_reference_cases(case, tmp_path):
-    run = netkf.simulate(netkf.load(written(case, tmp_path)))
+def test_reference_cases(case, engine, tmp_path):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    run = netkf.simulate(netkf.load(written(case, tmp_path)), engine=engine)
     expected = np.array(case["out"]["xhat"])
     assert run.xhat.shape == expected.shape
     size = np.abs(expected).max(axis=-1, keepdims=True)

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.push_sum import PushSum
 from netkf.core import compiling
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
@@ -35,11 +35,18 @@ from netkf.engines.compiled.replay import (
     WANT_TICKS,
     Cursor,
     Samples,
+    intersecting,
     replay,
 )
 from netkf.engines.compiled.schedule import Schedule, Window
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
-from netkf.engines.compiled.tables import empty_mail, host_tables, larger, link_tables
+from netkf.engines.compiled.tables import (
+    empty_mail,
+    host_tables,
+    larger,
+    link_tables,
+    room_for_parts,
+)
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
@@ -54,7 +61,7 @@ from netkf.trace.schema import CODES, EVENT
 KNOWN = (
     *(Diffusion, LinearPlant, RecordedPlant, UnknownPlant),
     *(LinearSensor, RegressorSensor, RecordedSensor),
-    *(Hybrid, Local, Central, *KERNELS),
+    *(Hybrid, CovarianceIntersection, Local, Central, *KERNELS),
 )
 DIVERGED = CODES["diverged"]
 FIRST_MAIL = 1024
@@ -63,9 +70,8 @@ MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
-    """Runs all built-in plants, sensors and filters but covariance intersection in continuous time
-    and push-sum that stops; clocks and channels may be anybody's, since schedules are made in
-    Python.
+    """Runs all built-in plants, sensors and filters; clocks and channels may be anybody's, since
+    schedules are made in Python.
     """
 
     name = "compiled"
@@ -76,18 +82,14 @@ class CompiledEngine(Engine):
         if not compiling.available():
             remedy = 'install it (pip install "netkf[fast]") or use engine="processes"'
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
-        algorithm = scenario.filter.algorithm
         parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
-        parts += [("filter", algorithm)]
+        parts += [("filter", scenario.filter.algorithm)]
         for family, part in parts:
             if type(part) not in KNOWN:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
-        if isinstance(algorithm, PushSum) and algorithm.stop != "never":
-            words = f'the filter "push-sum" with stop = "{algorithm.stop}"'
-            return f'engine "compiled" cannot run {words}; {remedy}'
         return None
 
     def run(
@@ -118,10 +120,12 @@ class FlowRun:
         schedule: Windows | None = None,
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
-        self._replay = compiling.announced(replay)
+        intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
+        self._replay = compiling.announced(intersecting if intersects else replay)
         assert self._replay is not None
         self._hosts, self._models = host_tables(scenario)
         self._links, self._mail = link_tables(scenario), empty_mail(self._hosts, FIRST_MAIL)
+        self._parts = room_for_parts(self._links, self._hosts) if intersects else None
         self._cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
         self._schedule = schedule or Schedule(scenario, streams)
         self._path = Path(scenario, streams)
@@ -170,6 +174,7 @@ class FlowRun:
                 self._samples,
                 float(self._scenario.horizon),
                 self._rows,
+                self._parts,
             )
         )
 

@@ -9,13 +9,16 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from functools import partial
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.slot import SlotFilter
+from netkf.algorithms.push_sum import MASS, PushSum
+from netkf.algorithms.slot import Intermittent, SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
+from netkf.engines.compiled.masses import stopping
 from netkf.network.channels import Fates
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
@@ -23,9 +26,12 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
 from netkf.trace.schema import CODES
 
-SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND = (
+SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND, STOP = (
     CODES[kind]
-    for kind in ("sense", "tick", "send", "deliver", "lost", "late", "absorb", "swap", "round")
+    for kind in (
+        *("sense", "tick", "send", "deliver", "lost"),
+        *("late", "absorb", "swap", "round", "stop"),
+    )
 )
 SENSING, EXCHANGING, SAMPLING = range(3)
 FATES = 64  # drawn at once
@@ -71,7 +77,9 @@ class Way:
 
 
 class Exchanges:
-    """Makes the slots of one run, as SlotProcess of the processes does, without the estimates."""
+    """Makes the slots of one run, as SlotProcess of the processes does, without the estimates; only
+    the mass of push-sum is looked at, where nodes may stop.
+    """
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
         algorithm = scenario.filter.algorithm
@@ -82,6 +90,7 @@ class Exchanges:
         self._talking = sorted({node for link in scenario.topology.links for node in link})
         self._random = streams.generator("matching")
         self._silent = _silent(scenario)
+        self._stopping = stopping(scenario)
         self._ways: dict[Link, list[Way]] = {}
         self._fates: dict[Link, list[Iterator[tuple[float, bool, float]]]] = {}
         self._last: dict[Link, list[tuple[float, bool, float]]] = {}
@@ -234,6 +243,7 @@ class Exchanges:
 
     def _close(self, now: float, phase: int) -> None:
         first = len(self._messages)
+        rows: list[tuple[int, Row]] = []
         for node in sorted(self._inbox):
             taken = self._inbox[node]
             here = self._index[node]
@@ -241,20 +251,34 @@ class Exchanges:
                 number, weight, age = taken[peer]
                 self._messages.append((here, self._index[peer], weight))
                 if self._algorithm.pairwise:
-                    self._note((now, SWAP, node, peer, number, phase, age))
+                    rows.append((here, (now, SWAP, node, peer, number, phase, age)))
             if not self._algorithm.pairwise:
                 oldest = max(age for _, _, age in taken.values())
-                self._note((now, ABSORB, node, -1, -1, phase, oldest))
+                rows.append((here, (now, ABSORB, node, -1, -1, phase, oldest)))
+        if self._stopping is not None and phase == MASS:
+            rows += self._stops(now, first)
+            rows.sort(key=itemgetter(0))
+        for _, row in rows:
+            self._note(row)
         self._inbox.clear()
         self._open = -1
         self._done.append((EXCHANGING, phase, first, len(self._messages)))
 
+    def _stops(self, now: float, first: int) -> list[tuple[int, Row]]:
+        """The rows of the nodes that stop with the exchange of messages from ``first`` on."""
+        assert self._stopping is not None
+        places = self._stopping.exchange(self._messages[first:])
+        nodes = [self._scenario.nodes[here] for here in places]
+        if self._stopping.silences:
+            self._silent |= {(node, MASS) for node in nodes}
+        return [
+            (here, (now, STOP, node, -1, -1, MASS, NAN))
+            for here, node in zip(places, nodes, strict=True)
+        ]
+
 
 def _silent(scenario: Scenario) -> set[tuple[int, int]]:
-    """The (node, phase) in which a node has nothing to send, for all of the run."""
-    from netkf.algorithms.push_sum import MASS, PushSum
-    from netkf.algorithms.slot import Intermittent
-
+    """The (node, phase) in which a node has nothing to send from the beginning."""
     algorithm = scenario.filter.algorithm
     if isinstance(algorithm, PushSum) and algorithm.asymptotic:
         return {(node, MASS) for node in scenario.nodes}

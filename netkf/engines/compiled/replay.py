@@ -7,10 +7,12 @@ Every state of it is in arrays, so that it goes on where it stopped.
 from __future__ import annotations
 
 import math
+from types import FunctionType
 from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.covariance_intersection import intersected_pairs
 from netkf.algorithms.flow import Payload, usable
 from netkf.algorithms.gains import GainTable, gain_update
 from netkf.algorithms.hybrid import reset
@@ -20,7 +22,7 @@ from netkf.core.compiling import compilable
 from netkf.core.small import fill, fill_square
 from netkf.engines.base import SHORTEST_SHARE
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Sensing
+from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Parts, Sensing
 from netkf.plants.paths import Step, seen
 from netkf.plants.sensors import cut, reading
 from netkf.trace.schema import CODES
@@ -254,6 +256,20 @@ def put(
 
 
 @compilable
+def put_in_order(hosts: np.ndarray, count: int) -> None:
+    """Sort the first ``count`` places (Shell's sort: a few lines to compile)."""
+    gap = count // 2
+    while gap > 0:
+        for k in range(gap, count):
+            host, place = hosts[k], k
+            while place >= gap and hosts[place - gap] > host:
+                hosts[place] = hosts[place - gap]
+                place -= gap
+            hosts[place] = host
+        gap //= 2
+
+
+@compilable
 def arrived(models: Models, xhat: FloatArray, P: FloatArray, age: float) -> Payload:
     """What a message that took ``age`` seconds says now."""
     other_P, other = riccati_step(flow_table(models, len(models.unit) - 1), P, xhat, age)
@@ -278,6 +294,15 @@ def note(
     place[ROW] += 1
 
 
+@compilable
+def add_part(parts: Parts, count: int, weight: float, xhat: FloatArray, P: FloatArray) -> int:
+    """Put one more pair behind ``count`` others; returns how many there are now."""
+    parts.weight[count] = weight
+    fill(parts.xhat[count], xhat)
+    fill_square(parts.P[count], P)
+    return count + 1
+
+
 def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function, and it stops often
     hosts: Hosts,
     models: Models,
@@ -291,8 +316,12 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     samples: Samples,
     horizon: float,
     rows: np.ndarray,
+    parts: Parts | None,
 ) -> int:
-    """Go on until something is wanted; see the words above. Order is (time, rank, entity)."""
+    """Go on until something is wanted; see the words above. Order is (time, rank, entity).
+
+    Resets are convex where ``parts`` is None; what is for the other kind is compiled with it alone.
+    """
     # Names of their own, because every look into a group counts references.
     place, mailed = cursor.place, cursor.mailed
     model, nodes, xhats, Ps, reached = hosts.model, hosts.node, hosts.xhat, hosts.P, hosts.now
@@ -344,7 +373,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
             after = 0
         elif ready == now:
             if place[READY] == 0:
-                waiting[: place[WAITING]].sort()
+                put_in_order(waiting, place[WAITING])
             first = waiting[place[READY]]
             after = first + 1
         for k in range(first, after):
@@ -417,6 +446,9 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 message = free[message]
             own = 1.0 - own
             xhat, P = own * xhats[h], own * Ps[h]
+            count = 0
+            if parts is not None:
+                count = add_part(parts, count, max(own, 0.0), xhats[h], Ps[h])
             oldest, message = 0.0, inbox[h]
             while message != -1:
                 age = now - sent[message]
@@ -424,12 +456,20 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 if age > 0.0:
                     oldest = max(oldest, age)
                     payload = arrived(models, mail_x[message], mail_P[message], age)
-                    xhat, P = reset(xhat, P, weight, payload.xhat, payload.P)
+                    other, other_P = payload.xhat, payload.P
                 else:
-                    xhat, P = reset(xhat, P, weight, mail_x[message], mail_P[message])
+                    other, other_P = mail_x[message], mail_P[message]
+                if parts is None:
+                    xhat, P = reset(xhat, P, weight, other, other_P)
+                else:
+                    count = add_part(parts, count, weight, other, other_P)
                 gone, message = message, free[message]
                 free[gone] = place[FREE]
                 place[FREE] = gone
+            if parts is not None:
+                xhat, P = intersected_pairs(
+                    parts.weight[:count], parts.xhat[:count], parts.P[:count]
+                )
             fill(xhats[h], xhat)
             fill_square(Ps[h], P)
             inbox[h] = -1
@@ -448,3 +488,10 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
             place[SHOWN] += 1
             if place[SHOWN] == len(samples.rows):
                 return WANT_SAMPLES
+
+
+intersecting = FunctionType(replay.__code__, replay.__globals__, "intersecting")
+"""The same, compiled on its own for covariance intersection, so that the first run of each kind
+says that it compiles.
+"""
+intersecting.__qualname__ = "intersecting"

@@ -12,13 +12,14 @@ import numpy as np
 
 from netkf.algorithms.diffusion import shares
 from netkf.algorithms.intersection import intersected
-from netkf.algorithms.push_sum import MASS, corrected, corrected_root, kept, share, understood
+from netkf.algorithms.push_sum import MASS, corrected, corrected_root
 from netkf.algorithms.slot import adapted, filtered
 from netkf.algorithms.square_root import predict_root
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.small import applied
 from netkf.engines.compiled.exchanges import SAMPLING, SENSING
+from netkf.engines.compiled.masses import Masses, exchange_masses
 
 
 class Nodes(NamedTuple):
@@ -184,58 +185,52 @@ def diffusion(
             nodes.xhat[h], nodes.root[h] = intersected(weights, means, roots)
 
 
-def push_sum(  # noqa: PLR0912 - the compiler sees one function
+def push_sum(
     nodes: Nodes,
     readings: Readings,
     steps: Steps,
     shown: Shown,
-    mass: FloatArray,
-    degree: np.ndarray,
-    information: FloatArray,
+    masses: Masses,
+    rule: int,
+    tolerance: float,
     limit: FloatArray,
     asymptotic: bool,
-    size: float,
     delta: float,
 ) -> None:
-    """PushSum that never stops: mass (H, 2 + n n), nominal degree (H,), information (H, n, n) of a
-    node by itself; with ``asymptotic`` the root of the ``limit`` (n, n) and the ``size`` are known.
+    """PushSum; with ``asymptotic`` gains the root of the ``limit`` (n, n) is known, and ``masses``
+    hold the number of nodes.
     """
     for k in range(len(steps.kind)):
         s = steps.number[k]
         if steps.kind[k] == SAMPLING:
             show(nodes, shown, s)
-            shown.mass[s] = mass[:, :2]
+            shown.mass[s] = masses.mass[:, :2]
         elif steps.kind[k] == SENSING:
             for h in range(len(nodes.xhat)):
-                root, number = limit, size
+                root = limit
                 if not asymptotic:
-                    learned, number = understood(mass[h], information[h])
                     ahead = predict_root(nodes.root[h], nodes.F, nodes.root_Q)
-                    root = corrected_root(ahead, learned)
+                    root = corrected_root(ahead, masses.information[h])
                 p = nodes.rows[h]
                 nodes.xhat[h] = corrected(
                     applied(nodes.F, nodes.xhat[h]),
                     root,
-                    number,
+                    masses.number[h],
                     readings.y[s, h, :p],
                     readings.H[s, h, :p],
                     nodes.R[h, :p, :p].copy(),
                 )
                 nodes.root[h] = root
+        elif s == MASS:
+            if not asymptotic:
+                first, after = steps.first[k], steps.after[k]
+                exchange_masses(masses, rule, tolerance, steps.receiver, steps.sender, first, after)
         else:
-            values = mass.copy() if s == MASS else nodes.xhat.copy()
+            z = nodes.xhat.copy()
             m = steps.first[k]
-            for h in range(len(nodes.xhat)):
-                begin, total = m, np.zeros(values.shape[1])
+            for h in range(len(z)):
+                total = np.zeros(z.shape[1])
                 while m < steps.after[k] and steps.receiver[m] == h:
-                    sender = steps.sender[m]
-                    if s == MASS:
-                        total += share(values[sender], degree[sender])
-                    else:
-                        total += values[sender] - values[h]
+                    total += z[steps.sender[m]] - z[h]
                     m += 1
-                if s == MASS:
-                    if not asymptotic:
-                        mass[h] = kept(values[h], m - begin, degree[h]) + total
-                else:
-                    nodes.xhat[h] = values[h] + total / delta
+                nodes.xhat[h] = z[h] + total / delta

@@ -11,11 +11,13 @@ import numpy as np
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
+from netkf.algorithms.stopping import RULES
 from netkf.core import compiling
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress, broken
 from netkf.engines.compiled.exchanges import SENSING, Exchanges, Slots
+from netkf.engines.compiled.masses import first_masses
 from netkf.engines.compiled.slots import (
     Nodes,
     Readings,
@@ -159,14 +161,8 @@ def _extra(scenario: Scenario) -> tuple[tuple[Any, ...], FloatArray]:
         return (own, algorithm.on_loss == "keep-own"), np.empty((0, 2))
     if not isinstance(algorithm, PushSum):
         return (), np.empty((0, 2))
-    states = [
-        algorithm.place(algorithm.init(model, *scenario.start(role.node)), role)
-        for role, model in zip(roles, scenario.slot_models, strict=True)
-    ]
-    mass = np.stack([state.mass for state in states])
-    known = states[0].network
-    limit = np.zeros((n, n)) if known.root is None else np.ascontiguousarray(known.root)
-    degree = np.array([role.neighbours for role in roles], dtype=np.int64)
-    information = np.stack([model.information for model in scenario.slot_models])
-    more = (limit, algorithm.asymptotic, float(known.number), algorithm.delta)
-    return (mass, degree, information, *more), mass
+    masses, root = first_masses(scenario)
+    limit = np.zeros((n, n)) if root is None else np.ascontiguousarray(root)
+    rule = RULES.index(algorithm.stop)
+    more = (rule, algorithm.tolerance, limit, algorithm.asymptotic, algorithm.delta)
+    return (masses, *more), masses.mass

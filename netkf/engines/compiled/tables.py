@@ -101,6 +101,16 @@ class Mail(NamedTuple):
     waiting: np.ndarray
 
 
+class Parts(NamedTuple):
+    """Room for what one covariance intersection combines, the own pair and D others: weight
+    (D + 1,), xhat (D + 1, n), P (D + 1, n, n).
+    """
+
+    weight: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+
+
 def model_tables(models: list[FlowModel]) -> Models:
     """The tables of the models, and of prediction without readings last."""
     flows = [model.riccati for model in models] + [models[0].prediction]
@@ -164,6 +174,13 @@ def link_tables(scenario: Scenario) -> Links:
         messages=np.zeros(len(links), dtype=np.int64),
         ways=1 if topology.directed else 2,
     )
+
+
+def room_for_parts(links: Links, hosts: Hosts) -> Parts:
+    """Room for all neighbours of the node that has most."""
+    size, n = hosts.xhat.shape
+    most = 1 + int(np.bincount(links.ends.ravel(), minlength=size).max())
+    return Parts(np.zeros(most), np.zeros((most, n)), np.zeros((most, n, n)))
 
 
 def empty_mail(hosts: Hosts, capacity: int) -> Mail:
