@@ -79,11 +79,16 @@ class Topology:
     @cached_property
     def components(self) -> list[set[int]]:
         """The connected parts (weakly connected where the graph is directed), largest first."""
-        import networkx
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
 
-        graph: networkx.Graph[int] = networkx.Graph(self.links)
-        graph.add_nodes_from(self.nodes)
-        return sorted(networkx.connected_components(graph), key=len, reverse=True)
+        ends = np.array([(self.index[i], self.index[j]) for i, j in self.links]).reshape(-1, 2)
+        ones, size = np.ones(len(ends)), len(self.nodes)
+        _, labels = connected_components(coo_array((ones, tuple(ends.T)), shape=(size, size)))
+        order = np.argsort(labels, kind="stable")
+        parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+        found = [{self.nodes[k] for k in part.tolist()} for part in parts]
+        return sorted(found, key=len, reverse=True)
 
 
 def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) -> None:

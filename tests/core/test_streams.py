@@ -13,6 +13,8 @@ ENTITIES = [(0, 1), (1, 0), (7, 123456), (2**32 - 1, 5)]
 def test_seeded_streams_are_the_same_streams(seed, replica, entities):
     plain = Streams(seed, replica)
     seeded = plain.seeded(("loss", "clock"), entities)
+    for one, entity in zip(plain.generators("sky", entities), entities, strict=True):
+        assert one.bit_generator.state == plain.generator("sky", *entity).bit_generator.state
     for purpose in ("loss", "clock", "delay"):
         for entity in [*entities, (11, 12, 13)]:
             one, other = (s.generator(purpose, *entity) for s in (plain, seeded))

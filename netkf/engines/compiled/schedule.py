@@ -2,7 +2,8 @@
 
 Nothing here depends on an estimate. Every link draws its ticks and fates in blocks from its own
 streams, as one message after the other would; a window takes what lies in a stretch of time and
-merges the links.
+merges the links. What links have in common is done for all of them at once, since there may be
+hundreds of thousands of them with a few ticks each.
 """
 
 from __future__ import annotations
@@ -15,8 +16,17 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.network.channels import Fates, chances, needed
-from netkf.network.clocks import LinkClock
+from netkf.network.channels import (
+    Bernoulli,
+    ConstantDelay,
+    Fates,
+    NoDelay,
+    NoLoss,
+    PerLink,
+    chances,
+    needed,
+)
+from netkf.network.clocks import LinkClock, Poisson
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 
@@ -37,85 +47,191 @@ class Window(NamedTuple):
     delay: FloatArray
 
 
-class LinkDraws:
-    """Ticks of one link and the fates of what it sends, drawn as they are asked for."""
+class Ticks(NamedTuple):
+    """Some ticks of L links, those of each link together and in order of time: ``t, link`` (K,),
+    ``delay`` (K, 2) as in a window.
+    """
 
-    def __init__(self, scenario: Scenario, streams: Streams, link: Link, longest: int) -> None:
-        clock, channel = scenario.network.activation, scenario.network.channel
-        assert isinstance(clock, LinkClock)
-        self._clock, self._link, self._longest = clock, link, longest
-        self._horizon = scenario.horizon
-        self._random = streams.generator("clock", *link)
-        self._origin = clock.origin(link, partial(_stream, streams, link, "phase"))
-        self._channel = channel
-        back = link[1], link[0]
-        self._fates = [Fates(channel, partial(_stream, streams, link))]
-        if not channel.symmetric:
-            self._fates.append(Fates(channel, partial(_stream, streams, back)))
-        self._ways = [(way, scenario.measured(way)) for way in (link, back)]
-        self.drawn, self.last, self._count = 0, 0.0, FIRST_BLOCK
-        self._ticks = [(np.empty(0), np.empty((0, 2)))]
+    t: FloatArray
+    link: np.ndarray
+    delay: FloatArray
 
-    def until(self, end: float) -> None:
-        """Draw until all ticks before ``end`` are known; ``last`` is the last one known."""
-        while self.last < end:
-            self._ticks.append(self.block())
 
-    def block(self) -> tuple[FloatArray, FloatArray]:
-        """Draw some more: times and delays; ``last`` is infinite after the last ones."""
-        t = self._clock.ticks(
-            self._link, self._origin, self.drawn, self.last, self._random, self._count
-        )
-        # The horizon is half open; later ticks, and there may be many, are not kept.
-        kept = int(np.searchsorted(t, self._horizon, side="left"))
-        delay = self._fate(kept)
-        self.drawn += len(t)
-        self.last = float(t[-1]) if 0 < len(t) == kept else math.inf
-        self._count = min(2 * self._count, self._longest)
-        return t[:kept], delay
+class Clocks:
+    """The ticks of all links, block by block: ``last`` (L,) are the last ones known, infinite after
+    the horizon, and ``drawn`` (L,) how many were drawn.
+    """
 
-    def _fate(self, count: int) -> FloatArray:
-        drawn = [fates.draws(count) for fates in self._fates]
-        out = np.empty((count, 2))
-        for k, (way, measured) in enumerate(self._ways):
-            luck, bad, delay = drawn[k % len(drawn)]
-            chance = chances(self._channel.loss, way, self.drawn, bad, measured)
-            out[:, k] = np.where(luck >= chance, LOST, delay)
+    def __init__(self, scenario: Scenario, streams: Streams, links: tuple[Link, ...]) -> None:
+        clock = scenario.network.activation
+        assert isinstance(clock, LinkClock) or not links
+        self._clock, self._links, self._horizon = clock, links, scenario.horizon
+        self._random = streams.generators("clock", links)
+        self.last, self.drawn = np.zeros(len(links)), np.zeros(len(links), dtype=np.int64)
+        self._alike = type(clock) is Poisson
+        self._rates = self._origins = np.empty(0)
+        if isinstance(clock, LinkClock) and self._alike:
+            self._rates = np.array([clock.mean_rate(link) for link in links])
+        elif isinstance(clock, LinkClock):
+            phases = [partial(streams.generator, "phase", *link) for link in links]
+            self._origins = np.array(
+                [clock.origin(link, phase) for link, phase in zip(links, phases, strict=True)]
+            )
+
+    def more(self, links: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
+        """So many more ticks of each of these links: the times before the horizon, one link after
+        the other, and how many each has. The horizon is half open; later ticks, and there may be
+        many, are not kept.
+        """
+        if self._alike:
+            times, asked = self._exponential(links, counts), counts
+        else:
+            drawn = [self._ticks(k, count) for k, count in zip(links, counts, strict=True)]
+            asked = np.array([len(t) for t in drawn])
+            times = np.full((len(links), max(asked.max(), 1)), np.inf)
+            for row, t in zip(times, drawn, strict=True):
+                row[: len(t)] = t
+        kept = times < self._horizon
+        got = kept.sum(axis=1)
+        self.drawn[links] += asked
+        ended = (asked == 0) | (got < asked)
+        self.last[links] = np.where(ended, np.inf, times[np.arange(len(links)), asked - 1])
+        return times[kept], got
+
+    def _exponential(self, links: np.ndarray, counts: np.ndarray) -> FloatArray:
+        """As ``Poisson.ticks`` for all links at once; infinite where a link has fewer."""
+        times = np.full((len(links), counts.max() + 1), np.inf)
+        times[:, 0] = self.last[links]
+        for k, row, count in zip(links.tolist(), times, counts.tolist(), strict=True):
+            self._random[k].standard_exponential(out=row[1 : count + 1])
+        times[:, 1:] /= self._rates[links, None]
+        return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
+
+    def _ticks(self, k: int, count: int) -> FloatArray:
+        assert isinstance(self._clock, LinkClock)
+        origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
+        return self._clock.ticks(self._links[k], origin, index, now, self._random[k], int(count))
+
+
+class Fortunes:
+    """The fates of all messages, activation after activation of each link."""
+
+    def __init__(self, scenario: Scenario, streams: Streams, links: tuple[Link, ...]) -> None:
+        self._channel = channel = scenario.network.channel
+        back = tuple((j, i) for i, j in links)
+        self._ways = (links, back)
+        self._measured = np.array([[scenario.measured(way) for way in ways] for ways in self._ways])
+        drawn = self._ways[:1] if channel.symmetric else self._ways
+        loss = channel.loss
+        self._alike = type(loss) in (NoLoss, Bernoulli, PerLink)
+        # By exact type: a class derived from one of these may draw in its own way.
+        self._plain = self._alike and type(channel.delay) in (NoDelay, ConstantDelay)
+        if self._alike:
+            self._chances = np.array(
+                [
+                    [loss.chance(w, 0, False, m) for w, m in zip(ways, measured, strict=True)]
+                    for ways, measured in zip(self._ways, self._measured.tolist(), strict=True)
+                ]
+            )
+        if self._plain:
+            lucky = () if loss.certain else drawn
+            self._luck = [streams.generators("loss", ways) for ways in lucky]
+        else:
+            seeded = [streams.seeded(needed(channel), ways) for ways in drawn]
+            self._fates = [
+                [Fates(channel, partial(_stream, made, way)) for way in ways]
+                for made, ways in zip(seeded, drawn, strict=True)
+            ]
+
+    def of(self, links: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
+        """(K, 2) delays, LOST where lost, of the next ``counts`` messages of each link, which are
+        numbers ``first`` and so on.
+        """
+        which = np.repeat(links, counts)
+        drawn = self._plainly(links, counts) if self._plain else self._one_by_one(links, counts)
+        out = np.empty((len(which), 2))
+        for way in range(2):
+            luck, bad, delay = drawn[way % len(drawn)]
+            if self._alike:
+                chance = self._chances[way][which]
+            else:
+                chance = self._chance(way, links, counts, first, bad)
+            out[:, way] = np.where(luck >= chance, LOST, delay)
         return out
 
-    def take(self, end: float) -> tuple[FloatArray, FloatArray]:
-        """Times and delays of the ticks before ``end``; they are forgotten."""
-        self.until(end)
-        if len(self._ticks) > 1:
-            t, delay = (np.concatenate([block[k] for block in self._ticks]) for k in range(2))
-        else:
-            t, delay = self._ticks[0]
-        cut = int(np.searchsorted(t, end, side="left"))
-        self._ticks = [(t[cut:], delay[cut:])]
-        return t[:cut], delay[:cut]
+    def _plainly(self, links: np.ndarray, counts: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+        total, ends = int(counts.sum()), np.cumsum(counts)
+        delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
+        fine, never = np.zeros(total, dtype=bool), np.zeros(total)
+        places = list(zip(links.tolist(), (ends - counts).tolist(), ends.tolist(), strict=True))
+        drawn: list[tuple[np.ndarray, ...]] = []
+        for randoms in self._luck:
+            luck = np.empty(total)
+            for k, start, end in places:
+                randoms[k].random(out=luck[start:end])
+            drawn.append((luck, fine, delay))
+        return drawn or [(never, fine, delay)]
+
+    def _one_by_one(self, links: np.ndarray, counts: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+        drawn = []
+        for fates in self._fates:
+            parts = [fates[k].draws(n) for k, n in zip(links, counts.tolist(), strict=True)]
+            columns = zip(*parts, strict=True)
+            drawn.append(tuple(np.concatenate([np.empty(0), *column]) for column in columns))
+        return drawn
+
+    def _chance(
+        self, way: int, links: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
+    ) -> FloatArray:
+        loss, out, done = self._channel.loss, np.empty(len(bad)), 0
+        for k, count, number in zip(links, counts.tolist(), first.tolist(), strict=True):
+            part = slice(done, done + count)
+            measured = float(self._measured[way, k])
+            out[part] = chances(loss, self._ways[way][k], number, bad[part].astype(bool), measured)
+            done += count
+        return out
 
 
-def link_draws(scenario: Scenario, streams: Streams) -> list[LinkDraws]:
-    """What every link draws, in the order of links; nothing where the filter does not talk."""
-    links = scenario.topology.links if scenario.filter.algorithm.talks else ()
-    longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(len(links), 1)))
-    channel = scenario.network.channel
-    ways = [*links] if channel.symmetric else [*links, *((j, i) for i, j in links)]
-    seeded = streams.seeded(("clock", *needed(channel)), ways)
-    return [LinkDraws(scenario, seeded, link, longest) for link in links]
+class LinkDraws:
+    """Ticks and fates of all links, drawn as they are asked for; nothing where the filter does not
+    talk.
+    """
+
+    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+        links = scenario.topology.links if scenario.filter.algorithm.talks else ()
+        self.count = len(links)
+        self._clocks = Clocks(scenario, streams, links)
+        self._fortunes = Fortunes(scenario, streams, links)
+        self._longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(len(links), 1)))
+        self._block = np.full(len(links), FIRST_BLOCK)
+
+    @property
+    def last(self) -> FloatArray:
+        """(L,) the last tick known of each link; infinite where all are."""
+        return self._clocks.last
+
+    @property
+    def rate(self) -> float:
+        """Ticks a second of all links together, as far as they are known."""
+        return float((self._clocks.drawn / self.last).sum())
+
+    def more(self, links: np.ndarray) -> Ticks:
+        """A block of ticks of each of these links (places, in order)."""
+        first = self._clocks.drawn[links]
+        t, counts = self._clocks.more(links, self._block[links])
+        self._block[links] = np.minimum(2 * self._block[links], self._longest)
+        return Ticks(t, np.repeat(links, counts), self._fortunes.of(links, counts, first))
 
 
 class Schedule:
     """The windows of one run, one after the other."""
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        self._links = link_draws(scenario, streams)
-        wanted = min(max(TICKS_A_LINK * len(self._links), LEAST_TICKS), MOST_TICKS)
+        self._links = links = LinkDraws(scenario, streams)
+        wanted = min(max(TICKS_A_LINK * links.count, LEAST_TICKS), MOST_TICKS)
         self._horizon, self._end = scenario.horizon, 0.0
-        for link in self._links:
-            link.until(math.ulp(0.0))
-        rate = sum(link.drawn / link.last for link in self._links)
-        self._length = wanted / rate if rate > 0.0 else math.inf
+        self._known = links.more(np.arange(links.count)) if links.count else _NOTHING
+        self._length = wanted / links.rate if links.rate > 0.0 else math.inf
 
     def following(self) -> Window:
         """The next window; its end is infinite where nothing comes after it."""
@@ -123,14 +239,20 @@ class Schedule:
         if not self._end < end < self._horizon:
             end = math.inf
         self._end = end
-        taken = [link.take(end) for link in self._links]
-        counts = [len(t) for t, _ in taken]
-        times = np.concatenate([np.empty(0), *(t for t, _ in taken)])
-        # Links follow each other, and a stable sort keeps them so where times are equal.
-        order = np.argsort(times, kind="stable")
-        places = np.repeat(np.arange(len(taken)), counts)
-        delays = np.concatenate([np.empty((0, 2)), *(delay for _, delay in taken)])
-        return Window(end, times[order], places[order], delays[order])
+        parts = [self._known]
+        while len(late := np.flatnonzero(self._links.last < end)):
+            parts.append(self._links.more(late))
+        known = Ticks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        now = known.t < end
+        self._known = Ticks(*(column[~now] for column in known))
+        t, link, delay = (column[now] for column in known)
+        order = np.argsort(t, kind="stable")
+        if (np.diff(t[order]) == 0.0).any():
+            order = np.lexsort((link, t))
+        return Window(end, t[order], link[order], delay[order])
+
+
+_NOTHING = Ticks(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2)))
 
 
 def _stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:

@@ -15,7 +15,7 @@ import simpy
 
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
-from netkf.engines.compiled.schedule import LinkDraws, Window, link_draws
+from netkf.engines.compiled.schedule import LinkDraws, Window
 from netkf.engines.processes.timeline import Timeline
 from netkf.scenario.scenario import Scenario
 
@@ -30,13 +30,14 @@ class TickingLinks:
         self._t: list[float] = []
         self._link: list[int] = []
         self._delay: list[list[float]] = []
-        for k, draws in enumerate(link_draws(scenario, streams)):
-            self._timeline.process(self._ticking(k, draws))
+        self._draws = LinkDraws(scenario, streams)
+        for k in range(self._draws.count):
+            self._timeline.process(self._ticking(k))
 
-    def _ticking(self, link: int, draws: LinkDraws) -> Generator[simpy.Event, object, None]:
-        at, rank = self._timeline.at, Rank.TICK
-        while draws.last < math.inf:
-            times, delays = draws.block()
+    def _ticking(self, link: int) -> Generator[simpy.Event, object, None]:
+        at, rank, draws = self._timeline.at, Rank.TICK, self._draws
+        while draws.last[link] < math.inf:
+            times, _, delays = draws.more(np.array([link]))
             for now, delay in zip(times.tolist(), delays.tolist(), strict=True):
                 yield at(now, rank, link)
                 self._t.append(now)
