@@ -82,7 +82,7 @@ def announced(function: Callable[..., Any]) -> Callable[..., Any] | None:
     """``compiled``, with a word on the terminal where that will take a while."""
     made = compiled(function)
     if made is not None and sys.stderr.isatty() and not _kept(made):
-        words = "netkf: compiling, once after an installation (some 30 s) ..."
+        words = "netkf: compiling, once after an installation (some 20 s) ..."
         print(words, file=sys.stderr, flush=True)
     return made
 
