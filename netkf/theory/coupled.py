@@ -134,36 +134,6 @@ def coupled(scenario: Scenario) -> Coupled:
     return Coupled(A, Q, informations(scenario), coupling(scenario), T, q, delay, start)
 
 
-def slope(equations: Coupled, P: FloatArray, sent: FloatArray) -> FloatArray:
-    """The right-hand side at ``P`` (N, n, n), where ``sent`` are the covariances that arrive."""
-    A, c = equations.A, equations.coupling
-    drift = A @ P
-    arriving = equations.T @ sent @ equations.T.T + equations.q
-    mixed = (c @ arriving.reshape(len(P), -1)).reshape(P.shape)
-    leaving = np.asarray(c.sum(axis=1)).reshape(-1, 1, 1)
-    change = drift + np.swapaxes(drift, 1, 2) + equations.Q - P @ equations.G @ P
-    return np.asarray(change + mixed - leaving * P)
-
-
-def linear_operator(
-    equations: Coupled, gains: FloatArray, arriving: bool = True
-) -> scipy.sparse.csr_array:
-    """(N n n, N n n): ``X_i -> (A - K_i) X_i + X_i (A - K_i)' + sum_j c_ij (T X_j T' - X_i)`` on
-    row-major vec(X), where ``K_i = gains[i]`` stands for L_i H_i; without the T X_j T' where they
-    are not ``arriving`` from the present.
-    """
-    n, eye = len(equations.A), np.eye(len(equations.A))
-    leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)
-    blocks = [
-        np.kron(equations.A - K, eye) + np.kron(eye, equations.A - K) - out * np.eye(n * n)
-        for K, out in zip(gains, leaving, strict=True)
-    ]
-    if not arriving:
-        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
-    between = scipy.sparse.kron(equations.coupling, np.kron(equations.T, equations.T))
-    return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks) + between)
-
-
 def balanced(scenario: Scenario) -> bool | None:
     """Whether both directions of each link arrive at one rate, so that the limit is S of H(13);
     None where the rates are not known beforehand.
