@@ -110,11 +110,13 @@ def informations(scenario: Scenario) -> FloatArray:
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times weight."""
     index, size = scenario.topology.index, len(scenario.nodes)
-    matrix = scipy.sparse.lil_array((size, size), dtype=np.float64)
-    for (sender, receiver), rate in scenario.effective_rates().items():
-        if rate > 0.0:
-            matrix[index[receiver], index[sender]] = rate * scenario.weight(receiver, sender)
-    return scipy.sparse.csr_array(matrix)
+    heard = {pair: rate for pair, rate in scenario.effective_rates().items() if rate > 0.0}
+    values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
+    places = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
+    entries = scipy.sparse.coo_array((values, (places[:, 0], places[:, 1])), shape=(size, size))
+    matrix = scipy.sparse.csr_array(entries)
+    matrix.eliminate_zeros()
+    return matrix
 
 
 def coupled(scenario: Scenario) -> Coupled:

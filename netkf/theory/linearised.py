@@ -47,10 +47,10 @@ def _iterated(packed: Packed, blocks: FloatArray, right: FloatArray) -> FloatArr
 
     def applied(x: FloatArray) -> FloatArray:
         X = x.reshape(right.shape)
-        return (np.einsum("ik,ikl->il", X, blocks) + packed.arriving(X)).reshape(-1)
+        return np.asarray(np.einsum("ik,ikl->il", X, blocks) + packed.arriving(X)).reshape(-1)
 
     def alone(x: FloatArray) -> FloatArray:
-        return np.einsum("ik,ikl->il", x.reshape(right.shape), inverse).reshape(-1)
+        return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)
 
     shape = (right.size, right.size)
     operator = scipy.sparse.linalg.LinearOperator(shape, matvec=applied, dtype=np.float64)

@@ -40,6 +40,7 @@ class Packed:
         self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
         self._C = _factors(equations.G[self._sensed])
+        self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
 
     def pack(self, P: FloatArray) -> FloatArray:
         """(..., n, n) to (..., m)."""
@@ -69,21 +70,26 @@ class Packed:
         """
         series = np.empty((order + 1, *Y.shape))
         series[0] = Y
-        seen, n, r = self._C.shape
-        # One product of P C gives the whole sum over i + j = k: forwards times backwards.
-        forwards, backwards = np.empty((2, seen, n, order * r))
+        # P G P is the sum of M_i M_j' over i + j = k with M = P C. Nodes come last, so that numpy
+        # runs along them; the half with i <= j and its transpose are enough.
+        n, r, seen = self._across.shape
+        every = np.empty((order, n, r, seen))
         for k in range(order):
             change = self._exchange @ series[k]
             change += series[k] @ self._own
             if k == 0:
                 change += self._Q
             if seen:
-                M = self.unpack(series[k, self._sensed]) @ self._C
-                forwards[:, :, k * r : (k + 1) * r] = M
-                first = (order - 1 - k) * r
-                backwards[:, :, first : first + r] = M
-                every = np.swapaxes(backwards[:, :, first:], 1, 2)
-                change[self._sensed] -= self.pack(forwards[:, :, : (k + 1) * r] @ every)
+                rows = np.ascontiguousarray(series[k, self._sensed].T)
+                P = rows[self._places].reshape(n, n, seen)
+                np.einsum("ijs,jrs->irs", P, self._across, out=every[k])
+                before = (k + 1) // 2
+                half = np.einsum("kirs,kjrs->ijs", every[:before], every[k : k - before : -1])
+                square = half[self._i, self._j] + half[self._j, self._i]
+                if k % 2 == 0:
+                    middle = every[k // 2]
+                    square += np.einsum("irs,jrs->ijs", middle, middle)[self._i, self._j]
+                change[self._sensed] -= square.T
             np.multiply(change, span / (k + 1), out=series[k + 1])
         return series
 
