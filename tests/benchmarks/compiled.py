@@ -210,10 +210,10 @@ def bound(case, constants, runs):
     once = statistics.median(timed(lambda: system.slope(0.0, y))[0] for _ in range(100))
     cost = seconds / once / constants
     print(
-        f"  {len(case.nodes)} nodes, {constants} time constants of {lasts:.2f} s (slowest mode at the"
-        f" steady state): a time constant takes the time of {cost:.0f} evaluations of the right-hand"
-        f" side, a second that of {cost / lasts:.0f}; solve_ivp makes {evaluations / constants:.0f}"
-        " in a time constant"
+        f"  {len(case.nodes)} nodes, {constants} time constants of {lasts:.2f} s (of the slowest"
+        f" mode at the steady state);\n  netkf takes the time of {cost:.0f} evaluations of the"
+        f" right-hand side in a time constant, {cost / lasts:.0f} in a second;"
+        f"\n  solve_ivp makes {evaluations / constants:.0f} in a time constant"
     )
 
 
