@@ -162,7 +162,8 @@ class _Pieces:
         with np.errstate(over="ignore", invalid="ignore"):
             solved = None
             if self._packed.equations.delay > 0.0:  # without delay only what is stiff comes here
-                with contextlib.suppress(StiffError):
+                # An explicit stage that overflows is no word about the solution.
+                with contextlib.suppress(StiffError, TheoryError):
                     solved = self._solve(begin, end, _limited(f), method="DOP853")
             if solved is None:
                 # A blind node's large covariance reaches precise sensors: P G is a large rate.

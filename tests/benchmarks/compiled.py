@@ -144,7 +144,7 @@ def compared(name, runs, mine, theirs, most=math.inf):
     """One line: two calls in turn, each gives its number of events (equal unless ``theirs`` makes
     only the first ``most``). Returns the median seconds of an event of mine.
     """
-    mine(), theirs()
+    mine()  # loads what is compiled
     pairs = [(timed(mine), timed(theirs)) for _ in range(runs)]
     (made,), (others,) = ({pair[k][1] for pair in pairs} for k in (0, 1))
     assert others == min(made, most) > 0, "the same events"
@@ -261,11 +261,10 @@ def main():
     short = big.replace({"horizon": max(4.0 * share, 1.0), "probe": 1.0})
     engines("SimPy, 1000 nodes, 4000 links", short, runs)
     long = big.replace({"horizon": 40.0 * share, "probe": 40.0 * share})
+    hand = hand_written(long)
+    hand()
     compared(
-        "a loop by hand, 1000 nodes",
-        runs,
-        lambda: engine_run(CompiledEngine(), long)[2],
-        hand_written(long),
+        "a loop by hand, 1000 nodes", runs, lambda: engine_run(CompiledEngine(), long)[2], hand
     )
     most = 400 if options.quick else 2000
     by_others("n = 2, 2 sensors", long, runs, most)
