@@ -5,7 +5,7 @@ import pytest
 
 import netkf
 from netkf.algorithms.chains import advance, alphabet
-from tests.benchmarks import peers
+from tests.benchmarks import compiled, peers
 
 
 @pytest.fixture(scope="module")
@@ -60,3 +60,10 @@ def test_plain_chains_end_where_compiled_ones_do():
     )
     plain = peers.plain_chains(roots, words, F, Q, H, R)
     np.testing.assert_allclose(ends @ np.swapaxes(ends, 1, 2), plain, rtol=1e-8)
+
+
+def test_a_row_refuses_runs_that_did_not_do_the_same():
+    with pytest.raises(AssertionError, match="the same events"):
+        compiled.compared("swaps", 1, lambda: 3, lambda: 2)
+    with pytest.raises(AssertionError, match="the same events"):
+        compiled.compared("the first two swaps", 1, lambda: 3, lambda: 1, most=2)
