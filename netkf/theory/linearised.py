@@ -18,7 +18,7 @@ from netkf.theory.packed import Packed
 FEW_UNKNOWNS = 2000
 ROUNDS, GAIN = 4, 1e-7  # each round solves for what the one before has left
 PRECISE = 1e-14
-RESTART, RESTARTS = 60, 10
+RESTART, RESTARTS = 60, 3
 
 
 def solved(packed: Packed, P: FloatArray, right: FloatArray) -> FloatArray:
