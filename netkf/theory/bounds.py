@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import scipy.integrate
 
 from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
-from netkf.core.arrays import FloatArray, symmetric
+from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
-from netkf.theory.coupled import Coupled, coupled, linear_operator, slope
+from netkf.theory.coupled import Coupled, coupled
+from netkf.theory.packed import Packed
+from netkf.theory.taylor import StiffError, followed
 
 TOLERANCE = 1e-10
 DEFECT = 1e-7
@@ -28,8 +31,8 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     rates of the channel; for filters that do not talk it is their own covariance.
 
     By H Theorem 2 it bounds E[P_i(t)]. Integrated with relative tolerance 1e-10 and returned only
-    when the defect of the integral equation is below 1e-7. Raises TheoryError where the theorem
-    does not apply, and says why.
+    when the defect is below that (below 1e-7 with a delay, or where precise sensors hear of large
+    covariances). Raises TheoryError where the theorem does not apply, and says why.
     """
     moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if moments.ndim != 1 or not moments.size or not np.isfinite(moments).all():
@@ -40,12 +43,26 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     if equations.coupling.nnz == 0:
         P = _uncoupled(equations, moments)
     else:
-        pieces = _Pieces(equations)
-        pieces.extend(float(moments[-1]))
-        P = symmetric(np.stack([pieces(float(t)) for t in moments]))
+        packed = Packed(equations)
+        P = packed.unpack(_solution(packed, moments))
     if not np.abs(P).max() < OVERFLOW:
         raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {moments[-1]:g} s")
     return P
+
+
+def _solution(packed: Packed, times: FloatArray) -> FloatArray:
+    if packed.equations.delay == 0.0:
+        with contextlib.suppress(StiffError), np.errstate(over="ignore", invalid="ignore"):
+            return followed(packed, times, _scale(packed), EXPLICIT_EVALUATIONS, OVERFLOW)
+    pieces = _Pieces(packed)
+    pieces.extend(float(times[-1]))
+    return np.stack([pieces(float(t)) for t in times])
+
+
+def _scale(packed: Packed) -> float:
+    """The size of covariances and of what drives them."""
+    sizes = (np.abs(packed.start).max(), np.abs(packed.equations.Q).max())
+    return max(*(float(size) for size in sizes), 1e-300)
 
 
 def _uncoupled(equations: Coupled, times: FloatArray) -> FloatArray:
@@ -67,13 +84,15 @@ def _uncoupled(equations: Coupled, times: FloatArray) -> FloatArray:
 class _Pieces:
     """The solution up to some time, one dense output for each stretch of one delay."""
 
-    def __init__(self, equations: Coupled) -> None:
-        self._equations = equations
+    def __init__(self, packed: Packed) -> None:
+        self._packed = packed
+        equations = packed.equations
+        self._silent = Packed(equations._replace(coupling=0.0 * equations.coupling))
         self._ends: list[float] = [0.0]
         self._outputs: list[Callable[[float], FloatArray]] = []
 
     def __call__(self, t: float) -> FloatArray:
-        start = self._equations.start
+        start = self._packed.start
         if t <= 0.0:
             return start
         # t may lie a rounding error beyond what is known so far.
@@ -88,8 +107,8 @@ class _Pieces:
         shorter than the times between messages, half such a time; what arrives from within it is
         then found by iteration (Picard), which gains a factor 2 k in the k-th round.
         """
-        delay = self._equations.delay
-        inflow = float(self._equations.coupling.sum(axis=1).max())
+        delay = self._packed.equations.delay
+        inflow = float(self._packed.leaving.max())
         while self._ends[-1] < last:
             begin = self._ends[-1]
             if delay == 0.0:
@@ -123,18 +142,17 @@ class _Pieces:
         raise TheoryError(f"what arrives late did not settle between {begin:g} and {end:g} s")
 
     def _slope(self, begin: float) -> Callable[[float, FloatArray], FloatArray]:
-        equations, shape = self._equations, self._equations.start.shape
-        silent = equations._replace(coupling=0.0 * equations.coupling)
+        packed, silent, delay = self._packed, self._silent, self._packed.equations.delay
 
         def f(t: float, y: FloatArray) -> FloatArray:
-            P = y.reshape(shape)
+            Y = y.reshape(packed.start.shape)
             if not np.abs(y).max() < OVERFLOW:
                 raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {t:g} s")
-            if equations.delay == 0.0:
-                return slope(equations, P, P).reshape(-1)
-            if begin < equations.delay * (1.0 - 1e-12):  # nothing has arrived yet
-                return slope(silent, P, P).reshape(-1)
-            return slope(equations, P, self(t - equations.delay)).reshape(-1)
+            if delay == 0.0:
+                return packed.slope(Y).reshape(-1)
+            if begin < delay * (1.0 - 1e-12):  # nothing has arrived yet
+                return silent.slope(Y).reshape(-1)
+            return packed.slope(Y, self(t - delay)).reshape(-1)
 
         return f
 
@@ -142,9 +160,12 @@ class _Pieces:
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray]
     ) -> Callable[[float], FloatArray]:
         with np.errstate(over="ignore", invalid="ignore"):
-            try:
-                solved = self._solve(begin, end, _limited(f), method="DOP853")
-            except _StiffError:
+            solved = None
+            if self._packed.equations.delay > 0.0:  # without delay only what is stiff comes here
+                # An explicit stage that overflows is no word about the solution.
+                with contextlib.suppress(StiffError, TheoryError):
+                    solved = self._solve(begin, end, _limited(f), method="DOP853")
+            if solved is None:
                 # A blind node's large covariance reaches precise sensors: P G is a large rate.
                 solved = self._solve(begin, end, f, method="Radau", jac=self._jacobian)
         if not solved.success:
@@ -158,29 +179,20 @@ class _Pieces:
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], **method: Any
     ) -> Any:
         y = self(begin).reshape(-1)
-        scale = max(float(np.abs(y).max()), float(np.abs(self._equations.Q).max()), 1e-300)
         return scipy.integrate.solve_ivp(
             f,
             (begin, end),
             y,
             dense_output=True,
             rtol=TOLERANCE,
-            atol=1e-3 * TOLERANCE * scale,
+            atol=1e-3 * TOLERANCE * _scale(self._packed),
             **method,
         )
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
-        equations = self._equations
-        if equations.delay > 0.0:  # what arrives is known, only what leaves depends on P
-            return linear_operator(equations, self._gains(y), arriving=False).tocsc()
-        return linear_operator(equations, self._gains(y)).tocsc()
-
-    def _gains(self, y: FloatArray) -> FloatArray:
-        return y.reshape(self._equations.start.shape) @ self._equations.G
-
-
-class _StiffError(Exception):
-    pass
+        blocks = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
+        # With a delay what arrives is known, only what leaves depends on P.
+        return self._packed.matrix(blocks, arriving=self._packed.equations.delay == 0.0)
 
 
 def _limited(
@@ -192,7 +204,7 @@ def _limited(
         nonlocal left
         left -= 1
         if left < 0:
-            raise _StiffError
+            raise StiffError
         return f(t, y)
 
     return counted

@@ -110,11 +110,13 @@ def informations(scenario: Scenario) -> FloatArray:
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times weight."""
     index, size = scenario.topology.index, len(scenario.nodes)
-    matrix = scipy.sparse.lil_array((size, size), dtype=np.float64)
-    for (sender, receiver), rate in scenario.effective_rates().items():
-        if rate > 0.0:
-            matrix[index[receiver], index[sender]] = rate * scenario.weight(receiver, sender)
-    return scipy.sparse.csr_array(matrix)
+    heard = {pair: rate for pair, rate in scenario.effective_rates().items() if rate > 0.0}
+    values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
+    places = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
+    entries = scipy.sparse.coo_array((values, (places[:, 0], places[:, 1])), shape=(size, size))
+    matrix = scipy.sparse.csr_array(entries)
+    matrix.eliminate_zeros()
+    return matrix
 
 
 def coupled(scenario: Scenario) -> Coupled:
@@ -132,36 +134,6 @@ def coupled(scenario: Scenario) -> Coupled:
         T = np.column_stack([riccati_step(table, q, e, delay)[1] for e in np.eye(n)])
     start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
     return Coupled(A, Q, informations(scenario), coupling(scenario), T, q, delay, start)
-
-
-def slope(equations: Coupled, P: FloatArray, sent: FloatArray) -> FloatArray:
-    """The right-hand side at ``P`` (N, n, n), where ``sent`` are the covariances that arrive."""
-    A, c = equations.A, equations.coupling
-    drift = A @ P
-    arriving = equations.T @ sent @ equations.T.T + equations.q
-    mixed = (c @ arriving.reshape(len(P), -1)).reshape(P.shape)
-    leaving = np.asarray(c.sum(axis=1)).reshape(-1, 1, 1)
-    change = drift + np.swapaxes(drift, 1, 2) + equations.Q - P @ equations.G @ P
-    return np.asarray(change + mixed - leaving * P)
-
-
-def linear_operator(
-    equations: Coupled, gains: FloatArray, arriving: bool = True
-) -> scipy.sparse.csr_array:
-    """(N n n, N n n): ``X_i -> (A - K_i) X_i + X_i (A - K_i)' + sum_j c_ij (T X_j T' - X_i)`` on
-    row-major vec(X), where ``K_i = gains[i]`` stands for L_i H_i; without the T X_j T' where they
-    are not ``arriving`` from the present.
-    """
-    n, eye = len(equations.A), np.eye(len(equations.A))
-    leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)
-    blocks = [
-        np.kron(equations.A - K, eye) + np.kron(eye, equations.A - K) - out * np.eye(n * n)
-        for K, out in zip(gains, leaving, strict=True)
-    ]
-    if not arriving:
-        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
-    between = scipy.sparse.kron(equations.coupling, np.kron(equations.T, equations.T))
-    return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks) + between)
 
 
 def balanced(scenario: Scenario) -> bool | None:

@@ -9,15 +9,14 @@ the time in which H(12) grows, and P grows past every bound.
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
-import scipy.sparse.linalg
 
-from netkf.core.arrays import FloatArray, symmetric
+from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
-from netkf.theory.coupled import Coupled, coupled, linear_operator, slope
+from netkf.theory.coupled import Coupled, coupled
+from netkf.theory.linearised import solved
+from netkf.theory.packed import Packed
 
 GROWN = 1e9  # a covariance that many times the first is taken to grow for ever
 RESIDUAL = 1e-9
@@ -71,13 +70,15 @@ def _steady(equations: Coupled) -> FloatArray | None:
     P = _stabilising(equations)
     if P is None:
         return None
+    packed = Packed(equations)
     for _ in range(60):
-        following = _newton(equations, P)
+        following = _newton(packed, P)
         change = np.abs(following - P).max()
         P = following
         if change <= 1e-13 * np.abs(P).max():
             break
-    residual = np.abs(slope(equations, P, P)).max()
+    Y = packed.pack(P)
+    residual = np.abs(packed.slope(Y, Y)).max()
     sizes = [np.abs(x).max() for x in (equations.Q, P @ equations.G @ P, equations.A @ P)]
     if not residual <= RESIDUAL * sum(sizes):
         raise TheoryError(
@@ -87,26 +88,21 @@ def _steady(equations: Coupled) -> FloatArray | None:
     return P
 
 
-def _solve(equations: Coupled, P: FloatArray, right: FloatArray) -> FloatArray:
-    operator = linear_operator(equations, P @ equations.G)
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
-        solution = scipy.sparse.linalg.spsolve(operator.tocsc(), -right.reshape(-1))
-    return symmetric(np.asarray(solution).reshape(P.shape))
+def _newton(packed: Packed, P: FloatArray) -> FloatArray:
+    equations = packed.equations
+    inflow = packed.leaving[:, None, None] * equations.q
+    right = equations.Q + P @ equations.G @ P + inflow
+    return packed.unpack(solved(packed, P, packed.pack(right)))
 
 
-def _newton(equations: Coupled, P: FloatArray) -> FloatArray:
-    inflow = np.asarray(equations.coupling.sum(axis=1)).reshape(-1, 1, 1) * equations.q
-    return _solve(equations, P, equations.Q + P @ equations.G @ P + inflow)
-
-
-def _stable(equations: Coupled, P: FloatArray) -> bool:
+def _stable(packed: Packed, P: FloatArray) -> bool:
     """Whether the gains of P stabilise H(12) made linear.
 
     That map X -> op(X) is a generator of positive maps, so it is stable if and only if
     op(X) = -I has a positive definite solution.
     """
-    X = _solve(equations, P, np.broadcast_to(np.eye(P.shape[-1]), P.shape))
+    right = packed.pack(np.broadcast_to(np.eye(P.shape[-1]), P.shape))
+    X = packed.unpack(solved(packed, P, right))
     return bool(np.isfinite(X).all() and np.linalg.eigvalsh(X)[:, 0].min() > 0.0)
 
 
@@ -117,11 +113,12 @@ def _stabilising(equations: Coupled) -> FloatArray | None:
     P = equations.start + equations.Q + 1e-3 * size * np.eye(n)
     leaving = float(equations.coupling.sum(axis=1).max())
     step = 0.1 / (float(np.abs(equations.A).max()) + leaving + 1e-9)
+    packed = Packed(equations)
     for _ in range(MOST_STEPS):
-        if _stable(equations, P):
+        if _stable(packed, P):
             return P
         shift = equations.A - 0.5 / step * np.eye(n)
-        implicit = equations._replace(A=shift, Q=equations.Q + P / step)
+        implicit = Packed(equations._replace(A=shift, Q=equations.Q + P / step))
         if not _stable(implicit, P):
             step *= 0.5
             continue

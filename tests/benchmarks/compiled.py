@@ -1,17 +1,25 @@
-"""The compiled engine against the SimPy engine, a loop written by hand, and filterpy objects.
+"""netkf against other ways to the same results: one table of ratios.
 
-    python -m tests.benchmarks.compiled [--runs 3] [--quick]
+    python -m tests.benchmarks.compiled [--runs 5] [--quick]
 
-Every line is a ratio of runs made in turn on this machine, the least of several: times of a shared
-machine mean little. Each engine must make the same events, so that speed never hides a changed run.
-The loop by hand replays the same ticks of 1000 nodes (flow of xhat and P over each gap, resets),
-written for the purpose in numba without a trace, sensors or delays; the job with filterpy is the
-same with one KalmanFilter a node and a heap of ticks, as a user without netkf would write it.
+Every line is the median of ratios of runs made in turn on this machine, in processor time: times of
+a shared machine mean little. Each pair must make the same events, so that speed never hides a
+changed run. What is compiled is loaded beforehand. The compiled engine runs against
+
+- the SimPy engine, on every scenario that both run;
+- a loop by hand, which replays the same ticks of 1000 nodes (flow of xhat and P over each gap,
+  resets), written for the purpose in numba without a trace, sensors or delays;
+- the same job with filterpy or Stone Soup objects and a heap of ticks (``peers``), as a user
+  without netkf would write it.
+
+Below: the bound (12) against scipy's solve_ivp on the stacked system, and draws of the invariant
+law of the random Riccati equation against a plain numpy loop, both a chain's step.
 """
 
 import argparse
-import heapq
+import importlib.util
 import math
+import statistics
 import time
 from pathlib import Path
 
@@ -24,16 +32,18 @@ from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.compiled.schedule import Schedule
 from netkf.engines.compiled.tables import host_tables, link_tables
 from netkf.engines.processes.engine import ProcessesEngine
+from netkf.theory import intermittent
 from netkf.trace.recorder import MemorySink, Recorder
+from tests.benchmarks import peers
 from tests.benchmarks.engine import scenario as thousand
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
 def timed(call):
-    began = time.perf_counter()
+    began = time.process_time()
     value = call()
-    return time.perf_counter() - began, value
+    return time.process_time() - began, value
 
 
 def engine_run(engine, case):
@@ -126,104 +136,142 @@ def hand_written(case):
     return run
 
 
-def filterpy_job(case, most):
-    """The first ``most`` ticks with one KalmanFilter a node; None where filterpy is missing."""
-    try:
-        from filterpy.kalman import KalmanFilter
-    except ImportError:
-        return None
-    from scipy.linalg import expm
-
-    n, truth = case.plant.n, case.truth
-    epsilon = case.filter.algorithm.epsilon
-
-    def discrete(gap):
-        M = expm(np.block([[-truth.A, truth.Q], [np.zeros((n, n)), truth.A.T]]) * gap)
-        F = M[n:, n:].T
-        return F, F @ M[:n, n:]
-
-    def run():
-        random = np.random.default_rng(1)
-        rate = case.network.activation.rate
-        nodes, now = {}, dict.fromkeys(case.nodes, 0.0)
-        for node in case.nodes:
-            nodes[node] = KalmanFilter(dim_x=n, dim_z=1)
-            nodes[node].P = np.array(case.truth.start_cov)
-        heap = [(random.exponential(1.0 / rate), link) for link in case.topology.links]
-        heapq.heapify(heap)
-        for _ in range(most):
-            t, (i, j) = heap[0]
-            for h in (i, j):
-                F, Q = discrete(t - now[h])
-                nodes[h].predict(F=F, Q=Q)
-                now[h] = t
-            if random.random() < case.network.channel.loss.delivery:
-                a, b = nodes[i], nodes[j]
-                mean, cov = epsilon * (b.x - a.x), epsilon * (b.P - a.P)
-                a.x, a.P, b.x, b.P = a.x + mean, a.P + cov, b.x - mean, b.P - cov
-            heapq.heapreplace(heap, (t + random.exponential(1.0 / rate), (i, j)))
-        return most
-
-    return run
-
-
-def least(call, runs):
-    """The least seconds of several runs, and what they all returned."""
-    found = [timed(call) for _ in range(runs)]
-    assert len({repr(value) for _, value in found}) == 1
-    return min(seconds for seconds, _ in found), found[0][1]
-
-
 def line(*cells):
-    print(f"{cells[0]:34s} {cells[1]:>12} {cells[2]:>14} {cells[3]:>14} {cells[4]:>8}")
+    print(f"{cells[0]:34s} {cells[1]:>12} {cells[2]:>14} {cells[3]:>14} {cells[4]:>8}", flush=True)
+
+
+def compared(name, runs, mine, theirs, most=math.inf):
+    """One line: two calls in turn, each gives its number of events (equal unless ``theirs`` makes
+    only the first ``most``). Returns the median seconds of an event of mine.
+    """
+    mine()  # loads what is compiled
+    pairs = [(timed(mine), timed(theirs)) for _ in range(runs)]
+    (made,), (others,) = ({pair[k][1] for pair in pairs} for k in (0, 1))
+    assert others == min(made, most) > 0, "the same events"
+    each = [(a / made, b / others) for (a, _), (b, _) in pairs]
+    a, b = (statistics.median(pair[k] for pair in each) for k in (0, 1))
+    ratio = statistics.median(b / a for a, b in each)
+    line(name, f"{made:,}", f"{1.0 / a:,.3g}", f"{1.0 / b:,.3g}", f"{ratio:.3g}")
+    return a
 
 
 def engines(name, case, runs):
-    """One line: the two engines in turn."""
+    """The two engines: the same fingerprints, too."""
+    seen = set()
+
+    def events(engine):
+        fingerprint, total, ticks = engine_run(engine, case)
+        seen.add((fingerprint, ticks))
+        return total
+
     fast, slow = CompiledEngine(), ProcessesEngine()
-    engine_run(fast, case)
-    pairs = [
-        (timed(lambda: engine_run(fast, case)), timed(lambda: engine_run(slow, case)))
-        for _ in range(runs)
-    ]
-    assert len({value for pair in pairs for _, value in pair}) == 1, "the same events"
-    events = pairs[0][0][1][1]
-    a, b = (min(pair[k][0] for pair in pairs) for k in range(2))
-    line(name, f"{events:,}", f"{events / a:,.0f}", f"{events / b:,.0f}", f"{b / a:.1f}")
+    compared(name, runs, lambda: events(fast), lambda: events(slow))
+    assert len(seen) == 1, "the same events"
+
+
+def by_others(name, case, runs, most):
+    """The first ``most`` ticks with objects of other packages, for each of them installed."""
+    for package, words, job in (
+        ("filterpy", "filterpy", peers.filterpy_job),
+        ("stonesoup", "Stone Soup", peers.stone_soup_job),
+    ):
+        if importlib.util.find_spec(package) is None:
+            print(f"{words} is not installed (pip install {package}): left out")
+            continue
+        compared(
+            f"{words}, {name}",
+            runs,
+            lambda: engine_run(CompiledEngine(), case)[2],
+            lambda job=job: job(case, peers.clocks(case, most))[0],
+            most,
+        )
+
+
+def bound(case, constants, runs):
+    """The bound over some time constants, and its cost in evaluations of the right-hand side."""
+    lasts = peers.time_constant(case)
+    times = np.linspace(0.0, constants * lasts, 41)
+    found = {}
+
+    def netkfs():
+        found["netkf"] = netkf.theory.covariance_bound(case, times)
+        return len(times)
+
+    def stacked():
+        found["system"] = peers.StackedBound(case)
+        found["scipy"] = found["system"].solved(times)
+        return len(times)
+
+    seconds = len(times) * compared("bound (12) by solve_ivp, n = 4", runs, netkfs, stacked)
+    error = np.abs(found["netkf"] - found["scipy"]).max() / np.abs(found["netkf"]).max()
+    assert error < 1e-6, "the same bound"
+    system, y = found["system"], found["netkf"][-1].reshape(-1)
+    evaluations = system.evaluations
+    once = statistics.median(timed(lambda: system.slope(0.0, y))[0] for _ in range(100))
+    cost = seconds / once / constants
+    print(
+        f"  {len(case.nodes)} nodes, {constants} time constants of {lasts:.2f} s (of the slowest"
+        f" mode at the steady state);\n  netkf takes the time of {cost:.0f} evaluations of the"
+        f" right-hand side in a time constant, {cost / lasts:.0f} in a second;"
+        f"\n  solve_ivp makes {evaluations / constants:.0f} in a time constant"
+    )
+
+
+def invariant(samples, runs):
+    """Steps of chains: those that invariant_samples takes, and as many of a plain loop."""
+    F, Q, H, R = peers.random_system()
+    random = np.random.default_rng(1)
+    words, roots = random.random((200, 64)) < 0.7, np.broadcast_to(np.eye(4), (200, 4, 4))
+    plain = intermittent.advance
+
+    def mine():
+        taken = 0
+
+        def counted(starts, some, *others):
+            nonlocal taken
+            taken += some.size
+            return plain(starts, some, *others)
+
+        intermittent.advance = counted
+        try:
+            netkf.theory.invariant_samples(F, Q, H, R, 0.7, samples, 1)
+        finally:
+            intermittent.advance = plain
+        return taken
+
+    def theirs():
+        return len(peers.plain_chains(roots, words, F, Q, H, R)) * words.shape[1]
+
+    compared("invariant law by a numpy loop", runs, mine, theirs, words.size)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="short horizons")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="short horizons, small networks")
     options = parser.parse_args()
-    share = 0.2 if options.quick else 1.0
-    line("scenario", "events", "compiled/s", "SimPy/s", "ratio")
+    runs, share = options.runs, 0.2 if options.quick else 1.0
+    line("against", "events", "netkf/s", "theirs/s", "ratio")
     for file in sorted(SCENARIOS.glob("*.toml")):
         case = netkf.load(file)
         if CompiledEngine().refusal(case) is None:
             horizon = max(case.horizon * share, float(np.max(case.probe)))
-            engines(file.stem, case.replace({"horizon": horizon}), options.runs)
+            engines(f"SimPy, {file.stem}", case.replace({"horizon": horizon}), runs)
     big = thousand()
-    engines("1000 nodes, 4000 links", big, options.runs)
+    short = big.replace({"horizon": max(4.0 * share, 1.0), "probe": 1.0})
+    engines("SimPy, 1000 nodes, 4000 links", short, runs)
     long = big.replace({"horizon": 40.0 * share, "probe": 40.0 * share})
-    print()
-    line("1000 nodes, 4000 links", "ticks", "ticks/s", "compiled/s", "ratio")
-    run = hand_written(long)
-    run()
-    hand, ticks = least(run, options.runs)
-    mine, (*_, made) = least(lambda: engine_run(CompiledEngine(), long), options.runs)
-    assert made == ticks, "the same ticks"
-    cells = f"{ticks / hand:,.0f}", f"{ticks / mine:,.0f}", f"{mine / hand:.2f}"
-    line("loop by hand, slower by", f"{ticks:,}", *cells)
-    job = filterpy_job(big, 2000)
-    if job is None:
-        print("filterpy is not installed (pip install filterpy): that comparison is left out")
-    else:
-        theirs, done = least(job, options.runs)
-        ratio = (theirs / done) / (mine / ticks)
-        cells = f"{done / theirs:,.0f}", f"{ticks / mine:,.0f}", f"{ratio:,.0f}"
-        line("filterpy and heapq, faster by", f"{done:,}", *cells)
+    hand = hand_written(long)
+    hand()
+    compared(
+        "a loop by hand, 1000 nodes", runs, lambda: engine_run(CompiledEngine(), long)[2], hand
+    )
+    most = 400 if options.quick else 2000
+    by_others("n = 2, 2 sensors", long, runs, most)
+    four = peers.planar(1000).replace({"horizon": 10.0 * share, "probe": 10.0 * share})
+    by_others("n = 4, 334 sensors", four, runs, most)
+    bound(peers.planar(200 if options.quick else 1000), 2 if options.quick else 10, runs)
+    invariant(2000 if options.quick else 20_000, runs)
 
 
 if __name__ == "__main__":

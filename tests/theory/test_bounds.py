@@ -99,6 +99,37 @@ def test_a_fixed_delay_enters_as_the_predicted_past(build):
     np.testing.assert_allclose(steady, far, rtol=1e-8)
 
 
+def test_a_precise_sensor_hears_late_of_large_covariances(build):
+    """Stiff and with a delay: what is heard in the second stretch is the first one's, in closed
+    form.
+    """
+    d, rate, eps, a, G = 0.1, 2.0, 0.5, -0.5, 1e8
+    network = {
+        "graph": {"kind": "path", "nodes": 2},
+        "activation": {"kind": "poisson", "rate": rate},
+        "channel": {"delay": {"kind": "constant", "seconds": d}},
+    }
+    scenario = build(network=network, sensors=[{"nodes": [0], "H": [[1.0]], "R": [[1.0 / G]]}])
+    got = theory.covariance_bound(scenario, [d, 0.15])[:, :, 0, 0]
+    root = np.sqrt(a * a + G)
+
+    def first(t):  # of both nodes, before a message arrives
+        seen = (a + root / np.tanh(root * t + np.arctanh(root / (G - a)))) / G
+        return np.array([seen, np.exp(2 * a * t) + (np.exp(2 * a * t) - 1.0) / (2 * a)])
+
+    np.testing.assert_allclose(got[0], first(d), rtol=1e-8)
+
+    def slope(t, P):
+        T = np.exp(2 * a * d)
+        arriving = T * first(t - d)[::-1] + (T - 1.0) / (2 * a)
+        return 2 * a * P + 1.0 - np.array([G, 0.0]) * P**2 + rate * eps * (arriving - P)
+
+    solved = scipy.integrate.solve_ivp(
+        slope, (d, 0.15), first(d), "Radau", rtol=1e-10, atol=1e-16, max_step=1e-3
+    )
+    np.testing.assert_allclose(got[1], solved.y[:, -1], rtol=1e-7)
+
+
 def test_a_short_delay_is_integrated_in_longer_stretches(build):
     """The same equation cut into stretches of one delay, and the limit of no delay."""
 

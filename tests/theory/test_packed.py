@@ -1,0 +1,139 @@
+"""H(12) on upper triangles, its Taylor series, and its linear equations, against plain formulas."""
+
+import mpmath
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+import scipy.sparse
+
+from netkf import theory
+from netkf.theory import linearised
+from netkf.theory.coupled import Coupled
+from netkf.theory.packed import Packed
+from netkf.theory.taylor import StiffError, followed
+
+N, n = 5, 3
+
+
+def equations(delay=0.0, seed=1):
+    random = np.random.default_rng(seed)
+    A, B = random.normal(size=(n, n)), random.normal(size=(n, n))
+    coupling = random.uniform(size=(N, N)) * (random.uniform(size=(N, N)) < 0.6)
+    np.fill_diagonal(coupling, 0.0)
+    G = np.zeros((N, n, n))
+    for i, rows in ((0, 1), (2, 2), (3, 3)):
+        H = random.normal(size=(rows, n)) * [1.0, 1e-3, 10.0]  # states in units of their own
+        G[i] = H.T @ H
+    T, q = scipy.linalg.expm(A * delay), delay * np.eye(n)
+    start = random.normal(size=(N, n, n))
+    start = start @ np.swapaxes(start, 1, 2)
+    return Coupled(A, B @ B.T, G, scipy.sparse.csr_array(coupling), T, q, delay, start)
+
+
+def plain(e, P, sent):
+    c = e.coupling.toarray()
+    return np.stack(
+        [
+            e.A @ P[i]
+            + P[i] @ e.A.T
+            + e.Q
+            - P[i] @ e.G[i] @ P[i]
+            + sum(c[i, j] * (e.T @ sent[j] @ e.T.T + e.q - P[i]) for j in range(N))
+            for i in range(N)
+        ]
+    )
+
+
+def near(got, expected, tolerance=1e-12):
+    assert np.abs(got - expected).max() <= tolerance * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3])
+def test_the_slope_is_the_right_hand_side(delay):
+    e, other = equations(delay), equations(seed=2).start
+    packed = Packed(e)
+    near(packed.unpack(packed.slope(packed.start, packed.pack(other))), plain(e, e.start, other))
+    if delay == 0.0:
+        near(packed.unpack(packed.slope(packed.start)), plain(e, e.start, e.start))
+
+
+@pytest.mark.parametrize("arriving", [True, False])
+def test_the_linear_part_is_the_derivative_of_the_slope(arriving):
+    e = equations(0.3)
+    packed, X = Packed(e), equations(seed=2).start
+    # The right-hand side is quadratic: central differences are exact.
+    sent = X if arriving else 0.0 * X
+    expected = 0.5 * (plain(e, e.start + X, sent) - plain(e, e.start - X, -sent))
+    blocks, rows = packed.linear(e.start), packed.pack(X)
+    applied = np.einsum("ik,ikl->il", rows, blocks) + arriving * packed.arriving(rows)
+    near(packed.unpack(applied), expected, 1e-11)
+    flat = packed.matrix(blocks, arriving) @ rows.reshape(-1)
+    near(packed.unpack(flat.reshape(rows.shape)), expected, 1e-11)
+
+
+def test_the_taylor_series_is_that_of_the_solution():
+    """A scalar node: P' = 2 a P + q - g P^2 in 40 digits."""
+    a, q, g, P0, span = 0.3, 0.7, 1.9, 2.5, 0.25
+    one = [np.array(x, dtype=float).reshape(1, 1) for x in (a, q, 1.0, 0.0)]
+    e = Coupled(
+        one[0], one[1], np.full((1, 1, 1), g), scipy.sparse.csr_array((1, 1)), one[2], one[3], 0.0,
+        np.full((1, 1, 1), P0),
+    )  # fmt: skip
+    series = Packed(e).series(np.array([[P0]]), span, 9)[:, 0, 0]
+    with mpmath.workdps(40):
+        root = mpmath.sqrt(mpmath.mpf(a) ** 2 + mpmath.mpf(g) * q)
+        c = mpmath.acoth((mpmath.mpf(g) * P0 - a) / root)
+        expected = mpmath.taylor(lambda s: (a + root * mpmath.coth(root * span * s + c)) / g, 0, 9)
+    np.testing.assert_allclose(series, [float(x) for x in expected], rtol=1e-12)
+
+
+def test_the_solution_is_followed_to_all_digits():
+    e = equations()
+    packed, times = Packed(e), np.array([0.0, 0.0, 0.1, 0.5, 2.0, 2.0])
+    got = packed.unpack(followed(packed, times, 1.0, 100_000, 1e150))
+    solved = scipy.integrate.solve_ivp(
+        lambda _, y: plain(e, y.reshape(N, n, n), y.reshape(N, n, n)).reshape(-1),
+        (0.0, 2.0), e.start.reshape(-1), "DOP853", times[2:5], rtol=1e-13, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_array_equal(got[:2], [e.start, e.start])
+    np.testing.assert_array_equal(got[5], got[4])
+    for P, expected in zip(got[2:5], solved.y.T.reshape(-1, N, n, n), strict=True):
+        near(P, expected, 1e-9)
+    with pytest.raises(StiffError):
+        followed(packed, times, 1.0, 28, 1e150)
+
+
+@pytest.fixture
+def random_graph(build):
+    """Random graphs of degree 8, four states, every third node senses two of them."""
+
+    def made(nodes):
+        A = np.kron(np.eye(2), [[0.0, 1.0], [-1.0, 0.1]])
+        eye, H = np.eye(4).tolist(), [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+        graph = {"kind": "regular", "nodes": nodes, "degree": 8, "seed": 1, "connected": True}
+        return build(
+            plant={"kind": "diffusion", "A": A.tolist(), "B": eye, "cov": eye},
+            sensors=[{"nodes": list(range(0, nodes, 3)), "H": H, "R": [[0.25, 0.0], [0.0, 0.25]]}],
+            network={"graph": graph, "activation": {"kind": "poisson", "rate": 3.0}},
+            filter={"kind": "hybrid", "epsilon": 0.1},
+        )
+
+    return made
+
+
+def test_a_large_network_comes_to_its_steady_state(random_graph, monkeypatch):
+    def refused(*_):
+        raise AssertionError("1000 nodes would take minutes")
+
+    monkeypatch.setattr(linearised, "_eliminated", refused)
+    scenario = random_graph(250)
+    steady = theory.steady_covariance_bound(scenario)
+    near(theory.covariance_bound(scenario, [0.0, 150.0])[1], steady, 1e-9)
+
+
+def test_iterations_and_elimination_agree(random_graph, monkeypatch):
+    scenario = random_graph(40)
+    eliminated = theory.steady_covariance_bound(scenario)
+    monkeypatch.setattr(linearised, "FEW_UNKNOWNS", 0)
+    near(theory.steady_covariance_bound(scenario), eliminated, 1e-12)
