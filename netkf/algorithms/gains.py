@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.algorithms.riccati import exponential_series, hamiltonian
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import compilable_as
 from netkf.core.legendre import MOMENTS, backward_coefficients
 from netkf.core.small import added, applied, polynomial
 
@@ -75,7 +75,25 @@ def _terms(size: float) -> int:
     return terms
 
 
-@compilable
+def _update_loops(
+    table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
+) -> FloatArray:
+    n, q = table.n, table.moments
+    values = polynomial(table.series, gap)
+    out = x.copy()
+    for m in range(q):
+        innovation = moments[m]
+        for j in range(n):
+            innovation -= values[(2 * q + m) * n + j] * x[j]
+        for i in range(n):
+            gain = values[i * q + m]
+            for k in range(n):
+                gain += P[i, k] * values[(n + k) * q + m]
+            out[i] += gain * innovation
+    return out
+
+
+@compilable_as(_update_loops)
 def gain_update(
     table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:

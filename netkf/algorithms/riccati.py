@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray, symmetric
-from netkf.core.compiling import compilable
-from netkf.core.small import added, applied, even, polynomial, product, solution
+from netkf.core.compiling import compilable, compilable_as
+from netkf.core.small import added, applied, eliminate, even, polynomial, product, solution
 
 TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
 
@@ -109,10 +109,61 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 @compilable
+def terms_for(share: float) -> int:
+    """How many terms of the series a gap of that share of a unit needs: the next one is below
+    double rounding of the first that depends on the gap.
+    """
+    terms, last = 1, share
+    while terms < TAYLOR_TERMS and last > 1e-18 * share:
+        terms += 1
+        last *= share / terms
+    return terms
+
+
 def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, FloatArray]:
     """``exp(M gap)`` (2n, 2n) and ``exp(A gap)`` (n, n) for a gap of at most one unit."""
-    n, values = table.n, polynomial(table.series, gap)
+    n = table.n
+    values = polynomial(table.series[: terms_for(gap / table.unit)], gap)
     return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
+
+
+def _part_loops(
+    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
+) -> tuple[FloatArray, FloatArray]:
+    # X' and Y' are made as such, and nothing else is: what is made in passing takes longer than
+    # the arithmetic.
+    n = table.n
+    E = polynomial(table.series[: terms_for(gap / table.unit)], gap)
+    X, Y, moved = np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        total = 0.0
+        for k in range(n):
+            total += E[(4 * n + i) * n + k] * x[k]
+        moved[i] = total
+        above, below = 2 * n * i, 2 * n * (n + i)
+        for j in range(n):
+            up, down = E[above + j], E[below + j]
+            for k in range(n):
+                up += E[above + n + k] * P[k, j]
+                down += E[below + n + k] * P[k, j]
+            X[j, i], Y[j, i] = up, down
+    eliminate(X, Y)
+    for i in range(n):
+        for j in range(i):
+            Y[i, j] = Y[j, i] = 0.5 * (Y[i, j] + Y[j, i])
+    return Y, moved
+
+
+@compilable_as(_part_loops)
+def part_of_unit(
+    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
+) -> tuple[FloatArray, FloatArray]:
+    """``riccati_step`` for a gap of at most one unit."""
+    n = table.n
+    E, transition = evaluate_hamiltonian(table, gap)
+    X = added(E[:n, :n], E[:n, n:], P)
+    Y = added(E[n:, :n], E[n:, n:], P)
+    return even(solution(X.T, Y.T)), applied(transition, x)
 
 
 @compilable
@@ -132,7 +183,4 @@ def riccati_step(
     rest = gap - whole * table.unit
     if rest <= 0.0:
         return P, x
-    E, transition = evaluate_hamiltonian(table, rest)
-    X = added(E[:n, :n], E[:n, n:], P)
-    Y = added(E[n:, :n], E[n:, n:], P)
-    return even(solution(X.T, Y.T)), applied(transition, x)
+    return part_of_unit(table, P, x, rest)

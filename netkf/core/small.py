@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg.lapack import dgesv
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable_as
+from netkf.core.compiling import compilable, compilable_as
 
 
 def _product_loops(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -94,19 +94,23 @@ def polynomial(series: FloatArray, gap: float) -> FloatArray:
     return np.asarray(np.multiply.accumulate(powers) @ series)
 
 
-def _solution_loops(  # noqa: PLR0912 - loops are what the compiler wants
-    left: FloatArray, right: FloatArray
-) -> FloatArray:
+@compilable
+def eliminate(  # noqa: PLR0912 - loops are what the compiler wants
+    L: FloatArray, out: FloatArray
+) -> None:
+    """Write ``L^-1 out`` over ``out`` (n, c), and over L (n, n) too; nan where it is singular."""
     # Gauss with the largest pivot of each column, as LAPACK does it.
-    n, columns = left.shape[0], right.shape[1]
-    L, out = left.copy(), right.copy()
+    n, columns = L.shape[0], out.shape[1]
     for k in range(n):
         best = k
         for i in range(k + 1, n):
             if abs(L[i, k]) > abs(L[best, k]):
                 best = i
         if L[best, k] == 0.0:
-            return np.full_like(out, np.nan)
+            for i in range(n):
+                for j in range(columns):
+                    out[i, j] = np.nan
+            return
         if best != k:
             for j in range(k, n):
                 L[k, j], L[best, j] = L[best, j], L[k, j]
@@ -124,6 +128,11 @@ def _solution_loops(  # noqa: PLR0912 - loops are what the compiler wants
                 out[i, j] -= L[i, k] * out[k, j]
         for j in range(columns):
             out[i, j] /= L[i, i]
+
+
+def _solution_loops(left: FloatArray, right: FloatArray) -> FloatArray:
+    out = right.copy()
+    eliminate(left.copy(), out)
     return out
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.compiling import compilable
 from netkf.core.legendre import forward_coefficients
-from netkf.core.small import applied, polynomial, product
+from netkf.core.small import added, applied, polynomial
 
 BLOCK = 64  # steps drawn at once
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
@@ -303,13 +303,21 @@ def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
 
 
 @compilable
-def _legendre(u: FloatArray) -> FloatArray:
-    values = np.empty((len(u), 4))
-    for k in range(len(u)):
-        z = 2.0 * u[k] - 1.0
-        values[k, 0], values[k, 1] = 1.0, z
-        values[k, 2], values[k, 3] = 1.5 * z * z - 0.5, (2.5 * z * z - 1.5) * z
-    return values
+def _legendre_moments(since: float, gap: float, length: float) -> FloatArray:
+    """(2, 4): the two moments over ``gap`` seconds from ``since`` on of the Legendre polynomials
+    of a step of ``length`` seconds, by Gauss's rule with three nodes, which is exact for them.
+    """
+    out = np.zeros((2, 4))
+    for k in range(3):
+        z = 2.0 * (since + 0.5 * gap * (1.0 + _THREE[k])) / length - 1.0
+        square = z * z
+        for m in range(2):
+            weight = 0.5 * gap * _THREE_MOMENTS[m, k]
+            out[m, 0] += weight
+            out[m, 1] += weight * z
+            out[m, 2] += weight * (1.5 * square - 0.5)
+            out[m, 3] += weight * (2.5 * square - 1.5) * z
+    return out
 
 
 @compilable
@@ -318,12 +326,9 @@ def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray
     n = len(step.x_start)
     if start == step.start and end == step.end:
         return step.moments
-    length, gap = step.end - step.start, end - start
-    places = (start + 0.5 * gap * (1.0 + _THREE) - step.start) / length
-    noise = product(_legendre(places), step.cubic)
-    from_noise = 0.5 * gap * product(_THREE_MOMENTS, noise)
+    since, gap = start - step.start, end - start
     x = step.x_start
-    if start > step.start:
-        x = applied(polynomial(series, start - step.start)[: n * n].reshape(n, n), x)
-    response = polynomial(series, gap)[n * n :].reshape(2 * n, n)
-    return applied(response, x).reshape(2, n) + from_noise
+    if since > 0.0:
+        x = applied(polynomial(series[:, : n * n], since).reshape(n, n), x)
+    plain = applied(polynomial(series, gap)[n * n :].reshape(2 * n, n), x).reshape(2, n)
+    return added(plain, _legendre_moments(since, gap, step.end - step.start), step.cubic)

@@ -143,14 +143,18 @@ def cut(
     Exact conditional law of four independent moments (variances g, g/3 on each part) given their
     two sums; written so that nothing cancels when a part is short.
     """
-    whole, tilted = rest[0], rest[1]
     w = 1.0 - u
     spread = 1.0 - 3.0 * u * w
-    first = math.sqrt(u * w * spread * length) * normals[0]
-    slope = math.sqrt(u * w / spread * length) * normals[0]
-    other = math.sqrt(u * w / (3.0 * spread) * length) * normals[1]
-    left = u * whole - 3.0 * u * w * tilted + first
-    left_tilted = u * u * (tilted + slope) + w * other
-    right = w * whole + 3.0 * u * w * tilted - first
-    right_tilted = w * w * (tilted + slope) - u * other
-    return np.stack((left, left_tilted)), np.stack((right, right_tilted))
+    size_first = math.sqrt(u * w * spread * length)
+    size_slope = math.sqrt(u * w / spread * length)
+    size_other = math.sqrt(u * w / (3.0 * spread) * length)
+    left, right = np.empty(rest.shape), np.empty(rest.shape)
+    for k in range(rest.shape[1]):
+        whole, tilted = rest[0, k], rest[1, k]
+        first, slope = size_first * normals[0, k], size_slope * normals[0, k]
+        other = size_other * normals[1, k]
+        left[0, k] = u * whole - 3.0 * u * w * tilted + first
+        left[1, k] = u * u * (tilted + slope) + w * other
+        right[0, k] = w * whole + 3.0 * u * w * tilted - first
+        right[1, k] = w * w * (tilted + slope) - u * other
+    return left, right
