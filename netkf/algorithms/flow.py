@@ -154,6 +154,13 @@ def usable(P: FloatArray, information: FloatArray) -> float:
     return STRETCH / rate if rate > 0.0 else math.inf
 
 
+@compilable
+def stretch_end(now: float, time: float, stretch: float) -> float:
+    """Where a stretch of readings ends: by ``time``, and not where it begins."""
+    end = now + stretch
+    return end if now < end < time else time
+
+
 def predict(model: FlowModel, payload: Payload, age: float) -> Payload:
     """A payload moved ``age`` seconds on by the model alone, without readings."""
     if age <= 0.0:

@@ -35,8 +35,11 @@ class Rank(IntEnum):
     PROBE = 5
 
 
-SHORTEST_SHARE = 1e-9
-"""The least part of a gap whose readings are used at once, however short the stretch."""
+SHORTEST_SHARE, LONGER = 1e-9, 1.02
+"""The least part of a gap whose readings are used at once, however short the stretch, and by what
+it grows from one stretch to the next: a covariance beyond all bounds, which no reading shrinks as
+it should, takes a thousand of them and not a billion.
+"""
 
 Progress = Callable[[float], None]
 """Called with the simulated time now and then."""

@@ -28,6 +28,8 @@ def scenario(links, events):
     rate = 2.0
     horizon = events / (ROWS_A_TICK * rate * links)
     changes = {"network.graph": graph, "filter.epsilon": 0.1, "horizon": horizon, "probe": horizon}
+    # A plant that stays bounded by itself: most nodes are far from both sensors.
+    changes["plant.A"] = [[0.0, 1.0], [-1.0, -0.1]]
     return netkf.load(RING).replace({**changes, "network.activation.rate": rate})
 
 

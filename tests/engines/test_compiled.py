@@ -16,6 +16,7 @@ from netkf.algorithms.hybrid import Hybrid
 from netkf.core import compiling, small
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.streams import Streams
+from netkf.engines.processes.engine import ProcessesEngine
 from netkf.experiments import simulate
 from netkf.network.channels import Bernoulli, Fates
 from netkf.scenario.reading import from_table
@@ -340,6 +341,23 @@ def test_growth_beyond_numbers_is_reported_alike(build):
     plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
     grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"})
     assert assert_agree(grown).status == "diverged"
+
+
+def test_covariances_beyond_all_bounds_take_their_time_and_no_more(build):
+    """Far from the only sensor nobody knows anything, and resets bring it P of 1e20."""
+    plant = {"kind": "diffusion", "A": [[0.0, 1.0], [-1.0, 0.2]], "B": [[0.0], [1.0]]}
+    clock = {"graph": {"kind": "path", "nodes": 8}, "activation": {"kind": "poisson", "rate": 2.0}}
+    far = build(
+        horizon=300.0,
+        probe=1.0,
+        plant={**plant, "cov": [[1.0, 0.0], [0.0, 1.0]]},
+        sensors=[{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.1]]}],
+        network=clock,
+        filter={"kind": "hybrid", "epsilon": 0.02},
+    )
+    run = netkf.simulate(far, engine="compiled")
+    assert run.P[-1, 7].max() > 1e25 > 1e3 > run.P[-1, 0].max()
+    assert run.fingerprint == netkf.simulate(far, engine=ProcessesEngine()).fingerprint
 
 
 def test_replicas_side_by_side_are_those_one_after_the_other(ring):

@@ -13,14 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.covariance_intersection import intersected_pairs
-from netkf.algorithms.flow import Payload, usable
+from netkf.algorithms.flow import Payload, stretch_end, usable
 from netkf.algorithms.gains import GainTable, gain_update
 from netkf.algorithms.hybrid import reset
 from netkf.algorithms.riccati import RiccatiTable, riccati_step
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.small import fill, fill_square
-from netkf.engines.base import SHORTEST_SHARE
+from netkf.engines.base import LONGER, SHORTEST_SHARE
 from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Parts, Sensing
 from netkf.plants.paths import Step, seen
@@ -147,7 +147,9 @@ def advance(
         if senses:
             stretch = usable(P, models.information[k])
             if stretch < time - now:
-                end = now + max(stretch, SHORTEST_SHARE * (time - now))
+                if hosts.least[h] == 0.0:
+                    hosts.least[h] = SHORTEST_SHARE * (time - now)
+                end = stretch_end(now, time, max(stretch, hosts.least[h]))
             last = path.last[piece]
             if end < last:
                 for s in range(first, after):
@@ -155,6 +157,7 @@ def advance(
                         enough = False
                 if not enough:
                     break
+            hosts.least[h] *= LONGER
         P, xhat = riccati_step(table, P, xhat, end - now)
         if senses:
             step = Step(
@@ -173,6 +176,8 @@ def advance(
     fill(hosts.xhat[h], xhat)
     fill_square(hosts.P[h], P)
     hosts.now[h] = now
+    if enough:
+        hosts.least[h] = 0.0
     return enough
 
 

@@ -38,8 +38,9 @@ class Models(NamedTuple):
 
 class Hosts(NamedTuple):
     """H filters: model (H,), node id to record (H,), xhat (H, n), P (H, n, n), the time ``now``
-    (H,) that they have reached, their sensors from ``sensors[h]`` to ``sensors[h + 1]``, and the
-    first message of their inbox (-1: none).
+    (H,) that they have reached, their sensors from ``sensors[h]`` to ``sensors[h + 1]``, the first
+    message of their inbox (-1: none), and the ``least`` stretch (H,) of readings that they use at
+    once on their way (0: they stand).
     """
 
     model: np.ndarray
@@ -49,6 +50,7 @@ class Hosts(NamedTuple):
     now: FloatArray
     sensors: np.ndarray
     inbox: np.ndarray
+    least: FloatArray
 
 
 class Sensing(NamedTuple):
@@ -158,6 +160,7 @@ def host_tables(scenario: Scenario) -> tuple[Hosts, Models]:
         now=np.zeros(len(starts)),
         sensors=sensors.astype(np.int64),
         inbox=np.full(len(starts), -1, dtype=np.int64),
+        least=np.zeros(len(starts)),
     )
     return hosts, model_tables(distinct)
 

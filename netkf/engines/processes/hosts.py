@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.flow import FlowFilter, FlowModel, Reading
+from netkf.algorithms.flow import FlowFilter, FlowModel, Reading, stretch_end
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.engines.base import SHORTEST_SHARE, Rank
+from netkf.engines.base import LONGER, SHORTEST_SHARE, Rank
 from netkf.engines.processes.timeline import Timeline
 from netkf.plants.paths import DiffusionPath
 from netkf.plants.sensors import LinearSensor, SensorPath
@@ -45,12 +45,14 @@ class Host:
     def advance(self, time: float) -> None:
         """Bring the filter to ``time``, with the readings of the stretch in between."""
         algorithm, state, now = self._algorithm, self._state, self._now
+        least = SHORTEST_SHARE * (time - now)
         while now < time:
             end = time
             if self._sensors:
                 stretch = algorithm.stretch(state)
                 if stretch < time - now:
-                    end = now + max(stretch, SHORTEST_SHARE * (time - now))
+                    end = stretch_end(now, time, max(stretch, least))
+                    least *= LONGER
             state = algorithm.flow(state, end - now)
             if self._sensors:
                 moments = self._read(now, end)
