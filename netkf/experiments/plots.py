@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -16,7 +17,8 @@ from matplotlib.figure import Figure
 from netkf.core.arrays import FloatArray
 from netkf.experiments.ensembles.directory import FinishedEnsemble
 from netkf.experiments.run import Finished
-from netkf.experiments.summary import Promise
+from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds
+from netkf.experiments.words import nees_words
 from netkf.scenario.scenario import Scenario
 
 SENSING, RELAY, PROMISE, DARK = "#c1440e", "#3b6ea5", "#222222", "#555555"
@@ -25,18 +27,22 @@ LONGEST_LEGEND = 72
 
 
 def run_picture(scenario: Scenario, finished: Finished) -> None:
-    """Write ``run.png``: errors and square roots of trace P over time against the bound and the
-    limits, and the network with its link activity.
+    """Write ``run.png``: errors, square roots of trace P over time against the bound and the
+    limits, NEES, and the network with its link activity.
     """
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(11.0, 6.4), layout="constrained")
+        rows = 3 if scenario.plant.shown else 2
+        figure = Figure(figsize=(11.0, 1.0 + 2.7 * rows), layout="constrained")
         FigureCanvasAgg(figure)
-        grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0])
+        grid = figure.add_gridspec(rows, 2, width_ratios=[1.15, 1.0])
         _errors(figure.add_subplot(grid[0, 0]), scenario, finished)
         _covariances(figure.add_subplot(grid[1, 0]), scenario, finished)
+        if scenario.plant.shown:
+            samples = finished.samples
+            _nees(figure.add_subplot(grid[2, 0]), np.array(samples.times), samples.nees, scenario)
         _network(figure, figure.add_subplot(grid[:, 1]), scenario, finished)
         title = scenario.name if not scenario.claim else f"{scenario.name}: {scenario.claim}"
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+        figure.suptitle(fill(title, 130), fontsize=10, x=0.01, ha="left")
         path = finished.directory / "run.png"
         part = path.with_name("run.png.part")
         figure.savefig(part, dpi=130, format="png")
@@ -45,13 +51,14 @@ def run_picture(scenario: Scenario, finished: Finished) -> None:
 
 def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
     """Write ``run.png``: root mean square errors and square roots of the mean trace of P over time,
-    each with a band of at least two standard errors, against the bound and the limits.
+    each with a band of at least two standard errors, against the bound and the limits, and NEES.
     """
     ensemble = finished.ensemble
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(9.0, 6.4), layout="constrained")
+        rows = 3 if ensemble.shown else 2
+        figure = Figure(figsize=(9.0, 1.0 + 2.7 * rows), layout="constrained")
         FigureCanvasAgg(figure)
-        above, below = figure.subplots(2, 1)
+        above, below, *lowest = figure.subplots(rows, 1)
         if ensemble.shown:
             _bands(above, scenario, finished, ensemble.mean_error, ensemble.se_error)
             above.set(ylabel="root mean square error", xlabel="simulated seconds")
@@ -60,9 +67,12 @@ def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
             above.axis("off")
         _bands(below, scenario, finished, ensemble.mean_P, ensemble.se_P)
         below.set(ylabel="square root of mean trace P", xlabel="simulated seconds")
+        runs = int(ensemble.runs.max())
+        if lowest:
+            _nees(lowest[0], ensemble.times, ensemble.mean_nees, scenario, runs)
         name = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
-        title = f"{name} ({int(ensemble.runs.max()):,} runs)"
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+        title = f"{name} ({runs:,} runs)"
+        figure.suptitle(fill(title, 105), fontsize=10, x=0.01, ha="left")
         path = finished.directory / "run.png"
         part = path.with_name("run.png.part")
         figure.savefig(part, dpi=130, format="png")
@@ -168,6 +178,21 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
     shown = root if promised.bound is None else np.concatenate([root, np.sqrt(promised.bound)])
     _scale(axes, shown)
     axes.set(ylabel="square root of trace P", xlabel="simulated seconds")
+    _legend(axes)
+
+
+def _nees(axes: Any, times: FloatArray, nees: Any, scenario: Scenario, runs: int = 1) -> None:
+    """NEES of every node, (T, N), a mean over the runs, and where it lies when P is exact."""
+    values = np.array(nees)
+    _lines(axes, times, values, scenario)
+    axes.plot(times, values.mean(axis=1), color=PROMISE, lw=1.6, label="mean of all", zorder=3)
+    words = f"{CONFIDENCE:.0%} where P is exact"
+    low, high = nees_bounds(scenario.plant.n, runs)
+    axes.axhspan(low, high, color="#2e8b57", alpha=0.15, label=words)
+    label = f"n = {scenario.plant.n}" + (", P is larger by design" if nees_words(scenario) else "")
+    axes.axhline(scenario.plant.n, color="#2e8b57", lw=1.1, label=label)
+    _scale(axes, np.append(values, high))
+    axes.set(ylabel="NEES" if runs == 1 else "mean NEES", xlabel="simulated seconds")
     _legend(axes)
 
 

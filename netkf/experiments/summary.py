@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
@@ -19,6 +20,7 @@ from netkf.trace.run import errors
 from netkf.trace.schema import CODES
 
 ROUNDING = 4.0 * np.finfo(float).eps
+CONFIDENCE = 0.95
 
 
 class SummarySink(Sink):
@@ -57,6 +59,15 @@ class SummarySink(Sink):
         blurred = ROUNDING * float(np.abs(x).max()) > 0.01 * deviation > 0.0
         if blurred and self.rounding_from is None:
             self.rounding_from = t
+
+
+def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
+    """Between which the mean NEES of one sample over the runs lies with CONFIDENCE where P is
+    exact, since their sum is chi-square with ``runs n`` degrees of freedom.
+    """
+    ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
+    low, high = (2.0 * float(gammaincinv(0.5 * runs * n, end)) / runs for end in ends)
+    return low, high
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from netkf.core.arrays import FloatArray
 from netkf.experiments.ensembles.tallies import MESSAGES, Tally
-from netkf.experiments.summary import Promise
+from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds
 from netkf.scenario.scenario import Scenario
-
-CONFIDENCE = 0.95
 
 
 def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> dict[str, Any]:
@@ -53,8 +50,7 @@ def _chi_square(scenario: Scenario, tally: Tally) -> dict[str, float]:
     samples after time 0 that every run has.
     """
     n, runs = scenario.plant.n, tally.runs
-    ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
-    low, high = (2.0 * float(gammaincinv(0.5 * runs * n, end)) / runs for end in ends)
+    low, high = nees_bounds(n, runs)
     kept = (scenario.times > 0.0) & (tally.samples.size[:, 0, 0] == runs)
     means = tally.samples.mean[kept, :, -1]
     inside = float(((means >= low) & (means <= high)).mean()) if means.size else np.nan
