@@ -290,8 +290,6 @@ def test_directories_are_never_overwritten(tmp_path, monkeypatch):
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
 def test_every_scenario_ends_in_its_expected_summary(file, tmp_path, capsys):
     """The file beside the scenario; numbers to 6 digits, counts exactly."""
-    # Errors of 1 beside states of 1e13, as in threshold, are those of SimPy with nothing compiled,
-    # which is what runs of this size get.
     options = ["--out", str(tmp_path / "out"), "--no-plot"]
     assert main(["run", str(file), *options]) == 0
     expected = json.loads(file.with_suffix(".expected.json").read_text())
