@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from netkf.algorithms.flow import FlowFilter, FlowState, Payload, predict
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import compilable_as
 from netkf.core.fields import number, setting
 
 
@@ -28,7 +28,8 @@ class Hybrid(FlowFilter):
         own = 1.0 - sum(weight for weight, _, _ in messages)
         xhat, P = own * state.xhat, own * state.P
         for weight, payload, age in messages:
-            xhat, P = reset(xhat, P, weight, *predict(state.model, payload, age))
+            other, other_P = predict(state.model, payload, age)
+            add_neighbour(xhat[None], P[None], 0, weight, other[None], other_P[None], 0)
         return state._replace(xhat=xhat, P=P)
 
     def weight(self, degree: int, peer_degree: int) -> float:
@@ -40,9 +41,33 @@ class Hybrid(FlowFilter):
         return (1.0 + 1e-12) / self.epsilon
 
 
-@compilable
-def reset(
-    xhat: FloatArray, P: FloatArray, weight: float, other: FloatArray, other_P: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """A partial sum of H (7) and (9) with one more neighbour in it."""
-    return xhat + weight * other, P + weight * other_P
+def _add_loops(
+    xhat: FloatArray,
+    P: FloatArray,
+    k: int,
+    weight: float,
+    other: FloatArray,
+    other_P: FloatArray,
+    m: int,
+) -> None:
+    for i in range(xhat.shape[1]):
+        xhat[k, i] += weight * other[m, i]
+        for j in range(xhat.shape[1]):
+            P[k, i, j] += weight * other_P[m, i, j]
+
+
+@compilable_as(_add_loops)
+def add_neighbour(
+    xhat: FloatArray,
+    P: FloatArray,
+    k: int,
+    weight: float,
+    other: FloatArray,
+    other_P: FloatArray,
+    m: int,
+) -> None:
+    """Put one more neighbour, place ``m`` of (M, n) and (M, n, n), into the partial sums of H (7)
+    and (9) at place ``k`` of (K, n) and (K, n, n).
+    """
+    xhat[k] += weight * other[m]
+    P[k] += weight * other_P[m]

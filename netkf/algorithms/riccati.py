@@ -17,7 +17,16 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.compiling import compilable, compilable_as
-from netkf.core.small import added, applied, eliminate, even, polynomial, product, solution
+from netkf.core.small import (
+    added,
+    applied,
+    eliminate,
+    even,
+    fill_polynomial,
+    polynomial,
+    product,
+    solution,
+)
 
 TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
 
@@ -127,31 +136,53 @@ def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, F
     return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
 
 
-def _part_loops(
-    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
-) -> tuple[FloatArray, FloatArray]:
-    # X' and Y' are made as such, and nothing else is: what is made in passing takes longer than
-    # the arithmetic.
-    n = table.n
-    E = polynomial(table.series[: terms_for(gap / table.unit)], gap)
-    X, Y, moved = np.empty((n, n)), np.empty((n, n)), np.empty(n)
-    for i in range(n):
+@compilable
+def move_part(
+    unit: float,
+    series: FloatArray,
+    P: FloatArray,
+    x: FloatArray,
+    k: int,
+    gap: float,
+    E: FloatArray,
+    X: FloatArray,
+    Y: FloatArray,
+) -> None:
+    """``part_of_unit`` in loops and in place, for place ``k`` of P (K, n, n) and x (K, n).
+
+    ``E`` (5 n n,), ``X, Y`` (n + 1, n) are room to work in. Compiled, making room takes longer than
+    the arithmetic, and so does every look into a tuple of arrays, since it counts references.
+    """
+    n = x.shape[1]
+    fill_polynomial(E, series, terms_for(gap / unit), gap)
+    for i in range(n):  # X' and Y' are made as such
         total = 0.0
-        for k in range(n):
-            total += E[(4 * n + i) * n + k] * x[k]
-        moved[i] = total
+        for j in range(n):
+            total += E[(4 * n + i) * n + j] * x[k, j]
+        X[n, i] = total
         above, below = 2 * n * i, 2 * n * (n + i)
         for j in range(n):
             up, down = E[above + j], E[below + j]
-            for k in range(n):
-                up += E[above + n + k] * P[k, j]
-                down += E[below + n + k] * P[k, j]
+            for m in range(n):
+                up += E[above + n + m] * P[k, m, j]
+                down += E[below + n + m] * P[k, m, j]
             X[j, i], Y[j, i] = up, down
-    eliminate(X, Y)
+    eliminate(X, Y, n)
     for i in range(n):
+        x[k, i] = X[n, i]
+        P[k, i, i] = Y[i, i]
         for j in range(i):
-            Y[i, j] = Y[j, i] = 0.5 * (Y[i, j] + Y[j, i])
-    return Y, moved
+            P[k, i, j] = P[k, j, i] = 0.5 * (Y[i, j] + Y[j, i])
+
+
+def _part_loops(
+    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
+) -> tuple[FloatArray, FloatArray]:
+    n = table.n
+    stack, means = P.copy().reshape(1, n, n), x.copy().reshape(1, n)
+    E, X, Y = np.empty(5 * n * n), np.empty((n + 1, n)), np.empty((n, n))
+    move_part(table.unit, table.series, stack, means, 0, gap, E, X, Y)
+    return stack[0], means[0]
 
 
 @compilable_as(_part_loops)

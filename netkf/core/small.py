@@ -74,14 +74,23 @@ def applied(a: FloatArray, x: FloatArray) -> FloatArray:
     return np.asarray(a @ x)
 
 
-def _polynomial_loops(series: FloatArray, gap: float) -> FloatArray:
-    terms, size = series.shape
-    out: FloatArray = series[0].copy()
+@compilable
+def fill_polynomial(out: FloatArray, series: FloatArray, terms: int, gap: float) -> None:
+    """Write ``sum_k gap^k series[k]`` of the first ``terms`` into a vector (size,)."""
+    size = len(out)
+    for j in range(size):
+        out[j] = series[0, j]
     power = 1.0
     for k in range(1, terms):
         power *= gap
         for j in range(size):
             out[j] += power * series[k, j]
+
+
+def _polynomial_loops(series: FloatArray, gap: float) -> FloatArray:
+    terms, size = series.shape
+    out = np.empty(size)
+    fill_polynomial(out, series, terms, gap)
     return out
 
 
@@ -96,11 +105,13 @@ def polynomial(series: FloatArray, gap: float) -> FloatArray:
 
 @compilable
 def eliminate(  # noqa: PLR0912 - loops are what the compiler wants
-    L: FloatArray, out: FloatArray
+    L: FloatArray, out: FloatArray, n: int
 ) -> None:
-    """Write ``L^-1 out`` over ``out`` (n, c), and over L (n, n) too; nan where it is singular."""
+    """Write ``L^-1 out`` over ``out`` (n, c), and over the first ``n`` rows of L (., n) too; nan
+    where they are singular.
+    """
     # Gauss with the largest pivot of each column, as LAPACK does it.
-    n, columns = L.shape[0], out.shape[1]
+    columns = out.shape[1]
     for k in range(n):
         best = k
         for i in range(k + 1, n):
@@ -132,7 +143,7 @@ def eliminate(  # noqa: PLR0912 - loops are what the compiler wants
 
 def _solution_loops(left: FloatArray, right: FloatArray) -> FloatArray:
     out = right.copy()
-    eliminate(left.copy(), out)
+    eliminate(left.copy(), out, len(left))
     return out
 
 

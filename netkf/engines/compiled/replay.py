@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.covariance_intersection import intersected_pairs
-from netkf.algorithms.flow import Payload, stretch_end, usable
+from netkf.algorithms.flow import stretch_end, usable
 from netkf.algorithms.gains import GainTable, gain_update
-from netkf.algorithms.hybrid import reset
-from netkf.algorithms.riccati import RiccatiTable, riccati_step
+from netkf.algorithms.hybrid import add_neighbour
+from netkf.algorithms.riccati import RiccatiTable, move_part, riccati_step
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.small import fill, fill_square
@@ -130,7 +130,13 @@ def gains_of(models: Models, k: int) -> GainTable:
 
 @compilable
 def advance(
-    hosts: Hosts, models: Models, sensing: Sensing, path: Stretch, piece: int, h: int, time: float
+    hosts: Hosts,
+    models: Models,
+    sensing: Sensing,
+    path: Stretch,
+    piece: int,
+    h: int,
+    time: float,
 ) -> bool:
     """Bring host ``h`` to ``time`` as a Host of the processes does; False where it needs more
     normals for cuts first, and then goes on where it stopped.
@@ -275,13 +281,6 @@ def put_in_order(hosts: np.ndarray, count: int) -> None:
 
 
 @compilable
-def arrived(models: Models, xhat: FloatArray, P: FloatArray, age: float) -> Payload:
-    """What a message that took ``age`` seconds says now."""
-    other_P, other = riccati_step(flow_table(models, len(models.unit) - 1), P, xhat, age)
-    return Payload(other, other_P)
-
-
-@compilable
 def note(
     rows: np.ndarray,
     place: np.ndarray,
@@ -297,6 +296,14 @@ def note(
     row.t, row.kind, row.node, row.peer = t, kind, node, peer
     row.message, row.phase, row.age = message, -1, age
     place[ROW] += 1
+
+
+@compilable
+def move_far(models: Models, k: int, P: FloatArray, x: FloatArray, place: int, gap: float) -> None:
+    """Move a place of P and x over a gap of any length by one of the models."""
+    moved, mean = riccati_step(flow_table(models, k), P[place], x[place], gap)
+    fill_square(P[place], moved)
+    fill(x[place], mean)
 
 
 @compilable
@@ -336,9 +343,10 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     numbers, arrivals, order, heap = mail.number, mail.arrival, mail.order, mail.heap
     waiting, ticks, ticking, delays = mail.waiting, window.t, window.link, window.delay
     grid, stop, awake, awake_node = path.grid, path.stop, sensing.host, sensing.node
-    unit, series, jump, F = models.unit, models.series, models.jump, models.F
-    G, Q, capacity = models.G, models.Q, len(mail.sent)
-    window_end, path_end = window.end, path.end
+    capacity, window_end, path_end = len(mail.sent), window.end, path.end
+    unit, n = models.unit, xhats.shape[1]
+    known, series = 0, models.series[0]
+    E, X, Y = np.empty(5 * n * n), np.empty((n + 1, n)), np.empty((n, n))
     while True:
         if place[ROW] + MOST_ROWS > len(rows):
             return WANT_ROWS
@@ -392,10 +400,12 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                     return WANT_CUTS
             else:
                 m, gap = model[h], now - reached[h]
-                table = RiccatiTable(F.shape[2], unit[m], series[m], jump[m], F[m], G[m], Q[m])
-                P, xhat = riccati_step(table, Ps[h], xhats[h], gap)
-                fill(xhats[h], xhat)
-                fill_square(Ps[h], P)
+                if m != known:
+                    known, series = m, models.series[m]
+                if gap < unit[m]:
+                    move_part(unit[m], series, Ps, xhats, h, gap, E, X, Y)
+                else:
+                    move_far(models, m, Ps, xhats, h, gap)
                 reached[h] = now
         if sense == now:
             note(rows, place, now, SENSE, awake_node[place[AWAKE]], -1, -1, np.nan)
@@ -418,8 +428,10 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 elif delay == 0.0 or arrival < horizon:
                     message = place[FREE]
                     place[FREE] = free[message]
-                    fill(mail_x[message], xhats[sender])
-                    fill_square(mail_P[message], Ps[sender])
+                    for r in range(n):
+                        mail_x[message, r] = xhats[sender, r]
+                        for c in range(n):
+                            mail_P[message, r, c] = Ps[sender, r, c]
                     sent[message] = now
                     way_of[message] = 2 * link + way
                     numbers[message] = number
@@ -450,9 +462,13 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 own += weights[way_of[message] // 2, way_of[message] % 2]
                 message = free[message]
             own = 1.0 - own
-            xhat, P = own * xhats[h], own * Ps[h]
             count = 0
-            if parts is not None:
+            if parts is None:  # what others sent is a copy, so that sums may grow in their place
+                for r in range(n):
+                    xhats[h, r] *= own
+                    for c in range(n):
+                        Ps[h, r, c] *= own
+            else:
                 count = add_part(parts, count, max(own, 0.0), xhats[h], Ps[h])
             oldest, message = 0.0, inbox[h]
             while message != -1:
@@ -460,14 +476,11 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 weight = weights[way_of[message] // 2, way_of[message] % 2]
                 if age > 0.0:
                     oldest = max(oldest, age)
-                    payload = arrived(models, mail_x[message], mail_P[message], age)
-                    other, other_P = payload.xhat, payload.P
-                else:
-                    other, other_P = mail_x[message], mail_P[message]
+                    move_far(models, len(unit) - 1, mail_P, mail_x, message, age)
                 if parts is None:
-                    xhat, P = reset(xhat, P, weight, other, other_P)
+                    add_neighbour(xhats, Ps, h, weight, mail_x, mail_P, message)
                 else:
-                    count = add_part(parts, count, weight, other, other_P)
+                    count = add_part(parts, count, weight, mail_x[message], mail_P[message])
                 gone, message = message, free[message]
                 free[gone] = place[FREE]
                 place[FREE] = gone
@@ -475,8 +488,8 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 xhat, P = intersected_pairs(
                     parts.weight[:count], parts.xhat[:count], parts.P[:count]
                 )
-            fill(xhats[h], xhat)
-            fill_square(Ps[h], P)
+                fill(xhats[h], xhat)
+                fill_square(Ps[h], P)
             inbox[h] = -1
             note(rows, place, now, ABSORB, nodes[h], -1, -1, oldest)
             place[READY] += 1
