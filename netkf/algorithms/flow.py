@@ -122,7 +122,7 @@ class FlowFilter(Part):
         A large covariance shrinks fast, and the weights of readings change as fast: on the time
         scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
         """
-        return usable(state.P, state.model.information)
+        return usable(float((state.P * state.model.information).sum()))
 
     def emit(self, state: Any) -> Any:
         """What the node sends now."""
@@ -148,9 +148,10 @@ class FlowFilter(Part):
 
 
 @compilable
-def usable(P: FloatArray, information: FloatArray) -> float:
-    """Seconds of readings that may be used at once from P on, see FlowFilter.stretch."""
-    rate = float((P * information).sum())
+def usable(rate: float) -> float:
+    """Seconds of readings that may be used at once from a P on with ``rate = trace(P G)``, see
+    FlowFilter.stretch.
+    """
     return STRETCH / rate if rate > 0.0 else math.inf
 
 

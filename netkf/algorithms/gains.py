@@ -18,9 +18,9 @@ import numpy as np
 
 from netkf.algorithms.riccati import exponential_series, hamiltonian
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable_as
+from netkf.core.compiling import compilable
 from netkf.core.legendre import MOMENTS, backward_coefficients
-from netkf.core.small import added, applied, polynomial
+from netkf.core.small import added, applied, fill_polynomial, polynomial
 
 LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
 
@@ -75,25 +75,34 @@ def _terms(size: float) -> int:
     return terms
 
 
-def _update_loops(
-    table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
-) -> FloatArray:
-    n, q = table.n, table.moments
-    values = polynomial(table.series, gap)
-    out = x.copy()
+@compilable
+def gain_move(
+    moments: FloatArray,
+    series: FloatArray,
+    P: FloatArray,
+    x: FloatArray,
+    k: int,
+    gap: float,
+    values: FloatArray,
+) -> None:
+    """``gain_update`` in loops and in place, for place ``k`` of P (K, n, n) and x (K, n); over the
+    ``moments`` (2p,) it writes innovations. ``values`` is room for a row of ``series``.
+    """
+    n, q = x.shape[1], len(moments)
+    fill_polynomial(values, series, len(series), gap)
     for m in range(q):
-        innovation = moments[m]
         for j in range(n):
-            innovation -= values[(2 * q + m) * n + j] * x[j]
-        for i in range(n):
+            moments[m] -= values[(2 * q + m) * n + j] * x[k, j]
+    for i in range(n):
+        total = 0.0
+        for m in range(q):
             gain = values[i * q + m]
-            for k in range(n):
-                gain += P[i, k] * values[(n + k) * q + m]
-            out[i] += gain * innovation
-    return out
+            for j in range(n):
+                gain += P[k, i, j] * values[(n + j) * q + m]
+            total += gain * moments[m]
+        x[k, i] += total
 
 
-@compilable_as(_update_loops)
 def gain_update(
     table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:

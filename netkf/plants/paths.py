@@ -18,7 +18,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.compiling import compilable
 from netkf.core.legendre import forward_coefficients
-from netkf.core.small import added, applied, polynomial
+from netkf.core.small import added, applied, fill_polynomial, polynomial
 
 BLOCK = 64  # steps drawn at once
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
@@ -320,7 +320,6 @@ def _legendre_moments(since: float, gap: float, length: float) -> FloatArray:
     return out
 
 
-@compilable
 def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray:
     """(2, n) moments of x over ``[start, end]`` inside a step; ``series`` is of the responses."""
     n = len(step.x_start)
@@ -332,3 +331,40 @@ def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray
         x = applied(polynomial(series[:, : n * n], since).reshape(n, n), x)
     plain = applied(polynomial(series, gap)[n * n :].reshape(2 * n, n), x).reshape(2, n)
     return added(plain, _legendre_moments(since, gap, step.end - step.start), step.cubic)
+
+
+@compilable
+def fill_seen(
+    out: FloatArray,
+    series: FloatArray,
+    since: float,
+    gap: float,
+    length: float,
+    x_start: FloatArray,
+    cubic: FloatArray,
+    k: int,
+    responses: FloatArray,
+    x: FloatArray,
+) -> None:
+    """``seen`` in loops, ``gap`` seconds from ``since`` on in piece ``k`` of ``length`` seconds,
+    into ``out`` (2, n); ``responses`` (3 n n,) and ``x`` (n,) are room to work in.
+    """
+    n = len(x)
+    for i in range(n):
+        x[i] = x_start[k, i]
+    if since > 0.0:
+        fill_polynomial(responses, series, len(series), since)
+        for i in range(n):
+            x[i] = 0.0
+            for j in range(n):
+                x[i] += responses[i * n + j] * x_start[k, j]
+    fill_polynomial(responses, series, len(series), gap)
+    from_noise = _legendre_moments(since, gap, length)
+    for m in range(2):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += responses[((m + 1) * n + i) * n + j] * x[j]
+            for c in range(4):
+                total += from_noise[m, c] * cubic[k, c, i]
+            out[m, i] = total

@@ -127,10 +127,34 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
     return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
 
 
-@compilable
 def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
     """(2, p) moments of dy from those of x (2, n) and of unit white noise (2, p)."""
     return added(product(seen, H.T), noise, root.T)
+
+
+@compilable
+def fill_reading(
+    out: FloatArray,
+    row: int,
+    rows: int,
+    seen: FloatArray,
+    H: FloatArray,
+    noise: FloatArray,
+    root: FloatArray,
+    s: int,
+) -> None:
+    """``reading`` in loops, of sensor ``s`` with ``rows`` rows of H (S, p, n) and root (S, p, p):
+    the first moments from ``out[row]`` on and the second ones half of ``out`` later.
+    """
+    half = len(out) // 2
+    for m in range(2):
+        for i in range(rows):
+            total = 0.0
+            for j in range(seen.shape[1]):
+                total += H[s, i, j] * seen[m, j]
+            for j in range(rows):
+                total += root[s, i, j] * noise[m, j]
+            out[m * half + row + i] = total
 
 
 @compilable

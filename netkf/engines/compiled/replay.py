@@ -14,7 +14,7 @@ import numpy as np
 
 from netkf.algorithms.covariance_intersection import intersected_pairs
 from netkf.algorithms.flow import stretch_end, usable
-from netkf.algorithms.gains import GainTable, gain_update
+from netkf.algorithms.gains import gain_move
 from netkf.algorithms.hybrid import add_neighbour
 from netkf.algorithms.riccati import RiccatiTable, move_part, riccati_step
 from netkf.core.arrays import FloatArray
@@ -23,8 +23,8 @@ from netkf.core.small import fill, fill_square
 from netkf.engines.base import LONGER, SHORTEST_SHARE
 from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Parts, Sensing
-from netkf.plants.paths import Step, seen
-from netkf.plants.sensors import cut, reading
+from netkf.plants.paths import fill_seen
+from netkf.plants.sensors import cut, fill_reading
 from netkf.trace.schema import CODES
 
 SENSE, TICK, SEND, DELIVER, LOST, ABSORB = (
@@ -84,31 +84,32 @@ class Stretch(NamedTuple):
 
 @compilable
 def read(
-    sensing: Sensing, first: int, after: int, x: FloatArray, step: int, u: float, length: float
-) -> FloatArray:
-    """(2 p,) moments of the readings of sensors ``first`` to ``after``, where x has the moments
-    ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1: all of it).
+    out: FloatArray,
+    sensing: Sensing,
+    first: int,
+    x: FloatArray,
+    step: int,
+    u: float,
+    length: float,
+) -> None:
+    """Moments (2 p,) of the readings of sensors from ``first`` on, as many as fill ``out``, where x
+    has the moments ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1:
+    all of it).
     """
-    total = 0
-    for s in range(first, after):
-        total += sensing.rows[s]
-    out, row = np.empty(2 * total), 0
-    for s in range(first, after):
+    rows, rest, used, H, root = sensing.rows, sensing.rest, sensing.used, sensing.H, sensing.root
+    s, row = first, 0
+    while 2 * row < len(out):
         if sensing.step[s] != step:
             sensing.step[s] = step
-            fill_square(sensing.rest[s], sensing.noise[s, step])
-        noise = sensing.rest[s].copy()
+            fill_square(rest[s], sensing.noise[s, step])
+        noise = rest[s]
         if u >= 0.0:
-            normals = sensing.normals[s, sensing.used[s]]
-            sensing.used[s] += 1
-            noise, rest = cut(noise, normals, u, length)
-            fill_square(sensing.rest[s], rest)
-        y = reading(x, sensing.H[s], noise, sensing.root[s])
-        for i in range(sensing.rows[s]):
-            out[row] = y[0, i]
-            out[total + row] = y[1, i]
-            row += 1
-    return out
+            noise, left = cut(noise, sensing.normals[s, used[s]], u, length)
+            used[s] += 1
+            fill_square(rest[s], left)
+        fill_reading(out, row, rows[s], x, H, noise, root, s)
+        row += rows[s]
+        s += 1
 
 
 @compilable
@@ -121,14 +122,6 @@ def flow_table(models: Models, k: int) -> RiccatiTable:
 
 
 @compilable
-def gains_of(models: Models, k: int) -> GainTable:
-    """The gains of one model."""
-    terms, width, first = models.shape[k, 1], models.shape[k, 2], models.first[k]
-    series = models.gains[first : first + terms * width].reshape(terms, width)
-    return GainTable(models.F.shape[2], models.shape[k, 0], series)
-
-
-@compilable
 def advance(
     hosts: Hosts,
     models: Models,
@@ -137,54 +130,57 @@ def advance(
     piece: int,
     h: int,
     time: float,
+    E: FloatArray,
+    X: FloatArray,
+    Y: FloatArray,
 ) -> bool:
-    """Bring host ``h`` to ``time`` as a Host of the processes does; False where it needs more
-    normals for cuts first, and then goes on where it stopped.
+    """Bring host ``h``, which has sensors, to ``time`` as a Host of the processes does; False where
+    it needs more normals for cuts first, and then goes on where it stopped.
     """
-    now = hosts.now[h]
-    if not now < time:
-        return True
-    first, after, k = hosts.sensors[h], hosts.sensors[h + 1], hosts.model[h]
-    table = flow_table(models, k)
-    xhat, P = hosts.xhat[h].copy(), hosts.P[h].copy()
-    senses, enough = after > first, True
+    # Names of their own, because every look into a group counts references.
+    now, k, n = hosts.now[h], hosts.model[h], hosts.xhat.shape[1]
+    first, after = hosts.sensors[h], hosts.sensors[h + 1]
+    P, xhat, least, G = hosts.P, hosts.xhat, hosts.least, models.information
+    unit, series, normals = models.unit[k], models.series[k], sensing.normals.shape[1]
+    terms, width, begin = models.shape[k, 1], models.shape[k, 2], models.first[k]
+    gains = models.gains[begin : begin + terms * width].reshape(terms, width)
+    responses, used = path.series, sensing.used
+    start, stop, last = path.start[piece], path.stop[piece], path.last[piece]
+    moments, seen, of_x = np.empty(models.shape[k, 0]), np.empty((2, n)), np.empty(n)
+    room = np.empty(max(width, 3 * n * n))
     while now < time:
-        end = time
-        if senses:
-            stretch = usable(P, models.information[k])
-            if stretch < time - now:
-                if hosts.least[h] == 0.0:
-                    hosts.least[h] = SHORTEST_SHARE * (time - now)
-                end = stretch_end(now, time, max(stretch, hosts.least[h]))
-            last = path.last[piece]
-            if end < last:
-                for s in range(first, after):
-                    if sensing.used[s] == sensing.normals.shape[1]:
-                        enough = False
-                if not enough:
-                    break
-            hosts.least[h] *= LONGER
-        P, xhat = riccati_step(table, P, xhat, end - now)
-        if senses:
-            step = Step(
-                path.start[piece],
-                path.stop[piece],
-                path.x_start[piece],
-                path.x_stop[piece],
-                path.moments[piece],
-                path.cubic[piece],
-            )
-            x = seen(path.series, step, now, end)
-            share = (end - now) / (last - now) if end < last else -1.0
-            moments = read(sensing, first, after, x, path.step[piece], share, last - now)
-            xhat = gain_update(gains_of(models, k), P, xhat, moments, end - now)
+        end, rate = time, 0.0
+        for i in range(n):
+            for j in range(n):
+                rate += P[h, i, j] * G[k, i, j]
+        stretch = usable(rate)
+        if stretch < time - now:
+            if least[h] == 0.0:
+                least[h] = SHORTEST_SHARE * (time - now)
+            end = stretch_end(now, time, max(stretch, least[h]))
+        if end < last:
+            for s in range(first, after):
+                if used[s] == normals:
+                    hosts.now[h] = now
+                    return False
+        least[h] *= LONGER
+        gap = end - now
+        if gap < unit:
+            move_part(unit, series, P, xhat, h, gap, E, X, Y)
+        else:
+            move_far(models, k, P, xhat, h, gap)
+        if now == start and end == stop:
+            fill_square(seen, path.moments[piece])
+        else:
+            since, x_start, cubic = now - start, path.x_start, path.cubic
+            length, few = stop - start, room[: 3 * n * n]
+            fill_seen(seen, responses, since, gap, length, x_start, cubic, piece, few, of_x)
+        share = gap / (last - now) if end < last else -1.0
+        read(moments, sensing, first, seen, path.step[piece], share, last - now)
+        gain_move(moments, gains, P, xhat, h, gap, room[:width])
         now = end
-    fill(hosts.xhat[h], xhat)
-    fill_square(hosts.P[h], P)
-    hosts.now[h] = now
-    if enough:
-        hosts.least[h] = 0.0
-    return enough
+    hosts.now[h], least[h] = now, 0.0
+    return True
 
 
 @compilable
@@ -396,7 +392,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
             if not reached[h] < now:
                 continue
             if sensors[h] < sensors[h + 1]:
-                if not advance(hosts, models, sensing, path, place[STEP_AT], h, now):
+                if not advance(hosts, models, sensing, path, place[STEP_AT], h, now, E, X, Y):
                     return WANT_CUTS
             else:
                 m, gap = model[h], now - reached[h]
