@@ -7,6 +7,9 @@ a shared machine mean little. Each pair must make the same events, so that speed
 changed run. What is compiled is loaded beforehand. The compiled engine runs against
 
 - the SimPy engine, on every scenario that both run;
+- bare SimPy, a process a link, with one compiled call a tick that does the work of the loop by hand
+  (here netkf is SimPy with compiled filters, as ``engine = "processes"`` gives it; also against
+  itself with nothing compiled);
 - a loop by hand, which replays the same ticks of 1000 nodes (flow of xhat and P over each gap,
   resets), written for the purpose in numba without a trace, sensors or delays;
 - the same job with filterpy or Stone Soup objects and a heap of ticks (``peers``), as a user
@@ -24,12 +27,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+import simpy
 
 import netkf
 from netkf.core.streams import Streams
 from netkf.engines.base import silent
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.engines.compiled.schedule import Schedule
+from netkf.engines.compiled.schedule import LinkDraws, Schedule, Window
 from netkf.engines.compiled.tables import host_tables, link_tables
 from netkf.engines.processes.engine import ProcessesEngine
 from netkf.theory import intermittent
@@ -136,6 +140,37 @@ def hand_written(case):
     return run
 
 
+def bare_simpy(case):
+    """A SimPy process a link that yields at the engine's ticks, and a compiled call for each."""
+    import numba
+
+    fast = numba.njit(nogil=True, error_model="numpy")(by_hand)
+
+    def run():
+        hosts, models = host_tables(case)
+        tables, series = link_tables(case), models.series[-1]
+        draws, env, made = LinkDraws(case, Streams(case.seed)), simpy.Environment(), 0
+        one = (series, tables.ends, tables.weight, hosts.xhat, hosts.P, hosts.now)
+
+        def ticking(k):
+            nonlocal made
+            link = np.array([k])
+            while draws.last[k] < math.inf:
+                t, links, delays = draws.more(link)
+                for m in range(len(t)):
+                    yield env.timeout(t[m] - env.now)
+                    part = slice(m, m + 1)
+                    window = Window(0.0, t[part], links[part], delays[part])
+                    made += fast(one[0], window, *one[1:])
+
+        for k in range(draws.count):
+            env.process(ticking(k))
+        env.run()
+        return made
+
+    return run
+
+
 def line(*cells):
     print(f"{cells[0]:34s} {cells[1]:>12} {cells[2]:>14} {cells[3]:>14} {cells[4]:>8}", flush=True)
 
@@ -155,8 +190,8 @@ def compared(name, runs, mine, theirs, most=math.inf):
     return a
 
 
-def engines(name, case, runs):
-    """The two engines: the same fingerprints, too."""
+def engines(name, case, runs, fast):
+    """An engine against SimPy with nothing compiled: the same fingerprints, too."""
     seen = set()
 
     def events(engine):
@@ -164,8 +199,7 @@ def engines(name, case, runs):
         seen.add((fingerprint, ticks))
         return total
 
-    fast, slow = CompiledEngine(), ProcessesEngine()
-    compared(name, runs, lambda: events(fast), lambda: events(slow))
+    compared(name, runs, lambda: events(fast), lambda: events(ProcessesEngine()))
     assert len(seen) == 1, "the same events"
 
 
@@ -256,10 +290,18 @@ def main():
         case = netkf.load(file)
         if CompiledEngine().refusal(case) is None:
             horizon = max(case.horizon * share, float(np.max(case.probe)))
-            engines(f"SimPy, {file.stem}", case.replace({"horizon": horizon}), runs)
+            case = case.replace({"horizon": horizon})
+            engines(f"SimPy, {file.stem}", case, runs, CompiledEngine())
     big = thousand()
     short = big.replace({"horizon": max(4.0 * share, 1.0), "probe": 1.0})
-    engines("SimPy, 1000 nodes, 4000 links", short, runs)
+    engines("SimPy, 1000 nodes, 4000 links", short, runs, CompiledEngine())
+    fifty = peers.planar(50, 5.0).replace({"horizon": 40.0 * share, "probe": 4.0 * share})
+    mixed = ProcessesEngine(compiled=True)
+    engines("SimPy, its filters compiled, n = 4", fifty, runs, mixed)
+    blind = fifty.replace({"sensors": []})
+    compared(
+        "bare SimPy, a call a tick", runs, lambda: engine_run(mixed, blind)[2], bare_simpy(blind)
+    )
     long = big.replace({"horizon": 40.0 * share, "probe": 40.0 * share})
     hand = hand_written(long)
     hand()
