@@ -22,10 +22,16 @@ from netkf.core.small import added, applied, fill_polynomial, polynomial
 
 BLOCK = 64  # steps drawn at once
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
+MOST_GRIDS = 256  # kept stretches of the sensing grid
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
 _THREE_MOMENTS = np.stack([_THREE_WEIGHTS, _THREE_WEIGHTS * _THREE])
+
+
+def grid_time(period: float, k: int) -> float:
+    """Rounded so that lattices of other periods meet it."""
+    return float(round(k * period, 12))
 
 
 class Laws:
@@ -40,6 +46,16 @@ class Laws:
         self.response = self.responses(period)
         self.spread = _factor(self._noise(period))
         self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
+        self._grids: dict[int, FloatArray] = {}
+
+    def grid(self, first: int) -> FloatArray:
+        """(BLOCK + 1,) points of the sensing grid from number ``first`` on."""
+        known = self._grids.get(first)
+        if known is None or len(known) != BLOCK + 1:
+            known = np.array([grid_time(self.period, first + k) for k in range(BLOCK + 1)])
+            if len(self._grids) < MOST_GRIDS:
+                self._grids[first] = known
+        return known
 
     def responses(self, gap: float) -> FloatArray:
         """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""
@@ -144,10 +160,8 @@ class DiffusionPath:
         self._step, self._step_end = Step(0.0, 0.0, *[start] * 4), 0.0
 
     def grid(self, k: int) -> float:
-        """Time of the k-th point of the sensing grid, rounded so that lattices of other periods
-        meet it.
-        """
-        return float(round(k * self.period, 12))
+        """Time of the k-th point of the sensing grid."""
+        return grid_time(self.period, k)
 
     def following(self) -> Block:
         """The next steps of the sensing grid."""
@@ -162,7 +176,7 @@ class DiffusionPath:
         moments = np.ascontiguousarray(
             np.einsum("mij,kj->kmi", laws.response[1:], x[:-1]) + noise[:, 1:]
         )
-        times = np.array([self.grid(self._drawn + k) for k in range(BLOCK + 1)])
+        times = laws.grid(self._drawn)
         self._drawn += BLOCK
         cubic = _cubics(self.period, noise[:, 0], noise[:, 1:])
         steps = np.arange(BLOCK)

@@ -202,9 +202,11 @@ class FlowRun:
         place = self._cursor.place
         count, place[SHOWN] = int(place[SHOWN]), 0
         times = self._probes[place[PROBE_AT] - count : place[PROBE_AT]].tolist()
-        return all(self._sample(time, k) for k, time in enumerate(times))
+        taken = self._samples.xhat[:count], self._samples.P[:count]
+        finite = all(bool(np.isfinite(part).all()) for part in taken)
+        return all(self._sample(time, k, finite) for k, time in enumerate(times))
 
-    def _sample(self, time: float, k: int) -> bool:
+    def _sample(self, time: float, k: int, finite: bool) -> bool:
         path, piece = self._stretch, int(self._samples.piece[k])
         x = path.x_stop[piece] if time == path.stop[piece] else path.x_start[piece]
         xhat, P = self._samples.xhat[k].copy(), self._samples.P[k].copy()
@@ -213,7 +215,7 @@ class FlowRun:
             xhat, P = np.repeat(xhat, count, axis=0), np.repeat(P, count, axis=0)
         self._recorder.sample(time, x.copy(), xhat, P)
         self._progress(time)
-        nodes = broken(self._scenario, xhat, P)
+        nodes = [] if finite else broken(self._scenario, xhat, P)
         if nodes:
             # What happened after this sample did not happen.
             self._pass_rows_on(int(self._samples.rows[k]))
