@@ -10,6 +10,7 @@ from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import longest_interval
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import Part
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
@@ -318,10 +319,11 @@ def _slots(scenario: Scenario) -> None:
         isinstance(activation, RecordedSlots) and activation.matching
     )
     if pairs != algorithm.pairwise:
+        assert activation is not None
         raise ScenarioError(
             "network.activation.kind",
             f"must be a {'matching' if algorithm.pairwise else 'broadcast'} for the {name} filter",
-            type(activation).__name__.lower(),
+            _told(activation),
             "choose another activation or another filter",
         )
     exchanges = algorithm.programme.count("exchange")
@@ -332,3 +334,12 @@ def _slots(scenario: Scenario) -> None:
             scenario.phase_length,
             "shorten it; the steps of an exchange share it",
         )
+
+
+def _told(activation: Part) -> str:
+    """The kind of an activation in a sentence."""
+    name = spoken(activation, "activation")
+    if not isinstance(activation, RecordedSlots):
+        return name
+    columns = "slot,node,peer: a matching" if activation.matching else "phase,step: broadcasts"
+    return f"{name} ({columns})"

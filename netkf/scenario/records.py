@@ -87,3 +87,19 @@ def _exchanges(scenario: Scenario) -> None:
                 f"slot {slot}, phase {phase}, step {step}",
                 "phases and steps count from 0; mend the row",
             )
+
+
+def record_notes(scenario: Scenario) -> tuple[str, ...]:
+    """One line where recorded exchanges are in slots in which nothing is exchanged."""
+    activation, algorithm = scenario.network.activation, scenario.filter.algorithm
+    if not isinstance(activation, RecordedSlots) or not isinstance(algorithm, SlotFilter):
+        return ()
+    used = range(algorithm.first_slot, _sensed(scenario).stop)
+    unused = sorted({slot for slot, _, _ in activation.recorded} - set(used))
+    if not unused:
+        return ()
+    listed = ", ".join(map(str, unused[:3])) + (", ..." if len(unused) > 3 else "")
+    return (
+        f"{activation.path.name}: rows of slot {listed} are not used; there are exchanges in slots "
+        f"{used.start} to {used.stop - 1}",
+    )

@@ -184,8 +184,9 @@ class Scenario(Part):
     def notes(self) -> tuple[str, ...]:
         """One line each about what a user should know before anything runs."""
         from netkf.scenario.push_sum import push_sum_notes
+        from netkf.scenario.records import record_notes
 
-        return (*self.topology.notes, *push_sum_notes(self))
+        return (*self.topology.notes, *push_sum_notes(self), *record_notes(self))
 
     @property
     def slotted(self) -> bool:

@@ -201,3 +201,17 @@ def test_recorded_readings_are_for_slots(build, tmp_path):
     entry = {"kind": "recorded", "path": "r.csv", "H": [[1.0]], "R": [[0.5]]}
     with pytest.raises(netkf.ScenarioError, match="belongs to plants in slots"):
         build(sensors=[entry])
+
+
+def test_recorded_exchanges_that_no_slot_has_are_noted(tmp_path):
+    (tmp_path / "pairs.csv").write_text("slot,node,peer\n0,0,1\n1,0,1\n2,1,2\n900,0,1\n")
+    network = {
+        "graph": {"kind": "path", "nodes": 4},
+        "activation": {"kind": "recorded", "path": "pairs.csv"},
+    }
+    (note,) = scenario(tmp_path, "gossip", {"kind": "linear"}, network=network).notes
+    assert note.startswith("pairs.csv: rows of slot 0, 900 are not used; ")
+    assert note.endswith("slots 1 to 29")
+    words = r"must be a broadcast .* got 'recorded \(slot,node,peer: a matching\)'"
+    with pytest.raises(netkf.ScenarioError, match=words):
+        scenario(tmp_path, "push-sum", {"kind": "linear"}, network=network)
