@@ -10,7 +10,8 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import matrix, positive, setting, square
-from netkf.plants.paths import DiffusionPath, Laws
+from netkf.plants.laws import Laws
+from netkf.plants.paths import DiffusionPath
 from netkf.plants.plant import Plant
 
 LONGEST_STEP = 8.0

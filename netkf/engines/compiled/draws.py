@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.core.streams import Streams
-from netkf.engines.compiled.replay import Stretch
+from netkf.engines.compiled.readings import Stretch
 from netkf.engines.compiled.tables import Sensing
 from netkf.plants.paths import BLOCK
 from netkf.plants.sensors import step_noise

@@ -21,13 +21,6 @@ from netkf.engines.base import Engine, Progress, broken
 from netkf.engines.compiled.draws import Noise, Path
 from netkf.engines.compiled.replay import (
     DONE,
-    GRID_AT,
-    PLACES,
-    PROBE_AT,
-    ROW,
-    SHOWN,
-    STEP_AT,
-    TICK_AT,
     WANT_CUTS,
     WANT_MAIL,
     WANT_ROWS,
@@ -41,6 +34,13 @@ from netkf.engines.compiled.replay import (
 from netkf.engines.compiled.schedule import Schedule, Window
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.engines.compiled.tables import (
+    GRID_AT,
+    PLACES,
+    PROBE_AT,
+    ROW,
+    SHOWN,
+    STEP_AT,
+    TICK_AT,
     empty_mail,
     host_tables,
     larger,

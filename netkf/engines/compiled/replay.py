@@ -13,18 +13,34 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.covariance_intersection import intersected_pairs
-from netkf.algorithms.flow import stretch_end, usable
-from netkf.algorithms.gains import gain_move
 from netkf.algorithms.hybrid import add_neighbour
-from netkf.algorithms.riccati import RiccatiTable, move_part, riccati_step
+from netkf.algorithms.riccati import move_part
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.small import fill, fill_square
-from netkf.engines.base import LONGER, SHORTEST_SHARE
+from netkf.engines.compiled.mail import pop, push, put, put_in_order
+from netkf.engines.compiled.readings import Stretch, advance, move_far
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.tables import Hosts, Links, Mail, Models, Parts, Sensing
-from netkf.plants.paths import fill_seen
-from netkf.plants.sensors import cut, fill_reading
+from netkf.engines.compiled.tables import (
+    AWAKE,
+    FREE,
+    GRID_AT,
+    HEAP,
+    PROBE_AT,
+    READY,
+    ROW,
+    SENT,
+    SHOWN,
+    STEP_AT,
+    TICK_AT,
+    WAITING,
+    Hosts,
+    Links,
+    Mail,
+    Models,
+    Parts,
+    Sensing,
+)
 from netkf.trace.schema import CODES
 
 SENSE, TICK, SEND, DELIVER, LOST, ABSORB = (
@@ -35,9 +51,6 @@ WANT_TICKS, WANT_STEPS, WANT_CUTS, WANT_MAIL, WANT_ROWS, WANT_SAMPLES, DONE = ra
 a larger pool of messages, room for rows or for samples; all is done.
 """
 
-# Places in Cursor.place.
-TICK_AT, STEP_AT, GRID_AT, AWAKE, PROBE_AT, ROW, FREE, HEAP, WAITING, READY, SENT, SHOWN = range(12)
-PLACES = 12
 MOST_ROWS = 5  # of one activation
 NEVER = math.inf
 
@@ -61,221 +74,6 @@ class Samples(NamedTuple):
     piece: np.ndarray
 
 
-class Stretch(NamedTuple):
-    """Some steps of the sensing grid, the last of which ends at ``end``.
-
-    K pieces (a step is cut where a state is shown): start, stop (K,), x at both (K, n), moments
-    (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid`` holds the
-    times at which sensors wake; ``series`` as of the path.
-    """
-
-    end: float
-    start: FloatArray
-    stop: FloatArray
-    x_start: FloatArray
-    x_stop: FloatArray
-    moments: FloatArray
-    cubic: FloatArray
-    step: np.ndarray
-    last: FloatArray
-    grid: FloatArray
-    series: FloatArray
-
-
-@compilable
-def read(
-    out: FloatArray,
-    sensing: Sensing,
-    first: int,
-    x: FloatArray,
-    step: int,
-    u: float,
-    length: float,
-) -> None:
-    """Moments (2 p,) of the readings of sensors from ``first`` on, as many as fill ``out``, where x
-    has the moments ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1:
-    all of it).
-    """
-    rows, rest, used, H, root = sensing.rows, sensing.rest, sensing.used, sensing.H, sensing.root
-    s, row = first, 0
-    while 2 * row < len(out):
-        if sensing.step[s] != step:
-            sensing.step[s] = step
-            fill_square(rest[s], sensing.noise[s, step])
-        noise = rest[s]
-        if u >= 0.0:
-            noise, left = cut(noise, sensing.normals[s, used[s]], u, length)
-            used[s] += 1
-            fill_square(rest[s], left)
-        fill_reading(out, row, rows[s], x, H, noise, root, s)
-        row += rows[s]
-        s += 1
-
-
-@compilable
-def flow_table(models: Models, k: int) -> RiccatiTable:
-    """The table of one model."""
-    n = models.F.shape[2]
-    return RiccatiTable(
-        n, models.unit[k], models.series[k], models.jump[k], models.F[k], models.G[k], models.Q[k]
-    )
-
-
-@compilable
-def advance(
-    hosts: Hosts,
-    models: Models,
-    sensing: Sensing,
-    path: Stretch,
-    piece: int,
-    h: int,
-    time: float,
-    E: FloatArray,
-    X: FloatArray,
-    Y: FloatArray,
-) -> bool:
-    """Bring host ``h``, which has sensors, to ``time`` as a Host of the processes does; False where
-    it needs more normals for cuts first, and then goes on where it stopped.
-    """
-    # Names of their own, because every look into a group counts references.
-    now, k, n = hosts.now[h], hosts.model[h], hosts.xhat.shape[1]
-    first, after = hosts.sensors[h], hosts.sensors[h + 1]
-    P, xhat, least, G = hosts.P, hosts.xhat, hosts.least, models.information
-    unit, series, normals = models.unit[k], models.series[k], sensing.normals.shape[1]
-    terms, width, begin = models.shape[k, 1], models.shape[k, 2], models.first[k]
-    gains = models.gains[begin : begin + terms * width].reshape(terms, width)
-    responses, used = path.series, sensing.used
-    start, stop, last = path.start[piece], path.stop[piece], path.last[piece]
-    moments, seen, of_x = np.empty(models.shape[k, 0]), np.empty((2, n)), np.empty(n)
-    room = np.empty(max(width, 3 * n * n))
-    while now < time:
-        end, rate = time, 0.0
-        for i in range(n):
-            for j in range(n):
-                rate += P[h, i, j] * G[k, i, j]
-        stretch = usable(rate)
-        if stretch < time - now:
-            if least[h] == 0.0:
-                least[h] = SHORTEST_SHARE * (time - now)
-            end = stretch_end(now, time, max(stretch, least[h]))
-        if end < last:
-            for s in range(first, after):
-                if used[s] == normals:
-                    hosts.now[h] = now
-                    return False
-        least[h] *= LONGER
-        gap = end - now
-        if gap < unit:
-            move_part(unit, series, P, xhat, h, gap, E, X, Y)
-        else:
-            move_far(models, k, P, xhat, h, gap)
-        if now == start and end == stop:
-            fill_square(seen, path.moments[piece])
-        else:
-            since, x_start, cubic = now - start, path.x_start, path.cubic
-            length, few = stop - start, room[: 3 * n * n]
-            fill_seen(seen, responses, since, gap, length, x_start, cubic, piece, few, of_x)
-        share = gap / (last - now) if end < last else -1.0
-        read(moments, sensing, first, seen, path.step[piece], share, last - now)
-        gain_move(moments, gains, P, xhat, h, gap, room[:width])
-        now = end
-    hosts.now[h], least[h] = now, 0.0
-    return True
-
-
-@compilable
-def sooner(arrival: FloatArray, way: np.ndarray, order: np.ndarray, a: int, b: int) -> bool:
-    """Whether message ``a`` arrives before message ``b``."""
-    if arrival[a] != arrival[b]:
-        return bool(arrival[a] < arrival[b])
-    if way[a] != way[b]:
-        return bool(way[a] < way[b])
-    return bool(order[a] < order[b])
-
-
-@compilable
-def push(mail: Mail, size: int, message: int) -> None:
-    """Put a message on the heap of ``size``."""
-    heap, arrival, way, order, k = mail.heap, mail.arrival, mail.way, mail.order, size
-    while k > 0 and sooner(arrival, way, order, message, heap[(k - 1) // 2]):
-        heap[k] = heap[(k - 1) // 2]
-        k = (k - 1) // 2
-    heap[k] = message
-
-
-@compilable
-def pop(mail: Mail, size: int) -> int:
-    """Take the next message off the heap of ``size``."""
-    heap, arrival, way, order = mail.heap, mail.arrival, mail.way, mail.order
-    top, moved, k = heap[0], heap[size - 1], 0
-    while 2 * k + 1 < size - 1:
-        child = 2 * k + 1
-        if child + 1 < size - 1 and sooner(arrival, way, order, heap[child + 1], heap[child]):
-            child += 1
-        if not sooner(arrival, way, order, heap[child], moved):
-            break
-        heap[k] = heap[child]
-        k = child
-    heap[k] = moved
-    return int(top)
-
-
-@compilable
-def put(
-    inbox: np.ndarray,
-    waiting: np.ndarray,
-    ends: np.ndarray,
-    sent: FloatArray,
-    ways: np.ndarray,
-    following: np.ndarray,
-    place: np.ndarray,
-    h: int,
-    message: int,
-    now: float,
-) -> None:
-    """Put a message into an inbox, by peer; the newest of several from one peer counts."""
-    if inbox[h] == -1:
-        waiting[place[WAITING]] = h
-        place[WAITING] += 1
-    way = ways[message]
-    peer, other = ends[way // 2, way % 2], -1
-    before, here = -1, inbox[h]
-    while here != -1:
-        other = ends[ways[here] // 2, ways[here] % 2]
-        if other >= peer:
-            break
-        before, here = here, following[here]
-    gone = -1
-    if here != -1 and other == peer:
-        if now - sent[message] > now - sent[here]:
-            gone = message
-        else:
-            gone, here = here, following[here]
-    if gone != message:
-        following[message] = here
-        if before == -1:
-            inbox[h] = message
-        else:
-            following[before] = message
-    if gone != -1:
-        following[gone] = place[FREE]
-        place[FREE] = gone
-
-
-@compilable
-def put_in_order(hosts: np.ndarray, count: int) -> None:
-    """Sort the first ``count`` places (Shell's sort: a few lines to compile)."""
-    gap = count // 2
-    while gap > 0:
-        for k in range(gap, count):
-            host, place = hosts[k], k
-            while place >= gap and hosts[place - gap] > host:
-                hosts[place] = hosts[place - gap]
-                place -= gap
-            hosts[place] = host
-        gap //= 2
-
-
 @compilable
 def note(
     rows: np.ndarray,
@@ -292,14 +90,6 @@ def note(
     row.t, row.kind, row.node, row.peer = t, kind, node, peer
     row.message, row.phase, row.age = message, -1, age
     place[ROW] += 1
-
-
-@compilable
-def move_far(models: Models, k: int, P: FloatArray, x: FloatArray, place: int, gap: float) -> None:
-    """Move a place of P and x over a gap of any length by one of the models."""
-    moved, mean = riccati_step(flow_table(models, k), P[place], x[place], gap)
-    fill_square(P[place], moved)
-    fill(x[place], mean)
 
 
 @compilable

@@ -15,6 +15,10 @@ from netkf.algorithms.gains import GainTable
 from netkf.core.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
+# Places in Cursor.place.
+TICK_AT, STEP_AT, GRID_AT, AWAKE, PROBE_AT, ROW, FREE, HEAP, WAITING, READY, SENT, SHOWN = range(12)
+PLACES = 12
+
 
 class Models(NamedTuple):
     """M models and, last, the one that predicts: their tables one after the other.

@@ -1,0 +1,148 @@
+"""Readings in the compiled replay: how a host with sensors gets from one time to another."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.flow import stretch_end, usable
+from netkf.algorithms.gains import gain_move
+from netkf.algorithms.riccati import RiccatiTable, move_part, riccati_step
+from netkf.core.arrays import FloatArray
+from netkf.core.compiling import compilable
+from netkf.core.small import fill, fill_square
+from netkf.engines.base import LONGER, SHORTEST_SHARE
+from netkf.engines.compiled.tables import Hosts, Models, Sensing
+from netkf.plants.paths import fill_seen
+from netkf.plants.sensors import cut, fill_reading
+
+
+class Stretch(NamedTuple):
+    """Some steps of the sensing grid, the last of which ends at ``end``.
+
+    K pieces (a step is cut where a state is shown): start, stop (K,), x at both (K, n), moments
+    (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid`` holds the
+    times at which sensors wake; ``series`` as of the path.
+    """
+
+    end: float
+    start: FloatArray
+    stop: FloatArray
+    x_start: FloatArray
+    x_stop: FloatArray
+    moments: FloatArray
+    cubic: FloatArray
+    step: np.ndarray
+    last: FloatArray
+    grid: FloatArray
+    series: FloatArray
+
+
+@compilable
+def read(
+    out: FloatArray,
+    sensing: Sensing,
+    first: int,
+    x: FloatArray,
+    step: int,
+    u: float,
+    length: float,
+) -> None:
+    """Moments (2 p,) of the readings of sensors from ``first`` on, as many as fill ``out``, where x
+    has the moments ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1:
+    all of it).
+    """
+    rows, rest, used, H, root = sensing.rows, sensing.rest, sensing.used, sensing.H, sensing.root
+    s, row = first, 0
+    while 2 * row < len(out):
+        if sensing.step[s] != step:
+            sensing.step[s] = step
+            fill_square(rest[s], sensing.noise[s, step])
+        noise = rest[s]
+        if u >= 0.0:
+            noise, left = cut(noise, sensing.normals[s, used[s]], u, length)
+            used[s] += 1
+            fill_square(rest[s], left)
+        fill_reading(out, row, rows[s], x, H, noise, root, s)
+        row += rows[s]
+        s += 1
+
+
+@compilable
+def flow_table(models: Models, k: int) -> RiccatiTable:
+    """The table of one model."""
+    n = models.F.shape[2]
+    return RiccatiTable(
+        n, models.unit[k], models.series[k], models.jump[k], models.F[k], models.G[k], models.Q[k]
+    )
+
+
+@compilable
+def advance(
+    hosts: Hosts,
+    models: Models,
+    sensing: Sensing,
+    path: Stretch,
+    piece: int,
+    h: int,
+    time: float,
+    E: FloatArray,
+    X: FloatArray,
+    Y: FloatArray,
+) -> bool:
+    """Bring host ``h``, which has sensors, to ``time`` as a Host of the processes does; False where
+    it needs more normals for cuts first, and then goes on where it stopped.
+    """
+    # Names of their own, because every look into a group counts references.
+    now, k, n = hosts.now[h], hosts.model[h], hosts.xhat.shape[1]
+    first, after = hosts.sensors[h], hosts.sensors[h + 1]
+    P, xhat, least, G = hosts.P, hosts.xhat, hosts.least, models.information
+    unit, series, normals = models.unit[k], models.series[k], sensing.normals.shape[1]
+    terms, width, begin = models.shape[k, 1], models.shape[k, 2], models.first[k]
+    gains = models.gains[begin : begin + terms * width].reshape(terms, width)
+    responses, used = path.series, sensing.used
+    start, stop, last = path.start[piece], path.stop[piece], path.last[piece]
+    moments, seen, of_x = np.empty(models.shape[k, 0]), np.empty((2, n)), np.empty(n)
+    room = np.empty(max(width, 3 * n * n))
+    while now < time:
+        end, rate = time, 0.0
+        for i in range(n):
+            for j in range(n):
+                rate += P[h, i, j] * G[k, i, j]
+        stretch = usable(rate)
+        if stretch < time - now:
+            if least[h] == 0.0:
+                least[h] = SHORTEST_SHARE * (time - now)
+            end = stretch_end(now, time, max(stretch, least[h]))
+        if end < last:
+            for s in range(first, after):
+                if used[s] == normals:
+                    hosts.now[h] = now
+                    return False
+        least[h] *= LONGER
+        gap = end - now
+        if gap < unit:
+            move_part(unit, series, P, xhat, h, gap, E, X, Y)
+        else:
+            move_far(models, k, P, xhat, h, gap)
+        if now == start and end == stop:
+            fill_square(seen, path.moments[piece])
+        else:
+            since, x_start, cubic = now - start, path.x_start, path.cubic
+            length, few = stop - start, room[: 3 * n * n]
+            fill_seen(seen, responses, since, gap, length, x_start, cubic, piece, few, of_x)
+        share = gap / (last - now) if end < last else -1.0
+        read(moments, sensing, first, seen, path.step[piece], share, last - now)
+        gain_move(moments, gains, P, xhat, h, gap, room[:width])
+        now = end
+    hosts.now[h], least[h] = now, 0.0
+    return True
+
+
+@compilable
+def move_far(models: Models, k: int, P: FloatArray, x: FloatArray, place: int, gap: float) -> None:
+    """Move a place of P and x over a gap of any length by one of the models."""
+    moved, mean = riccati_step(flow_table(models, k), P[place], x[place], gap)
+    fill_square(P[place], moved)
+    fill(x[place], mean)

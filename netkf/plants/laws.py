@@ -1,0 +1,124 @@
+"""The laws of the steps of a diffusion, which all its paths on one sensing grid share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray, square_root
+from netkf.core.legendre import forward_coefficients
+from netkf.core.small import polynomial
+
+MOST_SPLITS = 256  # kept laws of a state shown inside a step
+MOST_GRIDS = 256  # kept stretches of the sensing grid
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
+_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+
+
+def grid_time(period: float, k: int) -> float:
+    """Rounded so that lattices of other periods meet it."""
+    return float(round(k * period, 12))
+
+
+class Laws:
+    """What all paths of ``dx = A x dt + B dw`` on the grid of one ``period`` share; the laws of
+    states shown inside a step are worked out as they are asked for.
+    """
+
+    def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
+        self.n, self.period = len(A), period
+        self._B = B
+        self.series = _response_series(A, period)
+        self.response = self.responses(period)
+        self.spread = _factor(self._noise(period))
+        self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
+        self._grids: dict[tuple[int, int], FloatArray] = {}
+
+    def grid(self, first: int, count: int) -> FloatArray:
+        """(count,) points of the sensing grid from number ``first`` on."""
+        known = self._grids.get((first, count))
+        if known is None:
+            known = np.array([grid_time(self.period, first + k) for k in range(count)])
+            if len(self._grids) < MOST_GRIDS:
+                self._grids[first, count] = known
+        return known
+
+    def responses(self, gap: float) -> FloatArray:
+        """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""
+        return np.asarray(polynomial(self.series, gap).reshape(3, self.n, self.n))
+
+    def _noise(self, gap: float) -> FloatArray:
+        """(3 n, 20 m): responses of the end and the moments to noise at the quadrature nodes."""
+        columns = [
+            self._impulse(gap, 0.0, gap, s) * np.sqrt(w * gap)
+            for s, w in zip(_NODES * gap, _WEIGHTS, strict=True)
+        ]
+        return np.concatenate(columns, axis=1)
+
+    def _impulse(self, gap: float, start: float, end: float, s: float) -> FloatArray:
+        """(3 n, m): what dw at time s adds to x(end) and to the moments over [start, end] of
+        length ``gap``.
+        """
+        if s >= end:
+            return np.zeros((3 * self.n, self._B.shape[1]))
+        since = max(s, start)
+        entry = self.responses(since - s)[0] @ self._B
+        rest = end - since
+        to_end, plain, tilted = self.responses(rest)
+        share = rest / gap  # P_1 of the whole interval is (1 - share) + share P_1 of the rest
+        return np.asarray(
+            np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted]) @ entry
+        )
+
+    def split(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
+        """Gain and root (3 n, 3 n) of the law of state and moments at ``left`` seconds given those
+        of a whole step of ``length``.
+        """
+        key = round(length, 12), round(left, 12)
+        law = self._splits.get(key)
+        if law is None:
+            if len(self._splits) >= MOST_SPLITS:
+                self._splits.clear()
+            law = self._splits[key] = self._conditional(length, left)
+        return law
+
+    def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
+        n = self.n
+        places = np.concatenate([_NODES * left, left + _NODES * (length - left)])
+        weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])
+        columns = [
+            np.concatenate([self._impulse(length, 0, length, s), self._impulse(left, 0, left, s)])
+            * np.sqrt(w)
+            for s, w in zip(places, weights, strict=True)
+        ]
+        factor = np.concatenate(columns, axis=1)
+        C = factor @ factor.T
+        known, asked, cross = C[: 3 * n, : 3 * n], C[3 * n :, 3 * n :], C[3 * n :, : 3 * n]
+        gain = cross @ np.linalg.pinv(known, rcond=1e-13, hermitian=True)
+        return gain, square_root(asked - gain @ cross.T)
+
+
+def _response_series(A: FloatArray, longest: float) -> FloatArray:
+    """(terms, 3 n n): power series in the gap of ``exp(A g)`` and of its two moments."""
+    n, size = len(A), float(np.abs(A).sum(axis=0).max()) * longest
+    terms, last = 1, 1.0
+    while last > 1e-18 or terms < 8:
+        last *= size / terms
+        terms += 1
+    exponential = [np.eye(n)]
+    for k in range(1, terms):
+        exponential.append(exponential[-1] @ A / k)
+    powers = np.stack(exponential)
+    series = np.zeros((terms + 1, 3, n, n))
+    series[:-1, 0] = powers
+    series[1:, 1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), powers)
+    return series.reshape(terms + 1, -1)
+
+
+def _factor(noise: FloatArray) -> FloatArray:
+    """A square lower triangular S with ``S S' = noise noise'``, accurate where that is singular."""
+    R = np.linalg.qr(noise.T, mode="r")
+    size = len(noise)
+    square = np.zeros((size, size))
+    square[: len(R)] = R
+    signs = np.where(np.diag(square) < 0.0, -1.0, 1.0)
+    return np.asarray((signs[:, None] * square).T)
