@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from functools import cache, wraps
@@ -17,6 +18,9 @@ from typing import Any, TypeVar
 
 ROOMS = ("core", "algorithms", "plants", "trace", "engines")
 """Whose code and numbers compiled functions may hold."""
+
+MOST_STATES = 4
+"""Of the sources, whose compiled code is kept."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy"}
@@ -122,8 +126,16 @@ def _folder(chosen: str) -> Path:
     for file in sorted(files):
         sources.update(file.read_bytes())
     name = f"netkf-{sources.hexdigest()[:16]}"
+    kept = _kept_in(chosen, root)
+    if not (kept / name).exists():
+        _make_room(kept)
+    return kept / name
+
+
+def _kept_in(chosen: str, root: Path) -> Path:
+    """Where numba was told to keep code, else beside the sources, else in the user's cache."""
     if chosen:
-        return Path(chosen) / name
+        return Path(chosen)
     beside = root / "__pycache__"
     try:
         beside.mkdir(exist_ok=True)
@@ -131,7 +143,14 @@ def _folder(chosen: str) -> Path:
     except OSError:
         writable = False
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return (beside if writable else home / "netkf") / name
+    return beside if writable else home / "netkf"
+
+
+def _make_room(folder: Path) -> None:
+    """Remove what was compiled from sources that are long gone."""
+    found = [path for path in folder.glob("netkf-*") if path.is_dir()]
+    for old in sorted(found, key=lambda path: path.stat().st_mtime)[: -MOST_STATES + 1]:
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _kept(made: Any) -> bool:

@@ -1,6 +1,7 @@
 """The compiled engine: the events and states of the processes engine, and words where it cannot."""
 
 import dataclasses
+import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -510,3 +511,16 @@ def test_a_block_of_rows_is_recorded_like_one_row_after_the_other():
     other.extend(np.array(rows[7:], dtype=EVENT))
     assert one.fingerprint == other.fingerprint
     assert one.total == other.total == 10
+
+
+def test_code_compiled_from_sources_long_gone_is_removed(tmp_path):
+    for k in range(6):
+        (tmp_path / f"netkf-{k}").mkdir()
+        os.utime(tmp_path / f"netkf-{k}", (k, k))
+    (tmp_path / "other").mkdir()
+    folder = compiling._folder.__wrapped__(str(tmp_path))
+    assert folder.parent == tmp_path
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        *(f"netkf-{k}" for k in range(3, 6)),
+        "other",
+    ]
