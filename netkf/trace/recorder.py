@@ -10,6 +10,7 @@ import hashlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 
 import numpy as np
 
@@ -54,10 +55,12 @@ def _ignore(row: tuple[float, int, int, int, int, int, float]) -> None:
 
 
 class Recorder:
-    """Takes events and samples from an engine, counts them, fingerprints the events."""
+    """Takes events and samples from an engine, counts them, fingerprints the events. Where
+    ``counted`` events are only counted, and the sinks see samples alone.
+    """
 
-    def __init__(self, sinks: Sequence[Sink]) -> None:
-        self._sinks = tuple(sinks)
+    def __init__(self, sinks: Sequence[Sink], counted: bool = False) -> None:
+        self._sinks, self.counted = tuple(sinks), counted
         self._rows: list[tuple[float, int, int, int, int, int, float]] = []
         self._hash = hashlib.sha256()
         self._counts = np.zeros(len(KINDS), dtype=np.int64)
@@ -84,21 +87,33 @@ class Recorder:
         """Pass the gathered events on."""
         if not self._rows:
             return
+        if self.counted:
+            kinds = np.fromiter(map(itemgetter(1), self._rows), dtype=np.uint8)
+            with undisturbed():
+                self._rows.clear()
+                self._count(kinds)
+            return
         rows = np.array(self._rows, dtype=EVENT)
         with undisturbed():  # what is counted is also kept
             self._rows.clear()
             self._pass_on(rows)
 
     def extend(self, rows: np.ndarray) -> None:
-        """Record a block of EVENT rows; the array is the recorder's from then on."""
+        """Record a block of EVENT rows, of which sinks get a copy."""
         self.flush()
         if len(rows):
             with undisturbed():
-                self._pass_on(rows)
+                if self.counted:
+                    self._count(rows["kind"])
+                else:
+                    self._pass_on(rows.copy())
+
+    def _count(self, kinds: np.ndarray) -> None:
+        self._counts += np.bincount(kinds, minlength=len(KINDS))
 
     def _pass_on(self, rows: np.ndarray) -> None:
+        self._count(rows["kind"])
         self._hash.update(rows.data)
-        self._counts += np.bincount(rows["kind"], minlength=len(KINDS))
         for sink in self._sinks:
             sink.events(rows)
 
@@ -118,5 +133,7 @@ class Recorder:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the flushed events, independent of blocks and machines."""
-        return self._hash.hexdigest()
+        """SHA-256 of the flushed events, independent of blocks and machines; empty where they were
+        only counted.
+        """
+        return "" if self.counted else self._hash.hexdigest()

@@ -502,15 +502,19 @@ BURSTS = {"mean_loss": 0.3, "mean_burst": 3.0}
 def test_a_block_of_rows_is_recorded_like_one_row_after_the_other():
     rows = [(0.5 * k, k % 3, k, -1, -1, -1, np.nan) for k in range(10)]
     one, other = (Recorder([MemorySink()]) for _ in range(2))
+    counting = Recorder([MemorySink()], counted=True)
     for row in rows:
         one.append(row)
     one.flush()
-    for row in rows[:2]:
-        other.append(row)
-    other.extend(np.array(rows[2:7], dtype=EVENT))
-    other.extend(np.array(rows[7:], dtype=EVENT))
+    for recorder in (other, counting):
+        for row in rows[:2]:
+            recorder.append(row)
+        recorder.extend(np.array(rows[2:7], dtype=EVENT))
+        recorder.extend(np.array(rows[7:], dtype=EVENT))
     assert one.fingerprint == other.fingerprint
-    assert one.total == other.total == 10
+    assert one.total == other.total == counting.total == 10
+    assert one.count("sense") == counting.count("sense") == 4
+    assert counting.fingerprint == ""
 
 
 def test_code_compiled_from_sources_long_gone_is_removed(tmp_path):

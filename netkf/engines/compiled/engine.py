@@ -195,7 +195,7 @@ class FlowRun:
 
     def _pass_rows_on(self, used: int) -> None:
         self._cursor.place[ROW] = 0
-        self._recorder.extend(self._rows[:used].copy())
+        self._recorder.extend(self._rows[:used])
 
     def _take_samples(self) -> bool:
         """Record the samples that are there; False where one of them is no longer finite."""

@@ -92,7 +92,7 @@ class SlotRun:
         rows, passed = np.array(slots.rows, dtype=EVENT), 0
         first = self._recorder.sums
         for k, (slot, time, before) in enumerate(slots.samples):
-            self._recorder.extend(rows[passed:before].copy())
+            self._recorder.extend(rows[passed:before])
             passed = before
             if len(self._mass):
                 started = first or {name: (math.fsum(began[:, j]), 0.0) for j, name in SUMS}
@@ -100,7 +100,7 @@ class SlotRun:
                 self._recorder.sums = {name: (started[name][0], now[name]) for name in now}
             if not self._sample(time, states[slot], shown.xhat[k], shown.root[k]):
                 return False
-        self._recorder.extend(rows[passed:].copy())
+        self._recorder.extend(rows[passed:])
         return True
 
     def _readings(self, slots: Slots, states: dict[int, FloatArray]) -> Readings:

@@ -39,7 +39,7 @@ class Tally(NamedTuple):
     (4,) as MESSAGES, size (1,). ``totals`` are events, diverged runs. ``conserved``: of each sum
     its mean at the start and at the end, then the largest relative drift. ``rounding_from`` is the
     first sample of any run at which rounding blurs the errors, inf where none. ``fingerprint`` is
-    that of the first run. ``traces`` are those that were asked for, in order.
+    that of replica 0. ``traces`` are those that were asked for, in order.
     """
 
     samples: Moments
@@ -92,10 +92,12 @@ class _Samples(MemorySink):
 def reduced_run(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto", traces: int = 0
 ) -> Tally:
-    """Simulate one replica and reduce it; the first ``traces`` replicas keep everything too."""
+    """Simulate one replica and reduce it; the first ``traces`` replicas keep everything too. Only
+    theirs and replica 0's events have a fingerprint.
+    """
     traced = replica < traces
     memory, chosen = _Samples(traced), choose_engine(engine, scenario)
-    recorder = Recorder([memory])
+    recorder = Recorder([memory], counted=not traced and replica > 0)
     status = chosen.run(scenario, Streams(seed, replica), recorder, silent)
     run = collect(scenario, memory, recorder, seed, replica, chosen.name, status)
     return _tally(run, recorder, scenario.times, traced)
