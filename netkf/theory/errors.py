@@ -21,7 +21,7 @@ from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.riccati import evaluate_hamiltonian
+from netkf.algorithms.riccati import hamiltonians
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
@@ -277,7 +277,7 @@ class _Errors:
 
     def _step(self, gap: float) -> None:
         n, count, first = self._n, len(self._P), int(self._follows)
-        times = _NODES * gap
+        times, weights = _NODES * gap, _WEIGHTS * gap
         m = self._plant.B.shape[1]
         transition = np.zeros((count, n, n))
         driven = np.zeros((first + count, n, len(times) * m))
@@ -286,29 +286,26 @@ class _Errors:
         states = [_expm(self._plant.A, s) for s in (*times, gap)] if first else []
         for model, members in self._groups():
             P = self._P[members]
-            X_end, Y_end = _flow(model, P, gap)
-            inverse = np.swapaxes(np.linalg.inv(X_end), 1, 2)
-            self._P[members] = symmetric(
-                np.swapaxes(
-                    np.linalg.solve(np.swapaxes(X_end, 1, 2), np.swapaxes(Y_end, 1, 2)), 1, 2
-                )
-            )
+            X, Y = _flows(model, P, np.append(times, gap))
+            X_end, Y_end = np.swapaxes(X[-1], 1, 2), np.swapaxes(Y[-1], 1, 2)
+            self._P[members] = symmetric(np.swapaxes(np.linalg.solve(X_end, Y_end), 1, 2))
+            inverse = np.linalg.inv(X_end)
             transition[members] = inverse
-            for k, (s, w) in enumerate(zip(times, _WEIGHTS * gap, strict=True)):
-                X, Y = _flow(model, P, s)
-                phi = inverse @ np.swapaxes(X, 1, 2)
-                columns = slice(k * m, (k + 1) * m)
-                response = phi @ self._plant.B
-                if first:
-                    follow[members] += w * phi @ self._difference @ states[k]
-                    response = response + self._followed(model, P, inverse, s, gap)
-                driven[np.array(members) + first, :, columns] = np.sqrt(w) * response
-                for place, i in enumerate(members):
-                    if i < self.hosts and self._noise[i].shape[1]:
-                        gain = inverse[place] @ Y[place].T @ self._noise[i]
-                        own[i] += w * gain @ gain.T
+            phi = inverse @ np.swapaxes(X[:-1], 2, 3)
+            response = phi @ self._plant.B
+            if first:
+                for k, (s, w) in enumerate(zip(times, weights, strict=True)):
+                    follow[members] += w * phi[k] @ self._difference @ states[k]
+                    response[k] += self._followed(model, P, inverse, s, gap)
+            response *= np.sqrt(weights)[:, None, None, None]
+            rows = response.transpose(1, 2, 0, 3).reshape(len(members), n, -1)
+            driven[np.array(members) + first] = rows
+            for place, i in enumerate(members):
+                if i < self.hosts and self._noise[i].shape[1]:
+                    gain = inverse[place] @ np.swapaxes(Y[:-1, place], 1, 2) @ self._noise[i]
+                    own[i] += np.einsum("s,sap,sbp->ab", weights, gain, gain)
         if first:
-            for k, (s, w) in enumerate(zip(times, _WEIGHTS * gap, strict=True)):
+            for k, (s, w) in enumerate(zip(times, weights, strict=True)):
                 driven[0, :, k * m : (k + 1) * m] = (
                     np.sqrt(w) * _expm(self._plant.A, gap - s) @ self._plant.B
                 )
@@ -319,10 +316,9 @@ class _Errors:
     ) -> FloatArray:
         """What noise at time s adds to the errors through the state that they follow."""
         total = np.zeros((len(P), self._n, self._plant.B.shape[1]))
-        for z, w in zip(_NODES, _WEIGHTS, strict=True):
-            r = s + z * (gap - s)
-            X, _ = _flow(model, P, r)
-            phi = inverse @ np.swapaxes(X, 1, 2)
+        places = s + _NODES * (gap - s)
+        X, _ = _flows(model, P, places)
+        for r, w, phi in zip(places, _WEIGHTS, inverse @ np.swapaxes(X, 2, 3), strict=True):
             total += (
                 w * (gap - s) * phi @ self._difference @ _expm(self._plant.A, r - s) @ self._plant.B
             )
@@ -358,11 +354,11 @@ class _Errors:
         self._sigma = symmetric(result)
 
 
-def _flow(model: FlowModel, P: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """X and Y of a stack of covariances (k, n, n)."""
+def _flows(model: FlowModel, P: FloatArray, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """X and Y (g, k, n, n) of a stack of covariances (k, n, n) over each gap (g,)."""
     n = len(model.A)
-    E, _ = evaluate_hamiltonian(model.riccati, gap)
-    return E[:n, :n] + E[:n, n:] @ P, E[n:, :n] + E[n:, n:] @ P
+    E = hamiltonians(model.riccati, gaps)[:, None]
+    return E[..., :n, :n] + E[..., :n, n:] @ P, E[..., n:, :n] + E[..., n:, n:] @ P
 
 
 def _expm(A: FloatArray, gap: float) -> FloatArray:
