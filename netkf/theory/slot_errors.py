@@ -93,6 +93,8 @@ class _Errors:
         self._scenario, self._n = scenario, scenario.plant.n
         groups = [scenario.sensing] if pooled else [(node,) for node in nodes]
         self._hosts = [_host(scenario, streams, group) for group in groups]
+        self._root = block_diagonal([host.root for host in self._hosts])
+        self._believed: dict[tuple[int, ...], FloatArray] = {}
         self._P = np.stack([scenario.start(node)[1] for node in nodes[: len(groups)]])
         cov = scenario.plant.start_cov
         self._sigma = np.tile(cov, (1 + len(groups), 1 + len(groups)))
@@ -123,11 +125,13 @@ class _Errors:
             moves.append(closed)
             columns = np.concatenate([np.arange(ends[j], ends[j + 1]) for j in used])
             noise[i * self._n : (i + 1) * self._n, columns] = L
-        root = block_diagonal([host.root for host in self._hosts])
-        self._move(moves, noise @ root, predicts=True)
+        self._move(moves, noise @ self._root, predicts=True)
 
     def _noise(self, hosts: list[int]) -> FloatArray:
-        return block_diagonal([self._hosts[j].R for j in hosts])
+        key = tuple(hosts)
+        if key not in self._believed:
+            self._believed[key] = block_diagonal([self._hosts[j].R for j in hosts])
+        return self._believed[key]
 
     def swap(self, arrived: Arrived) -> None:
         """G (10): what a node received takes the place of its own."""
