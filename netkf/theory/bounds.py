@@ -22,7 +22,8 @@ DEFECT = 1e-7
 CHECKED_STEPS = 200
 EXPLICIT_EVALUATIONS = 20_000
 OVERFLOW = 1e150
-MOST_ROUNDS = 40
+MOST_ROUNDS, SETTLED = 40, 1e-8
+PARTS = (1, 40, 400)  # of a stretch that a step is at most one of, try after try
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
@@ -133,12 +134,16 @@ class _Pieces:
         first = self(begin).reshape(-1)
         places = np.linspace(begin, end, 9)[1:]
         self._append(end, lambda _: first)
+        last = np.inf
         for _ in range(MOST_ROUNDS):
             before = np.array([self(t).reshape(-1) for t in places])
             self._outputs[-1] = self._integrate(begin, end, f)
             after = np.array([self(t).reshape(-1) for t in places])
-            if np.abs(after - before).max() <= TOLERANCE * np.abs(after).max():
+            change = float(np.abs(after - before).max() / np.abs(after).max())
+            # What the steps of the solver change from round to round stays.
+            if change <= TOLERANCE or (0.5 * last < change <= SETTLED):
                 return
+            last = change
         raise TheoryError(f"what arrives late did not settle between {begin:g} and {end:g} s")
 
     def _slope(self, begin: float) -> Callable[[float, FloatArray], FloatArray]:
@@ -159,21 +164,33 @@ class _Pieces:
     def _integrate(
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray]
     ) -> Callable[[float], FloatArray]:
+        refused: TheoryError | None = None
+        for parts in PARTS:  # what is wrong between the steps gets better with shorter ones
+            most = (end - begin) / parts if parts > 1 else np.inf
+            solved = self._solved(begin, end, f, most)
+            if not solved.success:
+                raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
+            assert solved.sol is not None
+            try:
+                _check_defect(f, solved.sol)
+            except TheoryError as error:
+                refused = refused or error
+                continue
+            output: Callable[[float], FloatArray] = solved.sol
+            return output
+        assert refused is not None
+        raise refused
+
+    def _solved(
+        self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], most: float
+    ) -> Any:
         with np.errstate(over="ignore", invalid="ignore"):
-            solved = None
             if self._packed.equations.delay > 0.0:  # without delay only what is stiff comes here
                 # An explicit stage that overflows is no word about the solution.
                 with contextlib.suppress(StiffError, TheoryError):
-                    solved = self._solve(begin, end, _limited(f), method="DOP853")
-            if solved is None:
-                # A blind node's large covariance reaches precise sensors: P G is a large rate.
-                solved = self._solve(begin, end, f, method="Radau", jac=self._jacobian)
-        if not solved.success:
-            raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
-        assert solved.sol is not None
-        _check_defect(f, solved.sol)
-        output: Callable[[float], FloatArray] = solved.sol
-        return output
+                    return self._solve(begin, end, _limited(f), method="DOP853", max_step=most)
+            # A blind node's large covariance reaches precise sensors: P G is a large rate.
+            return self._solve(begin, end, f, method="Radau", jac=self._jacobian, max_step=most)
 
     def _solve(
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], **method: Any

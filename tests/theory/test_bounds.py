@@ -130,6 +130,76 @@ def test_a_precise_sensor_hears_late_of_large_covariances(build):
     np.testing.assert_allclose(got[1], solved.y[:, -1], rtol=1e-7)
 
 
+DELAYED = {
+    "what arrives late settles to the solver's noise": (
+        [[-2.03, 0.47], [0.64, -0.69]],
+        [[-0.66, -0.66], [1.57, -0.37]],
+        [([0, 1, 2], [[1.41, 1.51], [1.98, -0.15]], 0.01), ([2], [[-0.10, -0.56]], 10.0)],
+        ({"kind": "star", "nodes": 3}, 0.7, 0.36, 0.2),
+    ),
+    "long steps are wrong between their ends": (
+        [[-0.03, 0.56, -0.08], [-0.19, 0.04, -0.36], [-0.15, 0.0, 0.14]],
+        [[-0.18, -2.22, 0.55], [-1.13, -0.70, 2.0], [2.5, -0.14, -0.94]],
+        [([0, 1, 2, 3], [[-0.94, 1.25, 1.31]], 0.01)],
+        ({"kind": "path", "nodes": 4}, 0.097, 0.32, 0.01),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DELAYED.values(), ids=DELAYED)
+def test_precise_sensors_and_late_messages_have_a_bound(build, case):
+    """Against the method of steps: over each delay what arrives is known."""
+    A, B, sensors, (graph, rate, epsilon, d) = case
+    n, ends = len(A), 5.0
+    scenario = build(
+        horizon=ends,
+        plant={"kind": "diffusion", "A": A, "B": B, "cov": np.eye(n).tolist()},
+        sensors=[
+            {"nodes": nodes, "H": H, "R": (R * np.eye(len(H))).tolist()} for nodes, H, R in sensors
+        ],
+        network={
+            "graph": graph,
+            "activation": {"kind": "poisson", "rate": rate},
+            "channel": {
+                "loss": {"kind": "bernoulli", "delivery": 0.5},
+                "delay": {"kind": "constant", "seconds": d},
+            },
+        },
+        filter={"kind": "hybrid", "epsilon": epsilon},
+    )
+    A, Q, N = np.array(A), np.array(B) @ np.array(B).T, len(scenario.nodes)
+    G, L = np.zeros((N, n, n)), np.zeros((N, N))
+    for nodes, H, R in sensors:
+        G[nodes] += np.array(H).T @ np.array(H) / R
+    for i, j in scenario.topology.links:
+        L[i, j] = L[j, i] = 0.5 * rate * epsilon
+    M = scipy.linalg.expm(np.block([[A, Q], [np.zeros((n, n)), -A.T]]) * d)
+    F, W = M[:n, :n], M[:n, n:] @ M[:n, :n].T
+    past, P = None, np.tile(np.eye(n), (N, 1, 1))
+    for k in range(round(ends / d)):
+
+        def slope(t, y, past=past):
+            P = y.reshape(N, n, n)
+            out = A @ P + P @ A.T + Q - P @ G @ P
+            if past is not None:
+                late = F @ past(t - d).reshape(N, n, n) @ F.T + W
+                out += np.tensordot(L, late, 1) - L.sum(axis=1)[:, None, None] * P
+            return out.ravel()
+
+        solved = scipy.integrate.solve_ivp(
+            slope,
+            (k * d, (k + 1) * d),
+            P.ravel(),
+            "LSODA",
+            rtol=1e-9,
+            atol=1e-12,
+            dense_output=True,
+        )
+        past, P = solved.sol, solved.y[:, -1]
+    bound = netkf.theory.covariance_bound(scenario, [ends])[0]
+    np.testing.assert_allclose(bound, P.reshape(N, n, n), atol=1e-6 * np.abs(P).max())
+
+
 def test_a_short_delay_is_integrated_in_longer_stretches(build):
     """The same equation cut into stretches of one delay, and the limit of no delay."""
 
