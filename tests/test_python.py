@@ -1,6 +1,7 @@
 """The Python face: what users touch first."""
 
 import json
+import pickle
 
 import numpy as np
 import pandas as pd
@@ -112,3 +113,17 @@ def test_numbers_stand_for_matrices_of_one_entry():
 
 def test_the_theory_shows_its_public_names_only():
     assert dir(netkf.theory) == sorted(netkf.theory.__all__)
+
+
+@pytest.mark.parametrize("value", [None, "scenarios/poisson_ring.toml", 3])
+def test_theory_of_what_is_no_scenario_is_refused(value):
+    names = "covariance_bound steady_covariance_bound limit_covariance push_sum_limits assumptions"
+    for name in names.split():
+        with pytest.raises(netkf.ScenarioError, match=rf"theory\.{name} takes a netkf.Scenario"):
+            getattr(netkf.theory, name)(value)
+
+
+def test_theory_can_be_sent_to_other_processes():
+    for name in netkf.theory.__all__:
+        function = getattr(netkf.theory, name)
+        assert pickle.loads(pickle.dumps(function)) is function

@@ -3,6 +3,7 @@
 from netkf.theory.assumptions import assumptions
 from netkf.theory.bounds import covariance_bound
 from netkf.theory.certified_gamma import exact_minimum_gamma, gamma_constants, minimum_gamma
+from netkf.theory.demands import demanding
 from netkf.theory.disconnection import Probability, disconnection_probability
 from netkf.theory.errors import error_covariance
 from netkf.theory.gossip import detecting_walk, mean_matching
@@ -55,6 +56,8 @@ __all__ = [
     "support",
     "true_limit_covariance",
 ]
+
+globals().update(demanding({name: globals()[name] for name in __all__}))
 
 
 def __dir__() -> list[str]:
