@@ -291,8 +291,9 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
 
 def _layout(scenario: Scenario) -> dict[int, tuple[float, float]]:
     topology = scenario.topology
-    graph: networkx.Graph[int] = networkx.Graph(topology.links)
-    graph.add_nodes_from(topology.nodes)
+    graph: networkx.Graph[int] = networkx.Graph()
+    graph.add_nodes_from(topology.nodes)  # in their order, which is that around a circle
+    graph.add_edges_from(topology.links)
     degrees = set(topology.degrees.values())
     if len(topology.nodes) <= 30 and degrees <= {0, 2}:
         placed: dict[int, Any] = networkx.circular_layout(graph)

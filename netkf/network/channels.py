@@ -417,4 +417,16 @@ def chances(loss: Loss, link: Link, first: int, bad: np.ndarray, measured: float
     """(count,) ``loss.chance`` of the messages from number ``first`` on, ``bad`` (count,)."""
     if type(loss) in (NoLoss, Bernoulli, PerLink):
         return np.full(len(bad), loss.chance(link, first, False, measured))
-    return np.array([loss.chance(link, first + k, b, measured) for k, b in enumerate(bad.tolist())])
+    return np.array(
+        [checked_chance(loss, link, first + k, b, measured) for k, b in enumerate(bad.tolist())]
+    )
+
+
+def checked_chance(loss: Loss, link: Link, message: int, bad: bool, measured: float) -> float:
+    """``loss.chance``; raises ScenarioError where it is no probability."""
+    chance = loss.chance(link, message, bad, measured)
+    if not 0.0 <= chance <= 1.0:
+        words = f"{type(loss).__name__}: the chance of message {message} on link {list(link)} must"
+        remedy = "mend chance of the class"
+        raise ScenarioError("network.channel.loss", f"{words} be in [0, 1]", chance, remedy)
+    return chance

@@ -68,6 +68,25 @@ class LinkClock(Part):
         """Raise ScenarioError where the settings do not fit the graph."""
 
 
+def next_ticks(
+    clock: LinkClock,
+    link: Link,
+    origin: float,
+    index: int,
+    now: float,
+    random: np.random.Generator,
+    count: int,
+) -> FloatArray:
+    """``clock.ticks``; raises ScenarioError where time does not go on, since a run never ends
+    then.
+    """
+    t = np.asarray(clock.ticks(link, origin, index, now, random, count), dtype=np.float64)
+    if len(t) and not (t[-1] > now and t[0] >= now and (np.diff(t) >= 0.0).all()):
+        words = f"{type(clock).__name__}: ticks of link {list(link)} must increase, after {now:g} s"
+        raise ScenarioError("network.activation", words, t[:3].tolist(), "mend ticks of the class")
+    return t
+
+
 def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
     # One addition a tick, so that the size of a block never shows in a time.
     return np.asarray(np.add.accumulate(np.concatenate([[now], gaps]))[1:])

@@ -20,6 +20,7 @@ from netkf.core.streams import Streams
 from netkf.engines.processes.engine import ProcessesEngine
 from netkf.experiments import simulate
 from netkf.network.channels import Bernoulli, Fates
+from netkf.network.clocks import Poisson
 from netkf.scenario.reading import from_table
 from netkf.trace.recorder import MemorySink, Recorder
 from netkf.trace.schema import EVENT
@@ -396,6 +397,34 @@ def test_a_loss_of_ones_own_runs_in_both(ring):
     channel = dataclasses.replace(ring.network.channel, loss=Halved(delivery=0.8))
     network = dataclasses.replace(ring.network, channel=channel)
     assert assert_agree(dataclasses.replace(ring, network=network)).count("lost") > 100
+
+
+class Certain(Bernoulli):
+    """A user's loss that is no probability."""
+
+    def chance(self, link, message, bad, measured):
+        return np.nan if message > 3 else 1.0
+
+
+class Stuck(Poisson):
+    """A user's clock that stays where it is after some ticks."""
+
+    def ticks(self, link, origin, index, now, random, count):
+        times = super().ticks(link, origin, index, now, random, count)
+        return np.minimum(times, 1.5)
+
+
+@pytest.mark.parametrize("engine", [ProcessesEngine(), "compiled", "processes"], ids=str)
+def test_parts_of_ones_own_that_break_the_rules_are_refused_by_name(ring, engine):
+    channel = dataclasses.replace(ring.network.channel, loss=Certain(delivery=0.8))
+    lossy = dataclasses.replace(ring.network, channel=channel)
+    words = r"Certain: the chance of message 4 on link .* must be in \[0, 1\]; got nan"
+    with pytest.raises(ScenarioError, match=words):
+        netkf.simulate(dataclasses.replace(ring, network=lossy), engine=engine)
+    stuck = dataclasses.replace(ring.network, activation=Stuck(rate=2.0))
+    words = r"Stuck: ticks of link .* must increase, after 1.5 s"
+    with pytest.raises(ScenarioError, match=words):
+        netkf.simulate(dataclasses.replace(ring, network=stuck), engine=engine)
 
 
 def test_auto_is_compiled_for_long_runs_and_without_numba_processes(ring, monkeypatch):

@@ -19,7 +19,7 @@ from netkf.algorithms.slot import Intermittent, SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.compiled.masses import stopping
-from netkf.network.channels import Fates
+from netkf.network.channels import Fates, checked_chance
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.scenario.scenario import Scenario
@@ -219,7 +219,8 @@ class Exchanges:
         (sender, receiver), number = way.link, way.messages
         way.messages = number + 1
         self._note((now, SEND, sender, receiver, number, phase, NAN))
-        if fate is None or fate[0] >= self._loss.chance(way.link, number, fate[1], way.measured):
+        link, measured = way.link, way.measured
+        if fate is None or fate[0] >= checked_chance(self._loss, link, number, fate[1], measured):
             self._note((now, LOST, sender, receiver, number, phase, NAN))
             return
         arrival = now + fate[2]

@@ -26,7 +26,7 @@ from netkf.network.channels import (
     chances,
     needed,
 )
-from netkf.network.clocks import LinkClock, Poisson
+from netkf.network.clocks import LinkClock, Poisson, next_ticks
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 
@@ -110,7 +110,8 @@ class Clocks:
     def _ticks(self, k: int, count: int) -> FloatArray:
         assert isinstance(self._clock, LinkClock)
         origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
-        return self._clock.ticks(self._links[k], origin, index, now, self._random[k], int(count))
+        link, random = self._links[k], self._random[k]
+        return next_ticks(self._clock, link, origin, index, now, random, int(count))
 
 
 class Fortunes:

@@ -13,7 +13,7 @@ from netkf.engines.base import Rank
 from netkf.engines.processes.hosts import Host
 from netkf.engines.processes.timeline import Timeline
 from netkf.engines.processes.wires import Wire, stream
-from netkf.network.clocks import LinkClock
+from netkf.network.clocks import LinkClock, next_ticks
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -50,8 +50,8 @@ class LinkProcess:
         """The process: wait for a tick, activate, and so on until the horizon."""
         now, index, count = 0.0, 0, FIRST_BLOCK
         while True:
-            times = self._clock.ticks(
-                self._link, self._origin, index, now, self._random, count
+            times = next_ticks(
+                self._clock, self._link, self._origin, index, now, self._random, count
             ).tolist()
             for now in times:
                 if now >= self._horizon:

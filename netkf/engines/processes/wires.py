@@ -12,7 +12,7 @@ import simpy
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.processes.timeline import Timeline
-from netkf.network.channels import Fates
+from netkf.network.channels import Fates, checked_chance
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -104,7 +104,7 @@ class Wire:
         way.messages = number + 1
         append((now, SEND, sender, receiver, number, phase, NAN))
         luck, bad, delay = fate
-        if luck >= self._loss.chance(way.link, number, bad, way.measured):
+        if luck >= checked_chance(self._loss, way.link, number, bad, way.measured):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
         if delay == 0.0:

@@ -209,7 +209,8 @@ def verdict_text(found: Verdict, claim: str = "") -> str:
         if row.verdict == NOT_PROMISED:
             words = row.assumptions
         elif row.low < row.high:
-            words += f"; margin {row.margin:.3g} in [{row.low:.3g}, {row.high:.3g}]"
+            ends = [f"{value + 0.0:.3g}" for value in (row.margin, row.low, row.high)]  # no -0
+            words += "; margin {} in [{}, {}]".format(*ends)
             words += f", {row.tolerance:g} below 0 is tolerated" if row.tolerance else ""
         if row.needed is not None:
             words += f"; needs about {row.needed:,} runs"
