@@ -92,12 +92,17 @@ def _bands(
     spread = 2.0 * np.trace(error, axis1=2, axis2=3)
     _lines(axes, times, np.sqrt(trace), scenario)
     sensing = [node in scenario.placed for node in scenario.nodes]
+    for colour, words in ((SENSING, "with a sensor"), (RELAY, "without")):
+        axes.plot([], [], color=colour, label=f"{words}, two standard errors")
     for k in _evenly(np.arange(len(scenario.nodes))):
         ends = (np.sqrt(np.maximum(trace[:, k] + s * spread[:, k], 0.0)) for s in (-1.0, 1.0))
         colour = SENSING if sensing[k] else RELAY
         axes.fill_between(times, *ends, color=colour, alpha=0.2, lw=0)
     _promises(axes, times, promised)
-    _scale(axes, np.sqrt(trace + spread))
+    shown = np.sqrt(trace + spread)
+    if promised.bound is not None:
+        shown = np.concatenate([shown, np.sqrt(promised.bound)])
+    _scale(axes, shown)
     _legend(axes)
 
 
