@@ -7,7 +7,6 @@ A letter says which of several readings a chain gets in a slot: ``f_m(P) = F P F
 from __future__ import annotations
 
 import itertools
-import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
+from netkf.algorithms.square_root import lower_triangular, predict_root, reflect, update_root
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compiled
 
@@ -88,7 +87,7 @@ def _stack_by_stack(
     return roots
 
 
-def run_words(  # noqa: PLR0912 - one function, because the compiler sees no other
+def run_words(
     roots: FloatArray,
     words: np.ndarray,
     F: FloatArray,
@@ -99,7 +98,7 @@ def run_words(  # noqa: PLR0912 - one function, because the compiler sees no oth
 ) -> None:
     """The same as loops for a compiler, in place, on lower triangular roots (root_Q too).
 
-    square_root's orthogonal triangularisation written out: some 300 operations a step at n = 4.
+    square_root's triangularisation without its zeros: some 300 operations a step at n = 4.
     """
     count, steps = words.shape
     n = len(F)
@@ -123,23 +122,7 @@ def run_words(  # noqa: PLR0912 - one function, because the compiler sees no oth
             # Householder's reflections of the columns make it lower triangular, row by row; right
             # of the end there are zeros, because root_Q is lower triangular.
             for i in range(p + n):
-                columns = n + p + max(0, i - p + 1)
-                size = 0.0
-                for j in range(i, columns):
-                    size += work[i, j] * work[i, j]
-                if size == 0.0:
-                    continue
-                pivot = -math.copysign(math.sqrt(size), work[i, i])
-                scale = size - work[i, i] * pivot
-                work[i, i] -= pivot
-                for r in range(i + 1, p + n):
-                    total = 0.0
-                    for j in range(i, columns):
-                        total += work[i, j] * work[r, j]
-                    total /= scale
-                    for j in range(i, columns):
-                        work[r, j] -= total * work[i, j]
-                work[i, i] = pivot
+                reflect(work, i, p + n, n + p + max(0, i - p + 1))
             for i in range(n):
                 for j in range(i + 1):
                     S[i, j] = work[p + i, p + j]

@@ -15,32 +15,40 @@ import math
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable_as
+from netkf.core.compiling import compilable, compilable_as
 from netkf.core.small import product, solution
 
 
+@compilable
+def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
+    """Householder's reflection of the first ``columns`` that leaves row ``i`` nothing right of its
+    diagonal, in place, for the rows from ``i`` up to ``rows``. What is right of the diagonal in row
+    ``i`` itself is rubbish then, to be taken for zeros.
+    """
+    size = 0.0
+    for j in range(i, columns):
+        size += work[i, j] * work[i, j]
+    if size == 0.0:
+        return
+    pivot = -math.copysign(math.sqrt(size), work[i, i])
+    scale = size - work[i, i] * pivot
+    work[i, i] -= pivot
+    for r in range(i + 1, rows):
+        total = 0.0
+        for j in range(i, columns):
+            total += work[i, j] * work[r, j]
+        total /= scale
+        for j in range(i, columns):
+            work[r, j] -= total * work[i, j]
+    work[i, i] = pivot
+
+
 def _triangular_loops(array: FloatArray) -> FloatArray:
-    # Householder's reflections of the columns, row by row.
     work = array.copy()
     rows, columns = work.shape
     for i in range(rows):
-        size = 0.0
-        for j in range(i, columns):
-            size += work[i, j] * work[i, j]
-        if size == 0.0:
-            continue
-        pivot = -math.copysign(math.sqrt(size), work[i, i])
-        scale = size - work[i, i] * pivot
-        work[i, i] -= pivot
-        for r in range(i + 1, rows):
-            total = 0.0
-            for j in range(i, columns):
-                total += work[i, j] * work[r, j]
-            total /= scale
-            for j in range(i, columns):
-                work[r, j] -= total * work[i, j]
-        work[i, i] = pivot
-        for j in range(i + 1, columns):
+        reflect(work, i, rows, columns)
+        for j in range(i + 1, rows):
             work[i, j] = 0.0
     return work[:, :rows].copy()
 

@@ -87,14 +87,6 @@ def fill_polynomial(out: FloatArray, series: FloatArray, terms: int, gap: float)
             out[j] += power * series[k, j]
 
 
-def _polynomial_loops(series: FloatArray, gap: float) -> FloatArray:
-    terms, size = series.shape
-    out = np.empty(size)
-    fill_polynomial(out, series, terms, gap)
-    return out
-
-
-@compilable_as(_polynomial_loops)
 def polynomial(series: FloatArray, gap: float) -> FloatArray:
     """``sum_k gap^k series[k]`` (size,) of (terms, size)."""
     powers = np.empty(len(series))

@@ -413,9 +413,16 @@ def delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
     return np.array([delay.draw(random) for _ in range(count)])
 
 
+def alike(loss: Loss) -> bool:
+    """Whether all messages of a link have one chance; by exact type, since a class derived from
+    one of these may have its own way.
+    """
+    return type(loss) in (NoLoss, Bernoulli, PerLink)
+
+
 def chances(loss: Loss, link: Link, first: int, bad: np.ndarray, measured: float) -> FloatArray:
     """(count,) ``loss.chance`` of the messages from number ``first`` on, ``bad`` (count,)."""
-    if type(loss) in (NoLoss, Bernoulli, PerLink):
+    if alike(loss):
         return np.full(len(bad), loss.chance(link, first, False, measured))
     return np.array(
         [checked_chance(loss, link, first + k, b, measured) for k, b in enumerate(bad.tolist())]

@@ -16,16 +16,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
-from netkf.network.channels import (
-    Bernoulli,
-    ConstantDelay,
-    Fates,
-    NoDelay,
-    NoLoss,
-    PerLink,
-    chances,
-    needed,
-)
+from netkf.network.channels import Fates, alike, chances, needed
 from netkf.network.clocks import LinkClock, Poisson, next_ticks
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
@@ -124,9 +115,8 @@ class Fortunes:
         self._measured = np.array([[scenario.measured(way) for way in ways] for ways in self._ways])
         drawn = self._ways[:1] if channel.symmetric else self._ways
         loss = channel.loss
-        self._alike = type(loss) in (NoLoss, Bernoulli, PerLink)
-        # By exact type: a class derived from one of these may draw in its own way.
-        self._plain = self._alike and type(channel.delay) in (NoDelay, ConstantDelay)
+        self._alike = alike(loss)
+        self._plain = self._alike and channel.delay.fixed is not None
         if self._alike:
             self._chances = np.array(
                 [
