@@ -19,7 +19,7 @@ import numpy as np
 from netkf.algorithms.gains import GainTable, gain_table, gain_update
 from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import in_place
 from netkf.core.fields import Part
 
 STRETCH = 1.0
@@ -147,7 +147,7 @@ class FlowFilter(Part):
         return np.inf
 
 
-@compilable
+@in_place
 def usable(rate: float) -> float:
     """Seconds of readings that may be used at once from a P on with ``rate = trace(P G)``, see
     FlowFilter.stretch.
@@ -155,7 +155,7 @@ def usable(rate: float) -> float:
     return STRETCH / rate if rate > 0.0 else math.inf
 
 
-@compilable
+@in_place
 def stretch_end(now: float, time: float, stretch: float) -> float:
     """Where a stretch of readings ends: by ``time``, and not where it begins."""
     end = now + stretch

@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.algorithms.riccati import exponential_series, hamiltonian
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import in_place
 from netkf.core.legendre import MOMENTS, backward_coefficients
 from netkf.core.small import added, applied, fill_polynomial, polynomial
 
@@ -75,7 +75,7 @@ def _terms(size: float) -> int:
     return terms
 
 
-@compilable
+@in_place
 def gain_move(
     moments: FloatArray,
     series: FloatArray,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from netkf.algorithms.flow import FlowFilter, FlowState, Payload, predict
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable_as
+from netkf.core.compiling import compilable_as, in_place
 from netkf.core.fields import number, setting
 
 
@@ -41,6 +41,7 @@ class Hybrid(FlowFilter):
         return (1.0 + 1e-12) / self.epsilon
 
 
+@in_place
 def _add_loops(
     xhat: FloatArray,
     P: FloatArray,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray, symmetric
-from netkf.core.compiling import compilable, compilable_as
+from netkf.core.compiling import compilable, compilable_as, in_place
 from netkf.core.small import (
     added,
     applied,
@@ -117,7 +117,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return inverse
 
 
-@compilable
+@in_place
 def terms_for(share: float) -> int:
     """How many terms of the series a gap of that share of a unit needs: the next one is below
     double rounding of the first that depends on the gap.
@@ -143,7 +143,7 @@ def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, F
     return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
 
 
-@compilable
+@in_place
 def move_part(
     unit: float,
     series: FloatArray,

@@ -23,9 +23,11 @@ MOST_STATES = 4
 """Of the sources, whose compiled code is kept."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_OPTIONS: Any = {"nogil": True, "error_model": "numpy"}
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "_nrt": True}
+_UNCOUNTED: Any = {**_OPTIONS, "_nrt": False}
 _marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
 _known: set[Callable[..., Any]] = set()
+_in_place: set[Callable[..., Any]] = set()
 
 
 def compilable(function: Function) -> Function:
@@ -41,6 +43,14 @@ def compilable_as(loops: Callable[..., Any]) -> Callable[[Function], Function]:
         return function
 
     return mark
+
+
+def in_place(function: Function) -> Function:
+    """``compilable``, for a function that neither makes nor returns arrays. It may call one that
+    makes some for itself.
+    """
+    _in_place.add(function)
+    return compilable(function)
 
 
 @cache
@@ -60,7 +70,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
     # numba looks at the file of the function alone, and what it calls may have changed.
     config.CACHE_DIR = str(_folder(before))
     try:
-        made: Callable[..., Any] = numba.njit(cache=True, **_OPTIONS)(function)
+        made: Callable[..., Any] = numba.njit(cache=True, **_options(function))(function)
     finally:
         config.CACHE_DIR = before
     _moderately_optimised(made, config)
@@ -104,7 +114,11 @@ def _introduce() -> None:
     for function, loops in _marked:
         if function not in _known:
             _known.add(function)
-            overload(function, jit_options=_OPTIONS)(_always(loops))
+            overload(function, jit_options=_options(loops))(_always(loops))
+
+
+def _options(function: Callable[..., Any]) -> Any:
+    return _UNCOUNTED if function in _in_place else _OPTIONS
 
 
 def _always(loops: Callable[..., Any]) -> Callable[..., Any]:

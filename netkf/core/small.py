@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg.lapack import dgesv
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable, compilable_as
+from netkf.core.compiling import compilable_as, in_place
 
 
 def _product_loops(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -74,7 +74,7 @@ def applied(a: FloatArray, x: FloatArray) -> FloatArray:
     return np.asarray(a @ x)
 
 
-@compilable
+@in_place
 def fill_polynomial(out: FloatArray, series: FloatArray, terms: int, gap: float) -> None:
     """Write ``sum_k gap^k series[k]`` of the first ``terms`` into a vector (size,)."""
     size = len(out)
@@ -95,7 +95,7 @@ def polynomial(series: FloatArray, gap: float) -> FloatArray:
     return np.asarray(np.multiply.accumulate(powers) @ series)
 
 
-@compilable
+@in_place
 def eliminate(  # noqa: PLR0912 - loops are what the compiler wants
     L: FloatArray, out: FloatArray, n: int
 ) -> None:
@@ -147,6 +147,7 @@ def solution(left: FloatArray, right: FloatArray) -> FloatArray:
     return np.full_like(right, np.nan) if info else np.asarray(solved)
 
 
+@in_place
 def _fill_loops(target: FloatArray, source: FloatArray) -> None:
     for i in range(len(source)):
         target[i] = source[i]
@@ -159,6 +160,7 @@ def fill(target: FloatArray, source: FloatArray) -> None:
     target[:] = source
 
 
+@in_place
 def _fill_square_loops(target: FloatArray, source: FloatArray) -> None:
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import in_place
 from netkf.core.small import added, applied, fill_polynomial, polynomial
 from netkf.plants.laws import Laws, grid_time
 
@@ -202,12 +202,14 @@ def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
     return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=1)
 
 
-@compilable
-def _legendre_moments(since: float, gap: float, length: float) -> FloatArray:
-    """(2, 4): the two moments over ``gap`` seconds from ``since`` on of the Legendre polynomials
+@in_place
+def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> None:
+    """Write (2, 4) the two moments over ``gap`` seconds from ``since`` on of the Legendre polynomials
     of a step of ``length`` seconds, by Gauss's rule with three nodes, which is exact for them.
     """
-    out = np.zeros((2, 4))
+    for m in range(2):
+        for c in range(4):
+            out[m, c] = 0.0
     for k in range(3):
         z = 2.0 * (since + 0.5 * gap * (1.0 + _THREE[k])) / length - 1.0
         square = z * z
@@ -217,7 +219,6 @@ def _legendre_moments(since: float, gap: float, length: float) -> FloatArray:
             out[m, 1] += weight * z
             out[m, 2] += weight * (1.5 * square - 0.5)
             out[m, 3] += weight * (2.5 * square - 1.5) * z
-    return out
 
 
 def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray:
@@ -230,10 +231,12 @@ def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray
     if since > 0.0:
         x = applied(polynomial(series[:, : n * n], since).reshape(n, n), x)
     plain = applied(polynomial(series, gap)[n * n :].reshape(2 * n, n), x).reshape(2, n)
-    return added(plain, _legendre_moments(since, gap, step.end - step.start), step.cubic)
+    from_noise = np.empty((2, 4))
+    _fill_legendre(from_noise, since, gap, step.end - step.start)
+    return added(plain, from_noise, step.cubic)
 
 
-@compilable
+@in_place
 def fill_seen(
     out: FloatArray,
     series: FloatArray,
@@ -245,9 +248,11 @@ def fill_seen(
     k: int,
     responses: FloatArray,
     x: FloatArray,
+    from_noise: FloatArray,
 ) -> None:
     """``seen`` in loops, ``gap`` seconds from ``since`` on in piece ``k`` of ``length`` seconds,
-    into ``out`` (2, n); ``responses`` (3 n n,) and ``x`` (n,) are room to work in.
+    into ``out`` (2, n); ``responses`` (3 n n,), ``x`` (n,) and ``from_noise`` (2, 4) are room to
+    work in.
     """
     n = len(x)
     for i in range(n):
@@ -259,7 +264,7 @@ def fill_seen(
             for j in range(n):
                 x[i] += responses[i * n + j] * x_start[k, j]
     fill_polynomial(responses, series, len(series), gap)
-    from_noise = _legendre_moments(since, gap, length)
+    _fill_legendre(from_noise, since, gap, length)
     for m in range(2):
         for i in range(n):
             total = 0.0

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import in_place
 from netkf.core.fields import (
     Part,
     definite_covariance,
@@ -132,7 +132,7 @@ def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray
     return added(product(seen, H.T), noise, root.T)
 
 
-@compilable
+@in_place
 def fill_reading(
     out: FloatArray,
     row: int,
@@ -157,12 +157,23 @@ def fill_reading(
             out[m * half + row + i] = total
 
 
-@compilable
 def cut(
     rest: FloatArray, normals: FloatArray, u: float, length: float
 ) -> tuple[FloatArray, FloatArray]:
     """Moments (2, p) of the first share ``u`` of an interval of ``length`` seconds and of what is
     left, given those of the whole, from standard ``normals`` (2, p).
+    """
+    first, left = np.empty(rest.shape), rest.copy()
+    divide(first, left, normals, u, length)
+    return first, left
+
+
+@in_place
+def divide(
+    first: FloatArray, rest: FloatArray, normals: FloatArray, u: float, length: float
+) -> None:
+    """``cut`` in place: of ``rest`` (2, p) its first share goes to ``first``, and what is left
+    stays.
 
     Exact conditional law of four independent moments (variances g, g/3 on each part) given their
     two sums; written so that nothing cancels when a part is short.
@@ -172,13 +183,11 @@ def cut(
     size_first = math.sqrt(u * w * spread * length)
     size_slope = math.sqrt(u * w / spread * length)
     size_other = math.sqrt(u * w / (3.0 * spread) * length)
-    left, right = np.empty(rest.shape), np.empty(rest.shape)
     for k in range(rest.shape[1]):
         whole, tilted = rest[0, k], rest[1, k]
-        first, slope = size_first * normals[0, k], size_slope * normals[0, k]
+        early, slope = size_first * normals[0, k], size_slope * normals[0, k]
         other = size_other * normals[1, k]
-        left[0, k] = u * whole - 3.0 * u * w * tilted + first
-        left[1, k] = u * u * (tilted + slope) + w * other
-        right[0, k] = w * whole + 3.0 * u * w * tilted - first
-        right[1, k] = w * w * (tilted + slope) - u * other
-    return left, right
+        first[0, k] = u * whole - 3.0 * u * w * tilted + early
+        first[1, k] = u * u * (tilted + slope) + w * other
+        rest[0, k] = w * whole + 3.0 * u * w * tilted - early
+        rest[1, k] = w * w * (tilted + slope) - u * other

@@ -45,6 +45,7 @@ from netkf.engines.compiled.tables import (
     host_tables,
     larger,
     link_tables,
+    room_for,
     room_for_parts,
 )
 from netkf.plants.diffusion import Diffusion
@@ -125,6 +126,7 @@ class FlowRun:
         assert self._replay is not None
         self._hosts, self._models = host_tables(scenario)
         self._links, self._mail = link_tables(scenario), empty_mail(self._hosts, FIRST_MAIL)
+        self._room = room_for(self._models)
         self._parts = room_for_parts(self._links, self._hosts) if intersects else None
         self._cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
         self._schedule = schedule or Schedule(scenario, streams)
@@ -174,6 +176,7 @@ class FlowRun:
                 self._samples,
                 float(self._scenario.horizon),
                 self._rows,
+                self._room,
                 self._parts,
             )
         )

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import in_place
 from netkf.engines.compiled.tables import FREE, WAITING, Mail
 
 
-@compilable
+@in_place
 def sooner(arrival: FloatArray, way: np.ndarray, order: np.ndarray, a: int, b: int) -> bool:
     """Whether message ``a`` arrives before message ``b``."""
     if arrival[a] != arrival[b]:
@@ -19,7 +19,7 @@ def sooner(arrival: FloatArray, way: np.ndarray, order: np.ndarray, a: int, b: i
     return bool(order[a] < order[b])
 
 
-@compilable
+@in_place
 def push(mail: Mail, size: int, message: int) -> None:
     """Put a message on the heap of ``size``."""
     heap, arrival, way, order, k = mail.heap, mail.arrival, mail.way, mail.order, size
@@ -29,7 +29,7 @@ def push(mail: Mail, size: int, message: int) -> None:
     heap[k] = message
 
 
-@compilable
+@in_place
 def pop(mail: Mail, size: int) -> int:
     """Take the next message off the heap of ``size``."""
     heap, arrival, way, order = mail.heap, mail.arrival, mail.way, mail.order
@@ -46,7 +46,7 @@ def pop(mail: Mail, size: int) -> int:
     return int(top)
 
 
-@compilable
+@in_place
 def put(
     inbox: np.ndarray,
     waiting: np.ndarray,
@@ -88,7 +88,7 @@ def put(
         place[FREE] = gone
 
 
-@compilable
+@in_place
 def put_in_order(hosts: np.ndarray, count: int) -> None:
     """Sort the first ``count`` places (Shell's sort: a few lines to compile)."""
     gap = count // 2

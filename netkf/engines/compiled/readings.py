@@ -10,12 +10,12 @@ from netkf.algorithms.flow import stretch_end, usable
 from netkf.algorithms.gains import gain_move
 from netkf.algorithms.riccati import RiccatiTable, move_part, riccati_step
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import compilable, in_place
 from netkf.core.small import fill, fill_square
 from netkf.engines.base import LONGER, SHORTEST_SHARE
-from netkf.engines.compiled.tables import Hosts, Models, Sensing
+from netkf.engines.compiled.tables import Hosts, Models, Room, Sensing
 from netkf.plants.paths import fill_seen
-from netkf.plants.sensors import cut, fill_reading
+from netkf.plants.sensors import divide, fill_reading
 
 
 class Stretch(NamedTuple):
@@ -39,7 +39,7 @@ class Stretch(NamedTuple):
     series: FloatArray
 
 
-@compilable
+@in_place
 def read(
     out: FloatArray,
     sensing: Sensing,
@@ -48,10 +48,11 @@ def read(
     step: int,
     u: float,
     length: float,
+    early: FloatArray,
 ) -> None:
     """Moments (2 p,) of the readings of sensors from ``first`` on, as many as fill ``out``, where x
     has the moments ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1:
-    all of it).
+    all of it). ``early`` (2, most p) is room to work in.
     """
     rows, rest, used, H, root = sensing.rows, sensing.rest, sensing.used, sensing.H, sensing.root
     s, row = first, 0
@@ -61,9 +62,9 @@ def read(
             fill_square(rest[s], sensing.noise[s, step])
         noise = rest[s]
         if u >= 0.0:
-            noise, left = cut(noise, sensing.normals[s, used[s]], u, length)
+            noise = early
+            divide(early, rest[s], sensing.normals[s, used[s]], u, length)
             used[s] += 1
-            fill_square(rest[s], left)
         fill_reading(out, row, rows[s], x, H, noise, root, s)
         row += rows[s]
         s += 1
@@ -78,7 +79,7 @@ def flow_table(models: Models, k: int) -> RiccatiTable:
     )
 
 
-@compilable
+@in_place
 def advance(
     hosts: Hosts,
     models: Models,
@@ -87,14 +88,11 @@ def advance(
     piece: int,
     h: int,
     time: float,
-    E: FloatArray,
-    X: FloatArray,
-    Y: FloatArray,
+    room: Room,
 ) -> bool:
     """Bring host ``h``, which has sensors, to ``time`` as a Host of the processes does; False where
     it needs more normals for cuts first, and then goes on where it stopped.
     """
-    # Names of their own, because every look into a group counts references.
     now, k, n = hosts.now[h], hosts.model[h], hosts.xhat.shape[1]
     first, after = hosts.sensors[h], hosts.sensors[h + 1]
     P, xhat, least, G = hosts.P, hosts.xhat, hosts.least, models.information
@@ -103,8 +101,7 @@ def advance(
     gains = models.gains[begin : begin + terms * width].reshape(terms, width)
     responses, used = path.series, sensing.used
     start, stop, last = path.start[piece], path.stop[piece], path.last[piece]
-    moments, seen, of_x = np.empty(models.shape[k, 0]), np.empty((2, n)), np.empty(n)
-    room = np.empty(max(width, 3 * n * n))
+    readings, seen, values = room.moments[: models.shape[k, 0]], room.seen, room.values
     while now < time:
         end, rate = time, 0.0
         for i in range(n):
@@ -123,18 +120,18 @@ def advance(
         least[h] *= LONGER
         gap = end - now
         if gap < unit:
-            move_part(unit, series, P, xhat, h, gap, E, X, Y)
+            move_part(unit, series, P, xhat, h, gap, room.E, room.X, room.Y)
         else:
             move_far(models, k, P, xhat, h, gap)
         if now == start and end == stop:
             fill_square(seen, path.moments[piece])
         else:
             since, x_start, cubic = now - start, path.x_start, path.cubic
-            length, few = stop - start, room[: 3 * n * n]
-            fill_seen(seen, responses, since, gap, length, x_start, cubic, piece, few, of_x)
+            rooms = values[: 3 * n * n], room.of_x, room.from_noise
+            fill_seen(seen, responses, since, gap, stop - start, x_start, cubic, piece, *rooms)
         share = gap / (last - now) if end < last else -1.0
-        read(moments, sensing, first, seen, path.step[piece], share, last - now)
-        gain_move(moments, gains, P, xhat, h, gap, room[:width])
+        read(readings, sensing, first, seen, path.step[piece], share, last - now, room.early)
+        gain_move(readings, gains, P, xhat, h, gap, values[:width])
         now = end
     hosts.now[h], least[h] = now, 0.0
     return True

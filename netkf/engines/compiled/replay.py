@@ -16,7 +16,7 @@ from netkf.algorithms.covariance_intersection import intersected_pairs
 from netkf.algorithms.hybrid import add_neighbour
 from netkf.algorithms.riccati import move_part
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import compilable, in_place
 from netkf.core.small import fill, fill_square
 from netkf.engines.compiled.mail import pop, push, put, put_in_order
 from netkf.engines.compiled.readings import Stretch, advance, move_far
@@ -39,6 +39,7 @@ from netkf.engines.compiled.tables import (
     Mail,
     Models,
     Parts,
+    Room,
     Sensing,
 )
 from netkf.trace.schema import CODES
@@ -74,7 +75,7 @@ class Samples(NamedTuple):
     piece: np.ndarray
 
 
-@compilable
+@in_place
 def note(
     rows: np.ndarray,
     place: np.ndarray,
@@ -92,7 +93,7 @@ def note(
     place[ROW] += 1
 
 
-@compilable
+@in_place
 def add_part(parts: Parts, count: int, weight: float, xhat: FloatArray, P: FloatArray) -> int:
     """Put one more pair behind ``count`` others; returns how many there are now."""
     parts.weight[count] = weight
@@ -101,6 +102,15 @@ def add_part(parts: Parts, count: int, weight: float, xhat: FloatArray, P: Float
     return count + 1
 
 
+@compilable
+def intersect(parts: Parts, count: int, xhat: FloatArray, P: FloatArray, h: int) -> None:
+    """Write what the first ``count`` parts come to into place ``h`` of xhat (H, n), P (H, n, n)."""
+    mean, cov = intersected_pairs(parts.weight[:count], parts.xhat[:count], parts.P[:count])
+    fill(xhat[h], mean)
+    fill_square(P[h], cov)
+
+
+@in_place
 def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function, and it stops often
     hosts: Hosts,
     models: Models,
@@ -114,6 +124,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     samples: Samples,
     horizon: float,
     rows: np.ndarray,
+    room: Room,
     parts: Parts | None,
 ) -> int:
     """Go on until something is wanted; see the words above. Order is (time, rank, entity).
@@ -132,7 +143,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     capacity, window_end, path_end = len(mail.sent), window.end, path.end
     unit, n = models.unit, xhats.shape[1]
     known, series = 0, models.series[0]
-    E, X, Y = np.empty(5 * n * n), np.empty((n + 1, n)), np.empty((n, n))
+    E, X, Y = room.E, room.X, room.Y
     while True:
         if place[ROW] + MOST_ROWS > len(rows):
             return WANT_ROWS
@@ -182,7 +193,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
             if not reached[h] < now:
                 continue
             if sensors[h] < sensors[h + 1]:
-                if not advance(hosts, models, sensing, path, place[STEP_AT], h, now, E, X, Y):
+                if not advance(hosts, models, sensing, path, place[STEP_AT], h, now, room):
                     return WANT_CUTS
             else:
                 m, gap = model[h], now - reached[h]
@@ -271,11 +282,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 free[gone] = place[FREE]
                 place[FREE] = gone
             if parts is not None:
-                xhat, P = intersected_pairs(
-                    parts.weight[:count], parts.xhat[:count], parts.P[:count]
-                )
-                fill(xhats[h], xhat)
-                fill_square(Ps[h], P)
+                intersect(parts, count, xhats, Ps, h)
             inbox[h] = -1
             note(rows, place, now, ABSORB, nodes[h], -1, -1, oldest)
             place[READY] += 1
@@ -294,7 +301,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 return WANT_SAMPLES
 
 
-intersecting = FunctionType(replay.__code__, replay.__globals__, "intersecting")
+intersecting = in_place(FunctionType(replay.__code__, replay.__globals__, "intersecting"))
 """The same, compiled on its own for covariance intersection, so that the first run of each kind
 says that it compiles.
 """

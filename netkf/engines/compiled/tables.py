@@ -107,6 +107,23 @@ class Mail(NamedTuple):
     waiting: np.ndarray
 
 
+class Room(NamedTuple):
+    """Room to work in, since compiled functions make no arrays: E (5 n n,), X (n + 1, n), Y (n, n)
+    for the flow; moments (2 p,) and noise ``early`` (2, p) for the most rows p of any host, moments
+    ``seen`` (2, n) of x, ``values`` of the longest series, ``of_x`` (n,), ``from_noise`` (2, 4).
+    """
+
+    E: FloatArray
+    X: FloatArray
+    Y: FloatArray
+    moments: FloatArray
+    early: FloatArray
+    seen: FloatArray
+    values: FloatArray
+    of_x: FloatArray
+    from_noise: FloatArray
+
+
 class Parts(NamedTuple):
     """Room for what one covariance intersection combines, the own pair and D others: weight
     (D + 1,), xhat (D + 1, n), P (D + 1, n, n).
@@ -180,6 +197,22 @@ def link_tables(scenario: Scenario) -> Links:
         weight=np.array(weights, dtype=np.float64).reshape(-1, 2),
         messages=np.zeros(len(links), dtype=np.int64),
         ways=1 if topology.directed else 2,
+    )
+
+
+def room_for(models: Models) -> Room:
+    """Room for all that these models move."""
+    n, (most, _, width) = models.F.shape[2], models.shape.max(axis=0)
+    return Room(
+        E=np.zeros(5 * n * n),
+        X=np.zeros((n + 1, n)),
+        Y=np.zeros((n, n)),
+        moments=np.zeros(most),
+        early=np.zeros((2, most // 2)),
+        seen=np.zeros((2, n)),
+        values=np.zeros(max(width, 3 * n * n)),
+        of_x=np.zeros(n),
+        from_noise=np.zeros((2, 4)),
     )
 
 
