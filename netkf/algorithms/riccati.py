@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray, symmetric
-from netkf.core.compiling import compilable, compilable_as, in_place
+from netkf.core.compiling import in_place
 from netkf.core.small import (
     added,
     applied,
@@ -157,8 +157,7 @@ def move_part(
 ) -> None:
     """``part_of_unit`` in loops and in place, for place ``k`` of P (K, n, n) and x (K, n).
 
-    ``E`` (5 n n,), ``X, Y`` (n + 1, n) are room to work in. Compiled, making room takes longer than
-    the arithmetic, and so does every look into a tuple of arrays, since it counts references.
+    ``E`` (5 n n,), ``X`` (n + 1, n) and ``Y`` (n, n) are room to work in.
     """
     n = x.shape[1]
     fill_polynomial(E, series, terms_for(gap / unit), gap)
@@ -182,17 +181,48 @@ def move_part(
             P[k, i, j] = P[k, j, i] = 0.5 * (Y[i, j] + Y[j, i])
 
 
-def _part_loops(
-    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
-) -> tuple[FloatArray, FloatArray]:
-    n = table.n
-    stack, means = P.copy().reshape(1, n, n), x.copy().reshape(1, n)
-    E, X, Y = np.empty(5 * n * n), np.empty((n + 1, n)), np.empty((n, n))
-    move_part(table.unit, table.series, stack, means, 0, gap, E, X, Y)
-    return stack[0], means[0]
+@in_place
+def move_units(
+    whole: int,
+    jump: FloatArray,
+    F: FloatArray,
+    G: FloatArray,
+    Q: FloatArray,
+    P: FloatArray,
+    x: FloatArray,
+    k: int,
+    X: FloatArray,
+    Y: FloatArray,
+) -> None:
+    """The ``whole`` units of ``riccati_step`` in loops and in place, see ``move_part``."""
+    n, level = x.shape[1], 0
+    while whole >> level:
+        if whole >> level & 1:
+            for i in range(n):
+                X[n, i] = 0.0
+                for j in range(n):
+                    X[n, i] += jump[level, i, j] * x[k, j]
+                    total = 1.0 if i == j else 0.0
+                    for m in range(n):
+                        total += P[k, i, m] * G[level, m, j]
+                    X[i, j], Y[i, j] = total, P[k, i, j]
+            eliminate(X, Y, n)
+            for i in range(n):
+                x[k, i] = X[n, i]
+                for j in range(n):
+                    X[i, j] = 0.0
+                    for m in range(n):
+                        X[i, j] += F[level, i, m] * Y[m, j]
+            for i in range(n):
+                for j in range(i + 1):
+                    up, down = Q[level, i, j], Q[level, j, i]
+                    for m in range(n):
+                        up += X[i, m] * F[level, j, m]
+                        down += X[j, m] * F[level, i, m]
+                    P[k, i, j] = P[k, j, i] = 0.5 * (up + down)
+        level += 1
 
 
-@compilable_as(_part_loops)
 def part_of_unit(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -204,7 +234,6 @@ def part_of_unit(
     return even(solution(X.T, Y.T)), applied(transition, x)
 
 
-@compilable
 def riccati_step(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:

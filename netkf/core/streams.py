@@ -40,10 +40,16 @@ class Streams:
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
         """``generator`` of each of them, in order; see ``seeded``."""
-        if not _small(entities):
-            return [self.generator(purpose, *entity) for entity in entities]
-        made: list[Any] = [_Words(words) for words in self._words(purpose, entities)]
+        made: list[Any] = [_Words(words) for words in self.words(purpose, entities)]
         return [np.random.Generator(np.random.PCG64DXSM(words)) for words in made]
+
+    def words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """(K, 4) words of 64 bits that seed the generators of K entities."""
+        if _small(entities):
+            return self._words(purpose, entities)
+        some = [self._sequence(purpose, *entity) for entity in entities]
+        made = [sequence.generate_state(4, np.uint64) for sequence in some]
+        return np.array(made, dtype=np.uint64).reshape(-1, 4)
 
     def _words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
         start = (self.replica, _code(purpose))

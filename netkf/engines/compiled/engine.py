@@ -65,7 +65,7 @@ KNOWN = (
     *(Hybrid, CovarianceIntersection, Local, Central, *KERNELS),
 )
 DIVERGED = CODES["diverged"]
-FIRST_MAIL = 1024
+FIRST_MAIL, FIRST_ROWS = 1024, 4096
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 
 
@@ -135,7 +135,7 @@ class FlowRun:
         self._window = self._schedule.following()
         self._stretch = self._path.following()
         self._noise.following()
-        self._rows = np.empty(recording.BLOCK, dtype=EVENT)
+        self._rows = np.empty(FIRST_ROWS, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
         size, n = self._hosts.xhat.shape
         room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
@@ -199,6 +199,8 @@ class FlowRun:
     def _pass_rows_on(self, used: int) -> None:
         self._cursor.place[ROW] = 0
         self._recorder.extend(self._rows[:used])
+        if len(self._rows) < recording.BLOCK or not self._recorder.counted:
+            self._rows = np.empty(recording.BLOCK, dtype=EVENT)
 
     def _take_samples(self) -> bool:
         """Record the samples that are there; False where one of them is no longer finite."""

@@ -8,10 +8,10 @@ import numpy as np
 
 from netkf.algorithms.flow import stretch_end, usable
 from netkf.algorithms.gains import gain_move
-from netkf.algorithms.riccati import RiccatiTable, move_part, riccati_step
+from netkf.algorithms.riccati import move_part, move_units
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable, in_place
-from netkf.core.small import fill, fill_square
+from netkf.core.compiling import in_place
+from netkf.core.small import fill_square
 from netkf.engines.base import LONGER, SHORTEST_SHARE
 from netkf.engines.compiled.tables import Hosts, Models, Room, Sensing
 from netkf.plants.paths import fill_seen
@@ -70,15 +70,6 @@ def read(
         s += 1
 
 
-@compilable
-def flow_table(models: Models, k: int) -> RiccatiTable:
-    """The table of one model."""
-    n = models.F.shape[2]
-    return RiccatiTable(
-        n, models.unit[k], models.series[k], models.jump[k], models.F[k], models.G[k], models.Q[k]
-    )
-
-
 @in_place
 def advance(
     hosts: Hosts,
@@ -122,7 +113,7 @@ def advance(
         if gap < unit:
             move_part(unit, series, P, xhat, h, gap, room.E, room.X, room.Y)
         else:
-            move_far(models, k, P, xhat, h, gap)
+            move_far(models, k, P, xhat, h, gap, room)
         if now == start and end == stop:
             fill_square(seen, path.moments[piece])
         else:
@@ -137,9 +128,15 @@ def advance(
     return True
 
 
-@compilable
-def move_far(models: Models, k: int, P: FloatArray, x: FloatArray, place: int, gap: float) -> None:
-    """Move a place of P and x over a gap of any length by one of the models."""
-    moved, mean = riccati_step(flow_table(models, k), P[place], x[place], gap)
-    fill_square(P[place], moved)
-    fill(x[place], mean)
+@in_place
+def move_far(
+    models: Models, m: int, P: FloatArray, x: FloatArray, k: int, gap: float, room: Room
+) -> None:
+    """Move place ``k`` of P and x over a gap of any length by model ``m``."""
+    unit = models.unit[m]
+    whole = int(gap / unit)
+    jump, F, G, Q = models.jump[m], models.F[m], models.G[m], models.Q[m]
+    move_units(whole, jump, F, G, Q, P, x, k, room.X, room.Y)
+    rest = gap - whole * unit
+    if rest > 0.0:
+        move_part(unit, models.series[m], P, x, k, rest, room.E, room.X, room.Y)

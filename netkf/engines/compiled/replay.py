@@ -202,7 +202,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 if gap < unit[m]:
                     move_part(unit[m], series, Ps, xhats, h, gap, E, X, Y)
                 else:
-                    move_far(models, m, Ps, xhats, h, gap)
+                    move_far(models, m, Ps, xhats, h, gap, room)
                 reached[h] = now
         if sense == now:
             note(rows, place, now, SENSE, awake_node[place[AWAKE]], -1, -1, np.nan)
@@ -273,7 +273,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 weight = weights[way_of[message] // 2, way_of[message] % 2]
                 if age > 0.0:
                     oldest = max(oldest, age)
-                    move_far(models, len(unit) - 1, mail_P, mail_x, message, age)
+                    move_far(models, len(unit) - 1, mail_P, mail_x, message, age, room)
                 if parts is None:
                     add_neighbour(xhats, Ps, h, weight, mail_x, mail_P, message)
                 else:

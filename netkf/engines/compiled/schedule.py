@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.draws import Draws
 from netkf.core.streams import Streams
 from netkf.network.channels import Fates, alike, chances, needed
 from netkf.network.clocks import LinkClock, Poisson, next_ticks
@@ -57,13 +58,14 @@ class Clocks:
         clock = scenario.network.activation
         assert isinstance(clock, LinkClock) or not links
         self._clock, self._links, self._horizon = clock, links, scenario.horizon
-        self._random = streams.generators("clock", links)
         self.last, self.drawn = np.zeros(len(links)), np.zeros(len(links), dtype=np.int64)
         self._alike = type(clock) is Poisson
         self._rates = self._origins = np.empty(0)
         if isinstance(clock, LinkClock) and self._alike:
+            self._draws = Draws(streams, "clock", links)
             self._rates = np.array([clock.mean_rate(link) for link in links])
         elif isinstance(clock, LinkClock):
+            self._random = streams.generators("clock", links)
             phases = [partial(streams.generator, "phase", *link) for link in links]
             self._origins = np.array(
                 [clock.origin(link, phase) for link, phase in zip(links, phases, strict=True)]
@@ -93,9 +95,8 @@ class Clocks:
         """As ``Poisson.ticks`` for all links at once; infinite where a link has fewer."""
         times = np.full((len(links), counts.max() + 1), np.inf)
         times[:, 0] = self.last[links]
-        for k, row, count in zip(links.tolist(), times, counts.tolist(), strict=True):
-            self._random[k].standard_exponential(out=row[1 : count + 1])
-        times[:, 1:] /= self._rates[links, None]
+        gaps = self._draws.exponentials(links, counts) / np.repeat(self._rates[links], counts)
+        times[:, 1:][np.arange(times.shape[1] - 1) < counts[:, None]] = gaps
         return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
 
     def _ticks(self, k: int, count: int) -> FloatArray:
@@ -126,7 +127,7 @@ class Fortunes:
             )
         if self._plain:
             lucky = () if loss.certain else drawn
-            self._luck = [streams.generators("loss", ways) for ways in lucky]
+            self._luck = [Draws(streams, "loss", ways) for ways in lucky]
         else:
             seeded = [streams.seeded(needed(channel), ways) for ways in drawn]
             self._fates = [
@@ -151,16 +152,10 @@ class Fortunes:
         return out
 
     def _plainly(self, links: np.ndarray, counts: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-        total, ends = int(counts.sum()), np.cumsum(counts)
+        total = int(counts.sum())
         delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
         fine, never = np.zeros(total, dtype=bool), np.zeros(total)
-        places = list(zip(links.tolist(), (ends - counts).tolist(), ends.tolist(), strict=True))
-        drawn: list[tuple[np.ndarray, ...]] = []
-        for randoms in self._luck:
-            luck = np.empty(total)
-            for k, start, end in places:
-                randoms[k].random(out=luck[start:end])
-            drawn.append((luck, fine, delay))
+        drawn = [(draws.units(links, counts), fine, delay) for draws in self._luck]
         return drawn or [(never, fine, delay)]
 
     def _one_by_one(self, links: np.ndarray, counts: np.ndarray) -> list[tuple[np.ndarray, ...]]:
@@ -237,7 +232,7 @@ class Schedule:
         now = known.t < end
         self._known = Ticks(*(column[~now] for column in known))
         t, link, delay = (column[now] for column in known)
-        order = np.argsort(t, kind="stable")
+        order = np.argsort(t)
         if (np.diff(t[order]) == 0.0).any():
             order = np.lexsort((link, t))
         return Window(end, t[order], link[order], delay[order])
