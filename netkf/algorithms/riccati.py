@@ -11,6 +11,7 @@ the doubling formulas (Davison and Maki 1973; Anderson 1978), which only add pos
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ from netkf.core.small import (
 )
 
 TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
+ENOUGH = np.array([(1e-18 * math.factorial(k)) ** (1 / max(k - 1, 1)) for k in range(TAYLOR_TERMS)])
+"""The largest share of a unit for which ``k`` terms are enough: share^k / k! <= 1e-18 share."""
 
 
 class RiccatiTable(NamedTuple):
@@ -122,10 +125,9 @@ def terms_for(share: float) -> int:
     """How many terms of the series a gap of that share of a unit needs: the next one is below
     double rounding of the first that depends on the gap.
     """
-    terms, last = 1, share
-    while terms < TAYLOR_TERMS and last > 1e-18 * share:
+    terms = 2
+    while terms < TAYLOR_TERMS and share > ENOUGH[terms]:
         terms += 1
-        last *= share / terms
     return terms
 
 
