@@ -36,33 +36,29 @@ class Streams:
         key = (self.replica, _code(purpose), *entity)
         return np.random.SeedSequence(entropy=self.seed, spawn_key=key)
 
+    @property
+    def each(self) -> tuple[Streams, ...]:
+        """As of several runs, see ``Together``."""
+        return (self,)
+
+    def words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """(K, 4) words of 64 bits that seed the generators of K entities."""
+        return Together(self.seed, self.replica, 1).words(purpose, entities)
+
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
         """``generator`` of each of them, in order; see ``seeded``."""
-        made: list[Any] = [_Words(words) for words in self.words(purpose, entities)]
-        return [np.random.Generator(np.random.PCG64DXSM(words)) for words in made]
-
-    def words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """(K, 4) words of 64 bits that seed the generators of K entities."""
-        if _small(entities):
-            return self._words(purpose, entities)
-        some = [self._sequence(purpose, *entity) for entity in entities]
-        made = [sequence.generate_state(4, np.uint64) for sequence in some]
-        return np.array(made, dtype=np.uint64).reshape(-1, 4)
-
-    def _words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        start = (self.replica, _code(purpose))
-        return _all_words(self.seed, start, np.array(entities, dtype=np.uint32))
+        return Together(self.seed, self.replica, 1).generators(purpose, entities)
 
     def seeded(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
         """The same streams, with the seeds of these purposes and entities made all at once: numpy
         takes some 30 microseconds for one. Entities have as many numbers each.
         """
         made: dict[tuple[str, tuple[int, ...]], _Words] = {}
-        if _small(entities):
+        if entities and _small(entities):
             for purpose in purposes:
-                words = self._words(purpose, entities)
+                words = self.words(purpose, entities)
                 made |= {(purpose, e): _Words(w) for e, w in zip(entities, words, strict=True)}
         return _Seeded(self.seed, self.replica, made)
 
@@ -74,6 +70,42 @@ class _Seeded(Streams):
     def _sequence(self, purpose: str, *entity: int) -> Any:
         known = self.made.get((purpose, entity))
         return super()._sequence(purpose, *entity) if known is None else known
+
+
+@dataclass(frozen=True)
+class Together:
+    """The sources of ``count`` runs of one seed, the first of which is ``replica``; what they draw
+    is what each would draw for itself.
+    """
+
+    seed: int
+    replica: int
+    count: int
+
+    @property
+    def each(self) -> tuple[Streams, ...]:
+        """The source of each run."""
+        return tuple(Streams(self.seed, self.replica + k) for k in range(self.count))
+
+    def words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """(count K, 4) words of 64 bits that seed the generators of K entities, run by run."""
+        if not entities:
+            return np.empty((0, 4), dtype=np.uint64)
+        replicas = range(self.replica, self.replica + self.count)
+        if not (_small(entities) and replicas[-1] < WORD):
+            some = [s._sequence(purpose, *entity) for s in self.each for entity in entities]
+            return np.array([sequence.generate_state(4, np.uint64) for sequence in some])
+        keys = np.empty((self.count, len(entities), 2 + len(entities[0])), dtype=np.uint32)
+        keys[:, :, 0] = np.array(replicas, dtype=np.uint32)[:, None]
+        keys[:, :, 1], keys[:, :, 2:] = _code(purpose), np.array(entities, dtype=np.uint32)
+        return _all_words(self.seed, keys.reshape(-1, keys.shape[2]))
+
+    def generators(
+        self, purpose: str, entities: Sequence[tuple[int, ...]]
+    ) -> list[np.random.Generator]:
+        """The generators that these words seed."""
+        made: list[Any] = [_Words(words) for words in self.words(purpose, entities)]
+        return [np.random.Generator(np.random.PCG64DXSM(words)) for words in made]
 
 
 class _Words(ISeedSequence):
@@ -88,22 +120,21 @@ class _Words(ISeedSequence):
 
 
 def _small(entities: Sequence[tuple[int, ...]]) -> bool:
-    """Whether there are any, all of numbers of one word."""
-    return len(entities) > 0 and max(max(entity) for entity in entities) < WORD
+    """Whether all are of numbers of one word."""
+    return max(max(entity, default=0) for entity in entities) < WORD
 
 
 POOL, WORD, MASK = 4, 1 << 32, (1 << 32) - 1
 
 
-def _all_words(seed: int, start: tuple[int, ...], entities: np.ndarray) -> np.ndarray:
-    """(N, 4) what SeedSequence(seed, spawn_key=(*start, *entity)) gives PCG64DXSM for all entities
-    (N, k): numpy's algorithm, which its policy keeps as it is (M. E. O'Neill's seed_seq_fe).
+def _all_words(seed: int, keys: np.ndarray) -> np.ndarray:
+    """(N, 4) what SeedSequence(seed, spawn_key=key) gives PCG64DXSM for all keys (N, k): numpy's
+    algorithm, which its policy keeps as it is (M. E. O'Neill's seed_seq_fe).
     """
     root = _words_of(seed)
     root += [0] * (POOL - len(root))
-    fixed = root + [word for number in start for word in _words_of(number)]
-    columns = [np.full(len(entities), word, dtype=np.uint32) for word in fixed]
-    columns += list(entities.T.copy())
+    columns = [np.full(len(keys), word, dtype=np.uint32) for word in root]
+    columns += list(keys.T.copy())
     constant = 0x43B0D7E5
 
     def hashed(value: np.ndarray) -> np.ndarray:
@@ -125,7 +156,7 @@ def _all_words(seed: int, start: tuple[int, ...], entities: np.ndarray) -> np.nd
     for column in columns[POOL:]:
         for target in range(POOL):
             pool[target] = mixed(pool[target], hashed(column))
-    out, constant = np.empty((len(entities), 2 * POOL), dtype=np.uint32), 0x8B51F9DD
+    out, constant = np.empty((len(keys), 2 * POOL), dtype=np.uint32), 0x8B51F9DD
     for k in range(2 * POOL):
         value = pool[k % POOL] ^ np.uint32(constant)
         constant = constant * 0x58F38DED & MASK
