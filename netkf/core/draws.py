@@ -1,10 +1,10 @@
 """Numbers of many streams at once: those that numpy's ``Generator(PCG64DXSM)`` draws, compiled.
 
-A network of 1e5 links has as many streams, and a generator of numpy for each costs more than what is
-drawn from it. So the state of all of them is one array here. The words follow PCG64DXSM (M. E.
+A network of 1e5 links has as many streams, and a generator of numpy for each costs more than what
+is drawn from it. So the state of all of them is one array here. The words follow PCG64DXSM (M. E.
 O'Neill's permuted congruential generator with the output of numpy's issue 13635), which numpy's
-policy keeps as it is; exponentials come from the ziggurat of Marsaglia and Tsang (2000) with numpy's
-tables (``numpy/random/src/distributions/ziggurat_constants.h``, BSD-3-Clause) in ``ziggurat.npz``.
+policy keeps as it is; exponentials come from the ziggurat of Marsaglia and Tsang (2000) with
+numpy's tables (``ziggurat_constants.h``, BSD-3-Clause), kept in ``ziggurat.npz``.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.core import compiling
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import in_place
-from netkf.core.streams import Streams
+from netkf.core.streams import Streams, Together
 
 _U = np.uint64
 CHEAP = _U(0xDA942042E4DD58B5)
@@ -46,7 +46,7 @@ def _ziggurat() -> Ziggurat:
 
 
 @in_place
-def high_word(a: int, b: int) -> int:
+def high_word(a: Any, b: Any) -> Any:
     """The upper 64 bits of the product of two words."""
     a1, a0, b1, b0 = a >> S32, a & HALF, b >> S32, b & HALF
     low, cross = a0 * b0, a1 * b0
@@ -55,7 +55,7 @@ def high_word(a: int, b: int) -> int:
 
 
 @in_place
-def next_word(states: np.ndarray, k: int) -> int:
+def next_word(states: np.ndarray, k: int) -> Any:
     """The next word of stream ``k`` of states (K, 4): state and increment, high words first."""
     high, low = states[k, 0], states[k, 1]
     made = high ^ (high >> S32)
@@ -82,7 +82,7 @@ def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
         word = next_word(states, k) >> S3
         layer = int(word & LAYER)
         word >>= S8
-        x = float(word) * ziggurat.width[layer]
+        x: float = float(word) * ziggurat.width[layer]
         if word < ziggurat.inside[layer]:
             return x
         if layer == 0:
@@ -134,9 +134,11 @@ def fill_exponentials(
 
 
 class Draws:
-    """The streams of one purpose of many entities, in order; needs numba."""
+    """The streams of one purpose of many entities, in order, run by run; needs numba."""
 
-    def __init__(self, streams: Streams, purpose: str, entities: Sequence[tuple[int, ...]]) -> None:
+    def __init__(
+        self, streams: Streams | Together, purpose: str, entities: Sequence[tuple[int, ...]]
+    ) -> None:
         words = streams.words(purpose, entities)
         self._states = np.empty(words.shape, dtype=np.uint64)
         _compiled(seed_states)(words, self._states)

@@ -92,7 +92,8 @@ class Together:
         if not entities:
             return np.empty((0, 4), dtype=np.uint64)
         replicas = range(self.replica, self.replica + self.count)
-        if not (_small(entities) and replicas[-1] < WORD):
+        few = self.count * len(entities) < FEW
+        if few or replicas[-1] >= WORD or not _small(entities):
             some = [s._sequence(purpose, *entity) for s in self.each for entity in entities]
             return np.array([sequence.generate_state(4, np.uint64) for sequence in some])
         keys = np.empty((self.count, len(entities), 2 + len(entities[0])), dtype=np.uint32)
@@ -124,6 +125,7 @@ def _small(entities: Sequence[tuple[int, ...]]) -> bool:
     return max(max(entity, default=0) for entity in entities) < WORD
 
 
+FEW = 16  # seeds, which numpy makes faster one by one
 POOL, WORD, MASK = 4, 1 << 32, (1 << 32) - 1
 
 

@@ -150,7 +150,8 @@ class ParquetSink(Sink):
         self._shown = scenario.plant.shown
         self._events = _Table(directory / "events.parquet") if events else None
         self._states = _Table(directory / "states.parquet") if events else None
-        self._samples: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+        self._samples: list[tuple[FloatArray, ...]] = []
+        self._rows = 0
 
     def events(self, rows: np.ndarray) -> None:
         """A row group."""
@@ -158,18 +159,21 @@ class ParquetSink(Sink):
             self._events.write(event_columns(rows, self._replica, self._first))
             self._first += len(rows)
 
-    def states(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         """Gathered into row groups."""
         if self._states is not None:
             self._samples.append((t, x, xhat, P))
-            if len(self._samples) * len(self._nodes) >= ROWS:
+            self._rows += len(t) * len(self._nodes)
+            if self._rows >= ROWS:
                 self._flush()
 
     def _flush(self) -> None:
         if self._states is None or not self._samples:
             return
-        times, x, xhat, P = (np.array([s[k] for s in self._samples]) for k in range(4))
+        columns = zip(*self._samples, strict=True)
+        times, x, xhat, P = (np.concatenate(column) for column in columns)
         self._samples.clear()
+        self._rows = 0
         self._states.write(state_table(self._replica, times, self._nodes, x, xhat, P, self._shown))
 
     def close(self) -> None:

@@ -117,8 +117,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     samples, tables = SummarySink(), ParquetSink(folder, scenario, run.replica, True)
     for sink in (samples, tables):
         sink.events(run.log)
-        for sample in zip(run.times.tolist(), run.x, run.xhat, run.P, strict=True):
-            sink.states(*sample)
+        sink.states(run.times, run.x, run.xhat, run.P)
     tables.close()
     _summary(folder, scenario, samples, promise(scenario, run.times), run.count, run.sums)
     totals = {"events": len(run.log), "fingerprint": run.fingerprint}

@@ -102,13 +102,16 @@ def collect(
 ) -> Run:
     """A Run from what a recorder gathered."""
     count, n = len(scenario.nodes), scenario.plant.n
-    samples = memory.samples
+    shapes = (), (n,), (count, n), (count, n, n)
+    nothing = tuple(np.empty((0, *shape)) for shape in shapes)
+    columns = zip(nothing, *memory.samples, strict=True)
+    times, x, xhat, P = (np.concatenate(column) for column in columns)
     return Run(
-        times=np.array([sample[0] for sample in samples]),
+        times=times,
         nodes=scenario.nodes,
-        x=np.array([sample[1] for sample in samples]).reshape(-1, n),
-        xhat=np.array([sample[2] for sample in samples]).reshape(-1, count, n),
-        P=np.array([sample[3] for sample in samples]).reshape(-1, count, n, n),
+        x=x,
+        xhat=xhat,
+        P=P,
         log=np.concatenate([np.empty(0, dtype=EVENT), *memory.blocks]),
         seed=seed,
         replica=replica,

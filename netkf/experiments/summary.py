@@ -16,10 +16,9 @@ from netkf.theory import central_covariance, covariance_bound, limit_covariance
 from netkf.theory.coupled import not_promised
 from netkf.theory.steady import has_steady_state
 from netkf.trace.recorder import Sink
-from netkf.trace.run import errors
+from netkf.trace.run import errors, rounding_from
 from netkf.trace.schema import CODES
 
-ROUNDING = 4.0 * np.finfo(float).eps
 CONFIDENCE = 0.95
 
 
@@ -48,17 +47,18 @@ class SummarySink(Sink):
         for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
             self.delivered[i, j] = self.delivered.get((i, j), 0) + count
 
-    def states(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         """Reduced at once."""
-        sq_error, nees = errors(x[None], xhat[None], P[None])
-        self.times.append(t)
-        self.sq_error.append(sq_error[0])
-        self.nees.append(nees[0])
-        self.trace.append(np.trace(P, axis1=1, axis2=2))
-        deviation = np.sqrt(max(float(np.diagonal(P, axis1=1, axis2=2).min()), 0.0))
-        blurred = ROUNDING * float(np.abs(x).max()) > 0.01 * deviation > 0.0
-        if blurred and self.rounding_from is None:
-            self.rounding_from = t
+        if not len(t):
+            return
+        sq_error, nees = errors(x, xhat, P)
+        self.times += t.tolist()
+        self.sq_error += list(sq_error)
+        self.nees += list(nees)
+        self.trace += list(np.trace(P, axis1=2, axis2=3))
+        if self.rounding_from is None:
+            first = rounding_from(t, x, P)
+            self.rounding_from = first if first < np.inf else None
 
 
 def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +12,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import matrix, positive, setting, square
 from netkf.plants.laws import Laws
-from netkf.plants.paths import DiffusionPath
+from netkf.plants.paths import DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
 
 LONGEST_STEP = 8.0
@@ -56,8 +57,18 @@ class Diffusion(Plant):
         """A path of its own that can be asked for its state on the sensing grid and at the times
         ``shown`` (increasing); ``probing`` is used only for those off the grid.
         """
-        start = self.start_mean + square_root(self.start_cov) @ random.standard_normal(self.n)
-        return DiffusionPath(self.laws, start, random, probing, shown)
+        return DiffusionPath(self.paths([random], [probing], shown))
+
+    def paths(
+        self,
+        randoms: Sequence[np.random.Generator],
+        probings: Sequence[np.random.Generator],
+        shown: FloatArray,
+    ) -> DiffusionPaths:
+        """The paths of several runs together."""
+        normals = np.stack([random.standard_normal(self.n) for random in randoms])
+        start = self.start_mean + (normals[:, None] @ square_root(self.start_cov).T)[:, 0]
+        return DiffusionPaths(self.laws, start, randoms, probings, shown)
 
 
 def default_sensing_period(

@@ -11,6 +11,7 @@ state and moments are drawn from their exact law given the step, from a second s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +42,7 @@ class Step(NamedTuple):
 class Block(NamedTuple):
     """BLOCK steps as K pieces, since a step is cut where a state is shown: ``start, end`` (K,), x
     at both (K, n), ``moments`` (K, 2, n), ``cubic`` (K, 4, n) and whose ``step`` (K,) each is;
-    ``ends`` (BLOCK,) of the steps.
+    ``ends`` (BLOCK,) of the steps. What is random comes for B paths at once, (B, K, ...).
     """
 
     start: FloatArray
@@ -53,47 +54,52 @@ class Block(NamedTuple):
     step: np.ndarray
     ends: FloatArray
 
+    def of(self, k: int) -> Block:
+        """That of path ``k``."""
+        return self._replace(
+            x_start=self.x_start[k],
+            x_end=self.x_end[k],
+            moments=self.moments[k],
+            cubic=self.cubic[k],
+        )
 
-class DiffusionPath:
-    """The path of one run; ``shown`` are the times (increasing) at which its state is shown."""
+
+class DiffusionPaths:
+    """The paths of B runs, which are cut at the same times: ``start`` (B, n), the sources of each,
+    and the times ``shown`` (increasing) at which states are shown.
+
+    Each path is to the last bit what it is alone.
+    """
 
     def __init__(
         self,
         laws: Laws,
         start: FloatArray,
-        random: np.random.Generator,
-        probing: np.random.Generator,
+        randoms: Sequence[np.random.Generator],
+        probings: Sequence[np.random.Generator],
         shown: FloatArray,
     ) -> None:
-        self.laws, self.period = laws, laws.period
-        self._random, self._probing, self._shown = random, probing, shown
+        self.laws, self._randoms, self._probings, self._shown = laws, randoms, probings, shown
         self._x, self._drawn = start, 0
-        self._block: Block | None = None
-        self._first = self._piece = 0  # of the present step, and the one last asked for
-        self._step, self._step_end = Step(0.0, 0.0, *[start] * 4), 0.0
-
-    def grid(self, k: int) -> float:
-        """Time of the k-th point of the sensing grid."""
-        return grid_time(self.period, k)
 
     def following(self) -> Block:
         """The next steps of the sensing grid."""
-        n, laws = self.laws.n, self.laws
-        normals = self._random.standard_normal((BLOCK, 3 * n))
-        noise = (normals @ laws.spread.T).reshape(BLOCK, 3, n)
-        x = np.empty((BLOCK + 1, n))
-        x[0] = self._x
+        laws, (count, n) = self.laws, self._x.shape
+        normals = np.stack([random.standard_normal((BLOCK, 3 * n)) for random in self._randoms])
+        noise = (normals @ laws.spread.T).reshape(count, BLOCK, 3, n)
+        x = np.empty((count, BLOCK + 1, n))
+        x[:, 0] = self._x
+        onwards = laws.response[0].T
         for k in range(BLOCK):
-            x[k + 1] = laws.response[0] @ x[k] + noise[k, 0]
-        self._x = x[BLOCK]
-        moments = np.ascontiguousarray(
-            np.einsum("mij,kj->kmi", laws.response[1:], x[:-1]) + noise[:, 1:]
-        )
+            # Matrix by matrix, so that no path is rounded as its neighbours happen to be.
+            x[:, k + 1] = (x[:, k, None] @ onwards)[:, 0] + noise[:, k, 0]
+        self._x = x[:, BLOCK]
+        moments = _moved(laws.response[1:], x[:, :-1]) + noise[:, :, 1:]
         times = laws.grid(self._drawn, BLOCK + 1)
         self._drawn += BLOCK
-        cubic = _cubics(self.period, noise[:, 0], noise[:, 1:])
-        steps = np.arange(BLOCK)
-        whole = Block(times[:-1], times[1:], x[:-1], x[1:], moments, cubic, steps, times[1:])
+        cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
+        steps, ends = np.arange(BLOCK), times[1:]
+        whole = Block(times[:-1], ends, x[:, :-1], x[:, 1:], moments, cubic, steps, ends)
         first, last = np.searchsorted(self._shown, times[[0, -1]], side="right")
         shown = self._shown[first:last]
         inside = shown[~np.isin(shown, whole.ends)]
@@ -102,12 +108,22 @@ class DiffusionPath:
     def _cut(self, block: Block, shown: FloatArray) -> Block:
         """The block with pieces that end at the times ``shown``, which are inside its steps."""
         steps = np.searchsorted(block.ends, shown)
-        normals = self._probing.standard_normal((len(shown), 3 * self.laws.n))
+        size = len(shown), 3 * self.laws.n
+        normals = np.stack([probing.standard_normal(size) for probing in self._probings])
         counts = 1 + np.bincount(steps, minlength=len(block.ends))
         # A step that is cut twice is cut at the first time, and what is left of it at the second.
         turn = np.arange(len(shown)) - np.searchsorted(steps, steps)
-        repeated = [np.repeat(part, counts, axis=0) for part in block[:-1]]
-        pieces = Block._make([*repeated, block.ends])
+        which = np.repeat(block.step, counts)
+        pieces = Block(
+            start=block.start[which],
+            end=block.end[which],
+            x_start=block.x_start[:, which],
+            x_end=block.x_end[:, which],
+            moments=block.moments[:, which],
+            cubic=block.cubic[:, which],
+            step=which,
+            ends=block.ends,
+        )
         rows = (np.cumsum(counts) - counts)[steps] + turn
         for k in range(int(turn.max()) + 1):
             chosen = turn == k
@@ -116,7 +132,7 @@ class DiffusionPath:
             laws = np.unique(np.stack([lengths, lefts]), axis=1, return_inverse=True)[1].ravel()
             for law in range(int(laws.max()) + 1):
                 same = np.flatnonzero(chosen)[laws == law]
-                self._split(pieces, rows[same], shown[same], normals[same])
+                self._split(pieces, rows[same], shown[same], normals[:, same])
         return pieces
 
     def _split(
@@ -126,46 +142,55 @@ class DiffusionPath:
         times: FloatArray,
         normals: FloatArray,
     ) -> None:
-        """Draw the path at ``times`` given the pieces in ``rows``, all of one length and cut at
+        """Draw the paths at ``times`` given the pieces in ``rows``, all of one length and cut at
         the same place, and divide each with all rows of its step that come after it.
         """
         n, laws = self.laws.n, self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
         left = float(times[0] - pieces.start[rows[0]])
         gain, spread = laws.split(length, left)
-        x, end = pieces.x_start[rows], pieces.x_end[rows]
-        known = np.concatenate([end[:, None], pieces.moments[rows]], axis=1)
-        residual = known - np.einsum("mij,kj->kmi", laws.responses(length), x)
-        noise = (residual.reshape(-1, 3 * n) @ gain.T + normals @ spread.T).reshape(-1, 3, n)
-        values = np.einsum("mij,kj->kmi", laws.responses(left), x) + noise
-        middle, first = values[:, 0], values[:, 1:]
+        x, end = pieces.x_start[:, rows], pieces.x_end[:, rows]
+        known = np.concatenate([end[:, :, None], pieces.moments[:, rows]], axis=2)
+        residual = (known - _moved(laws.responses(length), x)).reshape(*x.shape[:2], 3 * n)
+        noise = (residual @ gain.T + normals @ spread.T).reshape(known.shape)
+        values = _moved(laws.responses(left), x) + noise
+        middle, first = values[:, :, 0], values[:, :, 1:]
         share = left / length
         # Moments of the rest: the whole's P_1 is (share - 1) + share P_1 on the left part and
         # share + (1 - share) P_1 on the right one.
-        plain = known[:, 1] - first[:, 0]
-        tilted = known[:, 2] - (share - 1.0) * first[:, 0] - share * first[:, 1] - share * plain
-        second = np.stack([plain, tilted / (1.0 - share)], axis=1)
-        later = np.concatenate([end[:, None], second], axis=1)
-        later -= np.einsum("mij,kj->kmi", laws.responses(length - left), middle)
-        cubics = _cubics(left, noise[:, 0], noise[:, 1:])
-        rest = _cubics(length - left, later[:, 0], later[:, 1:])
-        pieces.end[rows], pieces.x_end[rows] = times, middle
-        pieces.moments[rows], pieces.cubic[rows] = first, cubics
+        plain = known[:, :, 1] - first[:, :, 0]
+        tilted = known[:, :, 2] - (share - 1.0) * first[:, :, 0] - share * first[:, :, 1]
+        second = np.stack([plain, (tilted - share * plain) / (1.0 - share)], axis=2)
+        later = np.concatenate([end[:, :, None], second], axis=2)
+        later -= _moved(laws.responses(length - left), middle)
+        cubics = _cubics(left, noise[:, :, 0], noise[:, :, 1:])
+        rest = _cubics(length - left, later[:, :, 0], later[:, :, 1:])
+        pieces.end[rows], pieces.x_end[:, rows] = times, middle
+        pieces.moments[:, rows], pieces.cubic[:, rows] = first, cubics
         stops = np.searchsorted(pieces.step, pieces.step[rows], side="right")
         for k, (row, stop) in enumerate(zip(rows.tolist(), stops.tolist(), strict=True)):
             after = slice(row + 1, stop)
-            pieces.start[after], pieces.x_start[after] = times[k], middle[k]
-            pieces.moments[after], pieces.cubic[after] = second[k], rest[k]
+            pieces.start[after], pieces.x_start[:, after] = times[k], middle[:, k, None]
+            pieces.moments[:, after], pieces.cubic[:, after] = second[:, k, None], rest[:, k, None]
 
-    @property
-    def series(self) -> FloatArray:
-        """(terms, 3 n n) power series of the responses in the gap."""
-        return self.laws.series
+
+class DiffusionPath:
+    """The path of one run, asked for step by step."""
+
+    def __init__(self, paths: DiffusionPaths) -> None:
+        self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
+        self._block: Block | None = None
+        self._first = self._piece = 0  # of the present step, and the one last asked for
+        self._step, self._step_end = Step(0.0, 0.0, *[np.empty(0)] * 4), 0.0
+
+    def grid(self, k: int) -> float:
+        """Time of the k-th point of the sensing grid."""
+        return grid_time(self.period, k)
 
     def _at(self, time: float) -> Step:
         """The piece that ``time`` is in; it may lie before the last one asked for, in its step."""
         while self._block is None or time > self._block.ends[-1]:
-            self._block, self._first, self._piece = self.following(), 0, -1
+            self._block, self._first, self._piece = self._paths.following().of(0), 0, -1
         block, k = self._block, self._first
         while block.end[k] < time:
             k += 1
@@ -194,18 +219,23 @@ class DiffusionPath:
         return step.x_end if time == step.end else step.x_start
 
 
+def _moved(responses: FloatArray, x: FloatArray) -> FloatArray:
+    """(B, K, m, n) of responses (m, n, n) to states (B, K, n)."""
+    return np.swapaxes(x[:, None] @ np.swapaxes(responses, 1, 2), 1, 2)
+
+
 def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
-    """(K, 4, n) Legendre coefficients of the cubics on [0, 1] that start at 0, end at ``end``
-    (K, n) and have these moments (K, 2, n).
+    """(B, K, 4, n) Legendre coefficients of the cubics on [0, 1] that start at 0, end at ``end``
+    (B, K, n) and have these moments (B, K, 2, n).
     """
-    mean, slope = moments[:, 0] / length, 3.0 * moments[:, 1] / length
-    return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=1)
+    mean, slope = moments[:, :, 0] / length, 3.0 * moments[:, :, 1] / length
+    return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=2)
 
 
 @in_place
 def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> None:
-    """Write (2, 4) the two moments over ``gap`` seconds from ``since`` on of the Legendre polynomials
-    of a step of ``length`` seconds, by Gauss's rule with three nodes, which is exact for them.
+    """Write (2, 4) the two moments over ``gap`` seconds from ``since`` on of the Legendre
+    polynomials of a step of ``length`` seconds, by Gauss's rule with three nodes, which is exact.
     """
     for m in range(2):
         for c in range(4):

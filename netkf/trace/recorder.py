@@ -30,8 +30,8 @@ class Sink(ABC):
         """A block of EVENT rows that follows the one before."""
 
     @abstractmethod
-    def states(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
-        """One sample: x (n,), xhat (N, n), P (N, n, n)."""
+    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+        """Samples at times (T,): x (T, n), xhat (T, N, n), P (T, N, n, n)."""
 
 
 class MemorySink(Sink):
@@ -39,13 +39,13 @@ class MemorySink(Sink):
 
     def __init__(self) -> None:
         self.blocks: list[np.ndarray] = []
-        self.samples: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+        self.samples: list[tuple[FloatArray, ...]] = []
 
     def events(self, rows: np.ndarray) -> None:
         """Appended."""
         self.blocks.append(rows)
 
-    def states(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         """Appended."""
         self.samples.append((t, x, xhat, P))
 
@@ -119,6 +119,10 @@ class Recorder:
 
     def sample(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         """Record one sample of the truth (n,) and of all nodes (N, n), (N, n, n)."""
+        self.samples(np.array([t]), x[None], xhat[None], P[None])
+
+    def samples(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+        """Record some samples, which nobody writes to from now on."""
         for sink in self._sinks:
             sink.states(t, x, xhat, P)
 

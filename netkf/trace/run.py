@@ -15,6 +15,8 @@ from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 if TYPE_CHECKING:
     import pandas as pd
 
+ROUNDING = 4.0 * np.finfo(float).eps
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run:
@@ -92,6 +94,18 @@ def errors(x: FloatArray, xhat: FloatArray, P: FloatArray) -> tuple[FloatArray, 
                 if np.linalg.matrix_rank(P[place], hermitian=True) == P.shape[-1]:
                     solved[place] = np.linalg.solve(P[place], e[place])
         return (e * e).sum(axis=-1), (e * solved).sum(axis=-1)
+
+
+def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray) -> float:
+    """The first of the times (T,) at which states x (T, n) are so large that rounding blurs errors
+    of the size that P (T, N, n, n) says; inf where there is none.
+    """
+    if not len(times):
+        return np.inf
+    least = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
+    deviation = 0.01 * np.sqrt(np.maximum(least, 0.0))
+    blurred = (ROUNDING * np.abs(x).max(axis=1) > deviation) & (deviation > 0.0)
+    return float(times[np.argmax(blurred)]) if blurred.any() else np.inf
 
 
 def state_table(

@@ -326,8 +326,9 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     whole = netkf.simulate(busy, engine="compiled")
     module = "netkf.engines.compiled"
     monkeypatch.setattr("netkf.trace.recorder.BLOCK", 7)
-    monkeypatch.setattr(f"{module}.engine.FIRST_MAIL", 2)
-    monkeypatch.setattr(f"{module}.engine.MOST_SAMPLES", 2)
+    monkeypatch.setattr(f"{module}.flow.FIRST_ROWS", 6)
+    monkeypatch.setattr(f"{module}.flow.FIRST_MAIL", 2)
+    monkeypatch.setattr(f"{module}.flow.MOST_SAMPLES", 2)
     for blocks in ("netkf.plants.paths.BLOCK", f"{module}.draws.BLOCK"):
         monkeypatch.setattr(blocks, 3)
     monkeypatch.setattr(f"{module}.draws.CUTS", 1)

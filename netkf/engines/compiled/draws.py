@@ -1,59 +1,101 @@
-"""The path and the noise of all sensors, drawn in blocks of steps of the sensing grid."""
+"""The paths and the noise of all sensors, drawn in blocks of steps of the sensing grid, for one run
+or for several together.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from netkf.core.streams import Streams
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.readings import Stretch
 from netkf.engines.compiled.tables import Sensing
-from netkf.plants.paths import BLOCK
+from netkf.plants.paths import BLOCK, Block
 from netkf.plants.sensors import step_noise
 from netkf.scenario.scenario import Scenario
 
 CUTS = 64  # normals that a sensor has ready
 
 
-class Path:
-    """The path of one run as stretches of BLOCK steps."""
+class Paths:
+    """The paths of some runs as stretches of BLOCK steps."""
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        self._path = scenario.truth.path(
-            streams.generator("plant"), streams.generator("probe"), scenario.times
+    def __init__(self, scenario: Scenario, streams: Streams | Together) -> None:
+        self._paths = scenario.truth.paths(
+            streams.generators("plant", [()]), streams.generators("probe", [()]), scenario.times
         )
         self._senses, self._horizon = bool(scenario.sensing), scenario.horizon
 
-    def following(self) -> Stretch:
-        """The next stretch; the last one reaches beyond the horizon."""
-        block = self._path.following()
-        waking = block.ends[block.ends < self._horizon] if self._senses else np.empty(0)
-        return Stretch(
-            end=float(block.ends[-1]),
-            start=block.start,
-            stop=block.end,
-            x_start=block.x_start,
-            x_stop=block.x_end,
-            moments=block.moments,
-            cubic=block.cubic,
-            step=block.step,
-            last=block.ends[block.step],
-            grid=waking,
-            series=self._path.series,
+    def following(self) -> list[Stretch]:
+        """The next stretch of each run; the last one reaches beyond the horizon."""
+        return self._stretches([self._paths.following()])
+
+    def whole(self) -> list[Stretch]:
+        """All of them, as one stretch of each run."""
+        blocks = [self._paths.following()]
+        while blocks[-1].ends[-1] < self._horizon:
+            blocks.append(self._paths.following())
+        return self._stretches(blocks)
+
+    def _stretches(self, blocks: list[Block]) -> list[Stretch]:
+        step = np.concatenate([BLOCK * k + block.step for k, block in enumerate(blocks)])
+        ends = np.concatenate([block.ends for block in blocks])
+        nobody = np.empty((0, 0))
+        common = Stretch(
+            end=float(ends[-1]),
+            start=np.concatenate([block.start for block in blocks]),
+            stop=np.concatenate([block.end for block in blocks]),
+            x_start=nobody,
+            x_stop=nobody,
+            moments=nobody,
+            cubic=nobody,
+            step=step,
+            last=ends[step],
+            grid=ends[ends < self._horizon] if self._senses else np.empty(0),
+            series=self._paths.laws.series,
         )
+        random = (
+            np.concatenate(column, axis=1)
+            for column in zip(*(block[2:6] for block in blocks), strict=True)
+        )
+        return [
+            common._replace(x_start=x_start, x_stop=x_stop, moments=moments, cubic=cubic)
+            for x_start, x_stop, moments, cubic in zip(*random, strict=True)
+        ]
+
+
+class Own(NamedTuple):
+    """What of a Sensing differs from run to run."""
+
+    rest: FloatArray
+    step: np.ndarray
+    noise: FloatArray
+    normals: FloatArray
+    used: np.ndarray
 
 
 class Noise:
-    """The noise of all sensors, stretch by stretch."""
+    """The noise of all sensors in some runs: ``sensing`` of each run, filled stretch by stretch of
+    so many ``steps``.
+    """
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        streams: Streams | Together,
+        steps: int = BLOCK,
+        cuts: int = CUTS,
+    ) -> None:
         placed = [(node, place) for node in scenario.sensing for place in scenario.placed[node]]
         sensors = [scenario.sensors[place.entry] for _, place in placed]
         keys = [(node, place.ordinal) for node, place in placed]
-        self._noise = [streams.generator("noise", *key) for key in keys]
-        self._cuts = [streams.generator("cut", *key) for key in keys]
+        self._noise = streams.generators("noise", keys)
+        self._cuts = streams.generators("cut", keys)
         assert scenario.truth.sensing_period is not None
-        self._period = scenario.truth.sensing_period
-        n, count = scenario.plant.n, len(sensors)
+        self._period, self._steps = scenario.truth.sensing_period, steps
+        n, count, runs = scenario.plant.n, len(sensors), len(streams.each)
         self._rows = [len(sensor.R) for sensor in sensors]
         most = max(self._rows, default=0)
         H, root = np.zeros((count, most, n)), np.zeros((count, most, most))
@@ -62,31 +104,43 @@ class Noise:
             H[k, :p], root[k, :p, :p] = sensor.H, np.linalg.cholesky(sensor.R)
         index, pooled = scenario.topology.index, scenario.filter.algorithm.pooled
         hosts = [0 if pooled else index[node] for node in scenario.sensing]
-        self.sensing = Sensing(
+        self._own = Own(
+            rest=np.zeros((runs, count, 2, most)),
+            step=np.full((runs, count), -1, dtype=np.int64),
+            noise=np.zeros((runs, count, steps, 2, most)),
+            normals=np.zeros((runs, count, cuts, 2, most)),
+            used=np.full((runs, count), cuts, dtype=np.int64),
+        )
+        common = Sensing(
             rows=np.array(self._rows, dtype=np.int64),
             H=H,
             root=root,
-            rest=np.zeros((count, 2, most)),
-            step=np.full(count, -1, dtype=np.int64),
-            noise=np.zeros((count, BLOCK, 2, most)),
-            normals=np.zeros((count, CUTS, 2, most)),
-            used=np.full(count, CUTS, dtype=np.int64),
+            rest=self._own.rest[0],
+            step=self._own.step[0],
+            noise=self._own.noise[0],
+            normals=self._own.normals[0],
+            used=self._own.used[0],
             host=np.array(hosts, dtype=np.int64),
             node=np.array(scenario.sensing, dtype=np.int64),
         )
+        each = zip(*self._own, strict=True)
+        self.sensing = [common._replace(**Own(*mine)._asdict()) for mine in each]
 
     def following(self) -> None:
         """Draw the noise of the next stretch."""
-        sensing = self.sensing
-        for k, (random, p) in enumerate(zip(self._noise, self._rows, strict=True)):
-            sensing.noise[k, :, :, :p] = random.standard_normal((BLOCK, 2, p))
-        sensing.noise[:] = step_noise(sensing.noise, self._period)
-        sensing.step[:] = -1
+        own, count = self._own, len(self._rows)
+        for k, random in enumerate(self._noise):
+            p = self._rows[k % count]
+            own.noise[*divmod(k, count), :, :, :p] = random.standard_normal((self._steps, 2, p))
+        own.noise[:] = step_noise(own.noise, self._period)
+        own.step[:] = -1
 
-    def more_cuts(self) -> None:
+    def more_cuts(self, run: int) -> None:
         """Draw new normals where they are used up."""
-        sensing = self.sensing
-        for k in np.flatnonzero(sensing.used == CUTS):
+        used, normals = self._own.used[run], self._own.normals[run]
+        cuts = normals.shape[1]
+        for k in np.flatnonzero(used == cuts):
             p = self._rows[k]
-            sensing.normals[k, :, :, :p] = self._cuts[k].standard_normal((CUTS, 2, p))
-            sensing.used[k] = 0
+            random = self._cuts[run * len(self._rows) + k]
+            normals[k, :, :, :p] = random.standard_normal((cuts, 2, p))
+            used[k] = 0

@@ -16,7 +16,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.draws import Draws
-from netkf.core.streams import Streams
+from netkf.core.streams import Streams, Together
 from netkf.network.channels import Fates, alike, chances, needed
 from netkf.network.clocks import LinkClock, Poisson, next_ticks
 from netkf.network.graphs import Link
@@ -50,25 +50,31 @@ class Ticks(NamedTuple):
 
 
 class Clocks:
-    """The ticks of all links, block by block: ``last`` (L,) are the last ones known, infinite after
-    the horizon, and ``drawn`` (L,) how many were drawn.
+    """The ticks of all links, run by run and block by block: ``last`` (L,) are the last ones known,
+    infinite after the horizon, and ``drawn`` (L,) how many were drawn.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams, links: tuple[Link, ...]) -> None:
-        clock = scenario.network.activation
+    def __init__(
+        self, scenario: Scenario, streams: Streams | Together, links: tuple[Link, ...]
+    ) -> None:
+        clock, runs = scenario.network.activation, len(streams.each)
         assert isinstance(clock, LinkClock) or not links
-        self._clock, self._links, self._horizon = clock, links, scenario.horizon
-        self.last, self.drawn = np.zeros(len(links)), np.zeros(len(links), dtype=np.int64)
+        self._clock, self._links, self._horizon = clock, links * runs, scenario.horizon
+        count = len(self._links)
+        self.last, self.drawn = np.zeros(count), np.zeros(count, dtype=np.int64)
         self._alike = type(clock) is Poisson
         self._rates = self._origins = np.empty(0)
         if isinstance(clock, LinkClock) and self._alike:
             self._draws = Draws(streams, "clock", links)
-            self._rates = np.array([clock.mean_rate(link) for link in links])
+            self._rates = np.tile([clock.mean_rate(link) for link in links], runs)
         elif isinstance(clock, LinkClock):
             self._random = streams.generators("clock", links)
-            phases = [partial(streams.generator, "phase", *link) for link in links]
             self._origins = np.array(
-                [clock.origin(link, phase) for link, phase in zip(links, phases, strict=True)]
+                [
+                    clock.origin(link, partial(one.generator, "phase", *link))
+                    for one in streams.each
+                    for link in links
+                ]
             )
 
     def more(self, links: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
@@ -107,32 +113,39 @@ class Clocks:
 
 
 class Fortunes:
-    """The fates of all messages, activation after activation of each link."""
+    """The fates of all messages, run by run, activation after activation of each link."""
 
-    def __init__(self, scenario: Scenario, streams: Streams, links: tuple[Link, ...]) -> None:
+    def __init__(
+        self, scenario: Scenario, streams: Streams | Together, links: tuple[Link, ...]
+    ) -> None:
         self._channel = channel = scenario.network.channel
-        back = tuple((j, i) for i, j in links)
-        self._ways = (links, back)
-        self._measured = np.array([[scenario.measured(way) for way in ways] for ways in self._ways])
-        drawn = self._ways[:1] if channel.symmetric else self._ways
+        runs, both = len(streams.each), (links, tuple((j, i) for i, j in links))
+        self._ways = tuple(ways * runs for ways in both)
+        measured = [[scenario.measured(way) for way in ways] for ways in both]
+        self._measured = np.tile(measured, runs)
+        drawn = both[:1] if channel.symmetric else both
         loss = channel.loss
         self._alike = alike(loss)
         self._plain = self._alike and channel.delay.fixed is not None
         if self._alike:
-            self._chances = np.array(
+            self._chances = np.tile(
                 [
-                    [loss.chance(w, 0, False, m) for w, m in zip(ways, measured, strict=True)]
-                    for ways, measured in zip(self._ways, self._measured.tolist(), strict=True)
-                ]
+                    [loss.chance(w, 0, False, m) for w, m in zip(ways, some, strict=True)]
+                    for ways, some in zip(both, measured, strict=True)
+                ],
+                runs,
             )
         if self._plain:
             lucky = () if loss.certain else drawn
             self._luck = [Draws(streams, "loss", ways) for ways in lucky]
         else:
-            seeded = [streams.seeded(needed(channel), ways) for ways in drawn]
             self._fates = [
-                [Fates(channel, partial(_stream, made, way)) for way in ways]
-                for made, ways in zip(seeded, drawn, strict=True)
+                [
+                    Fates(channel, partial(_stream, made, way))
+                    for made in (one.seeded(needed(channel), ways) for one in streams.each)
+                    for way in ways
+                ]
+                for ways in drawn
             ]
 
     def of(self, links: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
@@ -155,6 +168,7 @@ class Fortunes:
         total = int(counts.sum())
         delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
         fine, never = np.zeros(total, dtype=bool), np.zeros(total)
+        drawn: list[tuple[np.ndarray, ...]]
         drawn = [(draws.units(links, counts), fine, delay) for draws in self._luck]
         return drawn or [(never, fine, delay)]
 
@@ -180,16 +194,16 @@ class Fortunes:
 
 class LinkDraws:
     """Ticks and fates of all links, drawn as they are asked for; nothing where the filter does not
-    talk.
+    talk. Links of several runs follow one another, run by run.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams | Together) -> None:
         links = scenario.topology.links if scenario.filter.algorithm.talks else ()
-        self.count = len(links)
+        self.count = len(links) * len(streams.each)
         self._clocks = Clocks(scenario, streams, links)
         self._fortunes = Fortunes(scenario, streams, links)
-        self._longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(len(links), 1)))
-        self._block = np.full(len(links), FIRST_BLOCK)
+        self._longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(self.count, 1)))
+        self._block = np.full(self.count, FIRST_BLOCK)
 
     @property
     def last(self) -> FloatArray:
@@ -236,6 +250,22 @@ class Schedule:
         if (np.diff(t[order]) == 0.0).any():
             order = np.lexsort((link, t))
         return Window(end, t[order], link[order], delay[order])
+
+
+def whole_schedules(scenario: Scenario, streams: Together) -> list[Window]:
+    """All ticks of each of several runs, as one window."""
+    links, runs = LinkDraws(scenario, streams), len(streams.each)
+    if not links.count:
+        return [Window(math.inf, *_NOTHING)] * runs
+    parts = []
+    while len(late := np.flatnonzero(links.last < math.inf)):
+        parts.append(links.more(late))
+    t, link, delay = (np.concatenate(column) for column in zip(*parts, strict=True))
+    run, link = np.divmod(link, links.count // runs)
+    order = np.lexsort((link, t, run))
+    cuts = np.cumsum(np.bincount(run, minlength=runs))[:-1]
+    columns = (np.split(column[order], cuts) for column in (t, link, delay))
+    return [Window(math.inf, *mine) for mine in zip(*columns, strict=True)]
 
 
 _NOTHING = Ticks(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2)))

@@ -12,7 +12,8 @@ import simpy
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, Rank, broken
-from netkf.engines.compiled.engine import CompiledEngine, FlowRun
+from netkf.engines.compiled.engine import CompiledEngine
+from netkf.engines.compiled.flow import Desk, FlowRun, Source
 from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
 from netkf.engines.processes.slots import SlotProcess
@@ -51,9 +52,10 @@ class ProcessesEngine(Engine):
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
         if self.compiled and not scenario.slotted and CompiledEngine().refusal(scenario) is None:
-            links = TickingLinks(scenario, streams)
+            source = Source(scenario, streams, TickingLinks(scenario, streams))
             with np.errstate(over="ignore", invalid="ignore"):
-                return FlowRun(scenario, streams, recorder, progress, links).to_the_end()
+                run = FlowRun(scenario, Desk(scenario), source, recorder, progress)
+                return run.to_the_end()
         timeline = Timeline()
         make = _in_slots if scenario.slotted else _in_continuous_time
         processes = make(scenario, streams, timeline, recorder, progress)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError
+from netkf.engines.compiled.lots import together
 from netkf.experiments.failures import told
 from netkf.scenario.plugins import in_words
 from netkf.scenario.registry import forget_other
@@ -92,14 +93,16 @@ def work(job: Job) -> Any:
 
 def block_result(scenario: Scenario, job: Job) -> Any:
     """The merged result of a block; raises EngineError that names a plugged-in class."""
+    first, stop = job.first + job.start, job.first + min(job.start + job.size, job.stop)
     try:
-        return tree(
-            lambda place: job.task(scenario, job.seed, job.first + place),
-            job.merge,
-            job.start,
-            job.stop,
-            job.size,
-        )
+        with together(scenario, job.seed, first, stop):
+            return tree(
+                lambda place: job.task(scenario, job.seed, job.first + place),
+                job.merge,
+                job.start,
+                job.stop,
+                job.size,
+            )
     except Exception as error:
         reason = told(scenario, error)
         if reason is error:

@@ -13,9 +13,8 @@ from netkf.experiments.ensembles.moments import Moments, merge_moments, single
 from netkf.experiments.simulate import choose_engine, collect
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder
-from netkf.trace.run import Run, errors
+from netkf.trace.run import Run, errors, rounding_from
 
-ROUNDING = 4.0 * np.finfo(float).eps
 MESSAGES = ("sent", "delivered", "lost", "in_flight")
 
 
@@ -110,7 +109,7 @@ def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Ta
     x, xhat, P = run.x[:kept], run.xhat[:kept], run.P[:kept]
     sq_error, nees = errors(x, xhat, P)
     trace = np.trace(P, axis1=2, axis2=3)
-    blurred = _rounding_from(run.times[:kept], x, P)
+    blurred = rounding_from(run.times[:kept], x, P)
     used = _after_start(run.times[:kept], blurred if diverged else np.inf)
     averages = np.stack([_mean(values[used]) for values in (sq_error, trace, nees)], axis=1)
     lost = recorder.count("lost") + recorder.count("late")
@@ -154,12 +153,3 @@ def _after_start(times: FloatArray, end: float) -> np.ndarray:
 
 def _mean(values: FloatArray) -> FloatArray:
     return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
-
-
-def _rounding_from(times: FloatArray, x: FloatArray, P: FloatArray) -> float:
-    if not len(times):
-        return np.inf
-    least = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
-    deviation = 0.01 * np.sqrt(np.maximum(least, 0.0))
-    blurred = (ROUNDING * np.abs(x).max(axis=1) > deviation) & (deviation > 0.0)
-    return float(times[np.argmax(blurred)]) if blurred.any() else np.inf

@@ -1,0 +1,235 @@
+"""One run in continuous time: what the compiled replay works on and is given when it stops.
+
+Python draws - ticks, fates, the path, the noise - from the streams that the processes engine uses,
+and the replay does everything that happens an event at a time.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
+from netkf.core import compiling
+from netkf.core.streams import Streams
+from netkf.engines.base import Progress, broken
+from netkf.engines.compiled.draws import Noise, Paths
+from netkf.engines.compiled.readings import Stretch
+from netkf.engines.compiled.replay import (
+    DONE,
+    WANT_CUTS,
+    WANT_MAIL,
+    WANT_ROWS,
+    WANT_STEPS,
+    WANT_TICKS,
+    Cursor,
+    Samples,
+    intersecting,
+    replay,
+)
+from netkf.engines.compiled.schedule import Schedule, Window
+from netkf.engines.compiled.tables import (
+    GRID_AT,
+    PLACES,
+    PROBE_AT,
+    ROW,
+    SHOWN,
+    STEP_AT,
+    TICK_AT,
+    Sensing,
+    empty_mail,
+    host_tables,
+    larger,
+    link_tables,
+    room_for,
+    room_for_parts,
+)
+from netkf.scenario.scenario import Scenario
+from netkf.trace import recorder as recording
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES, EVENT
+
+DIVERGED = CODES["diverged"]
+FIRST_MAIL, FIRST_ROWS = 1024, 4096
+MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
+
+
+class Windows(Protocol):
+    """Where ticks come from."""
+
+    def following(self) -> Window:
+        """The next window; its end is infinite where nothing comes after it."""
+
+
+class Draws(Protocol):
+    """What is drawn for one run, given out as the run goes on."""
+
+    sensing: Sensing
+
+    def window(self) -> Window:
+        """The next ticks."""
+
+    def stretch(self) -> Stretch:
+        """The next stretch of the path; the noise of its steps is in ``sensing``."""
+
+    def more_cuts(self) -> None:
+        """New normals for cuts in ``sensing``."""
+
+
+class Source:
+    """Draws as they are wanted."""
+
+    def __init__(
+        self, scenario: Scenario, streams: Streams, windows: Windows | None = None
+    ) -> None:
+        self._windows = windows or Schedule(scenario, streams)
+        self._paths, self._noise = Paths(scenario, streams), Noise(scenario, streams)
+        self.sensing = self._noise.sensing[0]
+
+    def window(self) -> Window:
+        """Some ticks for each link."""
+        return self._windows.following()
+
+    def stretch(self) -> Stretch:
+        """A block of steps."""
+        self._noise.following()
+        return self._paths.following()[0]
+
+    def more_cuts(self) -> None:
+        """A block for each sensor that has none left."""
+        self._noise.more_cuts(0)
+
+
+class Desk:
+    """The tables of a scenario, and where the states of a run are; serves one run after another."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
+        made = compiling.announced(intersecting if intersects else replay)
+        assert made is not None
+        self.replay = made
+        self.hosts, self.models = host_tables(scenario)
+        self._xhat, self._P = self.hosts.xhat.copy(), self.hosts.P.copy()
+        self.links, self.mail = link_tables(scenario), empty_mail(self.hosts, FIRST_MAIL)
+        self.room = room_for(self.models)
+        self.parts = room_for_parts(self.links, self.hosts) if intersects else None
+        self.cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
+        self.rows = np.empty(FIRST_ROWS, dtype=EVENT)
+        self.probes = np.array(scenario.times, dtype=np.float64)
+        size, n = self.hosts.xhat.shape
+        room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
+        self.samples = Samples(
+            xhat=np.zeros((room, size, n)),
+            P=np.zeros((room, size, n, n)),
+            rows=np.zeros(room, dtype=np.int64),
+            piece=np.zeros(room, dtype=np.int64),
+        )
+
+    def clear(self) -> None:
+        """Put everything where it is at time 0."""
+        hosts, mail = self.hosts, self.mail
+        hosts.xhat[:], hosts.P[:] = self._xhat, self._P
+        hosts.now[:], hosts.inbox[:], hosts.least[:] = 0.0, -1, 0.0
+        self.links.messages[:], mail.next[:] = 0, np.arange(1, len(mail.next) + 1)
+        self.cursor.place[:], self.cursor.mailed[:] = 0, 0.0
+
+
+class FlowRun:
+    """One run."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        desk: Desk,
+        draws: Draws,
+        recorder: Recorder,
+        progress: Progress,
+    ) -> None:
+        self._scenario, self._recorder, self._progress = scenario, recorder, progress
+        self._desk, self._draws = desk, draws
+        self._window, self._stretch = draws.window(), draws.stretch()
+
+    def to_the_end(self) -> str:
+        """Simulate up to the horizon; returns complete or diverged."""
+        try:
+            wanted = WANT_ROWS
+            while wanted != DONE:
+                wanted = self._go_on()
+                if not self._take_samples():
+                    return "diverged"
+                self._give(wanted)
+        finally:
+            self._pass_rows_on(int(self._desk.cursor.place[ROW]))
+            self._recorder.flush()
+        return "complete"
+
+    def _go_on(self) -> int:
+        desk = self._desk
+        return int(
+            desk.replay(
+                desk.hosts,
+                desk.models,
+                self._draws.sensing,
+                desk.links,
+                desk.mail,
+                desk.cursor,
+                self._window,
+                self._stretch,
+                desk.probes,
+                desk.samples,
+                float(self._scenario.horizon),
+                desk.rows,
+                desk.room,
+                desk.parts,
+            )
+        )
+
+    def _give(self, wanted: int) -> None:
+        place = self._desk.cursor.place
+        if wanted == WANT_TICKS:
+            self._window, place[TICK_AT] = self._draws.window(), 0
+        elif wanted == WANT_STEPS:
+            self._stretch = self._draws.stretch()
+            place[STEP_AT] = place[GRID_AT] = 0
+        elif wanted == WANT_CUTS:
+            self._draws.more_cuts()
+        elif wanted == WANT_MAIL:
+            self._desk.mail = larger(self._desk.mail)
+        elif wanted == WANT_ROWS:
+            self._pass_rows_on(int(place[ROW]))
+            if len(self._desk.rows) < recording.BLOCK:
+                self._desk.rows = np.empty(recording.BLOCK, dtype=EVENT)
+
+    def _pass_rows_on(self, used: int) -> None:
+        desk, recorder = self._desk, self._recorder
+        desk.cursor.place[ROW] = 0
+        recorder.extend(desk.rows[:used])
+        if not recorder.counted:  # they are the recorder's now
+            desk.rows = np.empty(len(desk.rows), dtype=EVENT)
+
+    def _take_samples(self) -> bool:
+        """Record the samples that are there; False where one of them is no longer finite."""
+        place, path = self._desk.cursor.place, self._stretch
+        count, place[SHOWN] = int(place[SHOWN]), 0
+        if not count:
+            return True
+        times = self._desk.probes[place[PROBE_AT] - count : place[PROBE_AT]]
+        piece = self._desk.samples.piece[:count]
+        ends = (times == path.stop[piece])[:, None]
+        x = np.where(ends, path.x_stop[piece], path.x_start[piece])
+        xhat, P = self._desk.samples.xhat[:count].copy(), self._desk.samples.P[:count].copy()
+        if self._scenario.filter.algorithm.pooled:
+            nodes = len(self._scenario.nodes)
+            xhat, P = np.repeat(xhat, nodes, axis=1), np.repeat(P, nodes, axis=1)
+        finite = np.isfinite(P).all(axis=(1, 2, 3)) & np.isfinite(xhat).all(axis=(1, 2))
+        kept = count if finite.all() else int(np.argmin(finite)) + 1
+        self._recorder.samples(times[:kept].copy(), x[:kept], xhat[:kept], P[:kept])
+        self._progress(float(times[kept - 1]))
+        if finite.all():
+            return True
+        # What happened after this sample did not happen.
+        self._pass_rows_on(int(self._desk.samples.rows[kept - 1]))
+        for node in broken(self._scenario, xhat[kept - 1], P[kept - 1]):
+            self._recorder.append((float(times[kept - 1]), DIVERGED, node, -1, -1, -1, NAN))
+        return False

@@ -1,0 +1,122 @@
+"""Runs of one scenario whose ticks, paths and noise are drawn together.
+
+What a short run costs beside its events is Python, call after call. Where it is known that the
+replicas of a block come one after the other (``together``), the calls are made once for all of
+them, and their compiled replays follow at one desk. Every number is what it is for a run alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from netkf.core.streams import Streams, Together
+from netkf.engines.compiled.draws import Noise, Paths
+from netkf.engines.compiled.flow import Desk
+from netkf.engines.compiled.readings import Stretch
+from netkf.engines.compiled.schedule import Window, whole_schedules
+from netkf.network.clocks import LinkClock
+from netkf.scenario.scenario import Scenario
+
+LARGEST_LOT = 64
+MOST_BYTES = 1 << 24
+"""Of what is drawn for a lot."""
+
+
+class OfLot:
+    """The draws of one run of a lot: all at once."""
+
+    def __init__(self, window: Window, stretch: Stretch, noise: Noise, run: int) -> None:
+        self._window, self._stretch, self._noise, self._run = window, stretch, noise, run
+        self.sensing = noise.sensing[run]
+
+    def window(self) -> Window:
+        """All ticks."""
+        return self._window
+
+    def stretch(self) -> Stretch:
+        """All steps."""
+        return self._stretch
+
+    def more_cuts(self) -> None:
+        """As many more."""
+        self._noise.more_cuts(self._run)
+
+
+class Lots:
+    """The runs of ``scenario`` with ``seed`` and a replica from ``first`` up to ``stop``."""
+
+    def __init__(self, scenario: Scenario, seed: int, first: int, stop: int) -> None:
+        self.scenario, self.seed = scenario, seed
+        self._first, self._stop, self._size = first, stop, 0
+        self._draws: dict[int, OfLot] = {}
+        self._desk: Desk | None = None
+
+    def prepared(self, replica: int) -> tuple[Desk, OfLot] | None:
+        """For the run of a replica, once; None where it had better draw for itself."""
+        if not self._first <= replica < self._stop:
+            return None
+        if self._desk is None:
+            self._desk, self._size = Desk(self.scenario), lot_size(self.scenario)
+        if self._size < 2:
+            return None
+        if replica not in self._draws:
+            self._draw(replica)
+        self._desk.clear()
+        return self._desk, self._draws.pop(replica)
+
+    def _draw(self, replica: int) -> None:
+        count = min(self._size, self._stop - replica)
+        streams = Together(self.seed, replica, count)
+        windows = whole_schedules(self.scenario, streams)
+        stretches = Paths(self.scenario, streams).whole()
+        steps = int(stretches[0].step[-1]) + 1
+        ticks = max(len(window.t) for window in windows)
+        cuts = 16 + len(self.scenario.times) + 3 * ticks // len(self.scenario.nodes)
+        noise = Noise(self.scenario, streams, steps, cuts)
+        noise.following()
+        self._draws = {
+            replica + run: OfLot(window, stretch, noise, run)
+            for run, (window, stretch) in enumerate(zip(windows, stretches, strict=True))
+        }
+
+
+def lot_size(scenario: Scenario) -> int:
+    """How many runs are drawn together, so that what is drawn is not too much to keep."""
+    period = scenario.truth.sensing_period
+    assert period is not None
+    steps, n = scenario.horizon / period + 64.0 + len(scenario.times), scenario.plant.n
+    sensors = sum(len(placed) for placed in scenario.placed.values())
+    rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
+    ticks = 0.0
+    clock = scenario.network.activation
+    if scenario.filter.algorithm.talks and isinstance(clock, LinkClock):
+        ticks = sum(clock.mean_rate(link) for link in scenario.topology.links) * scenario.horizon
+    numbers = steps * (8 * n + 2 * sensors * rows) + 8.0 * ticks
+    return int(min(LARGEST_LOT, MOST_BYTES / (8.0 * numbers)))
+
+
+_expected: ContextVar[Lots | None] = ContextVar("expected", default=None)
+
+
+@contextmanager
+def together(scenario: Scenario, seed: int, first: int, stop: int) -> Iterator[None]:
+    """Inside, runs of this scenario and seed with replicas from ``first`` up to ``stop`` are
+    expected one after the other.
+    """
+    before = _expected.set(Lots(scenario, seed, first, stop))
+    try:
+        yield
+    finally:
+        _expected.reset(before)
+
+
+def drawn_together(scenario: Scenario, streams: Streams) -> tuple[Desk, OfLot] | None:
+    """What a run needs, where it was expected and is drawn with others."""
+    lots = _expected.get()
+    if lots is None or lots.scenario is not scenario or lots.seed != streams.seed:
+        return None
+    if type(streams) is not Streams:
+        return None
+    return lots.prepared(streams.replica)
