@@ -78,16 +78,17 @@ class Own(NamedTuple):
 
 class Noise:
     """The noise of all sensors in some runs: ``sensing`` of each run, filled stretch by stretch of
-    so many ``steps``.
+    so many ``steps`` (BLOCK), and so many normals for cuts at once (CUTS).
     """
 
     def __init__(
         self,
         scenario: Scenario,
         streams: Streams | Together,
-        steps: int = BLOCK,
-        cuts: int = CUTS,
+        steps: int = 0,
+        cuts: int = 0,
     ) -> None:
+        steps, cuts = steps or BLOCK, cuts or CUTS
         placed = [(node, place) for node in scenario.sensing for place in scenario.placed[node]]
         sensors = [scenario.sensors[place.entry] for _, place in placed]
         keys = [(node, place.ordinal) for node, place in placed]
