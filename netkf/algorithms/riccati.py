@@ -7,6 +7,9 @@ One exponential over a long gap loses every digit, so a gap is cut into whole un
 the whole units use their binary digits: the flow over ``unit * 2^k`` is tabulated as the triple
 ``(F, G, Q)`` with ``P -> Q + F P (I + G P)^-1 F'``, and a triple follows from the one before it by
 the doubling formulas (Davison and Maki 1973; Anderson 1978), which only add positive terms.
+
+Where there are no readings, ``G = 0``, the rest needs no inverse: ``P(gap) = e P e' + W`` with
+``e = exp(A gap)`` and the covariance W of what the noise added.
 """
 
 from __future__ import annotations
@@ -38,6 +41,7 @@ class RiccatiTable(NamedTuple):
     """Everything that depends on ``A, Q, G`` and not on ``P`` or the gap.
 
     series : (terms, 5 n n) Taylor coefficients of the blocks of ``exp(M g)`` and of ``exp(A g)``
+    blind  : (terms, 2 n n) those of ``exp(A g)`` and of W where G = 0, else (0, 2 n n)
     unit   : gap that the series covers, seconds
     jump, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
     """
@@ -45,6 +49,7 @@ class RiccatiTable(NamedTuple):
     n: int
     unit: float
     series: FloatArray
+    blind: FloatArray
     jump: FloatArray
     F: FloatArray
     G: FloatArray
@@ -57,6 +62,16 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
     series[0] = np.eye(len(M))
     for k in range(1, terms):
         series[k] = series[k - 1] @ M / k
+    return series
+
+
+def growth_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
+    """(terms, n, n): those of ``W`` with ``dW = A W + W A' + Q`` from W = 0 on."""
+    series = np.zeros((terms, *A.shape))
+    series[1] = Q
+    for k in range(2, terms):
+        moved = A @ series[k - 1]
+        series[k] = (moved + moved.T) / k
     return series
 
 
@@ -77,16 +92,22 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
     """Tabulate the flow for gaps up to ``longest`` seconds; ``A, Q, G`` are (n, n)."""
     n = len(A)
     M, scale = hamiltonian(A, Q, G)
-    norm = float(np.abs(M).sum(axis=0).max())
+    norm, size, blind = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
+    if blind:  # W grows by A from both sides
+        norm = max(norm, float(size.sum(axis=0).max() + size.sum(axis=1).max()))
     # A power of two, so that a whole number of units is exact.
     unit = 2.0 ** np.floor(np.log2(min(1.0 / max(norm, 1e-300), longest)))
     blocks = exponential_series(M, TAYLOR_TERMS)
     blocks[:, :n, n:] /= scale
     blocks[:, n:, :n] *= scale
-    flat = [blocks, exponential_series(A, TAYLOR_TERMS)]
-    series = np.concatenate([block.reshape(TAYLOR_TERMS, -1) for block in flat], axis=1)
+    moves, grows = exponential_series(A, TAYLOR_TERMS), growth_series(A, Q, TAYLOR_TERMS)
+    both = (blocks, moves), (moves, grows)
+    series, lean = (
+        np.concatenate([part.reshape(TAYLOR_TERMS, -1) for part in parts], axis=1) for parts in both
+    )
+    lean = lean if blind else lean[:0]
     levels = max(1, int(longest / unit).bit_length())
-    return RiccatiTable(n, unit, series, *_triples(M, scale, A, unit, levels))
+    return RiccatiTable(n, unit, series, lean, *_triples(M, scale, A, unit, levels))
 
 
 def _triples(
@@ -184,6 +205,36 @@ def move_part(
 
 
 @in_place
+def move_blind(
+    unit: float,
+    blind: FloatArray,
+    P: FloatArray,
+    x: FloatArray,
+    k: int,
+    gap: float,
+    E: FloatArray,
+    X: FloatArray,
+) -> None:
+    """``move_part`` where there are no readings."""
+    n, size = x.shape[1], blind.shape[1]
+    fill_polynomial(E[:size], blind, terms_for(gap / unit), gap)
+    for i in range(n):
+        X[n, i] = 0.0
+        for j in range(n):
+            X[n, i] += E[i * n + j] * x[k, j]
+            X[i, j] = 0.0
+            for m in range(n):
+                X[i, j] += E[i * n + m] * P[k, m, j]
+    for i in range(n):
+        x[k, i] = X[n, i]
+        for j in range(i + 1):
+            total = E[(n + i) * n + j]
+            for m in range(n):
+                total += X[i, m] * E[j * n + m]
+            P[k, i, j] = P[k, j, i] = total
+
+
+@in_place
 def move_units(
     whole: int,
     jump: FloatArray,
@@ -230,6 +281,10 @@ def part_of_unit(
 ) -> tuple[FloatArray, FloatArray]:
     """``riccati_step`` for a gap of at most one unit."""
     n = table.n
+    if len(table.blind):
+        values = polynomial(table.blind[: terms_for(gap / table.unit)], gap)
+        transition, grown = values.reshape(2, n, n)
+        return even(added(grown, product(transition, P), transition.T)), applied(transition, x)
     E, transition = evaluate_hamiltonian(table, gap)
     X = added(E[:n, :n], E[:n, n:], P)
     Y = added(E[n:, :n], E[n:, n:], P)

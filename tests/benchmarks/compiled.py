@@ -61,7 +61,7 @@ def by_hand(table, window, ends, weights, xhat, P, now):
     """Flow both ends to each tick and reset who got a message; returns the number of ticks."""
     n = xhat.shape[1]
     E = np.empty(table.shape[1])
-    X, Y = np.empty((n, n)), np.empty((n, n))
+    X, Y = np.empty((n, n)), np.empty(n)
     for tick in range(len(window.t)):
         t, link = window.t[tick], window.link[tick]
         for side in range(2):
@@ -73,39 +73,19 @@ def by_hand(table, window, ends, weights, xhat, P, now):
                 power *= gap
                 for j in range(len(E)):
                     E[j] += power * table[k, j]
-            for i in range(n):  # transposed, so that the solution has columns of P'
+            for i in range(n):
+                Y[i] = 0.0
                 for j in range(n):
-                    a, b = E[i * 2 * n + j], E[(n + i) * 2 * n + j]
+                    Y[i] += E[i * n + j] * xhat[h, j]
+                    X[i, j] = 0.0
                     for k in range(n):
-                        a += E[i * 2 * n + n + k] * P[h, k, j]
-                        b += E[(n + i) * 2 * n + n + k] * P[h, k, j]
-                    X[j, i], Y[j, i] = a, b
-            for k in range(n):
-                best = k
-                for i in range(k + 1, n):
-                    if abs(X[i, k]) > abs(X[best, k]):
-                        best = i
-                for j in range(n):
-                    X[k, j], X[best, j] = X[best, j], X[k, j]
-                    Y[k, j], Y[best, j] = Y[best, j], Y[k, j]
-                for i in range(k + 1, n):
-                    f = X[i, k] / X[k, k]
-                    for j in range(k, n):
-                        X[i, j] -= f * X[k, j]
-                    for j in range(n):
-                        Y[i, j] -= f * Y[k, j]
-            for i in range(n - 1, -1, -1):
-                for j in range(n):
-                    for k in range(i + 1, n):
-                        Y[i, j] -= X[i, k] * Y[k, j]
-                    Y[i, j] /= X[i, i]
+                        X[i, j] += E[i * n + k] * P[h, k, j]
             for i in range(n):
-                X[0, i] = 0.0
+                xhat[h, i] = Y[i]
                 for j in range(n):
-                    P[h, i, j] = 0.5 * (Y[i, j] + Y[j, i])
-                    X[0, i] += E[4 * n * n + i * n + j] * xhat[h, j]
-            for i in range(n):
-                xhat[h, i] = X[0, i]
+                    P[h, i, j] = E[(n + i) * n + j]
+                    for k in range(n):
+                        P[h, i, j] += X[i, k] * E[j * n + k]
             now[h] = t
         i, j = ends[link]
         w_i = weights[link, 1] if window.delay[tick, 1] == 0.0 else 0.0
@@ -130,7 +110,7 @@ def hand_written(case):
     def run():
         hosts, models = host_tables(case)
         links, schedule = link_tables(case), Schedule(case, Streams(case.seed))
-        series, ticks = models.series[-1], 0
+        series, ticks = models.blind[-1], 0
         while True:
             window = schedule.following()
             ticks += fast(series, window, links.ends, links.weight, hosts.xhat, hosts.P, hosts.now)
@@ -148,7 +128,7 @@ def bare_simpy(case):
 
     def run():
         hosts, models = host_tables(case)
-        tables, series = link_tables(case), models.series[-1]
+        tables, series = link_tables(case), models.blind[-1]
         draws, env, made = LinkDraws(case, Streams(case.seed)), simpy.Environment(), 0
         one = (series, tables.ends, tables.weight, hosts.xhat, hosts.P, hosts.now)
 

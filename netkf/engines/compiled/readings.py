@@ -110,10 +110,9 @@ def advance(
                     return False
         least[h] *= LONGER
         gap = end - now
-        if gap < unit:
-            move_part(unit, series, P, xhat, h, gap, room.E, room.X, room.Y)
-        else:
-            move_far(models, k, P, xhat, h, gap, room)
+        rest = gap if gap < unit else move_far(models, k, P, xhat, h, gap, room)
+        if rest > 0.0:
+            move_part(unit, series, P, xhat, h, rest, room.E, room.X, room.Y)
         if now == start and end == stop:
             fill_square(seen, path.moments[piece])
         else:
@@ -131,12 +130,11 @@ def advance(
 @in_place
 def move_far(
     models: Models, m: int, P: FloatArray, x: FloatArray, k: int, gap: float, room: Room
-) -> None:
-    """Move place ``k`` of P and x over a gap of any length by model ``m``."""
-    unit = models.unit[m]
-    whole = int(gap / unit)
+) -> float:
+    """Move place ``k`` of P and x over the whole units of a long gap by model ``m``; returns what
+    is left of it.
+    """
+    whole = int(gap / models.unit[m])
     jump, F, G, Q = models.jump[m], models.F[m], models.G[m], models.Q[m]
     move_units(whole, jump, F, G, Q, P, x, k, room.X, room.Y)
-    rest = gap - whole * unit
-    if rest > 0.0:
-        move_part(unit, models.series[m], P, x, k, rest, room.E, room.X, room.Y)
+    return gap - whole * float(models.unit[m])

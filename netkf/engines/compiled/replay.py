@@ -14,7 +14,7 @@ import numpy as np
 
 from netkf.algorithms.covariance_intersection import intersected_pairs
 from netkf.algorithms.hybrid import add_neighbour
-from netkf.algorithms.riccati import move_part
+from netkf.algorithms.riccati import move_blind
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable, in_place
 from netkf.core.small import fill, fill_square
@@ -131,7 +131,6 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
 
     Resets are convex where ``parts`` is None; what is for the other kind is compiled with it alone.
     """
-    # Names of their own, because every look into a group counts references.
     place, mailed = cursor.place, cursor.mailed
     model, nodes, xhats, Ps, reached = hosts.model, hosts.node, hosts.xhat, hosts.P, hosts.now
     sensors, inbox, ends, weights = hosts.sensors, hosts.inbox, links.ends, links.weight
@@ -141,9 +140,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
     waiting, ticks, ticking, delays = mail.waiting, window.t, window.link, window.delay
     grid, stop, awake, awake_node = path.grid, path.stop, sensing.host, sensing.node
     capacity, window_end, path_end = len(mail.sent), window.end, path.end
-    unit, n = models.unit, xhats.shape[1]
-    known, series = 0, models.series[0]
-    E, X, Y = room.E, room.X, room.Y
+    unit, blind, E, X, n = models.unit, models.blind, room.E, room.X, xhats.shape[1]
     while True:
         if place[ROW] + MOST_ROWS > len(rows):
             return WANT_ROWS
@@ -197,12 +194,10 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                     return WANT_CUTS
             else:
                 m, gap = model[h], now - reached[h]
-                if m != known:
-                    known, series = m, models.series[m]
-                if gap < unit[m]:
-                    move_part(unit[m], series, Ps, xhats, h, gap, E, X, Y)
-                else:
-                    move_far(models, m, Ps, xhats, h, gap, room)
+                if gap >= unit[m]:
+                    gap = move_far(models, m, Ps, xhats, h, gap, room)
+                if gap > 0.0:
+                    move_blind(unit[m], blind[m], Ps, xhats, h, gap, E, X)
                 reached[h] = now
         if sense == now:
             note(rows, place, now, SENSE, awake_node[place[AWAKE]], -1, -1, np.nan)
@@ -273,7 +268,13 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 weight = weights[way_of[message] // 2, way_of[message] % 2]
                 if age > 0.0:
                     oldest = max(oldest, age)
-                    move_far(models, len(unit) - 1, mail_P, mail_x, message, age, room)
+                    m = len(unit) - 1
+                    if age >= unit[m]:
+                        gap = move_far(models, m, mail_P, mail_x, message, age, room)
+                    else:
+                        gap = age
+                    if gap > 0.0:
+                        move_blind(unit[m], blind[m], mail_P, mail_x, message, gap, E, X)
                 if parts is None:
                     add_neighbour(xhats, Ps, h, weight, mail_x, mail_P, message)
                 else:

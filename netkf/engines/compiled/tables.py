@@ -23,13 +23,15 @@ PLACES = 12
 class Models(NamedTuple):
     """M models and, last, the one that predicts: their tables one after the other.
 
-    unit (M + 1,), series (M + 1, terms, 5 n n), jump, F, G, Q (M + 1, levels, n, n), information
-    (M + 1, n, n); gains flat with a model's from ``first`` on, ``shape`` (M + 1, 3) = rows 2p of
-    its moments, terms and width of its series.
+    unit (M + 1,), series (M + 1, terms, 5 n n), ``blind`` (M + 1, terms, 2 n n) of those that see
+    nothing, jump, F, G, Q (M + 1, levels, n, n), information (M + 1, n, n); gains flat with a
+    model's from ``first`` on, ``shape`` (M + 1, 3) = rows 2p of its moments, terms and width of its
+    series.
     """
 
     unit: FloatArray
     series: FloatArray
+    blind: FloatArray
     jump: FloatArray
     F: FloatArray
     G: FloatArray
@@ -147,12 +149,16 @@ def model_tables(models: list[FlowModel]) -> Models:
             row[: len(table)] = table
         return out
 
+    blind = np.zeros((len(flows), *flows[-1].blind.shape))
+    for row, flow in zip(blind, flows, strict=True):
+        row[: len(flow.blind)] = flow.blind
     gains = [model.gains if len(model.H) else GainTable(n, 0, np.zeros((0, 0))) for model in models]
     gains.append(GainTable(n, 0, np.zeros((0, 0))))
     sizes = [gain.series.size for gain in gains]
     return Models(
         unit=np.array([flow.unit for flow in flows], dtype=np.float64),
         series=np.stack([flow.series for flow in flows]),
+        blind=blind,
         jump=stacked("jump"),
         F=stacked("F"),
         G=stacked("G"),
