@@ -1,7 +1,9 @@
 """What a run leaves behind, gathered with as little work in the loop as Python allows.
 
-Events are appended to a list as tuples and leave it in blocks; states come as one block a sample
-time. Both go to a sink, which keeps them in memory or writes them to files.
+Events are appended to a list as tuples and leave it in blocks, or come in blocks; states come as
+one block a sample time or several. Both go to sinks, which keep them in memory or write them to
+files. From the first long block on, a thread of its own does that and the fingerprint, one thing
+after the other, while the engine goes on.
 """
 
 from __future__ import annotations
@@ -10,7 +12,9 @@ import hashlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +23,7 @@ from netkf.core.interrupts import undisturbed
 from netkf.trace.schema import CODES, EVENT, KINDS
 
 BLOCK = 1 << 17  # rows; large enough that the system gives memory for them in large pages
+LONG = 1 << 14  # rows that are worth another thread
 NAN = math.nan
 
 
@@ -64,6 +69,8 @@ class Recorder:
         self._rows: list[tuple[float, int, int, int, int, int, float]] = []
         self._hash = hashlib.sha256()
         self._counts = np.zeros(len(KINDS), dtype=np.int64)
+        self._thread: ThreadPoolExecutor | None = None
+        self._handed: list[Future[None]] = []
         self.append: Callable[[tuple[float, int, int, int, int, int, float]], None]
         self.append = self._rows.append
         """``append((t, kind code, node, peer, message, phase, age))`` records one event."""
@@ -84,7 +91,16 @@ class Recorder:
             self.flush()
 
     def flush(self) -> None:
-        """Pass the gathered events on."""
+        """Pass the gathered events on; all that came is counted and kept then."""
+        try:
+            self._flush_gathered()
+            self._wait()
+        finally:
+            if self._thread is not None:
+                self._thread.shutdown()
+                self._thread = None
+
+    def _flush_gathered(self) -> None:
         if not self._rows:
             return
         if self.counted:
@@ -96,17 +112,35 @@ class Recorder:
         rows = np.array(self._rows, dtype=EVENT)
         with undisturbed():  # what is counted is also kept
             self._rows.clear()
-            self._pass_on(rows)
+            self._do(self._pass_on, rows)
 
     def extend(self, rows: np.ndarray) -> None:
         """Record a block of EVENT rows, which nobody writes to from now on."""
-        self.flush()
-        if len(rows):
-            with undisturbed():
-                if self.counted:
-                    self._count(rows["kind"])
-                else:
-                    self._pass_on(rows)
+        self._flush_gathered()
+        if not len(rows):
+            return
+        if len(rows) >= LONG and not self.counted:
+            self._wait()  # one block at most waits for its turn
+            if self._thread is None:
+                self._thread = ThreadPoolExecutor(1, "netkf-recorder")
+        with undisturbed():
+            if self.counted:
+                self._count(rows["kind"])
+            else:
+                self._do(self._pass_on, rows)
+
+    def _do(self, something: Callable[..., None], *arguments: Any) -> None:
+        """At once, or in its turn where there is a thread for it."""
+        if self._thread is None:
+            something(*arguments)
+        else:
+            self._handed.append(self._thread.submit(something, *arguments))
+
+    def _wait(self) -> None:
+        """Until all that was handed over is done; raises what failed first."""
+        while self._handed:
+            self._handed[0].result()
+            del self._handed[0]
 
     def _count(self, kinds: np.ndarray) -> None:
         self._counts += np.bincount(kinds, minlength=len(KINDS))
@@ -123,6 +157,9 @@ class Recorder:
 
     def samples(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         """Record some samples, which nobody writes to from now on."""
+        self._do(self._show, t, x, xhat, P)
+
+    def _show(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         for sink in self._sinks:
             sink.states(t, x, xhat, P)
 
