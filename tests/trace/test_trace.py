@@ -1,12 +1,15 @@
 """Tables, fingerprints, differences."""
 
 import hashlib
+import threading
 
 import numpy as np
+import pytest
 
 import netkf
 from netkf.trace import recorder
-from netkf.trace.schema import EVENT_COLUMNS, state_columns
+from netkf.trace.recorder import MemorySink
+from netkf.trace.schema import EVENT, EVENT_COLUMNS, state_columns
 
 
 def test_tables_have_their_columns(ring):
@@ -62,6 +65,61 @@ def test_fingerprint_does_not_depend_on_blocks(ring, monkeypatch):
     assert pieces.fingerprint == whole.fingerprint
     assert whole.fingerprint == hashlib.sha256(whole.log.tobytes()).hexdigest()
     assert netkf.first_difference(whole, pieces) is None
+
+
+class Watched(MemorySink):
+    """Notes which thread calls, and in which order; fails at its ``fails``-th block."""
+
+    def __init__(self, fails=0):
+        super().__init__()
+        self.calls, self.fails = [], fails
+
+    def events(self, rows):
+        self.calls.append((threading.current_thread(), "events", int(rows["node"][0])))
+        super().events(rows)
+        if len(self.blocks) == self.fails:
+            raise OSError("the disk is full")
+
+    def states(self, t, x, xhat, P):
+        self.calls.append((threading.current_thread(), "states", int(t[0])))
+
+
+def block(number, length):
+    rows = np.zeros(length, dtype=EVENT)
+    rows["node"] = number
+    return rows
+
+
+def test_long_blocks_are_kept_by_one_other_thread_in_their_order():
+    sink, plain = Watched(), hashlib.sha256()
+    record = recorder.Recorder([sink])
+    here = threading.current_thread()
+    for number in range(6):
+        rows = block(number, recorder.LONG if number in (2, 4) else 5)
+        plain.update(rows.tobytes())
+        record.extend(rows)
+        record.sample(float(number), *(np.zeros(shape) for shape in ((1,), (2, 1), (2, 1, 1))))
+    record.flush()
+    assert record.fingerprint == plain.hexdigest()
+    assert record.total == 2 * recorder.LONG + 20
+    expected = [(kind, number) for number in range(6) for kind in ("events", "states")]
+    assert [call[1:] for call in sink.calls] == expected
+    threads = [call[0] for call in sink.calls]
+    assert set(threads[:4]) == {here}
+    assert len(set(threads[4:])) == 1
+    assert here not in threads[4:]
+    assert not threads[-1].is_alive()
+    record.extend(block(6, 5))  # and on it goes
+    assert sink.calls[-1] == (here, "events", 6)
+
+
+def test_what_fails_in_the_other_thread_fails_the_run():
+    record = recorder.Recorder([Watched(fails=1)])
+    record.extend(block(0, recorder.LONG))
+    with pytest.raises(OSError, match="the disk is full"):
+        record.extend(block(1, recorder.LONG))
+    with pytest.raises(OSError, match="the disk is full"):
+        record.flush()
 
 
 def test_first_difference_names_the_event(ring):
