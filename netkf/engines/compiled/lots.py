@@ -76,6 +76,8 @@ class Lots:
         cuts = 16 + len(self.scenario.times) + 3 * ticks // len(self.scenario.nodes)
         noise = Noise(self.scenario, streams, steps, cuts)
         noise.following()
+        for run in range(count):
+            noise.more_cuts(run)
         self._draws = {
             replica + run: OfLot(window, stretch, noise, run)
             for run, (window, stretch) in enumerate(zip(windows, stretches, strict=True))

@@ -1,0 +1,7 @@
+"""``python -m netkf`` is ``netkf``."""
+
+import sys
+
+from netkf.cli import main
+
+sys.exit(main())
