@@ -24,7 +24,7 @@ from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
-from netkf.trace.schema import CODES
+from netkf.trace.schema import CODES, EVENT
 
 SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND, STOP = (
     CODES[kind]
@@ -45,7 +45,7 @@ class Slots(NamedTuple):
     kind (K,), ``number`` (K,): which of the slots here, exchange or sample it is; messages of an
     exchange from ``first`` (K,) to ``after`` (K,): receiver, sender (M,) places in ``nodes``, in
     their order, and weight (M,). ``slots`` are the numbers of the slots here, ``samples`` the
-    (slot, time, rows before it) of the samples.
+    (slot, time, rows before it) of the samples, ``rows`` are EVENT rows.
     """
 
     kind: np.ndarray
@@ -57,7 +57,7 @@ class Slots(NamedTuple):
     weight: FloatArray
     slots: list[int]
     samples: list[tuple[int, float, int]]
-    rows: list[Row]
+    rows: np.ndarray
 
 
 class Way:
@@ -89,7 +89,7 @@ class Exchanges:
         self._index = scenario.topology.index
         self._talking = sorted({node for link in scenario.topology.links for node in link})
         self._random = streams.generator("matching")
-        self._silent = _silent(scenario)
+        self._silent = silent(scenario)
         self._stopping = stopping(scenario)
         self._ways: dict[Link, list[Way]] = {}
         self._fates: dict[Link, list[Iterator[tuple[float, bool, float]]]] = {}
@@ -132,7 +132,7 @@ class Exchanges:
         weight = np.array([m[2] for m in self._messages], dtype=np.float64)
         return Slots(
             kind, number, first, after, places[0], places[1], weight,
-            self._slots, self._sampled, self._rows,
+            self._slots, self._sampled, np.array(self._rows, dtype=EVENT),
         )  # fmt: skip
 
     def _one_slot(self) -> bool:
@@ -278,7 +278,7 @@ class Exchanges:
         ]
 
 
-def _silent(scenario: Scenario) -> set[tuple[int, int]]:
+def silent(scenario: Scenario) -> set[tuple[int, int]]:
     """The (node, phase) in which a node has nothing to send from the beginning."""
     algorithm = scenario.filter.algorithm
     if isinstance(algorithm, PushSum) and algorithm.asymptotic:

@@ -16,8 +16,9 @@ from netkf.core import compiling
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress, broken
-from netkf.engines.compiled.exchanges import SENSING, Exchanges, Slots
+from netkf.engines.compiled.exchanges import SENSING, Slots
 from netkf.engines.compiled.masses import first_masses
+from netkf.engines.compiled.plain import make_exchanges
 from netkf.engines.compiled.slots import (
     Nodes,
     Readings,
@@ -32,7 +33,7 @@ from netkf.engines.compiled.slots import (
 from netkf.plants.linear import Truth
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES, EVENT
+from netkf.trace.schema import CODES
 
 KERNELS: dict[type[SlotFilter], Callable[..., None]] = {
     Gossip: gossip,
@@ -56,7 +57,7 @@ class SlotRun:
         kernel = compiling.announced(KERNELS[type(algorithm)])
         assert kernel is not None
         self._kernel, self._pooled = kernel, algorithm.pooled
-        self._exchanges = Exchanges(scenario, streams)
+        self._exchanges = make_exchanges(scenario, streams)
         self._truth: Truth = scenario.slot_plant.truth(streams.generator("plant"))
         paths = {
             node: [scenario.slot_path(streams, node, p) for p in scenario.placed[node]]
@@ -89,7 +90,7 @@ class SlotRun:
         states = {slot: self._truth.state(slot) for slot in slots.slots}
         readings = self._readings(slots, states)
         self._kernel(self._nodes, readings, Steps(*slots[:7]), shown, *self._extra)
-        rows, passed = np.array(slots.rows, dtype=EVENT), 0
+        rows, passed = slots.rows, 0
         first = self._recorder.sums
         for k, (slot, time, before) in enumerate(slots.samples):
             self._recorder.extend(rows[passed:before])
