@@ -6,6 +6,7 @@ the network does.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -67,6 +68,9 @@ class Readings(Protocol):
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """(p,) of that slot, in which the state is x."""
 
+    def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Both, (S, p) and (S, p, n), of slots that ascend, in which the states are x (S, n)."""
+
 
 class LinearPath:
     """The path of one run, slot by slot."""
@@ -104,6 +108,14 @@ class SlotReadings:
             self._slot += 1
         return np.asarray(self.matrix(slot) @ x + self._v)
 
+    def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``reading`` (S, p) and ``matrix`` (S, p, n) of slots that ascend, with states (S, n)."""
+        H = np.stack([self.matrix(slot) for slot in slots])
+        ahead = np.array(slots) - self._slot - 1
+        noise = self._noise.draws(int(ahead[-1]) + 1)[ahead] @ self._root.T
+        self._slot, self._v = slots[-1], noise[-1]
+        return (H @ x[:, :, None])[:, :, 0] + noise, H
+
 
 class Blocks:
     """Standard normal vectors, drawn many at a time."""
@@ -118,3 +130,12 @@ class Blocks:
             self._drawn, self._used = self._random.standard_normal((BLOCK, self._size)), 0
         self._used += 1
         return np.asarray(self._drawn[self._used - 1])
+
+    def draws(self, count: int) -> FloatArray:
+        """(count, size) the next vectors."""
+        short = self._used + count - len(self._drawn)
+        if short > 0:
+            more = self._random.standard_normal((max(short, BLOCK), self._size))
+            self._drawn, self._used = np.concatenate([self._drawn[self._used :], more]), 0
+        self._used += count
+        return np.asarray(self._drawn[self._used - count : self._used])

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -211,6 +211,12 @@ class RecordedReadings:
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """(p,) the reading of a slot."""
         return self._table[slot][: len(self._H)]
+
+    def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Both, (S, p) and (S, p, n), of some slots."""
+        made = [(self.reading(slot, x), self.matrix(slot)) for slot in slots]
+        y, H = (np.stack(column) for column in zip(*made, strict=True))
+        return y, H
 
 
 def _component(name: str, letter: str = "y") -> int:

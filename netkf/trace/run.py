@@ -90,9 +90,8 @@ def errors(x: FloatArray, xhat: FloatArray, P: FloatArray) -> tuple[FloatArray, 
             solved = np.linalg.solve(P, e[..., None])[..., 0]
         except np.linalg.LinAlgError:
             solved = np.full_like(e, np.nan)
-            for place in np.ndindex(*e.shape[:2]):
-                if np.linalg.matrix_rank(P[place], hermitian=True) == P.shape[-1]:
-                    solved[place] = np.linalg.solve(P[place], e[place])
+            regular = np.linalg.matrix_rank(P, hermitian=True) == P.shape[-1]
+            solved[regular] = np.linalg.solve(P[regular], e[regular][:, :, None])[:, :, 0]
         return (e * e).sum(axis=-1), (e * solved).sum(axis=-1)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.core import compiling
 from netkf.core.streams import Streams
-from netkf.engines.base import Progress, broken
+from netkf.engines.base import Progress
 from netkf.engines.compiled.draws import Noise, Paths
 from netkf.engines.compiled.readings import Stretch
 from netkf.engines.compiled.replay import (
@@ -28,6 +28,7 @@ from netkf.engines.compiled.replay import (
     intersecting,
     replay,
 )
+from netkf.engines.compiled.samples import recorded
 from netkf.engines.compiled.schedule import Schedule, Window
 from netkf.engines.compiled.tables import (
     GRID_AT,
@@ -47,10 +48,9 @@ from netkf.engines.compiled.tables import (
 )
 from netkf.scenario.scenario import Scenario
 from netkf.trace import recorder as recording
-from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES, EVENT
+from netkf.trace.recorder import Recorder
+from netkf.trace.schema import EVENT
 
-DIVERGED = CODES["diverged"]
 FIRST_MAIL, FIRST_ROWS = 1024, 4096
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 
@@ -210,26 +210,19 @@ class FlowRun:
 
     def _take_samples(self) -> bool:
         """Record the samples that are there; False where one of them is no longer finite."""
-        place, path = self._desk.cursor.place, self._stretch
+        place, path, taken = self._desk.cursor.place, self._stretch, self._desk.samples
         count, place[SHOWN] = int(place[SHOWN]), 0
-        if not count:
-            return True
         times = self._desk.probes[place[PROBE_AT] - count : place[PROBE_AT]]
-        piece = self._desk.samples.piece[:count]
+        piece = taken.piece[:count]
         ends = (times == path.stop[piece])[:, None]
         x = np.where(ends, path.x_stop[piece], path.x_start[piece])
-        xhat, P = self._desk.samples.xhat[:count].copy(), self._desk.samples.P[:count].copy()
-        if self._scenario.filter.algorithm.pooled:
-            nodes = len(self._scenario.nodes)
-            xhat, P = np.repeat(xhat, nodes, axis=1), np.repeat(P, nodes, axis=1)
-        finite = np.isfinite(P).all(axis=(1, 2, 3)) & np.isfinite(xhat).all(axis=(1, 2))
-        kept = count if finite.all() else int(np.argmin(finite)) + 1
-        self._recorder.samples(times[:kept].copy(), x[:kept], xhat[:kept], P[:kept])
-        self._progress(float(times[kept - 1]))
-        if finite.all():
-            return True
-        # What happened after this sample did not happen.
-        self._pass_rows_on(int(self._desk.samples.rows[kept - 1]))
-        for node in broken(self._scenario, xhat[kept - 1], P[kept - 1]):
-            self._recorder.append((float(times[kept - 1]), DIVERGED, node, -1, -1, -1, NAN))
-        return False
+        return recorded(
+            self._scenario,
+            self._recorder,
+            self._progress,
+            times.copy(),
+            x,
+            taken.xhat[:count].copy(),
+            taken.P[:count].copy(),
+            lambda k: self._pass_rows_on(int(taken.rows[k])),
+        )

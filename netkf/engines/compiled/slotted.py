@@ -15,10 +15,11 @@ from netkf.algorithms.stopping import RULES
 from netkf.core import compiling
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.streams import Streams
-from netkf.engines.base import Progress, broken
+from netkf.engines.base import Progress
 from netkf.engines.compiled.exchanges import SENSING, Slots
 from netkf.engines.compiled.masses import first_masses
 from netkf.engines.compiled.plain import make_exchanges
+from netkf.engines.compiled.samples import recorded
 from netkf.engines.compiled.slots import (
     Nodes,
     Readings,
@@ -32,8 +33,7 @@ from netkf.engines.compiled.slots import (
 )
 from netkf.plants.linear import Truth
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import NAN, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.recorder import Recorder
 
 KERNELS: dict[type[SlotFilter], Callable[..., None]] = {
     Gossip: gossip,
@@ -90,48 +90,43 @@ class SlotRun:
         states = {slot: self._truth.state(slot) for slot in slots.slots}
         readings = self._readings(slots, states)
         self._kernel(self._nodes, readings, Steps(*slots[:7]), shown, *self._extra)
-        rows, passed = slots.rows, 0
-        first = self._recorder.sums
-        for k, (slot, time, before) in enumerate(slots.samples):
-            self._recorder.extend(rows[passed:before])
-            passed = before
-            if len(self._mass):
-                started = first or {name: (math.fsum(began[:, j]), 0.0) for j, name in SUMS}
-                now = {name: math.fsum(shown.mass[k, :, j]) for j, name in SUMS}
-                self._recorder.sums = {name: (started[name][0], now[name]) for name in now}
-            if not self._sample(time, states[slot], shown.xhat[k], shown.root[k]):
-                return False
-        self._recorder.extend(rows[passed:])
-        return True
+        rows = slots.rows
+        if len(self._mass) and count:
+            started = {name: math.fsum(began[:, j]) for j, name in SUMS}
+            first = {name: sums[0] for name, sums in self._recorder.sums.items()} or started
+            now = {name: math.fsum(shown.mass[-1, :, j]) for j, name in SUMS}
+            self._recorder.sums = {name: (first[name], now[name]) for name in now}
+        fine = recorded(
+            self._scenario,
+            self._recorder,
+            self._progress,
+            np.array([time for _, time, _ in slots.samples]),
+            np.array([states[slot] for slot, _, _ in slots.samples]).reshape(-1, n),
+            shown.xhat,
+            shown.root @ np.swapaxes(shown.root, -1, -2),
+            lambda k: self._recorder.extend(rows[: slots.samples[k][2]]),
+        )
+        if fine:
+            self._recorder.extend(rows)
+        return fine
 
     def _readings(self, slots: Slots, states: dict[int, FloatArray]) -> Readings:
         size, n = self._nodes.xhat.shape
         most = self._nodes.R.shape[1]
         y = np.zeros((len(slots.slots), size, most))
         H = np.zeros((len(slots.slots), size, most, n))
-        for k in slots.number[slots.kind == SENSING].tolist():
-            slot = slots.slots[k]
+        which = slots.number[slots.kind == SENSING]
+        sensed = [slots.slots[k] for k in which.tolist()]
+        if sensed:
+            x = np.stack([states[slot] for slot in sensed])
             for h, paths in enumerate(self._paths):
                 row = 0
                 for path in paths:
-                    value = path.reading(slot, states[slot])
-                    after = row + len(value)
-                    y[k, h, row:after], H[k, h, row:after] = value, path.matrix(slot)
+                    values, matrices = path.several(sensed, x)
+                    after = row + values.shape[1]
+                    y[which, h, row:after], H[which, h, row:after] = values, matrices
                     row = after
         return Readings(y, H)
-
-    def _sample(self, time: float, x: FloatArray, xhat: FloatArray, root: FloatArray) -> bool:
-        scenario, recorder = self._scenario, self._recorder
-        P = root @ np.swapaxes(root, -1, -2)
-        if self._pooled:
-            count = len(scenario.nodes)
-            xhat, P = np.repeat(xhat, count, axis=0), np.repeat(P, count, axis=0)
-        recorder.sample(time, x, xhat, P)
-        self._progress(time)
-        nodes = broken(scenario, xhat, P)
-        for node in nodes:
-            recorder.append((time, CODES["diverged"], node, -1, -1, -1, NAN))
-        return not nodes
 
 
 SUMS = ((0, "weight"), (1, "number"))
