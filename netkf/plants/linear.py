@@ -108,9 +108,13 @@ class SlotReadings:
             self._slot += 1
         return np.asarray(self.matrix(slot) @ x + self._v)
 
+    def matrices(self, slots: Sequence[int]) -> FloatArray:
+        """``matrix`` (S, p, n) of slots that ascend."""
+        return np.broadcast_to(self._H, (len(slots), *self._H.shape))
+
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """``reading`` (S, p) and ``matrix`` (S, p, n) of slots that ascend, with states (S, n)."""
-        H = np.stack([self.matrix(slot) for slot in slots])
+        H = self.matrices(slots)
         ahead = np.array(slots) - self._slot - 1
         noise = self._noise.draws(int(ahead[-1]) + 1)[ahead] @ self._root.T
         self._slot, self._v = slots[-1], noise[-1]

@@ -6,7 +6,7 @@ with the reading as known data.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,3 +70,13 @@ class RegressorReadings(SlotReadings):
             self._s = self._sensor.A @ self._s + self._drive @ self._xi.draw()
             self._at += 1
         return np.asarray((self._sensor.C @ self._s)[None])
+
+    def matrices(self, slots: Sequence[int]) -> FloatArray:
+        """Their ``matrix`` (S, 1, n)."""
+        driven = self._xi.draws(slots[-1] - self._at) @ self._drive.T
+        states, A = [self._s], self._sensor.A
+        for push in driven:
+            states.append(A @ states[-1] + push)
+        made = np.stack(states)[np.array(slots) - self._at]
+        self._s, self._at = states[-1], slots[-1]
+        return np.asarray((made @ self._sensor.C.T)[:, None])

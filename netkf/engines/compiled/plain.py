@@ -102,6 +102,7 @@ class PlainExchanges:
         self._talks = np.array(
             [[(node, phase) not in quiet for node in scenario.nodes] for phase in phases]
         )
+        self._length = scenario.phase_length if algorithm.talks else 0.0
         self._samples, self._slot, self._over = set(scenario.slots), 0, False
         steps = sum(algorithm.steps(phase) for phase in phases)
         rows = len(scenario.sensing) + steps * (2 * self._sender.size + len(scenario.nodes))
@@ -148,7 +149,7 @@ class PlainExchanges:
                     self._done.append([SENSING, len(self._slots) - 1, 0, 0])
                 continue
             if algorithm.talks and slot >= algorithm.first_slot:
-                length, steps = self._scenario.phase_length, algorithm.steps(phase)
+                length, steps = self._length, algorithm.steps(phase)
                 for step in range(steps):
                     end = start + (phase + (step + 1) / steps) * length
                     fresh = algorithm.redraws(phase, step)
