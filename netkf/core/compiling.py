@@ -28,6 +28,7 @@ _UNCOUNTED: Any = {**_OPTIONS, "_nrt": False}
 _marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
 _known: set[Callable[..., Any]] = set()
 _in_place: set[Callable[..., Any]] = set()
+_said: set[Callable[..., Any]] = set()
 
 
 def compilable(function: Function) -> Function:
@@ -92,13 +93,15 @@ def _moderately_optimised(made: Any, config: Any) -> None:
     made._compile_for_args = moderately
 
 
-def announced(function: Callable[..., Any]) -> Callable[..., Any] | None:
-    """``compiled``, with a word on the terminal where that will take a while."""
-    made = compiled(function)
-    if made is not None and sys.stderr.isatty() and not _kept(made):
-        words = "netkf: compiling, once after an installation (some 20 s) ..."
+def announce(function: Callable[..., Any]) -> None:
+    """Say that a function will be compiled first, where its code is not kept on disk."""
+    if function in _said or not available():
+        return
+    _said.add(function)
+    folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
+    if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
+        words = "netkf: compiling, once after an installation (10 to 20 s) ..."
         print(words, file=sys.stderr, flush=True)
-    return made
 
 
 def available() -> bool:
@@ -165,8 +168,3 @@ def _make_room(folder: Path) -> None:
     found = [path for path in folder.glob("netkf-*") if path.is_dir()]
     for old in sorted(found, key=lambda path: path.stat().st_mtime)[: -MOST_STATES + 1]:
         shutil.rmtree(old, ignore_errors=True)
-
-
-def _kept(made: Any) -> bool:
-    folder = Path(made.stats.cache_path)
-    return any(folder.glob(f"*{made.py_func.__name__}*.nbi"))

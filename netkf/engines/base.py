@@ -58,6 +58,9 @@ class Engine(ABC):
     def refusal(self, scenario: Scenario) -> str | None:
         """Why this engine cannot run the scenario, with the remedy; None where it can."""
 
+    def announce(self, scenario: Scenario) -> None:  # noqa: B027 - there may be nothing to say
+        """Say on stderr what will take a while before the first run."""
+
     @abstractmethod
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

@@ -15,7 +15,7 @@ import numpy as np
 import netkf
 from netkf.core.errors import ScenarioError
 from netkf.core.streams import Streams
-from netkf.engines.base import Progress, silent
+from netkf.engines.base import Engine, Progress, silent
 from netkf.experiments.failures import told
 from netkf.experiments.files import (
     ParquetSink,
@@ -49,7 +49,7 @@ class Finished:
 def run_to_directory(
     scenario: Scenario,
     out: Path | None = None,
-    engine: str = "auto",
+    engine: str | Engine = "auto",
     trace: str = "full",
     progress: Progress = silent,
     finish: Callable[[Finished], None] | None = None,

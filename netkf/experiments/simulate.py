@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from netkf.algorithms.slot import SlotFilter
 from netkf.core import compiling
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
@@ -14,7 +13,6 @@ from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.processes.engine import ProcessesEngine
-from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
@@ -22,49 +20,28 @@ from netkf.trace.schema import EVENT
 
 LOAD = "load it first: netkf.simulate(netkf.load(path))"
 ENGINES = ("auto", "processes", "compiled")
-WORTH = 5e5  # events from which compiling pays, even the first time
 
 
-def choose_engine(name: str | Engine, scenario: Scenario, runs: int = 1) -> Engine:
-    """The engine of a name; ``auto`` is compiled where ``runs`` runs together are long enough to
-    repay the time that compiling takes, and processes else. Raises EngineError where it cannot run
-    the scenario.
+def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
+    """The engine of a name; ``auto`` is compiled where numba is installed and it can run the
+    scenario, and processes else. Raises EngineError where an engine cannot run it.
     """
-    engine: Engine
     if isinstance(name, Engine):
-        engine = name
-    elif name == "auto":
+        engine: Engine = name
+    elif name in ("auto", "compiled"):
         engine = CompiledEngine()
-        worth = runs * expected_events(scenario) >= WORTH
-        if not worth or engine.refusal(scenario) is not None:
+        if name == "auto" and engine.refusal(scenario) is not None:
             engine = ProcessesEngine()
     elif name == "processes":
         engine = ProcessesEngine(compiled=compiling.available())
-    elif name == "compiled":
-        engine = CompiledEngine()
     else:
         raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name!r}")
     refusal = engine.refusal(scenario)
     if refusal is not None:
         raise EngineError(refusal)
+    if engine is not name:
+        engine.announce(scenario)
     return engine
-
-
-def expected_events(scenario: Scenario) -> float:
-    """About how many events a run has."""
-    algorithm, links = scenario.filter.algorithm, scenario.topology.links
-    if isinstance(algorithm, SlotFilter):
-        exchanges = [k for k, kind in enumerate(algorithm.programme) if kind == "exchange"]
-        steps = sum(algorithm.steps(phase) for phase in range(len(exchanges)))
-        sent = 2.0 * len(links) * steps * algorithm.talks
-        slots = scenario.horizon / scenario.slot_plant.period
-        return slots * (len(scenario.sensing) + 2.0 * sent)
-    readings = len(scenario.sensing) * scenario.horizon / (scenario.truth.sensing_period or np.inf)
-    clock = scenario.network.activation
-    if not algorithm.talks or not isinstance(clock, LinkClock):
-        return readings
-    rates = np.array([clock.mean_rate(link) for link in links])
-    return readings + 7.0 * scenario.horizon * float(np.nansum(rates))
 
 
 def simulate(

@@ -116,7 +116,9 @@ class SlotReadings:
         """``reading`` (S, p) and ``matrix`` (S, p, n) of slots that ascend, with states (S, n)."""
         H = self.matrices(slots)
         ahead = np.array(slots) - self._slot - 1
-        noise = self._noise.draws(int(ahead[-1]) + 1)[ahead] @ self._root.T
+        # Slot by slot, so that no reading is rounded as the slots happen to be taken together.
+        normals = self._noise.draws(int(ahead[-1]) + 1)[ahead]
+        noise = (normals[:, None] @ self._root.T)[:, 0]
         self._slot, self._v = slots[-1], noise[-1]
         return (H @ x[:, :, None])[:, :, 0] + noise, H
 

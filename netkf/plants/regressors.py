@@ -73,10 +73,10 @@ class RegressorReadings(SlotReadings):
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
         """Their ``matrix`` (S, 1, n)."""
-        driven = self._xi.draws(slots[-1] - self._at) @ self._drive.T
+        driven = (self._xi.draws(slots[-1] - self._at)[:, None] @ self._drive.T)[:, 0]
         states, A = [self._s], self._sensor.A
         for push in driven:
             states.append(A @ states[-1] + push)
         made = np.stack(states)[np.array(slots) - self._at]
         self._s, self._at = states[-1], slots[-1]
-        return np.asarray((made @ self._sensor.C.T)[:, None])
+        return np.asarray(made[:, None] @ self._sensor.C.T)

@@ -15,6 +15,7 @@ import pytest
 
 import netkf
 from netkf.cli import main
+from netkf.engines.processes.engine import ProcessesEngine
 from netkf.experiments.ensembles.blocks import Grove, tree
 from netkf.experiments.ensembles.directory import runs_to_directory
 from netkf.experiments.ensembles.moments import merge_moments, single
@@ -225,7 +226,7 @@ def test_a_users_class_travels_and_its_failure_is_one_line(tmp_path, workers):
         netkf.monte_carlo(netkf.load(tmp_path / "Bad.toml"), 2, workers=workers)
     fine = netkf.monte_carlo(netkf.load(tmp_path / "Fine.toml"), 2, workers=workers)
     plain = netkf.load(SCENARIOS / "poisson_ring.toml").replace({"horizon": 1.0})
-    assert_same_bits(fine, netkf.monte_carlo(plain, 2, workers=1))
+    assert_same_bits(fine, netkf.monte_carlo(plain, 2, workers=1, engine=ProcessesEngine()))
 
 
 @pytest.mark.parametrize(

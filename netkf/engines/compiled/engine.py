@@ -9,11 +9,12 @@ import numpy as np
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.slot import SlotFilter
 from netkf.core import compiling
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress
-from netkf.engines.compiled.flow import Desk, FlowRun, Source
+from netkf.engines.compiled.flow import Desk, FlowRun, Source, replay_for
 from netkf.engines.compiled.lots import drawn_together
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.plants.diffusion import Diffusion
@@ -55,6 +56,14 @@ class CompiledEngine(Engine):
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
         return None
+
+    def announce(self, scenario: Scenario) -> None:
+        """That code is compiled, where it is not kept from before."""
+        algorithm = scenario.filter.algorithm
+        if isinstance(algorithm, SlotFilter):
+            compiling.announce(KERNELS[type(algorithm)])
+        else:
+            compiling.announce(replay_for(scenario))
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

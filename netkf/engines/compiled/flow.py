@@ -6,6 +6,7 @@ and the replay does everything that happens an event at a time.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -101,19 +102,25 @@ class Source:
         self._noise.more_cuts(0)
 
 
+def replay_for(scenario: Scenario) -> Callable[..., int]:
+    """What is compiled for the filters of a scenario."""
+    intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
+    return intersecting if intersects else replay
+
+
 class Desk:
     """The tables of a scenario, and where the states of a run are; serves one run after another."""
 
     def __init__(self, scenario: Scenario) -> None:
-        intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
-        made = compiling.announced(intersecting if intersects else replay)
+        function = replay_for(scenario)
+        made = compiling.compiled(function)
         assert made is not None
         self.replay = made
         self.hosts, self.models = host_tables(scenario)
         self._xhat, self._P = self.hosts.xhat.copy(), self.hosts.P.copy()
         self.links, self.mail = link_tables(scenario), empty_mail(self.hosts, FIRST_MAIL)
         self.room = room_for(self.models)
-        self.parts = room_for_parts(self.links, self.hosts) if intersects else None
+        self.parts = room_for_parts(self.links, self.hosts) if function is intersecting else None
         self.cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
         self.rows = np.empty(FIRST_ROWS, dtype=EVENT)
         self.probes = np.array(scenario.times, dtype=np.float64)

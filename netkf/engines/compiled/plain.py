@@ -100,8 +100,9 @@ class PlainExchanges:
         quiet = silent(scenario)
         phases = range(algorithm.programme.count("exchange"))
         self._talks = np.array(
-            [[(node, phase) not in quiet for node in scenario.nodes] for phase in phases]
-        )
+            [[(node, phase) not in quiet for node in scenario.nodes] for phase in phases],
+            dtype=bool,
+        ).reshape(len(phases), len(scenario.nodes))
         self._length = scenario.phase_length if algorithm.talks else 0.0
         self._samples, self._slot, self._over = set(scenario.slots), 0, False
         steps = sum(algorithm.steps(phase) for phase in phases)

@@ -54,7 +54,7 @@ class SlotRun:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, SlotFilter)
-        kernel = compiling.announced(KERNELS[type(algorithm)])
+        kernel = compiling.compiled(KERNELS[type(algorithm)])
         assert kernel is not None
         self._kernel, self._pooled = kernel, algorithm.pooled
         self._exchanges = make_exchanges(scenario, streams)

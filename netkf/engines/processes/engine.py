@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import simpy
 
+from netkf.core import compiling
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.engines.compiled.flow import Desk, FlowRun, Source
+from netkf.engines.compiled.flow import Desk, FlowRun, Source, replay_for
 from netkf.engines.processes.hosts import Host, make_hosts
 from netkf.engines.processes.links import LinkProcess
 from netkf.engines.processes.slots import SlotProcess
@@ -47,11 +48,19 @@ class ProcessesEngine(Engine):
         """None: this engine defines what a scenario means."""
         return None
 
+    def announce(self, scenario: Scenario) -> None:
+        """That filters are compiled, where their code is not kept from before."""
+        if self._compiles(scenario):
+            compiling.announce(replay_for(scenario))
+
+    def _compiles(self, scenario: Scenario) -> bool:
+        return self.compiled and not scenario.slotted and CompiledEngine().refusal(scenario) is None
+
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
-        if self.compiled and not scenario.slotted and CompiledEngine().refusal(scenario) is None:
+        if self._compiles(scenario):
             source = Source(scenario, streams, TickingLinks(scenario, streams))
             with np.errstate(over="ignore", invalid="ignore"):
                 run = FlowRun(scenario, Desk(scenario), source, recorder, progress)

@@ -185,7 +185,7 @@ def check(
         raise ScenarioError("horizon", words, scenario.horizon, "lengthen it")
     chosen = watched(scenario)
     seen = replicate(
-        partial(witness, engine=choose_engine("auto", chosen, count)),
+        partial(witness, engine=choose_engine("auto", chosen)),
         chosen,
         count,
         root,

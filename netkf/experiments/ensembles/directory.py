@@ -94,7 +94,7 @@ def runs_to_directory(
     """
     began = time.perf_counter()
     runs, trace = integer(low=1)("runs", runs), choice(*TRACES)("trace", trace)
-    engine_used = choose_engine(engine, scenario, runs)
+    engine_used = choose_engine(engine, scenario)
     chosen = engine_used.name
     check_sources(scenario)
     pool = make_pool(scenario, runs, workers, executor, scheduler)

@@ -11,7 +11,6 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import integer
 from netkf.experiments.ensembles.replicas import Progress, replicate
 from netkf.experiments.ensembles.tallies import MESSAGES, Tally, merge, reduced_run
 from netkf.experiments.simulate import choose_engine
@@ -94,7 +93,7 @@ def monte_carlo(
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)
-    chosen = choose_engine(engine, scenario, integer(low=1)("runs", runs))
+    chosen = choose_engine(engine, scenario)
     seed = scenario.seed if seed is None else seed
     whole = replicate(
         partial(reduced_run, engine=chosen),

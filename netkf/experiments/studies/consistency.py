@@ -200,7 +200,7 @@ def consistency(
         raise ScenarioError("plant", words, None, remedy)
     count = integer(low=FEWEST)("runs", runs)
     sure = number(above=0.0, below=1.0)("confidence", confidence)
-    task = partial(one_run, engine=choose_engine(engine, scenario, count))
+    task = partial(one_run, engine=choose_engine(engine, scenario))
     seen = replicate(
         task, scenario, count, seed, workers=workers, executor=executor, scheduler=scheduler
     )

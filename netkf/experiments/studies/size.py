@@ -64,7 +64,7 @@ def size(
         )
     base = scenario if seed is None else scenario.replace({"seed": seed})
     whole = _checked_range(base, key, low, high)
-    used = choose_engine(engine, base.replace({key: low}), runs)
+    used = choose_engine(engine, base.replace({key: low}))
     chosen = by or ("theory" if _theory_tells(base, key, (low, high), wanted) else "simulation")
     if chosen == "theory":
         search = Search(base, key, wanted, whole, "theory")

@@ -101,7 +101,7 @@ def _rows(
     with shared_pool(places[0].scenario, runs, *pool) as handed:
         for k, place in enumerate(places):
             try:
-                task = partial(one_run, engine=choose_engine(engine, place.scenario, runs))
+                task = partial(one_run, engine=choose_engine(engine, place.scenario))
                 found = replicate(task, place.scenario, runs, **handed)
             except Exception as error:
                 reason = told(place.scenario, error)
