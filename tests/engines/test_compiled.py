@@ -61,6 +61,32 @@ def test_every_scenario_in_continuous_time_agrees_with_covariance_intersection(f
     assert assert_agree(scenario.replace({"horizon": horizon})).count("absorb") > 50
 
 
+SLOTS = {
+    "local": ("gossip_ring", {"filter": {"kind": "local"}}),
+    "central": ("gossip_ring", {"filter": {"kind": "central"}}),
+    "own fates": ("push_sum_planar", {"network.channel.symmetric": False, "filter.gamma": 3}),
+    "held": ("push_sum_planar", {"filter.links": "held", "filter.gamma": 3}),
+    "limits": ("push_sum_planar", {"filter.asymptotic": True}),
+    "lossless": ("push_sum_planar", {"network.channel.loss": {"kind": "none"}}),
+    "late": ("gossip_ring", {"network.channel.delay": {"kind": "exponential", "mean": 0.2}}),
+    "wakeup": ("gossip_ring", {"network.activation.protocol": "node-wakeup"}),
+    "lazy": (
+        "gossip_ring",
+        {"network.activation": {"kind": "matching", "protocol": "one-edge", "lazy": 0.5}},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SLOTS)
+@pytest.mark.parametrize("rows", [1 << 15, 50])
+def test_slots_made_together_agree(monkeypatch, name, rows):
+    """Also where few are made at once."""
+    monkeypatch.setattr("netkf.engines.compiled.plain.MOST_ROWS", rows)
+    file, changes = SLOTS[name]
+    scenario = netkf.load(SCENARIOS / f"{file}.toml")
+    assert_agree(scenario.replace({"horizon": 12.0 * scenario.slot_plant.period, **changes}))
+
+
 @pytest.mark.parametrize("stop", ["safe", "paper"])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-16, 0.0])
 @pytest.mark.parametrize("links", ["fresh", "held"])

@@ -99,10 +99,8 @@ class PlainExchanges:
         self._sent = np.zeros(self._sender.shape, dtype=np.int64)
         quiet = silent(scenario)
         phases = range(algorithm.programme.count("exchange"))
-        self._talks = np.array(
-            [[(node, phase) not in quiet for node in scenario.nodes] for phase in phases],
-            dtype=bool,
-        ).reshape(len(phases), len(scenario.nodes))
+        talks = [[(node, phase) not in quiet for node in scenario.nodes] for phase in phases]
+        self._talks = np.array(talks, dtype=bool).reshape(len(phases), len(scenario.nodes))
         self._length = scenario.phase_length if algorithm.talks else 0.0
         self._samples, self._slot, self._over = set(scenario.slots), 0, False
         steps = sum(algorithm.steps(phase) for phase in phases)
