@@ -68,6 +68,9 @@ def invertible_root(P: FloatArray) -> FloatArray:
         return np.full(P.shape, np.nan)
     n = len(P)
     scale = np.sqrt(np.maximum(np.diag(P), TINY))
-    values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
+    scaled = P / np.outer(scale, scale)
+    if not np.isfinite(scaled).all():
+        return np.full(P.shape, np.nan)
+    values, vectors = np.linalg.eigh(scaled)
     floor = SINGULAR * max(values[n - 1], TINY)
     return np.asarray(scale.reshape(n, 1) * vectors * np.sqrt(np.maximum(values, floor)))

@@ -132,10 +132,15 @@ def _triples(
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """The inverse in the precision of ``matrix``, by Newton's iteration from double."""
+    """The inverse in the precision of ``matrix``, by Newton's iteration from double; nan where
+    there is none, as after so many units of an unstable plant that nothing is left of them.
+    """
     if not np.isfinite(matrix).all():
         return np.full_like(matrix, np.nan)
-    inverse = np.linalg.inv(matrix.astype(np.float64)).astype(matrix.dtype)
+    try:
+        inverse = np.linalg.inv(matrix.astype(np.float64)).astype(matrix.dtype)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
     for _ in range(2):
         inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
     return inverse

@@ -28,8 +28,8 @@ def undisturbed() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number in reversed(WAITING):  # a Ctrl-C from now on ends this loop: it comes last
+            signal.signal(number, before[number])
         for received, frame in came:
             handler = before[signal.Signals(received)]
             if callable(handler):

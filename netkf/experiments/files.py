@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -151,6 +151,8 @@ def missing_modules(scenario: Scenario) -> list[str]:
 class ParquetSink(Sink):
     """Streams events and states to Parquet, one row group a block, so that memory stays bounded."""
 
+    anywhere: ClassVar[bool] = True
+
     def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
         self._nodes, self._replica, self._first = scenario.nodes, replica, 0
         self._shown = scenario.plant.shown
@@ -248,14 +250,16 @@ class _Table:
         self._path, self._part = path, path.with_name(path.name + ".part")
         self._encoding = encoding or {}
         self._writer: Any = None
-        self._closed = False
+        self._closed = self._failed = False
 
     def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
         if self._writer is None:
             schema, how = table.schema, self._encoding
             self._writer = pq.ParquetWriter(self._part, schema, compression="zstd", **how)
+        self._failed = True  # half a row group is no file
         self._writer.write_table(table)
+        self._failed = False
 
     def close(self, empty: Callable[[], dict[str, Any]] | None) -> None:
         if self._closed:
@@ -263,6 +267,11 @@ class _Table:
         self._closed = True
         if self._writer is None and empty is not None:
             self.write(empty())
-        if self._writer is not None:
-            self._writer.close()
-            os.replace(self._part, self._path)
+        if self._writer is None:
+            return
+        if self._failed:
+            with contextlib.suppress(OSError, pa.ArrowException):
+                self._writer.close()
+            return
+        self._writer.close()
+        os.replace(self._part, self._path)

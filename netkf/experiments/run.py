@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 import time
 import traceback
@@ -85,11 +86,14 @@ def run_to_directory(
         if finish is not None:
             finish(finished)
     except BaseException as error:
-        tables.close()
         status = "failed" if isinstance(error, Exception) else "interrupted"
+        for finished_off in (recorder.flush, tables.close):
+            with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
+                finished_off()
         if not (directory / "summary.json").exists():
             nothing = Promise(None, np.nan, np.nan, f"not computed: the run {ENDS[status]}")
-            _summary(directory, scenario, samples, nothing, recorder.count, recorder.sums)
+            with contextlib.suppress(OSError):
+                _summary(directory, scenario, samples, nothing, recorder.count, recorder.sums)
         manifest.write(status, _totals(recorder), done, error)
         reason = told(scenario, error, directory)
         if reason is error:

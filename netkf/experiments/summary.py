@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -28,6 +28,8 @@ class SummarySink(Sink):
     is so large that rounding blurs the errors (unstable plants over long horizons), ``diverged``
     are the nodes whose covariance was no longer finite at the last one.
     """
+
+    anywhere: ClassVar[bool] = True
 
     def __init__(self) -> None:
         self.times: list[float] = []

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from operator import itemgetter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,7 +28,11 @@ NAN = math.nan
 
 
 class Sink(ABC):
-    """Where a recorder's blocks go."""
+    """Where a recorder's blocks go; from another thread too, one call at a time, where that is
+    ``anywhere``.
+    """
+
+    anywhere: ClassVar[bool] = False
 
     @abstractmethod
     def events(self, rows: np.ndarray) -> None:
@@ -41,6 +45,8 @@ class Sink(ABC):
 
 class MemorySink(Sink):
     """Keeps everything."""
+
+    anywhere: ClassVar[bool] = True
 
     def __init__(self) -> None:
         self.blocks: list[np.ndarray] = []
@@ -91,14 +97,17 @@ class Recorder:
             self.flush()
 
     def flush(self) -> None:
-        """Pass the gathered events on; all that came is counted and kept then."""
-        try:
-            self._flush_gathered()
-            self._wait()
-        finally:
-            if self._thread is not None:
-                self._thread.shutdown()
-                self._thread = None
+        """Pass the gathered events on; all that came is counted and kept then, and nothing goes on
+        in another thread.
+        """
+        with undisturbed():
+            try:
+                self._flush_gathered()
+                self._wait()
+            finally:
+                thread, self._thread = self._thread, None
+                if thread is not None:
+                    thread.shutdown()
 
     def _flush_gathered(self) -> None:
         if not self._rows:
@@ -119,15 +128,15 @@ class Recorder:
         self._flush_gathered()
         if not len(rows):
             return
-        if len(rows) >= LONG and not self.counted:
-            self._wait()  # one block at most waits for its turn
-            if self._thread is None:
-                self._thread = ThreadPoolExecutor(1, "netkf-recorder")
         with undisturbed():
             if self.counted:
                 self._count(rows["kind"])
-            else:
-                self._do(self._pass_on, rows)
+                return
+            if len(rows) >= LONG and all(sink.anywhere for sink in self._sinks):
+                self._wait()  # one block at most waits for its turn
+                if self._thread is None:
+                    self._thread = ThreadPoolExecutor(1, "netkf-recorder")
+            self._do(self._pass_on, rows)
 
     def _do(self, something: Callable[..., None], *arguments: Any) -> None:
         """At once, or in its turn where there is a thread for it."""

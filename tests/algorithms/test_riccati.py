@@ -64,6 +64,19 @@ def test_flow_composes_over_gaps_and_keeps_covariances(seed, n, first, second):
     assert np.linalg.eigvalsh(once)[0] >= -1e-12 * scale
 
 
+def test_tables_reach_as_far_as_numbers_do():
+    """What no sensor sees grows by e^60 a second: after some units there is nothing to invert."""
+    Q = np.array([[3.5328630320484016, -1.6336333703502892], [0.0, 0.8087844954083239]])
+    Q[1, 0] = Q[0, 1]
+    G = np.array([[0.4484587754453364, -0.8405481755376778], [0.0, 1.5754429929442604]])
+    G[1, 0] = G[0, 1]
+    A = 60.0 * np.eye(2)
+    table = riccati_table(A, Q, G, 20.0)
+    assert np.isnan(table.F[-1]).all()
+    P, _ = riccati_step(table, np.eye(2), np.zeros(2), 0.05)
+    np.testing.assert_allclose(P, exact(np.eye(2), A, Q, G, 0.05), rtol=1e-9)
+
+
 def test_flow_refuses_what_is_no_riccati_equation():
     eye = np.eye(2)
     with pytest.raises(netkf.TheoryError, match="P must be a 2 x 2 matrix"):

@@ -226,6 +226,17 @@ def test_a_module_that_does_not_travel_is_named(tmp_path, capsys, monkeypatch):
     assert len(err.splitlines()) == 1
 
 
+def test_half_a_row_group_gets_no_name(ring, tmp_path, monkeypatch):
+    def full(self, table):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pyarrow.parquet.ParquetWriter.write_table", full)
+    with pytest.raises(OSError, match="No space left"):
+        run_to_directory(ring, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["status"] == "failed"
+    assert not (tmp_path / "out" / "events.parquet").exists()
+
+
 def test_an_error_in_a_class_of_netkf_is_not_covered_up(ring, tmp_path, monkeypatch):
     monkeypatch.setattr("netkf.algorithms.hybrid.Hybrid.absorb", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):

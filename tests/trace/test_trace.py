@@ -113,6 +113,16 @@ def test_long_blocks_are_kept_by_one_other_thread_in_their_order():
     assert sink.calls[-1] == (here, "events", 6)
 
 
+def test_sinks_that_may_not_be_called_from_anywhere_are_called_from_here(monkeypatch):
+    monkeypatch.setattr(Watched, "anywhere", False)
+    sink = Watched()
+    record = recorder.Recorder([sink, MemorySink()])
+    for number in range(3):
+        record.extend(block(number, recorder.LONG))
+    record.flush()
+    assert {call[0] for call in sink.calls} == {threading.current_thread()}
+
+
 def test_what_fails_in_the_other_thread_fails_the_run():
     record = recorder.Recorder([Watched(fails=1)])
     record.extend(block(0, recorder.LONG))

@@ -14,8 +14,8 @@ from netkf.core import compiling
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress
-from netkf.engines.compiled.flow import Desk, FlowRun, Source, replay_for
-from netkf.engines.compiled.lots import drawn_together
+from netkf.engines.compiled.flow import FlowRun, replay_for
+from netkf.engines.compiled.lots import at_a_desk
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -72,6 +72,5 @@ class CompiledEngine(Engine):
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             if scenario.slotted:
                 return SlotRun(scenario, streams, recorder, progress).to_the_end()
-            prepared = drawn_together(scenario, streams)
-            desk, source = prepared or (Desk(scenario), Source(scenario, streams))
-            return FlowRun(scenario, desk, source, recorder, progress).to_the_end()
+            with at_a_desk(scenario, streams) as (desk, draws):
+                return FlowRun(scenario, desk, draws, recorder, progress).to_the_end()

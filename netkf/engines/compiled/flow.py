@@ -13,6 +13,7 @@ import numpy as np
 
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.core import compiling
+from netkf.core.interrupts import undisturbed
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress
 from netkf.engines.compiled.draws import Noise, Paths
@@ -167,8 +168,11 @@ class FlowRun:
                     return "diverged"
                 self._give(wanted)
         finally:
-            self._pass_rows_on(int(self._desk.cursor.place[ROW]))
-            self._recorder.flush()
+            with undisturbed():
+                try:
+                    self._pass_rows_on(int(self._desk.cursor.place[ROW]))
+                finally:
+                    self._recorder.flush()
         return "complete"
 
     def _go_on(self) -> int:

@@ -7,13 +7,14 @@ them, and their compiled replays follow at one desk. Every number is what it is 
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
 from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.draws import Noise, Paths
-from netkf.engines.compiled.flow import Desk
+from netkf.engines.compiled.flow import Desk, Draws, Source
 from netkf.engines.compiled.readings import Stretch
 from netkf.engines.compiled.schedule import Window, whole_schedules
 from netkf.network.clocks import LinkClock
@@ -45,24 +46,30 @@ class OfLot:
 
 
 class Lots:
-    """The runs of ``scenario`` with ``seed`` and a replica from ``first`` up to ``stop``."""
+    """The runs of ``scenario`` with ``seed`` and a replica from ``first`` up to ``stop``, which are
+    asked for one after the other.
+    """
 
     def __init__(self, scenario: Scenario, seed: int, first: int, stop: int) -> None:
         self.scenario, self.seed = scenario, seed
-        self._first, self._stop, self._size = first, stop, 0
+        self._next, self._stop = first, stop
         self._draws: dict[int, OfLot] = {}
         self._desk: Desk | None = None
+        self._size = -1
+        self.taken = threading.Lock()
+        """While a run is at the desk; another one, within it or in another thread, has its own."""
 
     def prepared(self, replica: int) -> tuple[Desk, OfLot] | None:
         """For the run of a replica, once; None where it had better draw for itself."""
-        if not self._first <= replica < self._stop:
+        if self._size < 0:
+            self._size = lot_size(self.scenario)
+        drawn = replica in self._draws
+        if self._size < 2 or not (drawn or self._next <= replica < self._stop):
             return None
-        if self._desk is None:
-            self._desk, self._size = Desk(self.scenario), lot_size(self.scenario)
-        if self._size < 2:
-            return None
-        if replica not in self._draws:
+        if not drawn:
             self._draw(replica)
+        if self._desk is None:
+            self._desk = Desk(self.scenario)
         self._desk.clear()
         return self._desk, self._draws.pop(replica)
 
@@ -82,6 +89,7 @@ class Lots:
             replica + run: OfLot(window, stretch, noise, run)
             for run, (window, stretch) in enumerate(zip(windows, stretches, strict=True))
         }
+        self._next = replica + count
 
 
 def lot_size(scenario: Scenario) -> int:
@@ -114,11 +122,19 @@ def together(scenario: Scenario, seed: int, first: int, stop: int) -> Iterator[N
         _expected.reset(before)
 
 
-def drawn_together(scenario: Scenario, streams: Streams) -> tuple[Desk, OfLot] | None:
-    """What a run needs, where it was expected and is drawn with others."""
-    lots = _expected.get()
-    if lots is None or lots.scenario is not scenario or lots.seed != streams.seed:
-        return None
-    if type(streams) is not Streams:
-        return None
-    return lots.prepared(streams.replica)
+@contextmanager
+def at_a_desk(scenario: Scenario, streams: Streams) -> Iterator[tuple[Desk, Draws]]:
+    """What a run works with: drawn with others where it was expected, else its own."""
+    lots, prepared = _expected.get(), None
+    known = lots is not None and lots.scenario is scenario and lots.seed == streams.seed
+    if lots is None or not known or type(streams) is not Streams:
+        yield Desk(scenario), Source(scenario, streams)
+        return
+    taken = lots.taken.acquire(blocking=False)
+    try:
+        if taken:
+            prepared = lots.prepared(streams.replica)
+        yield prepared or (Desk(scenario), Source(scenario, streams))
+    finally:
+        if taken:
+            lots.taken.release()

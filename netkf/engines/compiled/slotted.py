@@ -69,6 +69,7 @@ class SlotRun:
             self._paths = [paths.get(node, []) for node in nodes]
         self._nodes = _nodes(scenario, self._pooled)
         self._extra, self._mass = _extra(scenario)
+        self._sums = {name: math.fsum(self._mass[:, j]) for j, name in SUMS if len(self._mass)}
 
     def to_the_end(self) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
@@ -85,17 +86,14 @@ class SlotRun:
         shown = Shown(
             np.zeros((count, size, n)), np.zeros((count, size, n, n)), np.zeros((count, size, 2))
         )
-        began = self._mass[:, :2].copy()
         # States first: the truth is asked for in the order of the slots.
         states = {slot: self._truth.state(slot) for slot in slots.slots}
         readings = self._readings(slots, states)
         self._kernel(self._nodes, readings, Steps(*slots[:7]), shown, *self._extra)
         rows = slots.rows
         if len(self._mass) and count:
-            started = {name: math.fsum(began[:, j]) for j, name in SUMS}
-            first = {name: sums[0] for name, sums in self._recorder.sums.items()} or started
             now = {name: math.fsum(shown.mass[-1, :, j]) for j, name in SUMS}
-            self._recorder.sums = {name: (first[name], now[name]) for name in now}
+            self._recorder.sums = {name: (self._sums[name], now[name]) for name in now}
         fine = recorded(
             self._scenario,
             self._recorder,
