@@ -27,18 +27,6 @@ def product(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a @ b)
 
 
-def _added_loops(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    out = np.empty((a.shape[0], b.shape[1]))
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            total = c[i, j]
-            for k in range(a.shape[1]):
-                total += a[i, k] * b[k, j]
-            out[i, j] = total
-    return out
-
-
-@compilable_as(_added_loops)
 def added(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     """``c + a b`` (r, s) of (r, s), (r, m) and (m, s)."""
     return np.asarray(c + a @ b)

@@ -520,10 +520,9 @@ def test_covariance_intersection_compiled_is_that_of_python(n):
 def test_loops_are_what_numpy_says(n, seed):
     """The one place where a formula stands twice."""
     draw = np.random.default_rng([seed, n]).standard_normal
-    a, b, c, x = draw((n, n)), draw((n, n)), draw((n, n)), draw(n)
+    a, b, x = draw((n, n)), draw((n, n)), draw(n)
     close = {"rtol": 1e-12, "atol": 1e-12}
     np.testing.assert_allclose(small._product_loops(a, b), a @ b, **close)
-    np.testing.assert_allclose(small._added_loops(c, a, b), c + a @ b, **close)
     np.testing.assert_allclose(small._applied_loops(a, x), a @ x, **close)
     np.testing.assert_allclose(small._even_loops(a), 0.5 * (a + a.T), **close)
     solved = np.linalg.solve(a, b)

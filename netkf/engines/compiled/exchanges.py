@@ -7,6 +7,7 @@ slots are made first and the estimates follow.
 from __future__ import annotations
 
 import heapq
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import partial
 from operator import itemgetter
@@ -76,64 +77,38 @@ class Way:
             yield from zip(luck.tolist(), bad.tolist(), delay.tolist(), strict=True)
 
 
-class Exchanges:
-    """Makes the slots of one run, as SlotProcess of the processes does, without the estimates; only
-    the mass of push-sum is looked at, where nodes may stop.
-    """
+class Programme(ABC):
+    """Goes through the slots of one run: what is ``_done``, in order, for the ``_slots`` here."""
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, SlotFilter)
         self._scenario, self._algorithm = scenario, algorithm
-        self._loss, self._shared = scenario.network.channel.loss, scenario.network.channel.symmetric
-        self._index = scenario.topology.index
-        self._talking = sorted({node for link in scenario.topology.links for node in link})
-        self._random = streams.generator("matching")
-        self._silent = silent(scenario)
-        self._stopping = stopping(scenario)
-        self._ways: dict[Link, list[Way]] = {}
-        self._fates: dict[Link, list[Iterator[tuple[float, bool, float]]]] = {}
-        self._last: dict[Link, list[tuple[float, bool, float]]] = {}
-        if algorithm.talks:
-            for k, (i, j) in enumerate(scenario.topology.links):
-                self._connect(streams, (i, j), k)
+        self._length = scenario.phase_length if algorithm.talks else 0.0
         self._samples = set(scenario.slots)
-        self._slot, self._open, self._exchanges, self._order = 0, -1, 0, 0
-        self._mail: list[tuple[float, int, int, Way, int, float, int, int]] = []
-        self._inbox: dict[int, dict[int, tuple[int, float, float]]] = {}
-        self._over, self._noted = False, True
+        self._slot, self._over, self._noted = 0, False, True
+        self._begin()
 
-    def _connect(self, streams: Streams, link: Link, k: int) -> None:
-        scenario, (i, j) = self._scenario, link
-        ways = [Way(scenario, streams, (i, j), 2 * k)]
-        if not scenario.topology.directed:
-            ways.append(Way(scenario, streams, (j, i), 2 * k + 1))
-        self._ways[link] = ways
-        own = ways[:1] if self._shared else ways
-        self._fates[link] = [way.fates() for way in own]
-
-    def following(self) -> Slots | None:
-        """The next slots; None when all is done."""
-        if self._over:
-            return None
-        self._rows: list[Row] = []
-        self._done: list[tuple[int, int, int, int]] = []
-        self._messages: list[tuple[int, int, float]] = []
+    def _begin(self) -> None:
+        self._done: list[list[int]] = []
         self._slots: list[int] = []
         self._sampled: list[tuple[int, float, int]] = []
-        over = False
-        while not over and len(self._rows) + len(self._messages) < MOST_ROWS:
-            over = self._one_slot()
-        if over:
-            self._arrivals(np.inf)
-        self._over = over
-        kind, number, first, after = np.array(self._done, dtype=np.int64).reshape(-1, 4).T.copy()
-        places = np.array([m[:2] for m in self._messages], dtype=np.int64).reshape(-1, 2).T.copy()
-        weight = np.array([m[2] for m in self._messages], dtype=np.float64)
-        return Slots(
-            kind, number, first, after, places[0], places[1], weight,
-            self._slots, self._sampled, np.array(self._rows, dtype=EVENT),
-        )  # fmt: skip
+
+    @abstractmethod
+    def _arrivals(self, until: float) -> None:
+        """What arrives by then."""
+
+    @abstractmethod
+    def _sense(self, now: float) -> None:
+        """Every node takes its reading."""
+
+    @abstractmethod
+    def _exchange(self, now: float, end: float, slot: int, phase: int, step: int) -> None:
+        """One step of an exchange, from its beginning to its end."""
+
+    @abstractmethod
+    def _reached(self) -> int:
+        """How far the rows of the events are at a sample."""
 
     def _one_slot(self) -> bool:
         """Make one slot; True when nothing comes after it."""
@@ -148,47 +123,108 @@ class Exchanges:
             self._sample(slot, start)
         if not (last and algorithm.predicts):
             self._noted = not last  # the horizon is half open: this slot makes its sample only
-            self._programme(slot, start)
+            self._phases(slot, start)
             self._noted = True
             if not algorithm.predicts:
                 self._sample(slot, start)
         self._slot += 1
         return last
 
-    def _programme(self, slot: int, start: float) -> None:
+    def _phases(self, slot: int, start: float) -> None:
         algorithm, phase, now = self._algorithm, 0, start
         for kind in algorithm.programme:
             if kind == "sense":
-                self._sense(slot, now)
+                if slot > 0 or algorithm.predicts:
+                    # Else a filtered estimate starts from what is known before any reading.
+                    self._sense(now)
+                    self._done.append([SENSING, len(self._slots) - 1, 0, 0])
                 continue
             if algorithm.talks and slot >= algorithm.first_slot:
-                length, steps = self._scenario.phase_length, algorithm.steps(phase)
+                steps = algorithm.steps(phase)
                 for step in range(steps):
-                    self._exchanges += 1
-                    self._open = self._exchanges
-                    self._exchange(now, slot, phase, step)
-                    now = start + (phase + (step + 1) / steps) * length
-                    self._arrivals(now)
-                    self._close(now, phase)
+                    end = start + (phase + (step + 1) / steps) * self._length
+                    self._exchange(now, end, slot, phase, step)
+                    now = end
             phase += 1
+
+    def _sample(self, slot: int, start: float) -> None:
+        if slot in self._samples:
+            self._sampled.append((slot, start, self._reached()))
+            self._done.append([SAMPLING, len(self._sampled) - 1, 0, 0])
+
+
+class Exchanges(Programme):
+    """Makes the slots of one run, as SlotProcess of the processes does, without the estimates; only
+    the mass of push-sum is looked at, where nodes may stop.
+    """
+
+    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+        super().__init__(scenario)
+        self._loss, self._shared = scenario.network.channel.loss, scenario.network.channel.symmetric
+        self._index = scenario.topology.index
+        self._talking = sorted({node for link in scenario.topology.links for node in link})
+        self._random = streams.generator("matching")
+        self._silent = silent(scenario)
+        self._stopping = stopping(scenario)
+        self._ways: dict[Link, list[Way]] = {}
+        self._fates: dict[Link, list[Iterator[tuple[float, bool, float]]]] = {}
+        self._last: dict[Link, list[tuple[float, bool, float]]] = {}
+        if self._algorithm.talks:
+            for k, (i, j) in enumerate(scenario.topology.links):
+                self._connect(streams, (i, j), k)
+        self._open, self._exchanges, self._order = -1, 0, 0
+        self._mail: list[tuple[float, int, int, Way, int, float, int, int]] = []
+        self._inbox: dict[int, dict[int, tuple[int, float, float]]] = {}
+
+    def _connect(self, streams: Streams, link: Link, k: int) -> None:
+        scenario, (i, j) = self._scenario, link
+        ways = [Way(scenario, streams, (i, j), 2 * k)]
+        if not scenario.topology.directed:
+            ways.append(Way(scenario, streams, (j, i), 2 * k + 1))
+        self._ways[link] = ways
+        own = ways[:1] if self._shared else ways
+        self._fates[link] = [way.fates() for way in own]
+
+    def following(self) -> Slots | None:
+        """The next slots; None when all is done."""
+        if self._over:
+            return None
+        self._begin()
+        self._rows: list[Row] = []
+        self._messages: list[tuple[int, int, float]] = []
+        over = False
+        while not over and len(self._rows) + len(self._messages) < MOST_ROWS:
+            over = self._one_slot()
+        if over:
+            self._arrivals(np.inf)
+        self._over = over
+        kind, number, first, after = np.array(self._done, dtype=np.int64).reshape(-1, 4).T.copy()
+        places = np.array([m[:2] for m in self._messages], dtype=np.int64).reshape(-1, 2).T.copy()
+        weight = np.array([m[2] for m in self._messages], dtype=np.float64)
+        return Slots(
+            kind, number, first, after, places[0], places[1], weight,
+            self._slots, self._sampled, np.array(self._rows, dtype=EVENT),
+        )  # fmt: skip
 
     def _note(self, row: Row) -> None:
         if self._noted:
             self._rows.append(row)
 
-    def _sense(self, slot: int, now: float) -> None:
-        if slot == 0 and not self._algorithm.predicts:
-            return  # a filtered estimate starts from what is known before any reading
+    def _sense(self, now: float) -> None:
         for node in self._scenario.sensing:
             self._note((now, SENSE, node, -1, -1, -1, NAN))
-        self._done.append((SENSING, len(self._slots) - 1, 0, 0))
 
-    def _sample(self, slot: int, start: float) -> None:
-        if slot in self._samples:
-            self._done.append((SAMPLING, len(self._sampled), 0, 0))
-            self._sampled.append((slot, start, len(self._rows)))
+    def _reached(self) -> int:
+        return len(self._rows)
 
-    def _exchange(self, now: float, slot: int, phase: int, step: int) -> None:
+    def _exchange(self, now: float, end: float, slot: int, phase: int, step: int) -> None:
+        self._exchanges += 1
+        self._open = self._exchanges
+        self._send_all(now, slot, phase, step)
+        self._arrivals(end)
+        self._close(end, phase)
+
+    def _send_all(self, now: float, slot: int, phase: int, step: int) -> None:
         activation, topology = self._scenario.network.activation, self._scenario.topology
         pairs, up = list(topology.links), None
         broadcast = not self._algorithm.pairwise
@@ -263,7 +299,7 @@ class Exchanges:
             self._note(row)
         self._inbox.clear()
         self._open = -1
-        self._done.append((EXCHANGING, phase, first, len(self._messages)))
+        self._done.append([EXCHANGING, phase, first, len(self._messages)])
 
     def _stops(self, now: float, first: int) -> list[tuple[int, Row]]:
         """The rows of the nodes that stop with the exchange of messages from ``first`` on."""

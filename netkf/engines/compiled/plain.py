@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.draws import Draws
 from netkf.core.streams import Streams
@@ -20,13 +19,12 @@ from netkf.engines.compiled.exchanges import (
     LOST,
     MOST_ROWS,
     ROUND,
-    SAMPLING,
     SEND,
     SENSE,
-    SENSING,
     SWAP,
     TICK,
     Exchanges,
+    Programme,
     Slots,
     silent,
 )
@@ -67,17 +65,13 @@ class Exchange(NamedTuple):
     noted: bool
 
 
-class PlainExchanges:
+class PlainExchanges(Programme):
     """Makes the slots of one run."""
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        algorithm, topology, loss = (
-            scenario.filter.algorithm,
-            scenario.topology,
-            scenario.network.channel.loss,
-        )
-        assert isinstance(algorithm, SlotFilter)
-        self._scenario, self._algorithm = scenario, algorithm
+        super().__init__(scenario)
+        algorithm, topology = self._algorithm, scenario.topology
+        loss = scenario.network.channel.loss
         self._random = streams.generator("matching")
         links = topology.links if algorithm.talks else ()
         self._place = {link: k for k, link in enumerate(links)}
@@ -101,8 +95,6 @@ class PlainExchanges:
         phases = range(algorithm.programme.count("exchange"))
         talks = [[(node, phase) not in quiet for node in scenario.nodes] for phase in phases]
         self._talks = np.array(talks, dtype=bool).reshape(len(phases), len(scenario.nodes))
-        self._length = scenario.phase_length if algorithm.talks else 0.0
-        self._samples, self._slot, self._over = set(scenario.slots), 0, False
         steps = sum(algorithm.steps(phase) for phase in phases)
         rows = len(scenario.sensing) + steps * (2 * self._sender.size + len(scenario.nodes))
         self._together = max(1, MOST_ROWS // max(rows, 1))
@@ -111,9 +103,7 @@ class PlainExchanges:
         """The next slots; None when all is done."""
         if self._over:
             return None
-        self._done: list[list[int]] = []
-        self._slots: list[int] = []
-        self._sampled: list[tuple[int, float, int]] = []
+        self._begin()
         self._exchanges: list[Exchange] = []
         self._pairs: list[list[int]] = []
         self._sensed: list[tuple[int, float]] = []
@@ -121,54 +111,24 @@ class PlainExchanges:
             self._over = self._one_slot()
         return self._made()
 
-    def _one_slot(self) -> bool:
-        """Plan one slot; True when nothing comes after it."""
-        scenario, algorithm, slot = self._scenario, self._algorithm, self._slot
-        start = scenario.slot_plant.slot_time(slot)
-        last = scenario.slot_plant.over(slot, scenario.horizon)
-        if last and slot not in self._samples:
-            return True
-        self._slots.append(slot)
-        if algorithm.predicts:
-            self._sample(slot, start)
-        if not (last and algorithm.predicts):
-            self._programme(slot, start, not last)  # the horizon is half open
-            if not algorithm.predicts:
-                self._sample(slot, start)
-        self._slot += 1
-        return last
+    def _arrivals(self, until: float) -> None:
+        """Everything arrives when it is sent."""
 
-    def _programme(self, slot: int, start: float, noted: bool) -> None:
-        algorithm, phase, now = self._algorithm, 0, start
-        for kind in algorithm.programme:
-            if kind == "sense":
-                if slot > 0 or algorithm.predicts:
-                    if noted:
-                        self._sensed.append((len(self._done), now))
-                    self._done.append([SENSING, len(self._slots) - 1, 0, 0])
-                continue
-            if algorithm.talks and slot >= algorithm.first_slot:
-                length, steps = self._length, algorithm.steps(phase)
-                for step in range(steps):
-                    end = start + (phase + (step + 1) / steps) * length
-                    fresh = algorithm.redraws(phase, step)
-                    made = Exchange(len(self._done), now, end, phase, fresh, noted)
-                    self._exchanges.append(made)
-                    self._draw_pairs()
-                    self._done.append([EXCHANGING, phase, 0, 0])
-                    now = end
-            phase += 1
+    def _sense(self, now: float) -> None:
+        if self._noted:
+            self._sensed.append((len(self._done), now))
 
-    def _draw_pairs(self) -> None:
-        activation = self._scenario.network.activation
+    def _reached(self) -> int:
+        return len(self._done)
+
+    def _exchange(self, now: float, end: float, slot: int, phase: int, step: int) -> None:
+        fresh, activation = self._algorithm.redraws(phase, step), self._scenario.network.activation
+        made = Exchange(len(self._done), now, end, phase, fresh, self._noted)
+        self._exchanges.append(made)
         if isinstance(activation, Matching):
             pairs = activation.draw(self._scenario.topology, self._random)
             self._pairs.append([self._place[pair] for pair in pairs])
-
-    def _sample(self, slot: int, start: float) -> None:
-        if slot in self._samples:
-            self._sampled.append((slot, start, len(self._done)))
-            self._done.append([SAMPLING, len(self._sampled) - 1, 0, 0])
+        self._done.append([EXCHANGING, phase, 0, 0])
 
     def _made(self) -> Slots:
         item, now, end, phase, fresh, noted = (
