@@ -33,3 +33,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted([*_HERE, "kinds"])
+
+
+__all__ = __dir__()  # noqa: PLE0605 - as it was made

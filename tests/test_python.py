@@ -11,6 +11,12 @@ import netkf
 from netkf.experiments.run import run_to_directory
 
 
+def test_all_parts_can_be_taken_at_once():
+    names = {}
+    exec("from netkf.parts import *", names)
+    assert {"Scenario", "Hybrid", "Poisson", "FlowFilter", "setting", "kinds"} <= names.keys()
+
+
 def test_a_scenario_can_be_built_from_public_parts(ring):
     parts = netkf.parts
     built = netkf.Scenario(

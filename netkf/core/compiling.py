@@ -11,6 +11,7 @@ import hashlib
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from functools import cache, wraps
 from pathlib import Path
@@ -29,6 +30,7 @@ _marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
 _known: set[Callable[..., Any]] = set()
 _in_place: set[Callable[..., Any]] = set()
 _said: set[Callable[..., Any]] = set()
+_spent: list[float] = []
 
 
 def compilable(function: Function) -> Function:
@@ -83,14 +85,20 @@ def _moderately_optimised(made: Any, config: Any) -> None:
     compile_for = made._compile_for_args
 
     def moderately(*args: Any, **kwargs: Any) -> Any:
-        before = config.OPT
+        before, began = config.OPT, time.perf_counter()
         config.OPT = type(before)(2)
         try:
             return compile_for(*args, **kwargs)
         finally:
             config.OPT = before
+            _spent.append(time.perf_counter() - began)
 
     made._compile_for_args = moderately
+
+
+def seconds_spent() -> float:
+    """On compiling, or loading what is kept, in this process so far."""
+    return sum(_spent)
 
 
 def announce(function: Callable[..., Any]) -> None:

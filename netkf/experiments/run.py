@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 import netkf
+from netkf.core import compiling
 from netkf.core.errors import ScenarioError
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, silent
@@ -73,10 +74,11 @@ def run_to_directory(
     manifest = Manifest(directory, scenario.name, scenario.seed, 0, chosen.name)
     # Written at once, so that a run that is killed outright says that it did not finish.
     manifest.write("interrupted", {})
-    began, done = time.perf_counter(), False
+    began, compiled, done = time.perf_counter(), compiling.seconds_spent(), False
     try:
         status = chosen.run(scenario, Streams(scenario.seed, 0), recorder, progress)
-        seconds, done = time.perf_counter() - began, status == "complete"
+        compiled = compiling.seconds_spent() - compiled
+        seconds, done = time.perf_counter() - began - compiled, status == "complete"
         tables.close()
         promised = promise(scenario, np.array(samples.times))
         summary = _summary(directory, scenario, samples, promised, recorder.count, recorder.sums)

@@ -226,6 +226,13 @@ def test_a_module_that_does_not_travel_is_named(tmp_path, capsys, monkeypatch):
     assert len(err.splitlines()) == 1
 
 
+def test_seconds_are_those_of_the_simulation(ring, tmp_path, monkeypatch):
+    """Not of compiling, which only the first run has to wait for."""
+    spent = iter((5.0, 1005.0))
+    monkeypatch.setattr("netkf.core.compiling.seconds_spent", lambda: next(spent))
+    assert run_to_directory(ring, tmp_path / "out").seconds < -900.0
+
+
 def test_half_a_row_group_gets_no_name(ring, tmp_path, monkeypatch):
     def full(self, table):
         raise OSError(28, "No space left on device")
