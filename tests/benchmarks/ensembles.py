@@ -1,8 +1,9 @@
 """What an ensemble costs beside its simulations: ``python -m tests.benchmarks.ensembles``.
 
-Prints the share of the processor time that 1000 short runs spend outside the engine, in one
-process; how much faster two processes do 200 runs of the ring; and how much faster compiled runs of
-the ring are side by side than one after the other. Asserts the same results and no seconds.
+Prints the share of the processor time that 1000 short runs of SimPy spend outside the engine, in
+one process; how much faster two processes do 200 runs of the ring by SimPy; and how much faster
+compiled runs of the ring are side by side than one after the other. Asserts the same results and
+no seconds.
 """
 
 import statistics
@@ -15,6 +16,7 @@ from netkf.engines.processes.engine import ProcessesEngine
 from tests.conftest import SCENARIOS
 
 TOGETHER = 4096
+SIMPY = ProcessesEngine()  # with nothing compiled
 
 
 def outside(scenario, runs):
@@ -29,15 +31,15 @@ def outside(scenario, runs):
         finally:
             inside += time.process_time() - began
 
-    netkf.monte_carlo(scenario, 10, workers=1)
+    netkf.monte_carlo(scenario, 10, workers=1, engine=SIMPY)
     ProcessesEngine.run = timed
     began = time.process_time()
-    netkf.monte_carlo(scenario, runs, workers=1)
+    netkf.monte_carlo(scenario, runs, workers=1, engine=SIMPY)
     ProcessesEngine.run = plain
     return 1.0 - inside / (time.process_time() - began)
 
 
-def seconds(scenario, runs, workers, engine="auto"):
+def seconds(scenario, runs, workers, engine):
     """Wall time, with worker processes that start anew, and the mean of P."""
     began = time.perf_counter()
     found = netkf.monte_carlo(scenario, runs, workers=workers, engine=engine)
@@ -69,7 +71,7 @@ if __name__ == "__main__":
     ring = netkf.load(SCENARIOS / "poisson_ring.toml")
     share = outside(ring.replace({"horizon": 2.0}), 1000)
     print(f"outside the engine: {100.0 * share:.1f} % of the time of 1000 short runs")
-    ratio = seconds(ring, 200, 1)[0] / seconds(ring, 200, 2)[0]
+    ratio = seconds(ring, 200, 1, SIMPY)[0] / seconds(ring, 200, 2, SIMPY)[0]
     print(f"two processes are {ratio:.2f} times as fast as one for 200 runs of the ring")
     one, two = side_by_side(ring)
     print(
