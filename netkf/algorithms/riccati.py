@@ -100,14 +100,17 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
     blocks = exponential_series(M, TAYLOR_TERMS)
     blocks[:, :n, n:] /= scale
     blocks[:, n:, :n] *= scale
-    moves, grows = exponential_series(A, TAYLOR_TERMS), growth_series(A, Q, TAYLOR_TERMS)
-    both = (blocks, moves), (moves, grows)
-    series, lean = (
-        np.concatenate([part.reshape(TAYLOR_TERMS, -1) for part in parts], axis=1) for parts in both
-    )
-    lean = lean if blind else lean[:0]
+    moves = exponential_series(A, TAYLOR_TERMS)
+    series, lean = _side_by_side(blocks, moves), np.zeros((0, 2 * n * n))
+    if blind:
+        lean = _side_by_side(moves, growth_series(A, Q, TAYLOR_TERMS))
     levels = max(1, int(longest / unit).bit_length())
     return RiccatiTable(n, unit, series, lean, *_triples(M, scale, A, unit, levels))
+
+
+def _side_by_side(one: FloatArray, other: FloatArray) -> FloatArray:
+    """(terms, ...) coefficients of two matrices as rows (terms, size)."""
+    return np.concatenate([part.reshape(len(part), -1) for part in (one, other)], axis=1)
 
 
 def _triples(

@@ -42,26 +42,27 @@ class Paths:
     def _stretches(self, blocks: list[Block]) -> list[Stretch]:
         step = np.concatenate([BLOCK * k + block.step for k, block in enumerate(blocks)])
         ends = np.concatenate([block.ends for block in blocks])
-        nobody = np.empty((0, 0))
-        common = Stretch(
-            end=float(ends[-1]),
-            start=np.concatenate([block.start for block in blocks]),
-            stop=np.concatenate([block.end for block in blocks]),
-            x_start=nobody,
-            x_stop=nobody,
-            moments=nobody,
-            cubic=nobody,
-            step=step,
-            last=ends[step],
-            grid=ends[ends < self._horizon] if self._senses else np.empty(0),
-            series=self._paths.laws.series,
-        )
+        start = np.concatenate([block.start for block in blocks])
+        stop = np.concatenate([block.end for block in blocks])
+        grid = ends[ends < self._horizon] if self._senses else np.empty(0)
         random = (
             np.concatenate(column, axis=1)
             for column in zip(*(block[2:6] for block in blocks), strict=True)
         )
         return [
-            common._replace(x_start=x_start, x_stop=x_stop, moments=moments, cubic=cubic)
+            Stretch(
+                end=float(ends[-1]),
+                start=start,
+                stop=stop,
+                x_start=x_start,
+                x_stop=x_stop,
+                moments=moments,
+                cubic=cubic,
+                step=step,
+                last=ends[step],
+                grid=grid,
+                series=self._paths.laws.series,
+            )
             for x_start, x_stop, moments, cubic in zip(*random, strict=True)
         ]
 
@@ -112,20 +113,23 @@ class Noise:
             normals=np.zeros((runs, count, cuts, 2, most)),
             used=np.full((runs, count), cuts, dtype=np.int64),
         )
-        common = Sensing(
-            rows=np.array(self._rows, dtype=np.int64),
-            H=H,
-            root=root,
-            rest=self._own.rest[0],
-            step=self._own.step[0],
-            noise=self._own.noise[0],
-            normals=self._own.normals[0],
-            used=self._own.used[0],
-            host=np.array(hosts, dtype=np.int64),
-            node=np.array(scenario.sensing, dtype=np.int64),
-        )
-        each = zip(*self._own, strict=True)
-        self.sensing = [common._replace(**Own(*mine)._asdict()) for mine in each]
+        rows, host = np.array(self._rows, dtype=np.int64), np.array(hosts, dtype=np.int64)
+        node = np.array(scenario.sensing, dtype=np.int64)
+        self.sensing = [
+            Sensing(
+                rows=rows,
+                H=H,
+                root=root,
+                rest=self._own.rest[run],
+                step=self._own.step[run],
+                noise=self._own.noise[run],
+                normals=self._own.normals[run],
+                used=self._own.used[run],
+                host=host,
+                node=node,
+            )
+            for run in range(runs)
+        ]
 
     def following(self) -> None:
         """Draw the noise of the next stretch."""

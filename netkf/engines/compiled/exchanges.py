@@ -162,7 +162,6 @@ class Exchanges(Programme):
         super().__init__(scenario)
         self._loss, self._shared = scenario.network.channel.loss, scenario.network.channel.symmetric
         self._index = scenario.topology.index
-        self._talking = sorted({node for link in scenario.topology.links for node in link})
         self._random = streams.generator("matching")
         self._silent = silent(scenario)
         self._stopping = stopping(scenario)
@@ -192,12 +191,10 @@ class Exchanges(Programme):
         self._begin()
         self._rows: list[Row] = []
         self._messages: list[tuple[int, int, float]] = []
-        over = False
-        while not over and len(self._rows) + len(self._messages) < MOST_ROWS:
-            over = self._one_slot()
-        if over:
+        while not self._over and len(self._rows) + len(self._messages) < MOST_ROWS:
+            self._over = self._one_slot()
+        if self._over:
             self._arrivals(np.inf)
-        self._over = over
         kind, number, first, after = np.array(self._done, dtype=np.int64).reshape(-1, 4).T.copy()
         places = np.array([m[:2] for m in self._messages], dtype=np.int64).reshape(-1, 2).T.copy()
         weight = np.array([m[2] for m in self._messages], dtype=np.float64)

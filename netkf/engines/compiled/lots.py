@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cached_property
 
 from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.draws import Noise, Paths
@@ -51,37 +52,49 @@ class Lots:
     """
 
     def __init__(self, scenario: Scenario, seed: int, first: int, stop: int) -> None:
-        self.scenario, self.seed = scenario, seed
+        self._scenario, self._seed = scenario, seed
         self._next, self._stop = first, stop
         self._draws: dict[int, OfLot] = {}
-        self._desk: Desk | None = None
-        self._size = -1
-        self.taken = threading.Lock()
-        """While a run is at the desk; another one, within it or in another thread, has its own."""
+        self._taken = threading.Lock()
+
+    @cached_property
+    def _size(self) -> int:
+        return lot_size(self._scenario)
+
+    @cached_property
+    def _desk(self) -> Desk:
+        return Desk(self._scenario)
+
+    def take(self, scenario: Scenario, streams: Streams) -> bool:
+        """Whether such runs are expected and the desk was free; it is taken then, and a run within
+        this one or in another thread has its own.
+        """
+        expected = scenario is self._scenario and streams.seed == self._seed
+        return expected and type(streams) is Streams and self._taken.acquire(blocking=False)
+
+    def leave(self) -> None:
+        """The desk is free again."""
+        self._taken.release()
 
     def prepared(self, replica: int) -> tuple[Desk, OfLot] | None:
         """For the run of a replica, once; None where it had better draw for itself."""
-        if self._size < 0:
-            self._size = lot_size(self.scenario)
         drawn = replica in self._draws
         if self._size < 2 or not (drawn or self._next <= replica < self._stop):
             return None
         if not drawn:
             self._draw(replica)
-        if self._desk is None:
-            self._desk = Desk(self.scenario)
         self._desk.clear()
         return self._desk, self._draws.pop(replica)
 
     def _draw(self, replica: int) -> None:
         count = min(self._size, self._stop - replica)
-        streams = Together(self.seed, replica, count)
-        windows = whole_schedules(self.scenario, streams)
-        stretches = Paths(self.scenario, streams).whole()
+        streams = Together(self._seed, replica, count)
+        windows = whole_schedules(self._scenario, streams)
+        stretches = Paths(self._scenario, streams).whole()
         steps = int(stretches[0].step[-1]) + 1
         ticks = max(len(window.t) for window in windows)
-        cuts = 16 + len(self.scenario.times) + 3 * ticks // len(self.scenario.nodes)
-        noise = Noise(self.scenario, streams, steps, cuts)
+        cuts = 16 + len(self._scenario.times) + 3 * ticks // len(self._scenario.nodes)
+        noise = Noise(self._scenario, streams, steps, cuts)
         noise.following()
         for run in range(count):
             noise.more_cuts(run)
@@ -125,16 +138,11 @@ def together(scenario: Scenario, seed: int, first: int, stop: int) -> Iterator[N
 @contextmanager
 def at_a_desk(scenario: Scenario, streams: Streams) -> Iterator[tuple[Desk, Draws]]:
     """What a run works with: drawn with others where it was expected, else its own."""
-    lots, prepared = _expected.get(), None
-    known = lots is not None and lots.scenario is scenario and lots.seed == streams.seed
-    if lots is None or not known or type(streams) is not Streams:
+    lots = _expected.get()
+    if lots is None or not lots.take(scenario, streams):
         yield Desk(scenario), Source(scenario, streams)
         return
-    taken = lots.taken.acquire(blocking=False)
     try:
-        if taken:
-            prepared = lots.prepared(streams.replica)
-        yield prepared or (Desk(scenario), Source(scenario, streams))
+        yield lots.prepared(streams.replica) or (Desk(scenario), Source(scenario, streams))
     finally:
-        if taken:
-            lots.taken.release()
+        lots.leave()

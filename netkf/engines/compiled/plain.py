@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.draws import Draws
 from netkf.core.streams import Streams
 from netkf.engines.compiled.exchanges import (
     ABSORB,
@@ -29,6 +28,7 @@ from netkf.engines.compiled.exchanges import (
     silent,
 )
 from netkf.engines.compiled.masses import stopping
+from netkf.engines.compiled.schedule import way_chances, way_luck
 from netkf.network.channels import alike
 from netkf.network.matchings import Broadcast, Matching
 from netkf.scenario.scenario import Scenario
@@ -71,7 +71,6 @@ class PlainExchanges(Programme):
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
         super().__init__(scenario)
         algorithm, topology = self._algorithm, scenario.topology
-        loss = scenario.network.channel.loss
         self._random = streams.generator("matching")
         links = topology.links if algorithm.talks else ()
         self._place = {link: k for k, link in enumerate(links)}
@@ -82,13 +81,9 @@ class PlainExchanges(Programme):
         self._sender = ends[:, : len(ways)]
         self._receiver = ends[:, ::-1][:, : len(ways)]
         self._weight = np.array([[scenario.weight(j, i) for i, j in some] for some in ways]).T
-        self._chance = np.array(
-            [[loss.chance(way, 0, False, scenario.measured(way)) for way in some] for some in ways]
-        ).T
-        shared = scenario.network.channel.symmetric
-        lucky = [] if loss.certain else ways[:1] if shared else ways
-        self._draws = [Draws(streams, "loss", some) for some in lucky]
-        self._luck = np.zeros((len(links), max(1, len(lucky))))
+        self._chance = way_chances(scenario, ways).T
+        self._draws = way_luck(scenario, streams, ways)
+        self._luck = np.zeros((len(links), max(1, len(self._draws))))
         self._known = np.zeros(len(links), dtype=bool)
         self._sent = np.zeros(self._sender.shape, dtype=np.int64)
         quiet = silent(scenario)

@@ -268,11 +268,9 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 weight = weights[way_of[message] // 2, way_of[message] % 2]
                 if age > 0.0:
                     oldest = max(oldest, age)
-                    m = len(unit) - 1
-                    if age >= unit[m]:
-                        gap = move_far(models, m, mail_P, mail_x, message, age, room)
-                    else:
-                        gap = age
+                    m, gap = len(unit) - 1, age
+                    if gap >= unit[m]:
+                        gap = move_far(models, m, mail_P, mail_x, message, gap, room)
                     if gap > 0.0:
                         move_blind(unit[m], blind[m], mail_P, mail_x, message, gap, E, X)
                 if parts is None:

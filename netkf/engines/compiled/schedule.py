@@ -9,6 +9,7 @@ hundreds of thousands of them with a few ticks each.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -112,6 +113,25 @@ class Clocks:
         return next_ticks(self._clock, link, origin, index, now, random, int(count))
 
 
+def way_chances(scenario: Scenario, ways: Sequence[Sequence[Link]]) -> FloatArray:
+    """(ways, L): the one chance that all messages of a direction have, where losses are alike."""
+    loss = scenario.network.channel.loss
+    return np.array(
+        [[loss.chance(way, 0, False, scenario.measured(way)) for way in some] for some in ways]
+    )
+
+
+def way_luck(
+    scenario: Scenario, streams: Streams | Together, ways: Sequence[Sequence[Link]]
+) -> list[Draws]:
+    """What decides about them: of both ways together where they share their fate, and nothing where
+    nothing is left to decide.
+    """
+    channel = scenario.network.channel
+    drawn = ways[:1] if channel.symmetric else ways
+    return [] if channel.loss.certain else [Draws(streams, "loss", some) for some in drawn]
+
+
 class Fortunes:
     """The fates of all messages, run by run, activation after activation of each link."""
 
@@ -123,21 +143,12 @@ class Fortunes:
         self._ways = tuple(ways * runs for ways in both)
         measured = [[scenario.measured(way) for way in ways] for ways in both]
         self._measured = np.tile(measured, runs)
-        drawn = both[:1] if channel.symmetric else both
-        loss = channel.loss
-        self._alike = alike(loss)
+        self._alike = alike(channel.loss)
         self._plain = self._alike and channel.delay.fixed is not None
         if self._alike:
-            self._chances = np.tile(
-                [
-                    [loss.chance(w, 0, False, m) for w, m in zip(ways, some, strict=True)]
-                    for ways, some in zip(both, measured, strict=True)
-                ],
-                runs,
-            )
+            self._chances = np.tile(way_chances(scenario, both), runs)
         if self._plain:
-            lucky = () if loss.certain else drawn
-            self._luck = [Draws(streams, "loss", ways) for ways in lucky]
+            self._luck = way_luck(scenario, streams, both)
         else:
             self._fates = [
                 [
@@ -145,7 +156,7 @@ class Fortunes:
                     for made in (one.seeded(needed(channel), ways) for one in streams.each)
                     for way in ways
                 ]
-                for ways in drawn
+                for ways in (both[:1] if channel.symmetric else both)
             ]
 
     def of(self, links: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
