@@ -166,7 +166,8 @@ class Recorder:
 
     def samples(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         """Record some samples, which nobody writes to from now on."""
-        self._do(self._show, t, x, xhat, P)
+        with undisturbed():  # what one sink has seen all have
+            self._do(self._show, t, x, xhat, P)
 
     def _show(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
         for sink in self._sinks:

@@ -1,6 +1,8 @@
 """Tables, fingerprints, differences."""
 
 import hashlib
+import os
+import signal
 import threading
 
 import numpy as np
@@ -130,6 +132,30 @@ def test_what_fails_in_the_other_thread_fails_the_run():
         record.extend(block(1, recorder.LONG))
     with pytest.raises(OSError, match="the disk is full"):
         record.flush()
+
+
+class Interrupted(MemorySink):
+    """Ctrl-C comes while it takes a block."""
+
+    def events(self, rows):
+        os.kill(os.getpid(), signal.SIGINT)
+        super().events(rows)
+
+    def states(self, t, x, xhat, P):
+        os.kill(os.getpid(), signal.SIGINT)
+        super().states(t, x, xhat, P)
+
+
+def test_an_interrupt_leaves_every_sink_with_the_same():
+    sinks = [MemorySink(), Interrupted(), MemorySink()]
+    log = recorder.Recorder(sinks)
+    with pytest.raises(KeyboardInterrupt):
+        log.extend(block(0, 3))
+    with pytest.raises(KeyboardInterrupt):
+        log.samples(np.zeros(2), np.zeros((2, 1)), np.zeros((2, 3, 1)), np.zeros((2, 3, 1, 1)))
+    assert [len(sink.blocks) for sink in sinks] == [1, 1, 1]
+    assert [len(sink.samples) for sink in sinks] == [1, 1, 1]
+    assert log.total == 3
 
 
 def test_first_difference_names_the_event(ring):
