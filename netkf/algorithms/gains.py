@@ -20,13 +20,16 @@ from netkf.algorithms.riccati import exponential_series, hamiltonian
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import in_place
 from netkf.core.legendre import MOMENTS, backward_coefficients
-from netkf.core.small import added, applied, fill_polynomial, polynomial
+from netkf.core.series import fill_polynomial, polynomial, with_reach
+from netkf.core.small import added, applied
 
 LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
 
 
 class GainTable(NamedTuple):
-    """Power series in the interval g of U (n, 2p), W (n, 2p) and the predictor C (2p, n)."""
+    """Power series in the interval g of U (n, 2p), W (n, 2p) and the predictor C (2p, n), with
+    their reach, see core/series.
+    """
 
     n: int
     moments: int
@@ -57,7 +60,7 @@ def gain_table(
     series[:-1, :size_U] = from_Y.reshape(terms, -1)
     series[:-1, size_U : 2 * size_U] = from_P.reshape(terms, -1)
     series[1:, 2 * size_U :] = seen.reshape(terms, -1)
-    return GainTable(n, MOMENTS * p, series)
+    return GainTable(n, MOMENTS * p, with_reach(series, longest))
 
 
 def longest_interval(A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> float:
@@ -89,7 +92,7 @@ def gain_move(
     ``moments`` (2p,) it writes innovations. ``values`` is room for a row of ``series``.
     """
     n, q = x.shape[1], len(moments)
-    fill_polynomial(values, series, len(series), gap)
+    fill_polynomial(values, series, gap)
     for m in range(q):
         for j in range(n):
             moments[m] -= values[(2 * q + m) * n + j] * x[k, j]

@@ -14,34 +14,31 @@ Where there are no readings, ``G = 0``, the rest needs no inverse: ``P(gap) = e 
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.core.arrays import FloatArray, symmetric
 from netkf.core.compiling import in_place
+from netkf.core.series import fill_polynomial, polynomial, with_reach
 from netkf.core.small import (
     added,
     applied,
     eliminate,
     even,
-    fill_polynomial,
-    polynomial,
     product,
     solution,
 )
 
 TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
-ENOUGH = np.array([(1e-18 * math.factorial(k)) ** (1 / max(k - 1, 1)) for k in range(TAYLOR_TERMS)])
-"""The largest share of a unit for which ``k`` terms are enough: share^k / k! <= 1e-18 share."""
 
 
 class RiccatiTable(NamedTuple):
     """Everything that depends on ``A, Q, G`` and not on ``P`` or the gap.
 
-    series : (terms, 5 n n) Taylor coefficients of the blocks of ``exp(M g)`` and of ``exp(A g)``
-    blind  : (terms, 2 n n) those of ``exp(A g)`` and of W where G = 0, else (0, 2 n n)
+    series : (terms, 5 n n + 1) Taylor coefficients of the blocks of ``exp(M g)`` and of
+             ``exp(A g)``, with their reach, see core/series
+    blind  : (terms, 2 n n + 1) those of ``exp(A g)`` and of W where G = 0, else no row
     unit   : gap that the series covers, seconds
     jump, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
     """
@@ -101,16 +98,17 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
     blocks[:, :n, n:] /= scale
     blocks[:, n:, :n] *= scale
     moves = exponential_series(A, TAYLOR_TERMS)
-    series, lean = _side_by_side(blocks, moves), np.zeros((0, 2 * n * n))
+    series, lean = _side_by_side(unit, blocks, moves), np.zeros((0, 2 * n * n + 1))
     if blind:
-        lean = _side_by_side(moves, growth_series(A, Q, TAYLOR_TERMS))
+        lean = _side_by_side(unit, moves, growth_series(A, Q, TAYLOR_TERMS))
     levels = max(1, int(longest / unit).bit_length())
     return RiccatiTable(n, unit, series, lean, *_triples(M, scale, A, unit, levels))
 
 
-def _side_by_side(one: FloatArray, other: FloatArray) -> FloatArray:
-    """(terms, ...) coefficients of two matrices as rows (terms, size)."""
-    return np.concatenate([part.reshape(len(part), -1) for part in (one, other)], axis=1)
+def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
+    """(terms, ...) coefficients of matrices as rows (terms, size + 1)."""
+    rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    return with_reach(rows, unit)
 
 
 def _triples(
@@ -149,17 +147,6 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return inverse
 
 
-@in_place
-def terms_for(share: float) -> int:
-    """How many terms of the series a gap of that share of a unit needs: the next one is below
-    double rounding of the first that depends on the gap.
-    """
-    terms = 2
-    while terms < TAYLOR_TERMS and share > ENOUGH[terms]:
-        terms += 1
-    return terms
-
-
 def hamiltonians(table: RiccatiTable, gaps: FloatArray) -> FloatArray:
     """(g, 2n, 2n) ``exp(M gap)`` for gaps (g,) of at most one unit."""
     n = table.n
@@ -170,13 +157,12 @@ def hamiltonians(table: RiccatiTable, gaps: FloatArray) -> FloatArray:
 def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, FloatArray]:
     """``exp(M gap)`` (2n, 2n) and ``exp(A gap)`` (n, n) for a gap of at most one unit."""
     n = table.n
-    values = polynomial(table.series[: terms_for(gap / table.unit)], gap)
+    values = polynomial(table.series, gap)
     return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
 
 
 @in_place
 def move_part(
-    unit: float,
     series: FloatArray,
     P: FloatArray,
     x: FloatArray,
@@ -191,7 +177,7 @@ def move_part(
     ``E`` (5 n n,), ``X`` (n + 1, n) and ``Y`` (n, n) are room to work in.
     """
     n = x.shape[1]
-    fill_polynomial(E, series, terms_for(gap / unit), gap)
+    fill_polynomial(E, series, gap)
     for i in range(n):  # X' and Y' are made as such
         total = 0.0
         for j in range(n):
@@ -214,7 +200,6 @@ def move_part(
 
 @in_place
 def move_blind(
-    unit: float,
     blind: FloatArray,
     P: FloatArray,
     x: FloatArray,
@@ -224,8 +209,8 @@ def move_blind(
     X: FloatArray,
 ) -> None:
     """``move_part`` where there are no readings."""
-    n, size = x.shape[1], blind.shape[1]
-    fill_polynomial(E[:size], blind, terms_for(gap / unit), gap)
+    n = x.shape[1]
+    fill_polynomial(E[: 2 * n * n], blind, gap)
     for i in range(n):
         X[n, i] = 0.0
         for j in range(n):
@@ -290,7 +275,7 @@ def part_of_unit(
     """``riccati_step`` for a gap of at most one unit."""
     n = table.n
     if len(table.blind):
-        values = polynomial(table.blind[: terms_for(gap / table.unit)], gap)
+        values = polynomial(table.blind, gap)
         transition, grown = values.reshape(2, n, n)
         return even(added(grown, product(transition, P), transition.T)), applied(transition, x)
     E, transition = evaluate_hamiltonian(table, gap)

@@ -40,7 +40,8 @@ class Ziggurat(NamedTuple):
 
 
 @cache
-def _ziggurat() -> Ziggurat:
+def ziggurat() -> Ziggurat:
+    """As numpy has it."""
     with np.load(Path(__file__).with_name("ziggurat.npz")) as kept:
         return Ziggurat(kept["fe"], kept["we"], kept["ke"])
 
@@ -134,27 +135,29 @@ def fill_exponentials(
 
 
 class Draws:
-    """The streams of one purpose of many entities, in order, run by run; needs numba."""
+    """The streams of one purpose of many entities, in order, run by run: their ``states`` (K, 4),
+    which drawing changes; needs numba.
+    """
 
     def __init__(
         self, streams: Streams | Together, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> None:
         words = streams.words(purpose, entities)
-        self._states = np.empty(words.shape, dtype=np.uint64)
-        _compiled(seed_states)(words, self._states)
+        self.states = np.empty(words.shape, dtype=np.uint64)
+        _compiled(seed_states)(words, self.states)
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """``Generator.random(count)`` of each of the entities in these places, one after the
         other.
         """
         out = np.empty(int(counts.sum()))
-        _compiled(fill_units)(self._states, which, counts, out)
+        _compiled(fill_units)(self.states, which, counts, out)
         return out
 
     def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """The same for ``Generator.standard_exponential``."""
         out = np.empty(int(counts.sum()))
-        _compiled(fill_exponentials)(self._states, which, counts, _ziggurat(), out)
+        _compiled(fill_exponentials)(self.states, which, counts, ziggurat(), out)
         return out
 
 

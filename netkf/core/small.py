@@ -63,27 +63,6 @@ def applied(a: FloatArray, x: FloatArray) -> FloatArray:
 
 
 @in_place
-def fill_polynomial(out: FloatArray, series: FloatArray, terms: int, gap: float) -> None:
-    """Write ``sum_k gap^k series[k]`` of the first ``terms`` into a vector (size,)."""
-    size = len(out)
-    for j in range(size):
-        out[j] = series[0, j]
-    power = 1.0
-    for k in range(1, terms):
-        power *= gap
-        for j in range(size):
-            out[j] += power * series[k, j]
-
-
-def polynomial(series: FloatArray, gap: float) -> FloatArray:
-    """``sum_k gap^k series[k]`` (size,) of (terms, size)."""
-    powers = np.empty(len(series))
-    powers[0] = 1.0
-    powers[1:] = gap
-    return np.asarray(np.multiply.accumulate(powers) @ series)
-
-
-@in_place
 def eliminate(  # noqa: PLR0912 - loops are what the compiler wants
     L: FloatArray, out: FloatArray, n: int
 ) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.legendre import forward_coefficients
-from netkf.core.small import polynomial
+from netkf.core.series import polynomial, with_reach
 
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
 MOST_GRIDS = 256  # kept stretches of the sensing grid
@@ -27,11 +27,12 @@ class Laws:
     def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
         self.n, self.period = len(A), period
         self._B = B
-        self.series = _response_series(A, period)
+        self.to_end, self.to_moments = _response_series(A, period)
         self.response = self.responses(period)
         self.spread = _factor(self._noise(period))
         self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
         self._grids: dict[tuple[int, int], FloatArray] = {}
+        self._powers = self.response[:1]
 
     def grid(self, first: int, count: int) -> FloatArray:
         """(count,) points of the sensing grid from number ``first`` on."""
@@ -42,9 +43,17 @@ class Laws:
                 self._grids[first, count] = known
         return known
 
+    def powers(self, count: int) -> FloatArray:
+        """(count, n, n): what a state adds to those 1, 2 ... steps later."""
+        while len(self._powers) < count:
+            more = self._powers @ self._powers[-1]
+            self._powers = np.concatenate([self._powers, more])
+        return self._powers[:count]
+
     def responses(self, gap: float) -> FloatArray:
         """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""
-        return np.asarray(polynomial(self.series, gap).reshape(3, self.n, self.n))
+        values = [polynomial(series, gap) for series in (self.to_end, self.to_moments)]
+        return np.concatenate(values).reshape(3, self.n, self.n)
 
     def _noise(self, gap: float) -> FloatArray:
         """(3 n, 20 m): responses of the end and the moments to noise at the quadrature nodes."""
@@ -97,8 +106,10 @@ class Laws:
         return gain, square_root(asked - gain @ cross.T)
 
 
-def _response_series(A: FloatArray, longest: float) -> FloatArray:
-    """(terms, 3 n n): power series in the gap of ``exp(A g)`` and of its two moments."""
+def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
+    """Power series in the gap of ``exp(A g)`` (terms, n n + 1) and of its two moments
+    (terms, 2 n n + 1), with their reach, see core/series.
+    """
     n, size = len(A), float(np.abs(A).sum(axis=0).max()) * longest
     terms, last = 1, 1.0
     while last > 1e-18 or terms < 8:
@@ -108,10 +119,10 @@ def _response_series(A: FloatArray, longest: float) -> FloatArray:
     for k in range(1, terms):
         exponential.append(exponential[-1] @ A / k)
     powers = np.stack(exponential)
-    series = np.zeros((terms + 1, 3, n, n))
-    series[:-1, 0] = powers
-    series[1:, 1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), powers)
-    return series.reshape(terms + 1, -1)
+    moments = np.zeros((terms + 1, 2, n, n))
+    moments[1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), powers)
+    to_end, to_moments = (series.reshape(len(series), -1) for series in (powers, moments))
+    return with_reach(to_end, longest), with_reach(to_moments, longest)
 
 
 def _factor(noise: FloatArray) -> FloatArray:

@@ -18,10 +18,11 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import in_place
-from netkf.core.small import added, applied, fill_polynomial, polynomial
+from netkf.core.series import fill_polynomial, polynomial
+from netkf.core.small import added, applied
 from netkf.plants.laws import Laws, grid_time
 
-BLOCK = 64  # steps drawn at once
+BLOCK = 64  # steps drawn at once, or a multiple of it
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
 _THREE_MOMENTS = np.stack([_THREE_WEIGHTS, _THREE_WEIGHTS * _THREE])
 
@@ -40,9 +41,9 @@ class Step(NamedTuple):
 
 
 class Block(NamedTuple):
-    """BLOCK steps as K pieces, since a step is cut where a state is shown: ``start, end`` (K,), x
+    """Some steps S as K pieces, since a step is cut where a state is shown: ``start, end`` (K,), x
     at both (K, n), ``moments`` (K, 2, n), ``cubic`` (K, 4, n) and whose ``step`` (K,) each is;
-    ``ends`` (BLOCK,) of the steps. What is random comes for B paths at once, (B, K, ...).
+    ``ends`` (S,) of the steps. What is random comes for B paths at once, (B, K, ...).
     """
 
     start: FloatArray
@@ -68,7 +69,7 @@ class DiffusionPaths:
     """The paths of B runs, which are cut at the same times: ``start`` (B, n), the sources of each,
     and the times ``shown`` (increasing) at which states are shown.
 
-    Each path is to the last bit what it is alone.
+    Each path is to the last bit what it is alone, and however many steps are drawn at once.
     """
 
     def __init__(
@@ -82,28 +83,53 @@ class DiffusionPaths:
         self.laws, self._randoms, self._probings, self._shown = laws, randoms, probings, shown
         self._x, self._drawn = start, 0
 
-    def following(self) -> Block:
-        """The next steps of the sensing grid."""
-        laws, (count, n) = self.laws, self._x.shape
-        normals = np.stack([random.standard_normal((BLOCK, 3 * n)) for random in self._randoms])
-        noise = (normals @ laws.spread.T).reshape(count, BLOCK, 3, n)
-        x = np.empty((count, BLOCK + 1, n))
-        x[:, 0] = self._x
-        onwards = laws.response[0].T
-        for k in range(BLOCK):
-            # Matrix by matrix, so that no path is rounded as its neighbours happen to be.
-            x[:, k + 1] = (x[:, k, None] @ onwards)[:, 0] + noise[:, k, 0]
-        self._x = x[:, BLOCK]
-        moments = _moved(laws.response[1:], x[:, :-1]) + noise[:, :, 1:]
-        times = laws.grid(self._drawn, BLOCK + 1)
-        self._drawn += BLOCK
+    def following(self, blocks: int = 1) -> Block:
+        """The next steps of the sensing grid, ``blocks`` times BLOCK."""
+        laws, (count, n), total = self.laws, self._x.shape, blocks * BLOCK
+        # Block by block, so that no path is rounded as its neighbours happen to be.
+        size = blocks, BLOCK, 3 * n
+        normals = np.stack([random.standard_normal(size) for random in self._randoms])
+        noise = (normals @ laws.spread.T).reshape(count * blocks, BLOCK, 3, n)
         cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
-        steps, ends = np.arange(BLOCK), times[1:]
-        whole = Block(times[:-1], ends, x[:, :-1], x[:, 1:], moments, cubic, steps, ends)
+        x = self._states(noise[:, :, 0].reshape(count, blocks, BLOCK, n))
+        before = x[:, :-1].reshape(count * blocks, BLOCK, n)
+        moments = _moved(laws.response[1:], before) + noise[:, :, 1:]
+        times = laws.grid(self._drawn, total + 1)
+        self._drawn += total
+        whole = Block(
+            start=times[:-1],
+            end=times[1:],
+            x_start=x[:, :-1],
+            x_end=x[:, 1:],
+            moments=moments.reshape(count, total, 2, n),
+            cubic=cubic.reshape(count, total, 4, n),
+            step=np.arange(total),
+            ends=times[1:],
+        )
         first, last = np.searchsorted(self._shown, times[[0, -1]], side="right")
         shown = self._shown[first:last]
         inside = shown[~np.isin(shown, whole.ends)]
         return self._cut(whole, inside) if len(inside) else whole
+
+    def _states(self, noise: FloatArray) -> FloatArray:
+        """(B, steps + 1, n) the states from the present one on, each step of which adds its noise
+        (B, blocks, BLOCK, n).
+        """
+        (count, blocks, _, n), powers = noise.shape, self.laws.powers(BLOCK)
+        added, far = noise.copy(), 1
+        while far < BLOCK:  # what the last 1, 2, 4 ... steps added
+            added[:, :, far:] += added[:, :, :-far] @ powers[far - 1].T
+            far *= 2
+        starts = np.empty((count, blocks + 1, 1, n))
+        starts[:, 0, 0] = self._x
+        for k in range(blocks):
+            starts[:, k + 1] = starts[:, k] @ powers[-1].T + added[:, k, -1:]
+        moved = starts[:, :-1] @ powers.reshape(-1, n).T
+        x = np.empty((count, blocks * BLOCK + 1, n))
+        x[:, 0] = self._x
+        x[:, 1:] = (moved.reshape(added.shape) + added).reshape(count, -1, n)
+        self._x = x[:, -1]
+        return x
 
     def _cut(self, block: Block, shown: FloatArray) -> Block:
         """The block with pieces that end at the times ``shown``, which are inside its steps."""
@@ -210,7 +236,7 @@ class DiffusionPath:
         one before the last one asked for.
         """
         step = self._at(end)
-        return seen(self.laws.series, step, start, end)
+        return seen(self.laws, step, start, end)
 
     def state(self, time: float) -> FloatArray:
         """x(time) on the sensing grid or at a time shown, not before the last one asked for."""
@@ -251,16 +277,16 @@ def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> 
             out[m, 3] += weight * (2.5 * square - 1.5) * z
 
 
-def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray:
-    """(2, n) moments of x over ``[start, end]`` inside a step; ``series`` is of the responses."""
+def seen(laws: Laws, step: Step, start: float, end: float) -> FloatArray:
+    """(2, n) moments of x over ``[start, end]`` inside a step."""
     n = len(step.x_start)
     if start == step.start and end == step.end:
         return step.moments
     since, gap = start - step.start, end - start
     x = step.x_start
     if since > 0.0:
-        x = applied(polynomial(series[:, : n * n], since).reshape(n, n), x)
-    plain = applied(polynomial(series, gap)[n * n :].reshape(2 * n, n), x).reshape(2, n)
+        x = applied(polynomial(laws.to_end, since).reshape(n, n), x)
+    plain = applied(polynomial(laws.to_moments, gap).reshape(2 * n, n), x).reshape(2, n)
     from_noise = np.empty((2, 4))
     _fill_legendre(from_noise, since, gap, step.end - step.start)
     return added(plain, from_noise, step.cubic)
@@ -269,7 +295,8 @@ def seen(series: FloatArray, step: Step, start: float, end: float) -> FloatArray
 @in_place
 def fill_seen(
     out: FloatArray,
-    series: FloatArray,
+    to_end: FloatArray,
+    to_moments: FloatArray,
     since: float,
     gap: float,
     length: float,
@@ -281,25 +308,25 @@ def fill_seen(
     from_noise: FloatArray,
 ) -> None:
     """``seen`` in loops, ``gap`` seconds from ``since`` on in piece ``k`` of ``length`` seconds,
-    into ``out`` (2, n); ``responses`` (3 n n,), ``x`` (n,) and ``from_noise`` (2, 4) are room to
+    into ``out`` (2, n); ``responses`` (2 n n,), ``x`` (n,) and ``from_noise`` (2, 4) are room to
     work in.
     """
     n = len(x)
     for i in range(n):
         x[i] = x_start[k, i]
     if since > 0.0:
-        fill_polynomial(responses, series, len(series), since)
+        fill_polynomial(responses[: n * n], to_end, since)
         for i in range(n):
             x[i] = 0.0
             for j in range(n):
                 x[i] += responses[i * n + j] * x_start[k, j]
-    fill_polynomial(responses, series, len(series), gap)
+    fill_polynomial(responses, to_moments, gap)
     _fill_legendre(from_noise, since, gap, length)
     for m in range(2):
         for i in range(n):
             total = 0.0
             for j in range(n):
-                total += responses[((m + 1) * n + i) * n + j] * x[j]
+                total += responses[(m * n + i) * n + j] * x[j]
             for c in range(4):
                 total += from_noise[m, c] * cubic[k, c, i]
             out[m, i] = total

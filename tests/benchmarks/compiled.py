@@ -34,7 +34,8 @@ import netkf
 from netkf.core.streams import Streams
 from netkf.engines.base import silent
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.engines.compiled.schedule import LinkDraws, Schedule, Window
+from netkf.engines.compiled.poisson import schedule
+from netkf.engines.compiled.schedule import LinkDraws, Window
 from netkf.engines.compiled.tables import host_tables, link_tables
 from netkf.engines.processes.engine import ProcessesEngine
 from netkf.theory import intermittent
@@ -64,16 +65,17 @@ def recorded_run(engine, case, recorder):
 def by_hand(table, window, ends, weights, xhat, P, now):
     """Flow both ends to each tick and reset who got a message; returns the number of ticks."""
     n = xhat.shape[1]
-    E = np.empty(table.shape[1])
+    E = np.empty(table.shape[1] - 1)
     X, Y = np.empty((n, n)), np.empty(n)
     for tick in range(len(window.t)):
         t, link = window.t[tick], window.link[tick]
         for side in range(2):
             h = ends[link, side]
-            gap, power = t - now[h], 1.0
+            gap, power, k = t - now[h], 1.0, 0
             for j in range(len(E)):
                 E[j] = table[0, j]
-            for k in range(1, table.shape[0]):
+            while gap > table[k, -1]:  # as many terms as the gap needs
+                k += 1
                 power *= gap
                 for j in range(len(E)):
                     E[j] += power * table[k, j]
@@ -113,10 +115,10 @@ def hand_written(case):
 
     def run():
         hosts, models = host_tables(case)
-        links, schedule = link_tables(case), Schedule(case, Streams(case.seed))
+        links, windows = link_tables(case), schedule(case, Streams(case.seed))
         series, ticks = models.blind[-1], 0
         while True:
-            window = schedule.following()
+            window = windows.following()
             ticks += fast(series, window, links.ends, links.weight, hosts.xhat, hosts.P, hosts.now)
             if math.isinf(window.end):
                 return ticks

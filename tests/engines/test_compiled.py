@@ -355,9 +355,13 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     monkeypatch.setattr(f"{module}.flow.FIRST_ROWS", 6)
     monkeypatch.setattr(f"{module}.flow.FIRST_MAIL", 2)
     monkeypatch.setattr(f"{module}.flow.MOST_SAMPLES", 2)
-    for blocks in ("netkf.plants.paths.BLOCK", f"{module}.draws.BLOCK"):
-        monkeypatch.setattr(blocks, 3)
-    monkeypatch.setattr(f"{module}.draws.CUTS", 1)
+    for room in ("plants.paths", "engines.compiled.draws", "engines.compiled.flow"):
+        monkeypatch.setattr(f"netkf.{room}.BLOCK", 3)
+    monkeypatch.setattr(f"{module}.draws.MOST_BLOCKS", 1)
+    monkeypatch.setattr(f"{module}.draws.LEAST_CUTS", 1)
+    monkeypatch.setattr(f"{module}.draws.MOST_CUTS", 1)
+    monkeypatch.setattr(f"{module}.poisson.TICKS", 5)
+    monkeypatch.setattr(f"{module}.poisson.TICKS_A_LINK", 0)
     monkeypatch.setattr(f"{module}.schedule.LEAST_TICKS", 5)
     monkeypatch.setattr(f"{module}.schedule.TICKS_A_LINK", 1)
     pieces = netkf.simulate(busy, engine="compiled")
@@ -529,12 +533,6 @@ def test_loops_are_what_numpy_says(n, seed):
     scale = np.linalg.cond(a)
     np.testing.assert_allclose(small._solution_loops(a, b), solved, rtol=1e-12 * scale)
     np.testing.assert_allclose(small.solution(a, b), solved, rtol=1e-12 * scale)
-    series = draw((7, 4))
-    sums = sum(0.3**k * row for k, row in enumerate(series))
-    filled = np.empty_like(sums)
-    small.fill_polynomial(filled, series, len(series), 0.3)
-    np.testing.assert_allclose(filled, sums, **close)
-    np.testing.assert_allclose(small.polynomial(series, 0.3), sums, **close)
 
 
 def test_a_singular_matrix_gives_nan_in_both():

@@ -12,17 +12,39 @@ from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.readings import Stretch
 from netkf.engines.compiled.tables import Sensing
-from netkf.plants.paths import BLOCK, Block
+from netkf.plants.laws import grid_time
+from netkf.plants.paths import BLOCK
 from netkf.plants.sensors import step_noise
 from netkf.scenario.scenario import Scenario
 
-CUTS = 64  # normals that a sensor has ready
+LEAST_CUTS, MOST_CUTS = 64, 256  # normals that a sensor has ready
+MOST_BLOCKS = 16  # of steps that are drawn at once
+MOST_NORMALS = 1 << 20  # of all sensors
+
+
+def blocks_to_the_end(scenario: Scenario) -> int:
+    """How many blocks of steps reach the horizon."""
+    period = scenario.truth.sensing_period
+    assert period is not None
+    blocks = max(1, int(scenario.horizon / (period * BLOCK)))
+    while grid_time(period, blocks * BLOCK) < scenario.horizon:
+        blocks += 1
+    return blocks
+
+
+def sizes(scenario: Scenario) -> tuple[int, int]:
+    """How many blocks of steps and how many cuts of each sensor are drawn at once in a run."""
+    rows = [len(scenario.sensors[place.entry].R) for p in scenario.placed.values() for place in p]
+    share = MOST_NORMALS // max(2 * sum(rows), 1)
+    blocks = min(MOST_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
+    return blocks, max(LEAST_CUTS, min(MOST_CUTS, share))
 
 
 class Paths:
-    """The paths of some runs as stretches of BLOCK steps."""
+    """The paths of some runs, as stretches of so many ``blocks`` of BLOCK steps."""
 
-    def __init__(self, scenario: Scenario, streams: Streams | Together) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams | Together, blocks: int) -> None:
+        self._blocks = blocks
         self._paths = scenario.truth.paths(
             streams.generators("plant", [()]), streams.generators("probe", [()]), scenario.times
         )
@@ -30,40 +52,25 @@ class Paths:
 
     def following(self) -> list[Stretch]:
         """The next stretch of each run; the last one reaches beyond the horizon."""
-        return self._stretches([self._paths.following()])
-
-    def whole(self) -> list[Stretch]:
-        """All of them, as one stretch of each run."""
-        blocks = [self._paths.following()]
-        while blocks[-1].ends[-1] < self._horizon:
-            blocks.append(self._paths.following())
-        return self._stretches(blocks)
-
-    def _stretches(self, blocks: list[Block]) -> list[Stretch]:
-        step = np.concatenate([BLOCK * k + block.step for k, block in enumerate(blocks)])
-        ends = np.concatenate([block.ends for block in blocks])
-        start = np.concatenate([block.start for block in blocks])
-        stop = np.concatenate([block.end for block in blocks])
+        block, laws = self._paths.following(self._blocks), self._paths.laws
+        ends = block.ends
         grid = ends[ends < self._horizon] if self._senses else np.empty(0)
-        random = (
-            np.concatenate(column, axis=1)
-            for column in zip(*(block[2:6] for block in blocks), strict=True)
-        )
         return [
             Stretch(
                 end=float(ends[-1]),
-                start=start,
-                stop=stop,
-                x_start=x_start,
-                x_stop=x_stop,
-                moments=moments,
-                cubic=cubic,
-                step=step,
-                last=ends[step],
+                start=block.start,
+                stop=block.end,
+                x_start=np.ascontiguousarray(block.x_start[run]),
+                x_stop=np.ascontiguousarray(block.x_end[run]),
+                moments=np.ascontiguousarray(block.moments[run]),
+                cubic=np.ascontiguousarray(block.cubic[run]),
+                step=block.step,
+                last=ends[block.step],
                 grid=grid,
-                series=self._paths.laws.series,
+                to_end=laws.to_end,
+                to_moments=laws.to_moments,
             )
-            for x_start, x_stop, moments, cubic in zip(*random, strict=True)
+            for run in range(len(block.x_start))
         ]
 
 
@@ -79,17 +86,16 @@ class Own(NamedTuple):
 
 class Noise:
     """The noise of all sensors in some runs: ``sensing`` of each run, filled stretch by stretch of
-    so many ``steps`` (BLOCK), and so many normals for cuts at once (CUTS).
+    so many ``steps``, and so many normals for cuts at once.
     """
 
     def __init__(
         self,
         scenario: Scenario,
         streams: Streams | Together,
-        steps: int = 0,
-        cuts: int = 0,
+        steps: int,
+        cuts: int,
     ) -> None:
-        steps, cuts = steps or BLOCK, cuts or CUTS
         placed = [(node, place) for node in scenario.sensing for place in scenario.placed[node]]
         sensors = [scenario.sensors[place.entry] for _, place in placed]
         keys = [(node, place.ordinal) for node, place in placed]

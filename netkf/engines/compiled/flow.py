@@ -16,7 +16,8 @@ from netkf.core import compiling
 from netkf.core.interrupts import undisturbed
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress
-from netkf.engines.compiled.draws import Noise, Paths
+from netkf.engines.compiled.draws import Noise, Paths, sizes
+from netkf.engines.compiled.poisson import schedule
 from netkf.engines.compiled.readings import Stretch
 from netkf.engines.compiled.replay import (
     DONE,
@@ -31,7 +32,7 @@ from netkf.engines.compiled.replay import (
     replay,
 )
 from netkf.engines.compiled.samples import recorded
-from netkf.engines.compiled.schedule import Schedule, Window
+from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.tables import (
     GRID_AT,
     PLACES,
@@ -48,6 +49,7 @@ from netkf.engines.compiled.tables import (
     room_for,
     room_for_parts,
 )
+from netkf.plants.paths import BLOCK
 from netkf.scenario.scenario import Scenario
 from netkf.trace import recorder as recording
 from netkf.trace.recorder import Recorder
@@ -85,8 +87,10 @@ class Source:
     def __init__(
         self, scenario: Scenario, streams: Streams, windows: Windows | None = None
     ) -> None:
-        self._windows = windows or Schedule(scenario, streams)
-        self._paths, self._noise = Paths(scenario, streams), Noise(scenario, streams)
+        self._windows = windows or schedule(scenario, streams)
+        blocks, cuts = sizes(scenario)
+        self._paths = Paths(scenario, streams, blocks)
+        self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
         self.sensing = self._noise.sensing[0]
 
     def window(self) -> Window:

@@ -14,11 +14,13 @@ from contextvars import ContextVar
 from functools import cached_property
 
 from netkf.core.streams import Streams, Together
-from netkf.engines.compiled.draws import Noise, Paths
+from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
 from netkf.engines.compiled.flow import Desk, Draws, Source
+from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson
 from netkf.engines.compiled.readings import Stretch
 from netkf.engines.compiled.schedule import Window, whole_schedules
 from netkf.network.clocks import LinkClock
+from netkf.plants.paths import BLOCK
 from netkf.scenario.scenario import Scenario
 
 LARGEST_LOT = 64
@@ -89,12 +91,15 @@ class Lots:
     def _draw(self, replica: int) -> None:
         count = min(self._size, self._stop - replica)
         streams = Together(self._seed, replica, count)
-        windows = whole_schedules(self._scenario, streams)
-        stretches = Paths(self._scenario, streams).whole()
-        steps = int(stretches[0].step[-1]) + 1
+        if is_poisson(self._scenario):
+            windows = PoissonSchedules(self._scenario, streams).whole()
+        else:
+            windows = whole_schedules(self._scenario, streams)
+        blocks = blocks_to_the_end(self._scenario)
+        stretches = Paths(self._scenario, streams, blocks).following()
         ticks = max(len(window.t) for window in windows)
         cuts = 16 + len(self._scenario.times) + 3 * ticks // len(self._scenario.nodes)
-        noise = Noise(self._scenario, streams, steps, cuts)
+        noise = Noise(self._scenario, streams, blocks * BLOCK, cuts)
         noise.following()
         for run in range(count):
             noise.more_cuts(run)

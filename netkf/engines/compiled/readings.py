@@ -23,7 +23,7 @@ class Stretch(NamedTuple):
 
     K pieces (a step is cut where a state is shown): start, stop (K,), x at both (K, n), moments
     (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid`` holds the
-    times at which sensors wake; ``series`` as of the path.
+    times at which sensors wake; ``to_end`` and ``to_moments`` are those of the plant's laws.
     """
 
     end: float
@@ -36,7 +36,8 @@ class Stretch(NamedTuple):
     step: np.ndarray
     last: FloatArray
     grid: FloatArray
-    series: FloatArray
+    to_end: FloatArray
+    to_moments: FloatArray
 
 
 @in_place
@@ -90,7 +91,7 @@ def advance(
     unit, series, normals = models.unit[k], models.series[k], sensing.normals.shape[1]
     terms, width, begin = models.shape[k, 1], models.shape[k, 2], models.first[k]
     gains = models.gains[begin : begin + terms * width].reshape(terms, width)
-    responses, used = path.series, sensing.used
+    to_end, to_moments, used = path.to_end, path.to_moments, sensing.used
     start, stop, last = path.start[piece], path.stop[piece], path.last[piece]
     readings, seen, values = room.moments[: models.shape[k, 0]], room.seen, room.values
     while now < time:
@@ -112,16 +113,17 @@ def advance(
         gap = end - now
         rest = gap if gap < unit else move_far(models, k, P, xhat, h, gap, room)
         if rest > 0.0:
-            move_part(unit, series, P, xhat, h, rest, room.E, room.X, room.Y)
+            move_part(series, P, xhat, h, rest, room.E, room.X, room.Y)
         if now == start and end == stop:
             fill_square(seen, path.moments[piece])
         else:
             since, x_start, cubic = now - start, path.x_start, path.cubic
-            rooms = values[: 3 * n * n], room.of_x, room.from_noise
-            fill_seen(seen, responses, since, gap, stop - start, x_start, cubic, piece, *rooms)
+            rooms = values[: 2 * n * n], room.of_x, room.from_noise
+            whole = stop - start
+            fill_seen(seen, to_end, to_moments, since, gap, whole, x_start, cubic, piece, *rooms)
         share = gap / (last - now) if end < last else -1.0
         read(readings, sensing, first, seen, path.step[piece], share, last - now, room.early)
-        gain_move(readings, gains, P, xhat, h, gap, values[:width])
+        gain_move(readings, gains, P, xhat, h, gap, values[: width - 1])
         now = end
     hosts.now[h], least[h] = now, 0.0
     return True

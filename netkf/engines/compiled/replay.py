@@ -197,7 +197,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                 if gap >= unit[m]:
                     gap = move_far(models, m, Ps, xhats, h, gap, room)
                 if gap > 0.0:
-                    move_blind(unit[m], blind[m], Ps, xhats, h, gap, E, X)
+                    move_blind(blind[m], Ps, xhats, h, gap, E, X)
                 reached[h] = now
         if sense == now:
             note(rows, place, now, SENSE, awake_node[place[AWAKE]], -1, -1, np.nan)
@@ -272,7 +272,7 @@ def replay(  # noqa: PLR0911, PLR0912, PLR0915 - the compiler sees one function,
                     if gap >= unit[m]:
                         gap = move_far(models, m, mail_P, mail_x, message, gap, room)
                     if gap > 0.0:
-                        move_blind(unit[m], blind[m], mail_P, mail_x, message, gap, E, X)
+                        move_blind(blind[m], mail_P, mail_x, message, gap, E, X)
                 if parts is None:
                     add_neighbour(xhats, Ps, h, weight, mail_x, mail_P, message)
                 else:

@@ -23,10 +23,10 @@ PLACES = 12
 class Models(NamedTuple):
     """M models and, last, the one that predicts: their tables one after the other.
 
-    unit (M + 1,), series (M + 1, terms, 5 n n), ``blind`` (M + 1, terms, 2 n n) of those that see
-    nothing, jump, F, G, Q (M + 1, levels, n, n), information (M + 1, n, n); gains flat with a
-    model's from ``first`` on, ``shape`` (M + 1, 3) = rows 2p of its moments, terms and width of its
-    series.
+    unit (M + 1,), series (M + 1, terms, 5 n n + 1), ``blind`` (M + 1, terms, 2 n n + 1) of those
+    that see nothing, jump, F, G, Q (M + 1, levels, n, n), information (M + 1, n, n); gains flat
+    with a model's from ``first`` on, ``shape`` (M + 1, 3) = rows 2p of its moments, terms and width
+    of its series.
     """
 
     unit: FloatArray
@@ -216,7 +216,7 @@ def room_for(models: Models) -> Room:
         moments=np.zeros(most),
         early=np.zeros((2, most // 2)),
         seen=np.zeros((2, n)),
-        values=np.zeros(max(width, 3 * n * n)),
+        values=np.zeros(max(width, 2 * n * n)),
         of_x=np.zeros(n),
         from_noise=np.zeros((2, 4)),
     )

@@ -1,0 +1,104 @@
+"""Poisson schedules made in compiled code are those that are drawn link by link."""
+
+import math
+
+import numpy as np
+import pytest
+
+from netkf.core.streams import Streams, Together
+from netkf.engines.compiled import poisson
+from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson, schedule
+from netkf.engines.compiled.schedule import Schedule, whole_schedules
+
+pytest.importorskip("numba")
+
+CHANNELS = {
+    "shared": {"symmetric": True, "loss": {"kind": "bernoulli", "delivery": 0.7}},
+    "each way": {"symmetric": False, "loss": {"kind": "bernoulli", "delivery": 0.7}},
+    "late": {"symmetric": False, "delay": {"kind": "constant", "seconds": 0.25}},
+    "never": {"loss": {"kind": "bernoulli", "delivery": 0.0}},
+}
+
+
+def all_of(windows):
+    """Every tick of a run."""
+    parts = []
+    while not parts or parts[-1].end < math.inf:
+        parts.append(windows.following())
+    return parts, [np.concatenate(column) for column in list(zip(*parts, strict=True))[1:]]
+
+
+@pytest.fixture
+def busy(ring):
+    rates = [[0, 1, 7.0], [2, 3, 0.1]]
+    return lambda channel: ring.replace(
+        {
+            "horizon": 50.0,
+            "network.activation": {"kind": "poisson", "rate": 3.0, "rates": rates},
+            "network.channel": channel,
+        }
+    )
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_ticks_and_fates_are_those_drawn_link_by_link(busy, monkeypatch, name):
+    case = busy(CHANNELS[name])
+    assert is_poisson(case)
+    monkeypatch.setattr(poisson, "TICKS", 40)
+    parts, made = all_of(schedule(case, Streams(3)))
+    _, plain = all_of(Schedule(case, Streams(3)))
+    assert len(parts) > 5
+    assert len(made[0]) > 500
+    for one, other in zip(made, plain, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_room_grows_where_there_are_more_ticks_than_expected(busy):
+    case = busy(CHANNELS["each way"])
+    windows = PoissonSchedules(case, Streams(3))
+    windows._rate *= 1e-3
+    _, made = all_of(windows)
+    _, plain = all_of(Schedule(case, Streams(3)))
+    for one, other in zip(made, plain, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_several_runs_are_what_each_is_alone(busy):
+    case = busy(CHANNELS["shared"])
+    together = PoissonSchedules(case, Together(3, 5, 3)).whole()
+    for window, plain in zip(together, whole_schedules(case, Together(3, 5, 3)), strict=True):
+        for one, other in zip(window, plain, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_ticks_that_crowd_are_put_in_order():
+    """Even where the clocks are not as even in time as they should be, and at one instant."""
+    random = np.random.default_rng(1)
+    t = np.concatenate([random.random(200) ** 8, np.full(20, 0.5)])
+    link = random.permutation(len(t))
+    found = poisson.Found(t, link, np.column_stack([t, link]))
+    ordered = poisson._room(len(t))
+    place = np.empty(len(t) + 1, dtype=np.int64)
+    poisson.put_in_time_order(0.0, 1.0, len(t), found, ordered, place)
+    order = np.lexsort((link, t))
+    for one, other in zip(ordered, found, strict=True):
+        np.testing.assert_array_equal(one, other[order])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {
+            "network.activation": {
+                "kind": "renewal",
+                "distribution": "gamma",
+                "rate": 3.0,
+                "shape": 2.0,
+            }
+        },
+        {"network.channel.delay": {"kind": "exponential", "mean": 1.0}},
+        {"filter": {"kind": "local"}},
+    ],
+)
+def test_others_are_drawn_as_before(ring, changes):
+    assert not is_poisson(ring.replace(changes))
