@@ -10,24 +10,28 @@ from contextlib import contextmanager
 from typing import Any
 
 WAITING = (signal.SIGINT, signal.SIGTERM)
+_inside = False
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Ctrl-C and the request to end wait until the block is left.
+    """Ctrl-C and the request to end wait until the block is left, and all blocks around it.
 
     In other threads than the main one nothing is changed: Python delivers signals to that one.
     """
-    if threading.current_thread() is not threading.main_thread():
+    global _inside  # noqa: PLW0603 - of the main thread alone
+    if _inside or threading.current_thread() is not threading.main_thread():
         yield
         return
     came: list[tuple[int, Any]] = []
     before = {number: signal.getsignal(number) for number in WAITING}
     for number in WAITING:
         signal.signal(number, lambda number, frame: came.append((number, frame)))
+    _inside = True
     try:
         yield
     finally:
+        _inside = False
         for number in reversed(WAITING):  # a Ctrl-C from now on ends this loop: it comes last
             signal.signal(number, before[number])
         for received, frame in came:

@@ -24,6 +24,23 @@ def test_a_signal_waits_until_the_block_is_left():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_signal_waits_for_the_outermost_block():
+    done = []
+
+    def work():
+        with undisturbed():
+            with undisturbed():
+                os.kill(os.getpid(), signal.SIGINT)
+                done.append("inner")
+            done.append("outer")
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done == ["inner", "outer"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 def test_other_threads_go_on_as_they_are():
     seen = []
 
