@@ -1,5 +1,6 @@
 """Shared by all tests: where the scenarios are and how to build one from plain values."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,11 @@ ONCE = {replay, intersecting, *KERNELS.values()}
 
 def scenario_files():
     return sorted(SCENARIOS.glob("*.toml"))
+
+
+def pytest_configure():
+    """A shell ignores Ctrl-C for what it runs in the background; tests send it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, square_root
+from netkf.core.arrays import FloatArray, symmetric, symmetric_root
 from netkf.core.legendre import forward_coefficients
 from netkf.core.series import polynomial, with_reach
 
@@ -87,7 +87,7 @@ class Laws:
         if law is None:
             if len(self._splits) >= MOST_SPLITS:
                 self._splits.clear()
-            law = self._splits[key] = self._conditional(length, left)
+            law = self._splits[key] = self._conditional(*key)
         return law
 
     def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
@@ -103,7 +103,7 @@ class Laws:
         C = factor @ factor.T
         known, asked, cross = C[: 3 * n, : 3 * n], C[3 * n :, 3 * n :], C[3 * n :, : 3 * n]
         gain = cross @ np.linalg.pinv(known, rcond=1e-13, hermitian=True)
-        return gain, square_root(asked - gain @ cross.T)
+        return gain, symmetric_root(symmetric(asked - gain @ cross.T))
 
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:

@@ -8,6 +8,7 @@ import scipy.linalg
 
 from netkf.plants import paths, sensors
 from netkf.plants.diffusion import Diffusion, default_sensing_period
+from netkf.plants.laws import Laws
 from netkf.plants.sensors import LinearSensor
 from tests.engines.linearity import Unit
 
@@ -63,6 +64,18 @@ def test_states_have_their_exact_joint_law_on_and_off_the_grid(times):
         return np.concatenate([path.state(t) for t in times])
 
     np.testing.assert_allclose(covariance_of(compute, 2), exact_joint(times), rtol=0, atol=2e-9)
+
+
+def test_what_is_shown_does_not_hang_on_rounding():
+    """Roots of singular covariances may turn round at a touch; states drawn by them must not."""
+    A, B = np.array([[0.0, 1.0], [-1.0, 0.1]]), np.array([[0.0], [1.0]])
+    gain, spread = Laws(A, B, 0.2).split(0.2, 0.1)
+    random = np.random.default_rng(1)
+    for _ in range(20):
+        touched = A * (1.0 + 1e-14 * random.standard_normal((2, 2)))
+        others = Laws(touched, B, 0.2).split(0.6000000000000001 - 0.4, 0.1)
+        np.testing.assert_allclose(others[0], gain, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(others[1], spread, rtol=0.0, atol=1e-7)
 
 
 def test_the_grid_does_not_depend_on_what_is_shown():
