@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from textwrap import fill
 from typing import Any
 
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 
 from netkf.core.arrays import FloatArray
 from netkf.experiments.ensembles.directory import FinishedEnsemble
+from netkf.experiments.files import written_beside
 from netkf.experiments.run import Finished
 from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds
 from netkf.experiments.words import nees_words
@@ -43,10 +43,8 @@ def run_picture(scenario: Scenario, finished: Finished) -> None:
         _network(figure, figure.add_subplot(grid[:, 1]), scenario, finished)
         title = scenario.name if not scenario.claim else f"{scenario.name}: {scenario.claim}"
         figure.suptitle(fill(title, 130), fontsize=10, x=0.01, ha="left")
-        path = finished.directory / "run.png"
-        part = path.with_name("run.png.part")
-        figure.savefig(part, dpi=130, format="png")
-        os.replace(part, path)
+        with written_beside(finished.directory / "run.png") as part:
+            figure.savefig(part, dpi=130, format="png")
 
 
 def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
@@ -73,10 +71,8 @@ def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
         name = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
         title = f"{name} ({runs:,} runs)"
         figure.suptitle(fill(title, 105), fontsize=10, x=0.01, ha="left")
-        path = finished.directory / "run.png"
-        part = path.with_name("run.png.part")
-        figure.savefig(part, dpi=130, format="png")
-        os.replace(part, path)
+        with written_beside(finished.directory / "run.png") as part:
+            figure.savefig(part, dpi=130, format="png")
 
 
 def _bands(

@@ -10,7 +10,7 @@ import pytest
 import netkf
 from netkf.cli import main
 from netkf.engines.processes.engine import ProcessesEngine
-from netkf.experiments.files import new_directory
+from netkf.experiments.files import new_directory, written_beside
 from netkf.experiments.run import run_to_directory
 from tests.conftest import SCENARIOS, scenario_files
 
@@ -300,6 +300,25 @@ def test_a_run_stopped_before_its_first_sample_has_a_summary(ring, tmp_path, mon
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["bound"] == "not computed: the run was interrupted"
     assert summary["overall"]["rms_error"] is None
+
+
+def test_a_file_has_its_name_when_it_is_whole(tmp_path):
+    file = tmp_path / "run.png"
+    file.write_text("before")
+
+    def half():
+        with written_beside(file) as part:
+            part.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        half()
+    assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
+    assert file.read_text() == "before"
+    with written_beside(file) as part:
+        part.write_text("whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
+    assert file.read_text() == "whole"
 
 
 def test_directories_are_never_overwritten(tmp_path, monkeypatch):

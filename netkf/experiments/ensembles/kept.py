@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import zipfile
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ import numpy as np
 
 from netkf.experiments.ensembles.moments import Moments
 from netkf.experiments.ensembles.tallies import Tally, Trace
+from netkf.experiments.files import written_beside
 
 PARTS = ("samples", "averages", "messages")
 
@@ -34,11 +34,8 @@ class KeptBlocks:
     def save(self, number: int, tally: Tally) -> None:
         """A block with the traces that its runs left."""
         self._folder.mkdir(exist_ok=True)
-        file = self._file(number)
-        part = file.with_name(f"{number:06d}.part")
-        with part.open("wb") as opened:
+        with written_beside(self._file(number)) as part, part.open("wb") as opened:
             np.savez(opened, **_as_arrays(tally))
-        os.replace(part, file)
 
     def load(self, number: int) -> Tally:
         """A block without its traces."""

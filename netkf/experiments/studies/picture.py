@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
@@ -11,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from netkf.core.arrays import FloatArray
+from netkf.experiments.files import written_beside
 from netkf.experiments.studies.sweep import Swept
 
 if TYPE_CHECKING:
@@ -51,10 +51,8 @@ def sweep_picture(title: str, swept: Swept) -> bool:
         words = "; ".join(filter(None, (which, bars)))
         axes.set_title(words, fontsize=8, loc="right", color=CENTRAL)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-        path = swept.directory / "sweep.png"
-        part = path.with_name("sweep.png.part")
-        figure.savefig(part, dpi=130, format="png")
-        os.replace(part, path)
+        with written_beside(swept.directory / "sweep.png") as part:
+            figure.savefig(part, dpi=130, format="png")
     return True
 
 
