@@ -11,10 +11,10 @@ never hides a changed run. What is compiled is loaded beforehand. The compiled e
   (here netkf is SimPy with compiled filters, as ``engine = "processes"`` gives it; also against
   itself with nothing compiled);
 - a loop by hand, which replays the same ticks of 1000 nodes (flow of xhat and P over each gap,
-  resets), written for the purpose in numba without a trace, sensors or delays; netkf with all its
-  rows and their fingerprint, as a single run has them, and without, as ensembles do;
+  resets), written for the purpose in numba without a trace, sensors or delays; netkf without a
+  trace, as ensembles run it, and with all its rows and their fingerprint, as a single run has them;
 - the same job with filterpy or Stone Soup objects and a heap of ticks (``peers``), as a user
-  without netkf would write it.
+  without netkf would write it, who has no trace either; and with netkf's.
 
 Below: the bound (12) against scipy's solve_ivp on the stacked system, and draws of the invariant
 law of the random Riccati equation against a plain numpy loop, both a chain's step.
@@ -25,6 +25,7 @@ import importlib.util
 import math
 import statistics
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,18 @@ def engine_run(engine, case):
 def recorded_run(engine, case, recorder):
     assert engine.run(case, Streams(case.seed), recorder, silent) == "complete"
     return recorder.fingerprint, recorder.total, recorder.count("tick")
+
+
+def ticks_with_trace(case):
+    return engine_run(CompiledEngine(), case)[2]
+
+
+def ticks_without_trace(case):
+    return recorded_run(CompiledEngine(), case, Recorder([], counted=True))[2]
+
+
+def ticks_of(job, case, most):
+    return job(case, peers.clocks(case, most))[0]
 
 
 def by_hand(table, window, ends, weights, xhat, P, now):
@@ -198,13 +211,9 @@ def by_others(name, case, runs, most):
         if importlib.util.find_spec(package) is None:
             print(f"{words} is not installed (pip install {package}): left out")
             continue
-        compared(
-            f"{words}, {name}",
-            runs,
-            lambda: engine_run(CompiledEngine(), case)[2],
-            lambda job=job: job(case, peers.clocks(case, most))[0],
-            most,
-        )
+        theirs = partial(ticks_of, job, case, most)
+        compared(f"{words}, {name}", runs, partial(ticks_without_trace, case), theirs, most)
+        compared("  netkf with its trace", runs, partial(ticks_with_trace, case), theirs, most)
 
 
 def bound(case, constants, runs):
@@ -291,13 +300,11 @@ def main():
     long = big.replace({"horizon": 40.0 * share, "probe": 40.0 * share})
     hand = hand_written(long)
     hand()
-    single = lambda: engine_run(CompiledEngine(), long)[2]  # noqa: E731
-    bare = lambda: recorded_run(CompiledEngine(), long, Recorder([], counted=True))[2]  # noqa: E731
-    compared("a loop by hand, 1000 nodes", runs, single, hand)
-    compared("the same, netkf without a trace", runs, bare, hand)
+    compared("a loop by hand, 1000 nodes", runs, partial(ticks_without_trace, long), hand)
+    compared("  netkf with its trace", runs, partial(ticks_with_trace, long), hand)
     most = 400 if options.quick else 2000
     by_others("n = 2, 2 sensors", long, runs, most)
-    four = peers.planar(1000).replace({"horizon": 10.0 * share, "probe": 10.0 * share})
+    four = peers.planar(1000).replace({"horizon": 40.0 * share, "probe": 40.0 * share})
     by_others("n = 4, 334 sensors", four, runs, most)
     bound(peers.planar(200 if options.quick else 1000), 2 if options.quick else 10, runs)
     invariant(2000 if options.quick else 20_000, runs)

@@ -21,9 +21,9 @@ from netkf.network.channels import alike
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.scenario.scenario import Scenario
 
-TICKS, TICKS_A_LINK = 1 << 15, 4
-"""In a window at least: what they take fits the processor's cache, and what a link costs is spread
-over some.
+TICKS, TICKS_A_LINK, MOST_TICKS = 1 << 15, 4, 1 << 20
+"""In a window: what they take fits the processor's cache, unless there are so many links that what
+one costs is to be spread over some ticks.
 """
 
 
@@ -145,7 +145,7 @@ class PoissonSchedules:
         self._delay = float(scenario.network.channel.delay.fixed or 0.0)
         self._horizon, self._length = scenario.horizon, math.inf
         if self._rate > 0.0:
-            self._length = max(TICKS, TICKS_A_LINK * len(links)) / self._rate
+            self._length = max(TICKS, min(TICKS_A_LINK * len(links), MOST_TICKS)) / self._rate
         self._end, self._found = 0.0, _room(0)
 
     def following(self) -> Window:
