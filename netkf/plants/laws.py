@@ -10,6 +10,7 @@ from netkf.core.series import polynomial, with_reach
 
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
 MOST_GRIDS = 256  # kept stretches of the sensing grid
+DEPENDENT = 1e-9  # share of a row that is not rounding
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
@@ -126,10 +127,21 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
 
 
 def _factor(noise: FloatArray) -> FloatArray:
-    """A square lower triangular S with ``S S' = noise noise'``, accurate where that is singular."""
-    R = np.linalg.qr(noise.T, mode="r")
+    """The lower triangular S with ``S S' = noise noise'`` and no entry below zero on its diagonal,
+    whose column is zero where a row of ``noise`` depends on those before it.
+    """
+    # Gram and Schmidt, twice, which is enough (Kahan and Parlett). Householder's reflections would
+    # give a dependent row a direction of its own, made of rounding, and later rows a share in it.
     size = len(noise)
-    square = np.zeros((size, size))
-    square[: len(R)] = R
-    signs = np.where(np.diag(square) < 0.0, -1.0, 1.0)
-    return np.asarray((signs[:, None] * square).T)
+    S, directions = np.zeros((size, size)), np.zeros_like(noise)
+    for k, row in enumerate(noise):
+        rest = row.copy()
+        for _ in range(2):
+            along = directions[:k] @ rest
+            S[k, :k] += along
+            rest -= along @ directions[:k]
+        length = float(np.linalg.norm(rest))
+        if length > DEPENDENT * float(np.linalg.norm(row)):
+            S[k, k] = length
+            directions[k] = rest / length
+    return S

@@ -66,16 +66,21 @@ def test_states_have_their_exact_joint_law_on_and_off_the_grid(times):
     np.testing.assert_allclose(covariance_of(compute, 2), exact_joint(times), rtol=0, atol=2e-9)
 
 
-def test_what_is_shown_does_not_hang_on_rounding():
-    """Roots of singular covariances may turn round at a touch; states drawn by them must not."""
-    A, B = np.array([[0.0, 1.0], [-1.0, 0.1]]), np.array([[0.0], [1.0]])
-    gain, spread = Laws(A, B, 0.2).split(0.2, 0.1)
+@pytest.mark.parametrize("n", [2, 3])
+def test_no_draw_hangs_on_rounding(n):
+    """Covariances of states and moments are singular, as the integral of a speed is a distance:
+    roots of such may turn round at a touch, what is drawn by them must not.
+    """
+    A, B = np.eye(n, k=1) - 0.1 * np.eye(n, k=-1), np.eye(n)[:, n - 1 :]
+    plain = Laws(A, B, 0.2)
+    gain, spread = plain.split(0.2, 0.1)
     random = np.random.default_rng(1)
     for _ in range(20):
-        touched = A * (1.0 + 1e-14 * random.standard_normal((2, 2)))
-        others = Laws(touched, B, 0.2).split(0.6000000000000001 - 0.4, 0.1)
-        np.testing.assert_allclose(others[0], gain, rtol=1e-6, atol=1e-6)
+        laws = Laws(A * (1.0 + 1e-14 * random.standard_normal(A.shape)), B, 0.2)
+        others = laws.split(0.6000000000000001 - 0.4, 0.1)
+        np.testing.assert_allclose(others[0], gain, rtol=1e-6, atol=1e-6 * np.abs(gain).max())
         np.testing.assert_allclose(others[1], spread, rtol=0.0, atol=1e-7)
+        np.testing.assert_allclose(laws.spread, plain.spread, rtol=0.0, atol=1e-12)
 
 
 def test_the_grid_does_not_depend_on_what_is_shown():
