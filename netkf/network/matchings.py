@@ -158,7 +158,9 @@ def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
 
 
 def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link]:
-    return _greedy([topology.links[k] for k in random.permutation(len(topology.links))])
+    links = topology.links
+    order = random.permutation(len(links)).tolist()
+    return _greedy([links[k] for k in order])
 
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
@@ -171,7 +173,8 @@ def _greedy(links: list[Link]) -> list[Link]:
     chosen = []
     for i, j in links:
         if i not in taken and j not in taken:
-            taken |= {i, j}
+            taken.add(i)
+            taken.add(j)
             chosen.append((i, j))
     return chosen
 

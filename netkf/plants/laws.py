@@ -7,6 +7,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray, symmetric, symmetric_root
 from netkf.core.legendre import forward_coefficients
 from netkf.core.series import polynomial, with_reach
+from netkf.plants.recursion import powers
 
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
 MOST_GRIDS = 256  # kept stretches of the sensing grid
@@ -46,9 +47,8 @@ class Laws:
 
     def powers(self, count: int) -> FloatArray:
         """(count, n, n): what a state adds to those 1, 2 ... steps later."""
-        while len(self._powers) < count:
-            more = self._powers @ self._powers[-1]
-            self._powers = np.concatenate([self._powers, more])
+        if len(self._powers) < count:
+            self._powers = powers(self.response[0], count)
         return self._powers[:count]
 
     def responses(self, gap: float) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import covariance, positive, setting, square
 from netkf.plants.plant import Plant
+from netkf.plants.recursion import powers, states
 
 BLOCK = 64  # slots drawn at once
 
@@ -76,17 +77,18 @@ class LinearPath:
     """The path of one run, slot by slot."""
 
     def __init__(self, plant: LinearPlant, random: np.random.Generator) -> None:
-        self._F, self._root = plant.F, square_root(plant.Q)
-        self._noise = Blocks(random, plant.n)
-        self._x = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(plant.n)
-        self._slot = 0
+        self._random, self._root = random, square_root(plant.Q)
+        self._powers = powers(plant.F, BLOCK)
+        start = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(plant.n)
+        self._first, self._x = 0, start[None]
 
     def state(self, slot: int) -> FloatArray:
         """X at a slot not before the last one asked for."""
-        while self._slot < slot:
-            self._x = self._F @ self._x + self._root @ self._noise.draw()
-            self._slot += 1
-        return self._x
+        while slot >= self._first + len(self._x):
+            noise = self._random.standard_normal((BLOCK, len(self._root))) @ self._root.T
+            self._first += len(self._x) - 1
+            self._x = states(self._x[-1:], noise[None, None], self._powers)[0]
+        return np.asarray(self._x[slot - self._first])
 
 
 class SlotReadings:

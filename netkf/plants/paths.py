@@ -21,6 +21,7 @@ from netkf.core.compiling import in_place
 from netkf.core.series import fill_polynomial, polynomial
 from netkf.core.small import added, applied
 from netkf.plants.laws import Laws, grid_time
+from netkf.plants.recursion import states
 
 BLOCK = 64  # steps drawn at once, or a multiple of it
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -91,7 +92,9 @@ class DiffusionPaths:
         normals = np.stack([random.standard_normal(size) for random in self._randoms])
         noise = (normals @ laws.spread.T).reshape(count * blocks, BLOCK, 3, n)
         cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
-        x = self._states(noise[:, :, 0].reshape(count, blocks, BLOCK, n))
+        onwards = noise[:, :, 0].reshape(count, blocks, BLOCK, n)
+        x = states(self._x, onwards, laws.powers(BLOCK))
+        self._x = x[:, -1]
         before = x[:, :-1].reshape(count * blocks, BLOCK, n)
         moments = _moved(laws.response[1:], before) + noise[:, :, 1:]
         times = laws.grid(self._drawn, total + 1)
@@ -110,26 +113,6 @@ class DiffusionPaths:
         shown = self._shown[first:last]
         inside = shown[~np.isin(shown, whole.ends)]
         return self._cut(whole, inside) if len(inside) else whole
-
-    def _states(self, noise: FloatArray) -> FloatArray:
-        """(B, steps + 1, n) the states from the present one on, each step of which adds its noise
-        (B, blocks, BLOCK, n).
-        """
-        (count, blocks, _, n), powers = noise.shape, self.laws.powers(BLOCK)
-        added, far = noise.copy(), 1
-        while far < BLOCK:  # what the last 1, 2, 4 ... steps added
-            added[:, :, far:] += added[:, :, :-far] @ powers[far - 1].T
-            far *= 2
-        starts = np.empty((count, blocks + 1, 1, n))
-        starts[:, 0, 0] = self._x
-        for k in range(blocks):
-            starts[:, k + 1] = starts[:, k] @ powers[-1].T + added[:, k, -1:]
-        moved = starts[:, :-1] @ powers.reshape(-1, n).T
-        x = np.empty((count, blocks * BLOCK + 1, n))
-        x[:, 0] = self._x
-        x[:, 1:] = (moved.reshape(added.shape) + added).reshape(count, -1, n)
-        self._x = x[:, -1]
-        return x
 
     def _cut(self, block: Block, shown: FloatArray) -> Block:
         """The block with pieces that end at the times ``shown``, which are inside its steps."""

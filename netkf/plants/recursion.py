@@ -1,0 +1,43 @@
+"""x[k+1] = F x[k] + w[k] for many steps at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+
+
+def powers(F: FloatArray, count: int) -> FloatArray:
+    """(count, n, n): F, its square and so on."""
+    found = F[None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        while len(found) < count:
+            found = np.concatenate([found, found @ found[-1]])
+    return found[:count]
+
+
+def states(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
+    """(B, blocks L + 1, n) the states of B paths from ``start`` (B, n) on, each step of which adds
+    its noise (B, blocks, L, n); ``to_later`` (L, n, n) are the powers of F.
+
+    Block by block, so that no path is rounded as its neighbours happen to be.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # perhaps beyond the horizon
+        return _states(start, noise, to_later)
+
+
+def _states(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
+    count, blocks, length, n = noise.shape
+    x = np.empty((count, blocks * length + 1, n))
+    x[:, 0] = start
+    added, far = noise.copy(), 1
+    while far < length:  # what the last 1, 2, 4 ... steps added
+        added[:, :, far:] += added[:, :, :-far] @ to_later[far - 1].T
+        far *= 2
+    starts = np.empty((count, blocks + 1, 1, n))
+    starts[:, 0, 0] = start
+    for k in range(blocks):
+        starts[:, k + 1] = starts[:, k] @ to_later[-1].T + added[:, k, -1:]
+    moved = starts[:, :-1] @ to_later.reshape(-1, n).T
+    x[:, 1:] = (moved.reshape(added.shape) + added).reshape(count, -1, n)
+    return x
