@@ -119,11 +119,12 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
     exponential = [np.eye(n)]
     for k in range(1, terms):
         exponential.append(exponential[-1] @ A / k)
-    powers = np.stack(exponential)
-    moments = np.zeros((terms + 1, 2, n, n))
-    moments[1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), powers)
-    to_end, to_moments = (series.reshape(len(series), -1) for series in (powers, moments))
-    return with_reach(to_end, longest), with_reach(to_moments, longest)
+    end, moments = np.stack(exponential), np.zeros((terms + 1, 2, n, n))
+    moments[1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), end)
+    to_end, to_moments = (
+        with_reach(series.reshape(len(series), -1), longest) for series in (end, moments)
+    )
+    return to_end, to_moments
 
 
 def _factor(noise: FloatArray) -> FloatArray:

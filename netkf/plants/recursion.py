@@ -23,10 +23,20 @@ def states(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatA
     Block by block, so that no path is rounded as its neighbours happen to be.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # perhaps beyond the horizon
-        return _states(start, noise, to_later)
+        summed = np.isfinite(to_later[-1]).all()
+        return (_in_sums if summed else _one_by_one)(start, noise, to_later)
 
 
-def _states(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
+def _one_by_one(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
+    """Where powers overflow, which a state that is not moved by them need not."""
+    count, _, _, n = noise.shape
+    x = [start[:, None]]
+    for w in np.moveaxis(noise.reshape(count, -1, 1, n), 1, 0):
+        x.append(x[-1] @ to_later[0].T + w)
+    return np.concatenate(x, axis=1)
+
+
+def _in_sums(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
     count, blocks, length, n = noise.shape
     x = np.empty((count, blocks * length + 1, n))
     x[:, 0] = start

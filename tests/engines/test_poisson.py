@@ -8,7 +8,7 @@ import pytest
 from netkf.core.streams import Streams, Together
 from netkf.engines.compiled import poisson
 from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson, schedule
-from netkf.engines.compiled.schedule import Schedule, whole_schedules
+from netkf.engines.compiled.schedule import Schedule, Ticks, whole_schedules
 
 pytest.importorskip("numba")
 
@@ -76,7 +76,7 @@ def test_ticks_that_crowd_are_put_in_order():
     random = np.random.default_rng(1)
     t = np.concatenate([random.random(200) ** 8, np.full(20, 0.5)])
     link = random.permutation(len(t))
-    found = poisson.Found(t, link, np.column_stack([t, link]))
+    found = Ticks(t, link, np.column_stack([t, link]))
     ordered = poisson._room(len(t))
     place = np.empty(len(t) + 1, dtype=np.int64)
     poisson.put_in_time_order(0.0, 1.0, len(t), found, ordered, place)

@@ -54,6 +54,16 @@ def test_a_path_in_slots_does_not_depend_on_who_asks(monkeypatch):
     np.testing.assert_allclose([plain.state(k) for k in range(200)], every, rtol=1e-12)
 
 
+def test_a_state_that_growth_does_not_reach_stays(recwarn):
+    """1e6 to the 64th is no number, and zero times it is zero all the same."""
+    F, noise = np.diag([1e6, 0.5]), np.zeros((1, 3, 64, 2))
+    noise[..., 1] = 1.0
+    found = states(np.array([[0.0, 2.0]]), noise, powers(F, 64))
+    np.testing.assert_array_equal(found[0, :, 0], 0.0)
+    np.testing.assert_allclose(found[0, :, 1], 2.0, rtol=1e-12)
+    assert not recwarn
+
+
 def test_growth_beyond_the_horizon_is_nobodys_business():
     path = LinearPath(plant_of([[1e6]]), np.random.default_rng(3))
     assert path.state(20)[0] == pytest.approx(1e120, rel=1e-5)

@@ -16,7 +16,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compiled, in_place
 from netkf.core.draws import Draws, Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.core.streams import Streams, Together
-from netkf.engines.compiled.schedule import LOST, Schedule, Window, way_chances, way_luck
+from netkf.engines.compiled.schedule import LOST, Schedule, Ticks, Window, way_chances, way_luck
 from netkf.network.channels import alike
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.scenario.scenario import Scenario
@@ -27,7 +27,7 @@ one costs is to be spread over some ticks.
 """
 
 
-class Clocks(NamedTuple):
+class Drawing(NamedTuple):
     """L links of several runs: the tick that is ``coming`` (L,), ``rate`` (L,), the states of the
     streams of ``ticks`` (L, 4) and of what decides about messages forth and back ``fates`` (W L, 4)
     with W = 0 (nothing is drawn), 1 (both share it) or 2, and ``chance`` (2, L) to arrive.
@@ -40,30 +40,22 @@ class Clocks(NamedTuple):
     chance: FloatArray
 
 
-class Found(NamedTuple):
-    """Room for ticks and fates, see Window: t (K,), link (K,), delay (K, 2)."""
-
-    t: FloatArray
-    link: np.ndarray
-    delay: FloatArray
-
-
 @in_place
 def draw_ticks(
-    clocks: Clocks,
+    links: Drawing,
     first: int,
     after: int,
     end: float,
     delay: float,
     exponential: Ziggurat,
-    found: Found,
+    found: Ticks,
     place: int,
 ) -> int:
     """Write the ticks before ``end`` of the links from ``first`` up to ``after``, as links of one
     run, from ``place`` on; returns the place after the last one: where the room ends there may be
     more.
     """
-    coming, links = clocks.coming, len(clocks.coming)
+    coming, count = links.coming, len(links.coming)
     for k in range(first, after):
         while coming[k] < end:
             if place == len(found.t):
@@ -71,18 +63,18 @@ def draw_ticks(
             found.t[place], found.link[place] = coming[k], k - first
             luck = 0.0
             for way in range(2):
-                if way * links < len(clocks.fates):
-                    luck = next_unit(clocks.fates, way * links + k)
-                found.delay[place, way] = delay if luck < clocks.chance[way, k] else LOST
+                if way * count < len(links.fates):
+                    luck = next_unit(links.fates, way * count + k)
+                found.delay[place, way] = delay if luck < links.chance[way, k] else LOST
             place += 1
-            gap: float = next_exponential(clocks.ticks, k, exponential)
-            coming[k] += gap / clocks.rate[k]
+            gap: float = next_exponential(links.ticks, k, exponential)
+            coming[k] += gap / links.rate[k]
     return place
 
 
 @in_place
 def put_in_time_order(
-    begin: float, end: float, count: int, found: Found, ordered: Found, place: np.ndarray
+    begin: float, end: float, count: int, found: Ticks, ordered: Ticks, place: np.ndarray
 ) -> None:
     """Write the first ``count`` ticks, which lie in [begin, end), in the order of (time, link);
     ``place`` (count + 1,) is room to work in.
@@ -133,14 +125,14 @@ class PoissonSchedules:
         ticks, count = Draws(streams, "clock", links), len(links) * runs
         luck = [draws.states for draws in way_luck(scenario, streams, both)]
         rates = np.array([clock.mean_rate(link) for link in links])
-        self._clocks = Clocks(
+        self._drawing = Drawing(
             coming=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),
             rate=np.tile(rates, runs),
             ticks=ticks.states,
             fates=np.concatenate([*luck, np.empty((0, 4), dtype=np.uint64)]),
             chance=np.tile(way_chances(scenario, both), runs),
         )
-        self._clocks.coming[:] /= self._clocks.rate
+        self._drawing.coming[:] /= self._drawing.rate
         self._links, self._rate = len(links), float(rates.sum())
         self._delay = float(scenario.network.channel.delay.fixed or 0.0)
         self._horizon, self._length = scenario.horizon, math.inf
@@ -158,7 +150,7 @@ class PoissonSchedules:
 
     def whole(self) -> list[Window]:
         """All ticks of each run, as one window."""
-        runs = len(self._clocks.coming) // self._links
+        runs = len(self._drawing.coming) // self._links
         return [self._window(run, 0.0, math.inf) for run in range(runs)]
 
     def _window(self, run: int, begin: float, end: float) -> Window:
@@ -176,7 +168,7 @@ class PoissonSchedules:
                 for target, source in zip(larger, self._found, strict=True):
                     target[:count] = source[:count]
                 self._found = larger
-            count = draw(self._clocks, *some, self._found, count)
+            count = draw(self._drawing, *some, self._found, count)
             if count < len(self._found.t):
                 break
             room = 2 * count
@@ -185,8 +177,8 @@ class PoissonSchedules:
         return Window(end, *ordered)
 
 
-def _room(count: int) -> Found:
-    return Found(np.empty(count), np.empty(count, dtype=np.int64), np.empty((count, 2)))
+def _room(count: int) -> Ticks:
+    return Ticks(np.empty(count), np.empty(count, dtype=np.int64), np.empty((count, 2)))
 
 
 def schedule(scenario: Scenario, streams: Streams) -> PoissonSchedules | Schedule:
