@@ -24,18 +24,19 @@ def undisturbed() -> Iterator[None]:
         yield
         return
     came: list[tuple[int, Any]] = []
-    before = {number: signal.getsignal(number) for number in WAITING}
-    for number in WAITING:
+    found = {number: signal.getsignal(number) for number in WAITING}
+    before = {number: handler for number, handler in found.items() if handler is not None}
+    for number in before:  # one that is None is not Python's, and Python could not put it back
         signal.signal(number, lambda number, frame: came.append((number, frame)))
     _inside = True
     try:
         yield
     finally:
         _inside = False
-        for number in reversed(WAITING):  # a Ctrl-C from now on ends this loop: it comes last
+        for number in reversed(before):  # a Ctrl-C from now on ends this loop: it comes last
             signal.signal(number, before[number])
         for received, frame in came:
-            handler = before[signal.Signals(received)]
+            handler: Any = before[signal.Signals(received)]
             if callable(handler):
                 handler(received, frame)
             elif handler == signal.SIG_DFL:

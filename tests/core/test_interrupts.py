@@ -41,6 +41,15 @@ def test_a_signal_waits_for_the_outermost_block():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_handler_that_is_not_pythons_is_left_alone(monkeypatch):
+    plain = signal.getsignal
+    monkeypatch.setattr(signal, "getsignal", lambda n: None if n == signal.SIGTERM else plain(n))
+    before = plain(signal.SIGTERM)
+    with undisturbed():
+        assert plain(signal.SIGTERM) is before
+    assert plain(signal.SIGTERM) is before
+
+
 def test_other_threads_go_on_as_they_are():
     seen = []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -111,7 +112,7 @@ def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Ta
     trace = np.trace(P, axis1=2, axis2=3)
     blurred = rounding_from(run.times[:kept], x, P)
     used = _after_start(run.times[:kept], blurred if diverged else np.inf)
-    averages = np.stack([_mean(values[used]) for values in (sq_error, trace, nees)], axis=1)
+    averages = _mean(np.stack([sq_error, trace, nees], axis=2)[used])
     lost = recorder.count("lost") + recorder.count("late")
     sent, delivered = recorder.count("send"), recorder.count("deliver")
     return Tally(
@@ -129,8 +130,13 @@ def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Ta
     )
 
 
+@cache
+def _upper(n: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.triu_indices(n)
+
+
 def _columns(x: FloatArray, xhat: FloatArray, P: FloatArray, nees: FloatArray) -> FloatArray:
-    i, j = np.triu_indices(x.shape[1])
+    i, j = _upper(x.shape[1])
     e = x[:, None, :] - xhat
     with np.errstate(over="ignore"):
         return np.concatenate([P[:, :, i, j], e[:, :, i] * e[:, :, j], nees[:, :, None]], axis=2)
@@ -152,4 +158,4 @@ def _after_start(times: FloatArray, end: float) -> np.ndarray:
 
 
 def _mean(values: FloatArray) -> FloatArray:
-    return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
+    return values.mean(axis=0) if len(values) else np.full(values.shape[1:], np.nan)
