@@ -16,6 +16,7 @@ import pytest
 import netkf
 from netkf.cli import main
 from netkf.engines.processes.engine import ProcessesEngine
+from netkf.experiments.ensembles import pools
 from netkf.experiments.ensembles.blocks import Grove, tree
 from netkf.experiments.ensembles.directory import runs_to_directory
 from netkf.experiments.ensembles.moments import merge_moments, single
@@ -336,6 +337,25 @@ def test_a_single_run_that_was_killed_is_done_again(tmp_path):
     (tmp_path / "cut" / "notes.txt").unlink()
     assert run(tmp_path, "cut", "--resume") == 0
     assert files(tmp_path / "cut") == files(tmp_path / "whole")
+
+
+class NoProcesses:
+    def __init__(self, workers):
+        raise AssertionError(f"{workers} processes were started")
+
+
+def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setattr(pools, "Processes", NoProcesses)
+    monkeypatch.setattr(pools, "cores", lambda: 2)
+    short = ring.replace({"horizon": 2.0})
+    here = netkf.monte_carlo(short, 20)
+    assert here.runs.max() == 20
+    for asked in ({"workers": 2}, {"engine": ProcessesEngine()}):
+        with pytest.raises(AssertionError, match="2 processes were started"):
+            netkf.monte_carlo(short, 20, **asked)
+    with pytest.raises(AssertionError, match="2 processes were started"):
+        netkf.monte_carlo(ring.replace({"horizon": 1000.0}), 1000)
 
 
 def begin(out, *arguments):

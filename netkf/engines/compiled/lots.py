@@ -27,6 +27,9 @@ LARGEST_LOT = 64
 MOST_BYTES = 1 << 24
 """Of what is drawn for a lot."""
 
+A_RUN, A_STEP, A_TICK = 5e-4, 1e-6, 1e-6
+"""Seconds of a run, a sensor's step and a tick for each dimension of the state, on some machine."""
+
 
 class OfLot:
     """The draws of one run of a lot: all at once."""
@@ -110,19 +113,30 @@ class Lots:
         self._next = replica + count
 
 
-def lot_size(scenario: Scenario) -> int:
-    """How many runs are drawn together, so that what is drawn is not too much to keep."""
-    period = scenario.truth.sensing_period
+def work_of(scenario: Scenario) -> tuple[float, int, float]:
+    """Of one run: steps of the path, sensors, and ticks, nan where they are not known."""
+    period, clock = scenario.truth.sensing_period, scenario.network.activation
     assert period is not None
-    steps, n = scenario.horizon / period + 64.0 + len(scenario.times), scenario.plant.n
-    sensors = sum(len(placed) for placed in scenario.placed.values())
-    rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
-    ticks = 0.0
-    clock = scenario.network.activation
+    steps = scenario.horizon / period + 64.0 + len(scenario.times)
+    sensors, ticks = sum(len(placed) for placed in scenario.placed.values()), 0.0
     if scenario.filter.algorithm.talks and isinstance(clock, LinkClock):
         ticks = sum(clock.mean_rate(link) for link in scenario.topology.links) * scenario.horizon
-    numbers = steps * (8 * n + 2 * sensors * rows) + 8.0 * ticks
+    return steps, sensors, ticks
+
+
+def lot_size(scenario: Scenario) -> int:
+    """How many runs are drawn together, so that what is drawn is not too much to keep."""
+    steps, sensors, ticks = work_of(scenario)
+    rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
+    numbers = steps * (8 * scenario.plant.n + 2 * sensors * rows) + 8.0 * ticks
     return int(min(LARGEST_LOT, MOST_BYTES / (8.0 * numbers)))
+
+
+def guessed_seconds(scenario: Scenario, runs: int) -> float:
+    """What so many runs of a scenario in continuous time take in lots; nan where nobody knows."""
+    steps, sensors, ticks = work_of(scenario)
+    one = A_RUN + A_STEP * steps * max(sensors, 1) + A_TICK * ticks
+    return runs * one * scenario.plant.n
 
 
 _expected: ContextVar[Lots | None] = ContextVar("expected", default=None)

@@ -16,7 +16,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, integer
 from netkf.experiments.ensembles.kept import KeptBlocks
 from netkf.experiments.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
-from netkf.experiments.ensembles.pools import make_pool
+from netkf.experiments.ensembles.pools import make_pool, workers_for
 from netkf.experiments.ensembles.replicas import Progress, block_size, replicate
 from netkf.experiments.ensembles.summary import summarise_ensemble
 from netkf.experiments.ensembles.tallies import Tally, merge, reduced_run
@@ -97,6 +97,7 @@ def runs_to_directory(
     engine_used = choose_engine(engine, scenario)
     chosen = engine_used.name
     check_sources(scenario)
+    workers = workers_for(scenario, runs, engine_used, workers, executor, scheduler)
     pool = make_pool(scenario, runs, workers, executor, scheduler)
     size = block_size(runs, pool.width)
     size = min(size, LARGEST_TRACED) if trace == "full" else size

@@ -11,6 +11,8 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import integer
+from netkf.experiments.ensembles.pools import workers_for
 from netkf.experiments.ensembles.replicas import Progress, replicate
 from netkf.experiments.ensembles.tallies import MESSAGES, Tally, merge, reduced_run
 from netkf.experiments.simulate import choose_engine
@@ -84,9 +86,10 @@ def monte_carlo(
     """Simulate replicas 0 .. runs - 1 and keep their means and standard errors.
 
     Replica 0 is the run of ``netkf.simulate(scenario, seed)``. The result is the same to the last
-    bit for any number of ``workers`` (processes; by default as many as there are cores), for any
-    ``executor`` of concurrent.futures and for any Dask ``scheduler`` ("tcp://HOST:PORT").
-    ``progress(done, wanted)`` is called as runs are done.
+    bit for any number of ``workers`` (processes; by default as many as there are cores, or this one
+    where the runs are done before others have started), for any ``executor`` of concurrent.futures
+    and for any Dask ``scheduler`` ("tcp://HOST:PORT"). ``progress(done, wanted)`` is called as runs
+    are done.
 
     Raises ScenarioError for arguments that are wrong and EngineError where the engine cannot run
     the scenario, a plugged-in class fails, or workers die again and again.
@@ -94,14 +97,14 @@ def monte_carlo(
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)
     chosen = choose_engine(engine, scenario)
-    seed = scenario.seed if seed is None else seed
+    seed, count = scenario.seed if seed is None else seed, integer(low=1)("runs", runs)
     whole = replicate(
         partial(reduced_run, engine=chosen),
         scenario,
-        runs,
+        count,
         seed,
         merge=merge,
-        workers=workers,
+        workers=workers_for(scenario, count, chosen, workers, executor, scheduler),
         executor=executor,
         scheduler=scheduler,
         progress=progress,

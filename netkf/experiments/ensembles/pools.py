@@ -13,12 +13,18 @@ from typing import Any
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
+from netkf.engines.base import Engine
+from netkf.engines.compiled.engine import CompiledEngine
+from netkf.engines.compiled.lots import guessed_seconds
 from netkf.experiments.ensembles.blocks import Job, block_result, work
 from netkf.experiments.ensembles.starting import context, main_hidden, one_blas_thread
 from netkf.scenario.scenario import Scenario
 
 AHEAD = 1024
 """Most blocks that are handed out and not yet back."""
+
+STARTING = 0.6
+"""Seconds until processes of our own do something."""
 
 PATIENCE = 10
 """Seconds to wait for a scheduler."""
@@ -174,6 +180,25 @@ def make_pool(
     count = cores() if workers is None else integer(low=1)("workers", workers)
     count = min(count, blocks)
     return Here(scenario) if count == 1 else Processes(count)
+
+
+def workers_for(
+    scenario: Scenario,
+    runs: int,
+    engine: Engine,
+    workers: int | None,
+    executor: Executor | None,
+    scheduler: str | None,
+) -> int | None:
+    """``workers``; 1 where nothing was asked for and all is done here before processes, once they
+    have started, would have done it.
+    """
+    if any(asked is not None for asked in (workers, executor, scheduler)):
+        return workers
+    if not isinstance(engine, CompiledEngine) or scenario.slotted:
+        return None
+    seconds = guessed_seconds(scenario, runs)
+    return 1 if seconds < STARTING + seconds / cores() else None
 
 
 def _prepare() -> None:
