@@ -80,6 +80,13 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
     return made
 
 
+def demanded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``compiled``, where numba is known to be there."""
+    made = compiled(function)
+    assert made is not None, "the extra fast is needed"
+    return made
+
+
 def _moderately_optimised(made: Any, config: Any) -> None:
     """Let LLVM work at its level 2: level 3 takes a quarter longer and gains nothing here."""
     compile_for = made._compile_for_args

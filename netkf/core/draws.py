@@ -10,16 +10,15 @@ numpy's tables (``ziggurat_constants.h``, BSD-3-Clause), kept in ``ziggurat.npz`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core import compiling
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import in_place
+from netkf.core.compiling import demanded, in_place
 from netkf.core.streams import Streams, Together
 
 _U = np.uint64
@@ -144,24 +143,18 @@ class Draws:
     ) -> None:
         words = streams.words(purpose, entities)
         self.states = np.empty(words.shape, dtype=np.uint64)
-        _compiled(seed_states)(words, self.states)
+        demanded(seed_states)(words, self.states)
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """``Generator.random(count)`` of each of the entities in these places, one after the
         other.
         """
         out = np.empty(int(counts.sum()))
-        _compiled(fill_units)(self.states, which, counts, out)
+        demanded(fill_units)(self.states, which, counts, out)
         return out
 
     def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """The same for ``Generator.standard_exponential``."""
         out = np.empty(int(counts.sum()))
-        _compiled(fill_exponentials)(self.states, which, counts, ziggurat(), out)
+        demanded(fill_exponentials)(self.states, which, counts, ziggurat(), out)
         return out
-
-
-def _compiled(function: Callable[..., None]) -> Callable[..., None]:
-    made = compiling.compiled(function)
-    assert made is not None, "the extra fast is needed"
-    return made

@@ -7,7 +7,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray, symmetric, symmetric_root
 from netkf.core.legendre import forward_coefficients
 from netkf.core.series import polynomial, with_reach
-from netkf.plants.recursion import powers
+from netkf.plants.recursion import Recursion
 
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
 MOST_GRIDS = 256  # kept stretches of the sensing grid
@@ -34,7 +34,7 @@ class Laws:
         self.spread = _factor(self._noise(period))
         self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
         self._grids: dict[tuple[int, int], FloatArray] = {}
-        self._powers = self.response[:1]
+        self.steps = Recursion(self.response[0])
 
     def grid(self, first: int, count: int) -> FloatArray:
         """(count,) points of the sensing grid from number ``first`` on."""
@@ -44,12 +44,6 @@ class Laws:
             if len(self._grids) < MOST_GRIDS:
                 self._grids[first, count] = known
         return known
-
-    def powers(self, count: int) -> FloatArray:
-        """(count, n, n): what a state adds to those 1, 2 ... steps later."""
-        if len(self._powers) < count:
-            self._powers = powers(self.response[0], count)
-        return self._powers[:count]
 
     def responses(self, gap: float) -> FloatArray:
         """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import covariance, positive, setting, square
 from netkf.plants.plant import Plant
-from netkf.plants.recursion import powers, states
+from netkf.plants.recursion import Recursion
 
 BLOCK = 64  # slots drawn at once
 
@@ -50,7 +51,12 @@ class LinearPlant(Plant):
 
     def truth(self, random: np.random.Generator) -> Truth:
         """The truth of one run."""
-        return LinearPath(self, random)
+        start = self.start_mean + square_root(self.start_cov) @ random.standard_normal(self.n)
+        return LinearPath(self._steps, square_root(self.Q), start, random)
+
+    @cached_property
+    def _steps(self) -> Recursion:
+        return Recursion(self.F)
 
 
 class Truth(Protocol):
@@ -74,20 +80,22 @@ class Readings(Protocol):
 
 
 class LinearPath:
-    """The path of one run, slot by slot."""
+    """The path of one run, slot by slot, from ``start`` (n,) on; what each step adds is ``root``
+    (n, q) times standard normals.
+    """
 
-    def __init__(self, plant: LinearPlant, random: np.random.Generator) -> None:
-        self._random, self._root = random, square_root(plant.Q)
-        self._powers = powers(plant.F, BLOCK)
-        start = plant.start_mean + square_root(plant.start_cov) @ random.standard_normal(plant.n)
+    def __init__(
+        self, steps: Recursion, root: FloatArray, start: FloatArray, random: np.random.Generator
+    ) -> None:
+        self._steps, self._root, self._random = steps, root, random
         self._first, self._x = 0, start[None]
 
     def state(self, slot: int) -> FloatArray:
         """X at a slot not before the last one asked for."""
         while slot >= self._first + len(self._x):
-            noise = self._random.standard_normal((BLOCK, len(self._root))) @ self._root.T
+            noise = self._random.standard_normal((BLOCK, self._root.shape[1])) @ self._root.T
             self._first += len(self._x) - 1
-            self._x = states(self._x[-1:], noise[None, None], self._powers)[0]
+            self._x = self._steps.states(self._x[-1:], noise[None, None])[0]
         return np.asarray(self._x[slot - self._first])
 
 

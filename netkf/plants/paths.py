@@ -21,7 +21,6 @@ from netkf.core.compiling import in_place
 from netkf.core.series import fill_polynomial, polynomial
 from netkf.core.small import added, applied
 from netkf.plants.laws import Laws, grid_time
-from netkf.plants.recursion import states
 
 BLOCK = 64  # steps drawn at once, or a multiple of it
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -93,7 +92,7 @@ class DiffusionPaths:
         noise = (normals @ laws.spread.T).reshape(count * blocks, BLOCK, 3, n)
         cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
         onwards = noise[:, :, 0].reshape(count, blocks, BLOCK, n)
-        x = states(self._x, onwards, laws.powers(BLOCK))
+        x = laws.steps.states(self._x, onwards)
         self._x = x[:, -1]
         before = x[:, :-1].reshape(count * blocks, BLOCK, n)
         moments = _moved(laws.response[1:], before) + noise[:, :, 1:]

@@ -7,24 +7,30 @@ import numpy as np
 from netkf.core.arrays import FloatArray
 
 
-def powers(F: FloatArray, count: int) -> FloatArray:
-    """(count, n, n): F, its square and so on."""
-    found = F[None]
-    with np.errstate(over="ignore", invalid="ignore"):
+class Recursion:
+    """What all paths of one ``F`` (n, n) share: its powers."""
+
+    def __init__(self, F: FloatArray) -> None:
+        self._powers = F[None]
+
+    def states(self, start: FloatArray, noise: FloatArray) -> FloatArray:
+        """(B, blocks L + 1, n) the states of B paths from ``start`` (B, n) on, each step of which
+        adds its noise (B, blocks, L, n).
+
+        Block by block, so that no path is rounded as its neighbours happen to be.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):  # perhaps beyond the horizon
+            to_later = self._to_later(noise.shape[2])
+            summed = np.isfinite(to_later[-1]).all()
+            return (_in_sums if summed else _one_by_one)(start, noise, to_later)
+
+    def _to_later(self, count: int) -> FloatArray:
+        """(count, n, n): F, its square and so on."""
+        found = self._powers
         while len(found) < count:
             found = np.concatenate([found, found @ found[-1]])
-    return found[:count]
-
-
-def states(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
-    """(B, blocks L + 1, n) the states of B paths from ``start`` (B, n) on, each step of which adds
-    its noise (B, blocks, L, n); ``to_later`` (L, n, n) are the powers of F.
-
-    Block by block, so that no path is rounded as its neighbours happen to be.
-    """
-    with np.errstate(over="ignore", invalid="ignore"):  # perhaps beyond the horizon
-        summed = np.isfinite(to_later[-1]).all()
-        return (_in_sums if summed else _one_by_one)(start, noise, to_later)
+        self._powers = found
+        return found[:count]
 
 
 def _one_by_one(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from netkf.core.arrays import FloatArray, frozen, square_root
 from netkf.core.fields import covariance, definite_covariance, matrix, setting, square, vector
-from netkf.plants.linear import Blocks, SlotReadings
+from netkf.plants.linear import LinearPath, SlotReadings
+from netkf.plants.recursion import Recursion
 from netkf.plants.sensors import Sensor
 
 
@@ -43,6 +45,11 @@ class RegressorSensor(Sensor):
         """(1, n): the row of slot 0."""
         return frozen((self.C @ self.start)[None])
 
+    @cached_property
+    def steps(self) -> Recursion:
+        """Of ``s``."""
+        return Recursion(self.A)
+
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RegressorReadings:
@@ -60,23 +67,14 @@ class RegressorReadings(SlotReadings):
         driving: np.random.Generator,
     ) -> None:
         super().__init__(sensor.H, sensor.R, random)
-        self._sensor, self._s, self._at = sensor, sensor.start, 0
-        self._drive = sensor.B @ square_root(sensor.xi_cov)
-        self._xi = Blocks(driving, len(sensor.xi_cov))
+        drive = sensor.B @ square_root(sensor.xi_cov)
+        self._C, self._s = sensor.C, LinearPath(sensor.steps, drive, sensor.start, driving)
 
     def matrix(self, slot: int) -> FloatArray:
         """``phi_k'`` (1, n) of a slot not before the last one asked for."""
-        while self._at < slot:
-            self._s = self._sensor.A @ self._s + self._drive @ self._xi.draw()
-            self._at += 1
-        return np.asarray((self._sensor.C @ self._s)[None])
+        return np.asarray((self._C @ self._s.state(slot))[None])
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
         """Their ``matrix`` (S, 1, n)."""
-        driven = (self._xi.draws(slots[-1] - self._at)[:, None] @ self._drive.T)[:, 0]
-        states, A = [self._s], self._sensor.A
-        for push in driven:
-            states.append(A @ states[-1] + push)
-        made = np.stack(states)[np.array(slots) - self._at]
-        self._s, self._at = states[-1], slots[-1]
-        return np.asarray(made[:, None] @ self._sensor.C.T)
+        states = np.stack([self._s.state(slot) for slot in slots])
+        return np.asarray(states[:, None] @ self._C.T)

@@ -114,21 +114,19 @@ class Recorder:
             return
         if self.counted:
             kinds = np.fromiter(map(itemgetter(1), self._rows), dtype=np.uint8)
-            with undisturbed():
-                self._rows.clear()
-                self._count(kinds)
+            self._rows.clear()
+            self._count(kinds)
             return
         rows = np.array(self._rows, dtype=EVENT)
-        with undisturbed():  # what is counted is also kept
-            self._rows.clear()
-            self._do(self._pass_on, rows)
+        self._rows.clear()
+        self._do(self._pass_on, rows)
 
     def extend(self, rows: np.ndarray) -> None:
         """Record a block of EVENT rows, which nobody writes to from now on."""
-        self._flush_gathered()
-        if not len(rows):
-            return
-        with undisturbed():
+        with undisturbed():  # what is counted is also kept
+            self._flush_gathered()
+            if not len(rows):
+                return
             if self.counted:
                 self._count(rows["kind"])
                 return

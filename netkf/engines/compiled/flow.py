@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.core import compiling
+from netkf.core.compiling import demanded
 from netkf.core.interrupts import undisturbed
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress
@@ -118,9 +118,7 @@ class Desk:
 
     def __init__(self, scenario: Scenario) -> None:
         function = replay_for(scenario)
-        made = compiling.compiled(function)
-        assert made is not None
-        self.replay = made
+        self.replay = demanded(function)
         self.hosts, self.models = host_tables(scenario)
         self._xhat, self._P = self.hosts.xhat.copy(), self.hosts.P.copy()
         self.links, self.mail = link_tables(scenario), empty_mail(self.hosts, FIRST_MAIL)

@@ -16,9 +16,9 @@ from functools import cached_property
 from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
 from netkf.engines.compiled.flow import Desk, Draws, Source
-from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson
+from netkf.engines.compiled.poisson import schedules
 from netkf.engines.compiled.readings import Stretch
-from netkf.engines.compiled.schedule import Window, whole_schedules
+from netkf.engines.compiled.schedule import Window
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
 from netkf.scenario.scenario import Scenario
@@ -94,10 +94,7 @@ class Lots:
     def _draw(self, replica: int) -> None:
         count = min(self._size, self._stop - replica)
         streams = Together(self._seed, replica, count)
-        if is_poisson(self._scenario):
-            windows = PoissonSchedules(self._scenario, streams).whole()
-        else:
-            windows = whole_schedules(self._scenario, streams)
+        windows = schedules(self._scenario, streams)
         blocks = blocks_to_the_end(self._scenario)
         stretches = Paths(self._scenario, streams, blocks).following()
         ticks = max(len(window.t) for window in windows)

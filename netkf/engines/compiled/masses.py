@@ -12,9 +12,8 @@ import numpy as np
 
 from netkf.algorithms.push_sum import PushSum, kept, share, understood
 from netkf.algorithms.stopping import PAPER, RULES, stops
-from netkf.core import compiling
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
+from netkf.core.compiling import compilable, demanded
 from netkf.core.small import fill, fill_square
 from netkf.scenario.scenario import Scenario
 
@@ -100,13 +99,12 @@ class Stopping:
         self._masses, _ = first_masses(scenario)
         self._rule, self._tolerance = RULES.index(algorithm.stop), algorithm.tolerance
         self.silences = self._rule == PAPER
-        self._exchange = compiling.compiled(exchange_masses)
+        self._exchange = demanded(exchange_masses)
 
     def exchange(self, messages: list[tuple[int, int, float]]) -> list[int]:
         """One exchange of the mass, of messages (receiver, sender, weight); the places of the nodes
         that stop with it.
         """
-        assert self._exchange is not None
         before = self._masses.frozen.copy()
         if self.silences and before.all():
             return []

@@ -13,10 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compiled, in_place
+from netkf.core.compiling import demanded, in_place
 from netkf.core.draws import Draws, Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.core.streams import Streams, Together
-from netkf.engines.compiled.schedule import LOST, Schedule, Ticks, Window, way_chances, way_luck
+from netkf.engines.compiled.schedule import (
+    LOST,
+    Schedule,
+    Ticks,
+    Window,
+    way_chances,
+    way_luck,
+    whole_schedules,
+)
 from netkf.network.channels import alike
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.scenario.scenario import Scenario
@@ -154,9 +162,7 @@ class PoissonSchedules:
         return [self._window(run, 0.0, math.inf) for run in range(runs)]
 
     def _window(self, run: int, begin: float, end: float) -> Window:
-        draw, put = compiled(draw_ticks), compiled(put_in_time_order)
-        assert draw is not None
-        assert put is not None
+        draw, put = demanded(draw_ticks), demanded(put_in_time_order)
         last = min(end, self._horizon)
         expected = self._rate * (last - begin)
         count, room = 0, int(expected + 8.0 * math.sqrt(expected)) + 8
@@ -179,6 +185,13 @@ class PoissonSchedules:
 
 def _room(count: int) -> Ticks:
     return Ticks(np.empty(count), np.empty(count, dtype=np.int64), np.empty((count, 2)))
+
+
+def schedules(scenario: Scenario, streams: Together) -> list[Window]:
+    """All ticks of each of several runs, as one window."""
+    if is_poisson(scenario):
+        return PoissonSchedules(scenario, streams).whole()
+    return whole_schedules(scenario, streams)
 
 
 def schedule(scenario: Scenario, streams: Streams) -> PoissonSchedules | Schedule:

@@ -12,8 +12,8 @@ from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.algorithms.stopping import RULES
-from netkf.core import compiling
 from netkf.core.arrays import FloatArray, square_root
+from netkf.core.compiling import demanded
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress
 from netkf.engines.compiled.exchanges import SENSING, Slots
@@ -54,9 +54,7 @@ class SlotRun:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, SlotFilter)
-        kernel = compiling.compiled(KERNELS[type(algorithm)])
-        assert kernel is not None
-        self._kernel, self._pooled = kernel, algorithm.pooled
+        self._kernel, self._pooled = demanded(KERNELS[type(algorithm)]), algorithm.pooled
         self._exchanges = make_exchanges(scenario, streams)
         self._truth: Truth = scenario.slot_plant.truth(streams.generator("plant"))
         paths = {
