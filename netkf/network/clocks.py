@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,9 +10,9 @@ from functools import cached_property
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
-    Part,
     SourceFile,
     choice,
     either,
@@ -30,61 +29,14 @@ from netkf.network.graphs import Link, Topology, demand_links
 
 
 @dataclass(frozen=True, eq=False)
-class LinkClock(Part):
-    """The contract of a clock: a stateless maker of increasing tick times, all above 0.
+class LinkClock(Clock):
+    """A clock of links: the contract of ``network.activation`` in continuous time.
 
-    A link is a pair (i, j) with i < j. The engine owns each link's generator, one draw a tick, so
-    that a link's times depend on nothing but its own stream.
+    A link is a pair (i, j) with i < j.
     """
-
-    @abstractmethod
-    def ticks(
-        self,
-        link: Link,
-        origin: float,
-        index: int,
-        now: float,
-        random: np.random.Generator,
-        count: int,
-    ) -> FloatArray:
-        """Times of up to ``count`` ticks from number ``index`` on; tick ``index - 1`` was at
-        ``now`` (0.0 before the first). Empty when the clock has stopped for good.
-        """
-
-    def origin(self, link: Link, random: Callable[[], np.random.Generator]) -> float:
-        """What is drawn once for a link at its start, such as a phase, from ``random()``."""
-        return 0.0
-
-    def mean_rate(self, link: Link) -> float:
-        """Mean ticks per second in the long run; nan where it is not known beforehand."""
-        return math.nan
-
-    @property
-    def memoryless(self) -> bool:
-        """Whether the ticks are a Poisson process, as H Theorem 2 demands."""
-        return False
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError where the settings do not fit the graph."""
-
-
-def next_ticks(
-    clock: LinkClock,
-    link: Link,
-    origin: float,
-    index: int,
-    now: float,
-    random: np.random.Generator,
-    count: int,
-) -> FloatArray:
-    """``clock.ticks``; raises ScenarioError where time does not go on, since a run never ends
-    then.
-    """
-    t = np.asarray(clock.ticks(link, origin, index, now, random, count), dtype=np.float64)
-    if len(t) and not (t[-1] > now and t[0] >= now and (np.diff(t) >= 0.0).all()):
-        words = f"{type(clock).__name__}: ticks of link {list(link)} must increase, after {now:g} s"
-        raise ScenarioError("network.activation", words, t[:3].tolist(), "mend ticks of the class")
-    return t
 
 
 def _accumulate(now: float, gaps: FloatArray) -> FloatArray:

@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.clock import next_ticks
 from netkf.core.draws import Draws
 from netkf.core.streams import Streams, Together
 from netkf.network.channels import Fates, alike, chances, needed
-from netkf.network.clocks import LinkClock, Poisson, next_ticks
+from netkf.network.clocks import LinkClock, Poisson
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 

@@ -8,12 +8,13 @@ from typing import Any
 
 import simpy
 
+from netkf.core.clock import next_ticks
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.processes.hosts import Host
 from netkf.engines.processes.timeline import Timeline
 from netkf.engines.processes.wires import Wire, stream
-from netkf.network.clocks import LinkClock, next_ticks
+from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
