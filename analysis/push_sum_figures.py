@@ -51,7 +51,7 @@ def simulated(cell):
         scenario = scenario.replace({"filter": {"kind": gamma}})
     run = netkf.simulate(scenario.replace({"probe": 0.5}), replica=replica)
     used = run.times >= scenario.horizon / 5.0
-    return float(((run.x[:, None] - run.xhat)[used] ** 2).sum(axis=-1).mean())
+    return float((run.error[used] ** 2).sum(axis=-1).mean())
 
 
 def interval(values):

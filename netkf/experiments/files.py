@@ -181,10 +181,12 @@ class ParquetSink(Sink):
             self._events.write(event_columns(rows, self._replica, self._first))
             self._first += len(rows)
 
-    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
         """Gathered into row groups."""
         if self._states is not None:
-            self._samples.append((t, x, xhat, P))
+            self._samples.append((t, x, xhat, P, error))
             self._rows += len(t) * len(self._nodes)
             if self._rows >= ROWS:
                 self._flush()
@@ -193,10 +195,12 @@ class ParquetSink(Sink):
         if self._states is None or not self._samples:
             return
         columns = zip(*self._samples, strict=True)
-        times, x, xhat, P = (np.concatenate(column) for column in columns)
+        times, x, xhat, P, error = (np.concatenate(column) for column in columns)
         self._samples.clear()
         self._rows = 0
-        self._states.write(state_table(self._replica, times, self._nodes, x, xhat, P, self._shown))
+        self._states.write(
+            state_table(self._replica, times, self._nodes, x, xhat, P, error, self._shown)
+        )
 
     def close(self) -> None:
         """Finish the files and give them their names."""
@@ -227,9 +231,10 @@ class TraceTables:
         x: FloatArray,
         xhat: FloatArray,
         P: FloatArray,
+        error: FloatArray,
     ) -> None:
         """All of one run: EVENT rows, and samples as in ``netkf.Run``."""
-        states = state_table(replica, times, self._nodes, x, xhat, P, self._shown)
+        states = state_table(replica, times, self._nodes, x, xhat, P, error, self._shown)
         for gathered, columns in zip(
             self._gathered, (event_columns(log, replica, 0), states), strict=True
         ):

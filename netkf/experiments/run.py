@@ -123,7 +123,8 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     samples, tables = SummarySink(), ParquetSink(folder, scenario, run.replica, True)
     for sink in (samples, tables):
         sink.events(run.log)
-        sink.states(run.times, run.x, run.xhat, run.P)
+        sink.exact_errors = run.exact_errors
+        sink.states(run.times, run.x, run.xhat, run.P, run.error)
     tables.close()
     _summary(folder, scenario, samples, promise(scenario, run.times), run.count, run.sums)
     totals = {"events": len(run.log), "fingerprint": run.fingerprint}

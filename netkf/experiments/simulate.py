@@ -79,16 +79,17 @@ def collect(
 ) -> Run:
     """A Run from what a recorder gathered."""
     count, n = len(scenario.nodes), scenario.plant.n
-    shapes = (), (n,), (count, n), (count, n, n)
+    shapes = (), (n,), (count, n), (count, n, n), (count, n)
     nothing = tuple(np.empty((0, *shape)) for shape in shapes)
     columns = zip(nothing, *memory.samples, strict=True)
-    times, x, xhat, P = (np.concatenate(column) for column in columns)
+    times, x, xhat, P, error = (np.concatenate(column) for column in columns)
     return Run(
         times=times,
         nodes=scenario.nodes,
         x=x,
         xhat=xhat,
         P=P,
+        error=error,
         log=np.concatenate([np.empty(0, dtype=EVENT), *memory.blocks]),
         seed=seed,
         replica=replica,
@@ -97,4 +98,6 @@ def collect(
         fingerprint=recorder.fingerprint,
         sums=recorder.sums,
         shown=scenario.plant.shown,
+        exact_errors=recorder.exact_errors,
+        stats=recorder.stats,
     )

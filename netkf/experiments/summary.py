@@ -49,17 +49,19 @@ class SummarySink(Sink):
         for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
             self.delivered[i, j] = self.delivered.get((i, j), 0) + count
 
-    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
         """Reduced at once."""
         if not len(t):
             return
-        sq_error, nees = errors(x, xhat, P)
+        sq_error, nees = errors(error, P)
         self.times += t.tolist()
         self.sq_error += list(sq_error)
         self.nees += list(nees)
         self.trace += list(np.trace(P, axis1=2, axis2=3))
-        if self.rounding_from is None:
-            first = rounding_from(t, x, P)
+        if self.rounding_from is None and not self.exact_errors:
+            first = rounding_from(t, x, P, error)
             self.rounding_from = first if first < np.inf else None
 
 

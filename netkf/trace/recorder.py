@@ -33,14 +33,20 @@ class Sink(ABC):
     """
 
     anywhere: ClassVar[bool] = False
+    exact_errors: bool = False
+    """Whether errors keep their digits however large the state is; the recorder sets it."""
 
     @abstractmethod
     def events(self, rows: np.ndarray) -> None:
         """A block of EVENT rows that follows the one before."""
 
     @abstractmethod
-    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
-        """Samples at times (T,): x (T, n), xhat (T, N, n), P (T, N, n, n)."""
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
+        """Samples at times (T,): x (T, n), xhat (T, N, n), P (T, N, n, n), nan where the filter
+        gives none, and error (T, N, n), x - xhat without the rounding of large x and xhat.
+        """
 
 
 class MemorySink(Sink):
@@ -56,9 +62,11 @@ class MemorySink(Sink):
         """Appended."""
         self.blocks.append(rows)
 
-    def states(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
         """Appended."""
-        self.samples.append((t, x, xhat, P))
+        self.samples.append((t, x, xhat, P, error))
 
 
 def _ignore(row: tuple[float, int, int, int, int, int, float]) -> None:
@@ -82,6 +90,23 @@ class Recorder:
         """``append((t, kind code, node, peer, message, phase, age))`` records one event."""
         self.sums: dict[str, tuple[float, float]] = {}
         """Sums over all nodes that exchanges should conserve: at the start, at the last sample."""
+        self.stats: dict[str, int] = {}
+        """What the engine counted of its own work, such as SimPy processes and events."""
+        self._exact_errors = False
+
+    @property
+    def exact_errors(self) -> bool:
+        """Whether errors keep their digits however large the state is: False where the engine
+        subtracts xhat from x, and True where it simulates the state in a frame that moves along.
+        An engine sets it before the first sample.
+        """
+        return self._exact_errors
+
+    @exact_errors.setter
+    def exact_errors(self, value: bool) -> None:
+        self._exact_errors = value
+        for sink in self._sinks:
+            sink.exact_errors = value
 
     def pause(self) -> None:
         """Record no events until ``resume``."""
@@ -158,18 +183,24 @@ class Recorder:
         for sink in self._sinks:
             sink.events(rows)
 
-    def sample(self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
-        """Record one sample of the truth (n,) and of all nodes (N, n), (N, n, n)."""
-        self.samples(np.array([t]), x[None], xhat[None], P[None])
+    def sample(
+        self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
+        """Record one sample of the truth (n,) and of all nodes: xhat and error (N, n), P (N, n, n),
+        nan where the filter gives no covariance.
+        """
+        self.samples(np.array([t]), x[None], xhat[None], P[None], error[None])
 
-    def samples(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def samples(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
         """Record some samples, which nobody writes to from now on."""
         with undisturbed():  # what one sink has seen all have
-            self._do(self._show, t, x, xhat, P)
+            self._do(self._show, t, x, xhat, P, error)
 
-    def _show(self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray) -> None:
+    def _show(self, *sample: FloatArray) -> None:
         for sink in self._sinks:
-            sink.states(t, x, xhat, P)
+            sink.states(*sample)
 
     def count(self, kind: str) -> int:
         """Events of a kind that were flushed."""

@@ -22,10 +22,14 @@ ROUNDING = 4.0 * np.finfo(float).eps
 class Run:
     """What happened in one run.
 
-    times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n); ``log`` holds the events as a
-    structured array (trace.schema.EVENT). ``status`` is complete, interrupted or diverged.
-    ``sums`` holds what exchanges should conserve, summed over all nodes: at the start and at the
-    last sample. Where the truth is not ``shown``, x is nan and tables have no columns of errors.
+    times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n), nan where the filter gives no
+    covariance, error (T, N, n); ``log`` holds the events as a structured array
+    (trace.schema.EVENT). ``error`` is x - xhat; with ``exact_errors`` it has digits even where x
+    and xhat are so large that their difference has lost them, else digits are lost from
+    ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds what
+    exchanges should conserve, summed over all nodes: at the start and at the last sample. Where the
+    truth is not ``shown``, x is nan and tables have no columns of errors. ``stats`` holds what the
+    engine counted of its own work.
     """
 
     times: FloatArray
@@ -33,6 +37,7 @@ class Run:
     x: FloatArray
     xhat: FloatArray
     P: FloatArray
+    error: FloatArray
     log: np.ndarray
     seed: int
     replica: int
@@ -41,6 +46,8 @@ class Run:
     fingerprint: str
     sums: dict[str, tuple[float, float]] = field(default_factory=dict)
     shown: bool = True
+    exact_errors: bool = False
+    stats: dict[str, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         span = f"{self.times[0]:g} .. {self.times[-1]:g} s" if len(self.times) else "nothing"
@@ -62,8 +69,17 @@ class Run:
         """Table of state samples, columns as trace.schema.state_columns."""
         import pandas as pd
 
-        samples = (self.times, self.nodes, self.x, self.xhat, self.P)
+        samples = (self.times, self.nodes, self.x, self.xhat, self.P, self.error)
         return pd.DataFrame(state_table(self.replica, *samples, self.shown))
+
+    @cached_property
+    def rounding_from(self) -> float:
+        """The first sample time at which rounding of the state blurs ``error``, inf if none does;
+        always inf with ``exact_errors``.
+        """
+        if self.exact_errors:
+            return np.inf
+        return rounding_from(self.times, self.x, self.P, self.error)
 
     def count(self, kind: str) -> int:
         """Number of events of a kind."""
@@ -80,31 +96,40 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
     return {name: columns[name] if name in columns else rows[name] for name in EVENT_COLUMNS}
 
 
-def errors(x: FloatArray, xhat: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared error and NEES ``e' P^-1 e``, (T, N) each, of x (T, n), xhat (T, N, n) and
-    P (T, N, n, n); NEES is nan where P is singular.
+def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared error and NEES ``e' P^-1 e``, (T, N) each, of errors (T, N, n) and P (T, N, n, n);
+    NEES is nan where P is singular or nan.
     """
-    e = x[:, None, :] - xhat
     with np.errstate(all="ignore"):
         try:
             solved = np.linalg.solve(P, e[..., None])[..., 0]
         except np.linalg.LinAlgError:
             solved = np.full_like(e, np.nan)
-            regular = np.linalg.matrix_rank(P, hermitian=True) == P.shape[-1]
+            regular = np.array(np.isfinite(P).all(axis=(2, 3)))
+            ranks = np.linalg.matrix_rank(P[regular], hermitian=True)
+            regular[regular] = np.asarray(ranks) == P.shape[-1]
             solved[regular] = np.linalg.solve(P[regular], e[regular][:, :, None])[:, :, 0]
         return (e * e).sum(axis=-1), (e * solved).sum(axis=-1)
 
 
-def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray) -> float:
+def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray) -> float:
     """The first of the times (T,) at which states x (T, n) are so large that rounding blurs errors
-    of the size that P (T, N, n, n) says; inf where there is none.
+    x - xhat of the size that P (T, N, n, n) says, or, where P is nan, of the root mean square of
+    the errors e (T, N, n) themselves; inf where there is none.
     """
     if not len(times):
         return np.inf
-    least = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        least = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
+        least = np.where(np.isnan(P).all(axis=(1, 2, 3)), (e * e).mean(axis=(1, 2)), least)
     deviation = 0.01 * np.sqrt(np.maximum(least, 0.0))
-    blurred = (ROUNDING * np.abs(x).max(axis=1) > deviation) & (deviation > 0.0)
+    blurred = (rounding(x) > deviation) & (deviation > 0.0)
     return float(times[np.argmax(blurred)]) if blurred.any() else np.inf
+
+
+def rounding(x: FloatArray) -> FloatArray:
+    """(T,) the size of the error that rounding adds to x - xhat where both are about x (T, n)."""
+    return np.asarray(ROUNDING * np.abs(x).max(axis=1))
 
 
 def state_table(
@@ -114,13 +139,14 @@ def state_table(
     x: FloatArray,
     xhat: FloatArray,
     P: FloatArray,
+    error: FloatArray,
     shown: bool = True,
 ) -> dict[str, Any]:
     """Samples as named columns, a row a time and node; errors only where the truth is shown."""
     count, n = len(nodes), x.shape[1]
     rows = len(times) * count
     upper = np.triu_indices(n)
-    sq_error, nees = errors(x, xhat, P)
+    sq_error, nees = errors(error, P)
     values = [
         np.full(rows, replica, dtype=np.int64),
         np.repeat(times, count),

@@ -48,7 +48,7 @@ class OneDraw(Streams):
 def run(scenario, streams):
     memory = MemorySink()
     ProcessesEngine().run(scenario, streams, Recorder([memory]), lambda time: None)
-    return np.concatenate([x[:, None] - xhat for _, x, xhat, _ in memory.samples])
+    return np.concatenate([error for *_, error in memory.samples])
 
 
 def engine_covariance(scenario):

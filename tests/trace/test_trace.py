@@ -82,7 +82,7 @@ class Watched(MemorySink):
         if len(self.blocks) == self.fails:
             raise OSError("the disk is full")
 
-    def states(self, t, x, xhat, P):
+    def states(self, t, x, xhat, P, error):
         self.calls.append((threading.current_thread(), "states", int(t[0])))
 
 
@@ -100,7 +100,9 @@ def test_long_blocks_are_kept_by_one_other_thread_in_their_order():
         rows = block(number, recorder.LONG if number in (2, 4) else 5)
         plain.update(rows.tobytes())
         record.extend(rows)
-        record.sample(float(number), *(np.zeros(shape) for shape in ((1,), (2, 1), (2, 1, 1))))
+        record.sample(
+            float(number), *(np.zeros(shape) for shape in ((1,), (2, 1), (2, 1, 1), (2, 1)))
+        )
     record.flush()
     assert record.fingerprint == plain.hexdigest()
     assert record.total == 2 * recorder.LONG + 20
@@ -141,9 +143,9 @@ class Interrupted(MemorySink):
         os.kill(os.getpid(), signal.SIGINT)
         super().events(rows)
 
-    def states(self, t, x, xhat, P):
+    def states(self, t, x, xhat, P, error):
         os.kill(os.getpid(), signal.SIGINT)
-        super().states(t, x, xhat, P)
+        super().states(t, x, xhat, P, error)
 
 
 def test_an_interrupt_leaves_every_sink_with_the_same():
@@ -152,7 +154,13 @@ def test_an_interrupt_leaves_every_sink_with_the_same():
     with pytest.raises(KeyboardInterrupt):
         log.extend(block(0, 3))
     with pytest.raises(KeyboardInterrupt):
-        log.samples(np.zeros(2), np.zeros((2, 1)), np.zeros((2, 3, 1)), np.zeros((2, 3, 1, 1)))
+        log.samples(
+            np.zeros(2),
+            np.zeros((2, 1)),
+            np.zeros((2, 3, 1)),
+            np.zeros((2, 3, 1, 1)),
+            np.zeros((2, 3, 1)),
+        )
     assert [len(sink.blocks) for sink in sinks] == [1, 1, 1]
     assert [len(sink.samples) for sink in sinks] == [1, 1, 1]
     assert log.total == 3

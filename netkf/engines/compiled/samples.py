@@ -37,7 +37,8 @@ def recorded(
     finite = np.isfinite(P).all(axis=(1, 2, 3)) & np.isfinite(xhat).all(axis=(1, 2))
     last = len(times) - 1 if finite.all() else int(np.argmin(finite))
     after, time = last + 1, float(times[last])
-    recorder.samples(times[:after], x[:after], xhat[:after], P[:after])
+    error = x[:after, None] - xhat[:after]
+    recorder.samples(times[:after], x[:after], xhat[:after], P[:after], error)
     progress(time)
     if finite.all():
         return True

@@ -158,7 +158,7 @@ def _record(
     xhat: FloatArray,
     P: FloatArray,
 ) -> None:
-    recorder.sample(time, x, xhat, P)
+    recorder.sample(time, x, xhat, P, x - xhat)
     recorder.flush_if_full()
     progress(time)
     nodes = broken(scenario, xhat, P)

@@ -54,8 +54,8 @@ class Exact(NamedTuple):
 
 def exact(scenario: Scenario, run: Run) -> Exact:
     """Reduce a run."""
-    _, nees = errors(run.x, run.xhat, run.P)
-    e = run.x[:, None] - run.xhat
+    e = run.error
+    _, nees = errors(e, run.P)
     replayed = Sigma = np.full(run.P.shape, np.nan)
     whole = np.full((len(run.times), 2), np.nan)
     if run.replica < MOST and within_reach(scenario).holds:

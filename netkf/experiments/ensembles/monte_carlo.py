@@ -31,7 +31,7 @@ class Ensemble:
     """What many runs of one scenario came to.
 
     times (T,), nodes (N,), ``runs`` (T,): how many have that sample (runs that diverge end early);
-    mean_P and mean_error (T, N, n, n): means of P and of (x - xhat)(x - xhat)'; mean_nees (T, N);
+    mean_P and mean_error (T, N, n, n): means of P and of e e', e = x - xhat; mean_nees (T, N);
     se_P, se_error, se_nees: their standard errors entry by entry, nan for a single run. ``average``
     and ``se_average`` (N + 1, 3): mean square error, mean trace of P and mean NEES, each averaged
     over the samples after time 0, of the nodes in their order and, last, of all of them together.

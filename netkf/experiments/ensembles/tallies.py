@@ -14,7 +14,7 @@ from netkf.experiments.ensembles.moments import Moments, merge_moments, single
 from netkf.experiments.simulate import choose_engine, collect
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder
-from netkf.trace.run import Run, errors, rounding_from
+from netkf.trace.run import Run, errors
 
 MESSAGES = ("sent", "delivered", "lost", "in_flight")
 
@@ -28,12 +28,13 @@ class Trace(NamedTuple):
     x: FloatArray
     xhat: FloatArray
     P: FloatArray
+    error: FloatArray
 
 
 class Tally(NamedTuple):
     """Some runs, reduced.
 
-    ``samples``: (T, N, 2 u + 1) upper triangles of P and of e e' with e = x - xhat, then NEES;
+    ``samples``: (T, N, 2 u + 1) upper triangles of P and of e e' with the error e, then NEES;
     size (T, 1, 1). ``averages``: (N + 1, 3) of every run: mean square error, mean trace of P and
     mean NEES over the samples after time 0, of the nodes and of all; size (1, 1). ``messages``:
     (4,) as MESSAGES, size (1,). ``totals`` are events, diverged runs. ``conserved``: of each sum
@@ -107,16 +108,16 @@ def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Ta
     """A sample at which a node's estimate or covariance is no longer finite is left out."""
     diverged = run.status == "diverged"
     kept = len(run.times) - 1 if diverged else len(run.times)
-    x, xhat, P = run.x[:kept], run.xhat[:kept], run.P[:kept]
-    sq_error, nees = errors(x, xhat, P)
+    P, e = run.P[:kept], run.error[:kept]
+    sq_error, nees = errors(e, P)
     trace = np.trace(P, axis1=2, axis2=3)
-    blurred = rounding_from(run.times[:kept], x, P)
+    blurred = run.rounding_from
     used = _after_start(run.times[:kept], blurred if diverged else np.inf)
     averages = _mean(np.stack([sq_error, trace, nees], axis=2)[used])
     lost = recorder.count("lost") + recorder.count("late")
     sent, delivered = recorder.count("send"), recorder.count("deliver")
     return Tally(
-        single(*_padded(_columns(x, xhat, P, nees), len(wanted))),
+        single(*_padded(_columns(P, e, nees), len(wanted))),
         single(np.vstack([averages, averages.mean(axis=0)]), np.ones((1, 1))),
         single(np.array([sent, delivered, lost, sent - delivered - lost], float), np.ones(1)),
         np.array([recorder.total, int(diverged)]),
@@ -126,7 +127,9 @@ def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Ta
         },
         blurred,
         run.fingerprint,
-        (Trace(run.replica, run.log, run.times, run.x, run.xhat, run.P),) if traced else (),
+        (Trace(run.replica, run.log, run.times, run.x, run.xhat, run.P, run.error),)
+        if traced
+        else (),
     )
 
 
@@ -135,9 +138,8 @@ def _upper(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.triu_indices(n)
 
 
-def _columns(x: FloatArray, xhat: FloatArray, P: FloatArray, nees: FloatArray) -> FloatArray:
-    i, j = _upper(x.shape[1])
-    e = x[:, None, :] - xhat
+def _columns(P: FloatArray, e: FloatArray, nees: FloatArray) -> FloatArray:
+    i, j = _upper(e.shape[2])
     with np.errstate(over="ignore"):
         return np.concatenate([P[:, :, i, j], e[:, :, i] * e[:, :, j], nees[:, :, None]], axis=2)
 

@@ -54,7 +54,7 @@ class Seen(NamedTuple):
 def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Seen:
     """What one replica says, for ``replicate``."""
     run = simulate(scenario, seed, replica, engine)
-    _, nees = errors(run.x, run.xhat, run.P)
+    _, nees = errors(run.error, run.P)
     kept = np.flatnonzero(run.times > 0.0)
     try:
         sigma = error_covariance(scenario, run)
