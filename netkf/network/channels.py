@@ -6,7 +6,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -14,17 +13,14 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Part,
-    SourceFile,
     boolean,
     instance,
     number,
     positive,
     probability,
     setting,
-    source_file,
 )
-from netkf.core.tables import read_columns, whole
-from netkf.network.graphs import Link, Topology, demand_links
+from netkf.network.graphs import Link, Topology
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,73 +194,31 @@ class GilbertElliott(Loss):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedLoss(Loss):
-    """Fates read from a table ``sender,receiver,message,delivered`` (0 or 1, messages of a
-    directed link counted from 0); what the table does not list is delivered.
-    """
-
-    path: SourceFile = setting(source_file)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _ = self._lost  # a bad file is refused now
-
-    @cached_property
-    def _lost(self) -> dict[Link, frozenset[int]]:
-        names = ("sender", "receiver", "message", "delivered")
-        table = read_columns(self.path, names)
-        rows = zip(*(whole(self.path, name, table[name]) for name in names), strict=True)
-        known: dict[tuple[int, int, int], int] = {}
-        lost: dict[Link, set[int]] = {}
-        for sender, receiver, message, delivered in rows:
-            key = (sender, receiver, message)
-            if delivered not in (0, 1) or known.setdefault(key, delivered) != delivered:
-                raise ScenarioError(
-                    "path",
-                    f"{self.path.name}: delivered must be 0 or 1, one value a message",
-                    [sender, receiver, message, delivered],
-                    "mend the row",
-                )
-            fates = lost.setdefault((sender, receiver), set())
-            if not delivered:
-                fates.add(message)
-        return {link: frozenset(fates) for link, fates in lost.items()}
-
-    @property
-    def certain(self) -> bool:
-        """True."""
-        return True
-
-    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
-        """0 or 1."""
-        return 0.0 if message in self._lost.get(link, ()) else 1.0
-
-    def mean_delivery(self, link: Link, measured: float) -> float:
-        """Not known beforehand."""
-        return math.nan
-
-    @property
-    def independent(self) -> bool:
-        """A record is one outcome, not a law."""
-        return False
-
-    def check(self, topology: Topology) -> None:
-        """Every recorded pair is a link."""
-        demand_links(self.path, self._lost, topology)
-
-
-@dataclass(frozen=True, eq=False)
 class Delay(Part):
     """The contract of a delay model."""
 
     @abstractmethod
     def draw(self, random: np.random.Generator) -> float:
-        """Seconds, not negative."""
+        """Seconds, not negative; once per activation, and only if ``drawn``."""
 
     @property
     def fixed(self) -> float | None:
         """The delay where it is always the same, else None."""
         return None
+
+    @property
+    def drawn(self) -> bool:
+        """Whether ``draw`` is called."""
+        return self.fixed is None
+
+    def message_delay(self, link: Link, message: int, drawn: float) -> float:
+        """Seconds that message number ``message`` takes from link[0] to link[1], not negative; nan
+        if it is lost. ``drawn`` is what ``draw`` gave, or ``fixed``, or else 0.
+        """
+        return drawn
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError if the settings do not fit the graph."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,21 +314,22 @@ class Fates:
 
     def __init__(self, channel: Channel, generator: Callable[[str], np.random.Generator]) -> None:
         self._loss, self._delay = channel.loss, channel.delay
-        self._fixed = channel.delay.fixed
+        self._fixed = channel.delay.fixed or 0.0
         self._bad: bool | None = None
         made = {purpose: generator(purpose) for purpose in needed(channel)}
         self._luck, self._sky = made.get("loss"), made.get("weather")
         self._post = made.get("delay")
 
     def draw(self) -> tuple[float, bool, float]:
-        """A uniform number, whether the link is in its bad state, and a delay in seconds."""
+        """A uniform number, whether the link is in its bad state, and a delay in seconds (0 if
+        none is drawn).
+        """
         luck, bad, delay = 0.0, False, self._fixed
         if self._luck is not None:
             luck = float(self._luck.random())
         if self._sky is not None:
             self._bad = bad = self._loss.weather(self._bad, self._sky)
-        if delay is None:
-            assert self._post is not None
+        if self._post is not None:
             delay = self._delay.draw(self._post)
         return luck, bad, delay
 
@@ -398,7 +353,7 @@ def needed(channel: Channel) -> tuple[str, ...]:
         asked.append("loss")
     if channel.loss.changing:
         asked.append("weather")
-    if channel.delay.fixed is None:
+    if channel.delay.drawn:
         asked.append("delay")
     return tuple(asked)
 
@@ -437,3 +392,34 @@ def checked_chance(loss: Loss, link: Link, message: int, bad: bool, measured: fl
         remedy = "mend chance of the class"
         raise ScenarioError("network.channel.loss", f"{words} be in [0, 1]", chance, remedy)
     return chance
+
+
+def by_message(delay: Delay) -> bool:
+    """Whether delays depend on the message, so that ``message_delay`` must be asked."""
+    return type(delay).message_delay is not Delay.message_delay
+
+
+def checked_delay(delay: Delay, link: Link, message: int, drawn: float) -> float:
+    """``delay.message_delay``; raises ScenarioError if it is negative."""
+    seconds = delay.message_delay(link, message, drawn)
+    if seconds < 0.0:
+        words = f"{type(delay).__name__}: the delay of message {message} on link {list(link)} must"
+        remedy = "mend message_delay of the class"
+        raise ScenarioError("network.channel.delay", f"{words} not be negative", seconds, remedy)
+    return seconds
+
+
+def outcome(
+    channel: Channel,
+    link: Link,
+    message: int,
+    draw: tuple[float, bool, float],
+    measured: float,
+) -> float:
+    """Seconds after which message number ``message`` of a directed link arrives, nan if it is
+    lost; ``draw`` is that of Fates. Raises ScenarioError for chances and delays that are none.
+    """
+    luck, bad, delay = draw
+    if luck >= checked_chance(channel.loss, link, message, bad, measured):
+        return math.nan
+    return checked_delay(channel.delay, link, message, delay)

@@ -1,18 +1,20 @@
-"""Link clocks: when each link activates by itself."""
+"""Clocks of the network: when links, directions or nodes activate by themselves."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.clock import Clock
+from netkf.core.clock import Clock, Entity
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
+    Rule,
     SourceFile,
     choice,
     either,
@@ -24,19 +26,56 @@ from netkf.core.fields import (
     several,
     source_file,
 )
-from netkf.core.tables import read_columns, whole
-from netkf.network.graphs import Link, Topology, demand_links
+from netkf.core.tables import read_columns, read_header, whole
+from netkf.network.graphs import Topology, demand_links, demand_nodes
+
+
+AT = ("links", "directions", "nodes")
+"""What has a clock: every link, every direction of every link, or every node."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkClock(Clock):
-    """A clock of links: the contract of ``network.activation`` in continuous time.
+    """The contract of a clock that activates the network, see Clock.
 
-    A link is a pair (i, j) with i < j.
+    ``at`` says what has a clock of its own. "links": both ends exchange; an entity is (i, j) with
+    i < j. "directions": the sender pushes; an entity is (sender, receiver). "nodes": the node
+    broadcasts to every neighbour; an entity is (node,).
     """
 
+    at: str = setting(choice(*AT), default="links")
+
+    def entities(self, topology: Topology) -> tuple[Entity, ...]:
+        """Ids of everything that has a clock, in order."""
+        if self.at == "nodes":
+            return tuple((node,) for node in topology.nodes)
+        return topology.directions if self.at == "directions" else topology.links
+
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError where the settings do not fit the graph."""
+        """Raise ScenarioError if the settings do not fit the graph."""
+
+
+@dataclass(frozen=True, eq=False)
+class OnReadings(LinkClock):
+    """A node transmits whenever it has taken a sample, after using it; no clock ticks."""
+
+    at: str = field(init=False, default="readings")
+
+    def entities(self, topology: Topology) -> tuple[Entity, ...]:
+        """None."""
+        return ()
+
+    def ticks(
+        self,
+        entity: Entity,
+        origin: float,
+        index: int,
+        now: float,
+        random: np.random.Generator,
+        count: int,
+    ) -> FloatArray:
+        """None."""
+        return np.empty(0)
 
 
 def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
@@ -46,26 +85,49 @@ def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
 
 _rate = number(above=0.0, high=1e9)
 _link_rate = row(integer(), integer(), _rate, what="a triple [i, j, rate]")
+_node_rate = row(integer(), _rate, what="a pair [i, rate]")
+
+
+def _one_rate(value: Any) -> tuple[float, ...]:
+    # Which of the two it must be depends on `at`; the clock checks that.
+    single = isinstance(value, (list, tuple, np.ndarray)) and len(value) == 2
+    rates: tuple[float, ...] = (_node_rate if single else _link_rate).convert(value)
+    return rates
+
+
+_entity_rate = Rule(_link_rate.words, _one_rate, _link_rate.remedy)
 
 
 @dataclass(frozen=True, eq=False)
 class Poisson(LinkClock):
     """Independent Poisson processes of ``rate`` ticks a second; ``rates = [[i, j, rate], ...]``
-    sets single links over that default.
+    sets single links or directions over that default, ``[[i, rate], ...]`` single nodes.
     """
 
     rate: float | None = setting(_rate, default=None)
-    rates: tuple[tuple[int, int, float], ...] = setting(
-        several(_link_rate, "triples [i, j, rate]", least=0), default=()
+    rates: tuple[tuple[float, ...], ...] = setting(
+        several(_entity_rate, "triples [i, j, rate]", least=0), default=()
     )
 
-    @cached_property
-    def _by_link(self) -> dict[Link, float]:
-        return {(min(i, j), max(i, j)): rate for i, j, rate in self.rates}
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        length, rule = (2, _node_rate) if self.at == "nodes" else (3, _link_rate)
+        for k, given in enumerate(self.rates):
+            if len(given) != length:
+                words = f'{rule.words}, because at = "{self.at}"'
+                raise ScenarioError(f"rates[{k}]", words, list(given), rule.remedy)
 
-    def mean_rate(self, link: Link) -> float:
-        """The rate of the link's process."""
-        rate = self._by_link.get(link, self.rate)
+    @cached_property
+    def _own(self) -> dict[Entity, float]:
+        return {self._named(given): given[-1] for given in self.rates}
+
+    def _named(self, given: tuple[float, ...]) -> Entity:
+        ids = tuple(int(number) for number in given[:-1])
+        return tuple(sorted(ids)) if self.at == "links" else ids
+
+    def mean_rate(self, entity: Entity) -> float:
+        """The rate of its process."""
+        rate = self._own.get(entity, self.rate)
         return math.nan if rate is None else rate
 
     @property
@@ -75,32 +137,35 @@ class Poisson(LinkClock):
 
     def ticks(
         self,
-        link: Link,
+        entity: Entity,
         origin: float,
         index: int,
         now: float,
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Exponential gaps; a link of twice the rate has the same gaps, halved."""
-        return _accumulate(now, random.standard_exponential(count) / self.mean_rate(link))
+        """Exponential gaps; twice the rate gives the same gaps, halved."""
+        return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
 
     def check(self, topology: Topology) -> None:
-        """Every link has a rate, and every rate a link, once."""
-        links, named = set(topology.links), set()
-        for k, (i, j, _) in enumerate(self.rates):
-            link = (min(i, j), max(i, j))
-            if link not in links or link in named:
-                words = "names a link again" if link in named else "must name a link of the graph"
-                raise ScenarioError(f"rates[{k}]", words, [i, j], "remove or mend it")
-            named.add(link)
-        bare = sorted(links - self._by_link.keys())
+        """Every entity has a rate, and every rate an entity, once."""
+        entities, named = self.entities(topology), set()
+        known, what = set(entities), self.at.removesuffix("s")
+        for k, given in enumerate(self.rates):
+            entity = self._named(given)
+            if entity not in known or entity in named:
+                again = f"names a {what} again"
+                words = again if entity in named else f"must name a {what} of the graph"
+                raise ScenarioError(f"rates[{k}]", words, list(given[:-1]), "remove or mend it")
+            named.add(entity)
+        bare = sorted(known - self._own.keys())
         if self.rate is None and bare:
+            one = bare[0][0] if len(bare[0]) == 1 else bare[0]
             raise ScenarioError(
                 "rate",
-                f"is missing, and link {bare[0]} has no rate of its own",
+                f"is missing, and {what} {one} has no rate of its own",
                 None,
-                "add rate = ... as the default of all links",
+                f"add rate = ... as the default of all {self.at}",
             )
 
 
@@ -164,7 +229,7 @@ class Renewal(LinkClock):
             return self.scale * unit
         return self.mean if self.mean is not None else 1.0 / (self.rate or math.nan)
 
-    def mean_rate(self, link: Link) -> float:
+    def mean_rate(self, entity: Entity) -> float:
         """One over the mean gap."""
         return 1.0 / self._mean
 
@@ -175,7 +240,7 @@ class Renewal(LinkClock):
 
     def ticks(
         self,
-        link: Link,
+        entity: Entity,
         origin: float,
         index: int,
         now: float,
@@ -224,19 +289,19 @@ class Periodic(LinkClock):
             if isinstance(value, float) and value >= self.period:
                 raise ScenarioError(name, "must be below the period", value, "give less")
 
-    def origin(self, link: Link, random: Callable[[], np.random.Generator]) -> float:
+    def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
         """The phase."""
         if isinstance(self.phase, str):
             return self.period * float(random().random())
         return self.phase
 
-    def mean_rate(self, link: Link) -> float:
+    def mean_rate(self, entity: Entity) -> float:
         """One over the period."""
         return 1.0 / self.period
 
     def ticks(
         self,
-        link: Link,
+        entity: Entity,
         origin: float,
         index: int,
         now: float,
@@ -250,7 +315,9 @@ class Periodic(LinkClock):
 
 @dataclass(frozen=True, eq=False)
 class RecordedClock(LinkClock):
-    """Ticks read from a table ``t,node,peer``; a link listed twice at one time ticks once."""
+    """Ticks read from a table: ``t,node,peer`` for links and directions (from node to peer),
+    ``t,node`` for nodes. An entity listed twice at one time ticks once.
+    """
 
     path: SourceFile = setting(source_file)
 
@@ -259,9 +326,16 @@ class RecordedClock(LinkClock):
         _ = self._times  # a bad file is refused now
 
     @cached_property
-    def _times(self) -> dict[Link, FloatArray]:
-        table = read_columns(self.path, ("t", "node", "peer"))
-        nodes, peers = (whole(self.path, name, table[name]) for name in ("node", "peer"))
+    def _times(self) -> dict[Entity, FloatArray]:
+        columns = ("node",) if self.at == "nodes" else ("node", "peer")
+        if self.at == "nodes" and "peer" in read_header(self.path):
+            raise ScenarioError(
+                "path",
+                f'{self.path.name} must have no column peer, because at = "nodes"',
+                None,
+                'set at = "directions", or remove the column',
+            )
+        table = read_columns(self.path, ("t", *columns))
         early = np.flatnonzero(table["t"] <= 0.0)
         if early.size:
             raise ScenarioError(
@@ -270,14 +344,25 @@ class RecordedClock(LinkClock):
                 float(table["t"][early[0]]),
                 "shift the times or remove the row",
             )
-        times: dict[Link, list[float]] = {}
-        for t, i, j in zip(table["t"].tolist(), nodes, peers, strict=True):
-            times.setdefault((min(i, j), max(i, j)), []).append(t)
-        return {link: np.unique(values) for link, values in times.items()}
+        ids = zip(*(whole(self.path, name, table[name]) for name in columns), strict=True)
+        times: dict[Entity, list[float]] = {}
+        for t, entity in zip(table["t"].tolist(), ids, strict=True):
+            key = tuple(sorted(entity)) if self.at == "links" else entity
+            times.setdefault(key, []).append(t)
+        return {entity: np.array(values) for entity, values in times.items()}
+
+    @cached_property
+    def _instants(self) -> dict[Entity, FloatArray]:
+        return {entity: np.unique(values) for entity, values in self._times.items()}
+
+    @property
+    def rows(self) -> FloatArray:
+        """(K,) times of all rows, sorted."""
+        return np.sort(np.concatenate([np.empty(0), *self._times.values()]))
 
     def ticks(
         self,
-        link: Link,
+        entity: Entity,
         origin: float,
         index: int,
         now: float,
@@ -285,8 +370,11 @@ class RecordedClock(LinkClock):
         count: int,
     ) -> FloatArray:
         """The recorded times."""
-        return self._times.get(link, np.empty(0))[index : index + count]
+        return self._instants.get(entity, np.empty(0))[index : index + count]
 
     def check(self, topology: Topology) -> None:
-        """Every recorded pair is a link."""
-        demand_links(self.path, self._times, topology)
+        """Everything listed is a link, a direction or a node of the graph."""
+        if self.at == "nodes":
+            demand_nodes(self.path, (node for (node,) in self._times), topology)
+        else:
+            demand_links(self.path, ((i, j) for i, j in self._times), topology)

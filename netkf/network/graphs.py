@@ -77,6 +77,28 @@ class Topology:
         return tuple(sorted((*self.links, *back)))
 
     @cached_property
+    def _receivers(self) -> dict[int, tuple[int, ...]]:
+        return self._ends(0)
+
+    @cached_property
+    def _senders(self) -> dict[int, tuple[int, ...]]:
+        return self._ends(1)
+
+    def _ends(self, end: int) -> dict[int, tuple[int, ...]]:
+        found: dict[int, list[int]] = {node: [] for node in self.nodes}
+        for direction in self.directions:
+            found[direction[end]].append(direction[1 - end])
+        return {node: tuple(sorted(others)) for node, others in found.items()}
+
+    def receivers(self, node: int) -> tuple[int, ...]:
+        """Ids of the nodes that may hear ``node``, in increasing order."""
+        return self._receivers[node]
+
+    def senders(self, node: int) -> tuple[int, ...]:
+        """Ids of the nodes that ``node`` may hear, in increasing order."""
+        return self._senders[node]
+
+    @cached_property
     def components(self) -> list[set[int]]:
         """The connected parts (weakly connected where the graph is directed), largest first."""
         from scipy.sparse import coo_array
@@ -100,6 +122,14 @@ def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) 
     if strange:
         words = f"{source.name}: every pair must be a link of the graph"
         raise ScenarioError("path", words, list(strange[0]), "add the link or remove the rows")
+
+
+def demand_nodes(source: SourceFile, nodes: Iterable[int], topology: Topology) -> None:
+    """Raise ScenarioError if a file names a node that the graph does not have."""
+    strange = sorted(set(nodes) - topology.index.keys())
+    if strange:
+        words = f"{source.name} names a node that the graph does not have"
+        raise ScenarioError("path", words, strange[0], "mend the row or the graph")
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,6 +124,7 @@ def _network(scenario: Scenario) -> None:
     for key, part in (
         ("network.activation", network.activation),
         ("network.channel.loss", network.channel.loss),
+        ("network.channel.delay", network.channel.delay),
     ):
         if part is not None:
             try:
@@ -164,13 +165,14 @@ def _network(scenario: Scenario) -> None:
 def _ticks(scenario: Scenario) -> None:
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
-    for link in scenario.topology.links:
-        ticks = clock.mean_rate(link) * scenario.horizon
+    what = clock.at.removesuffix("s")
+    for entity in clock.entities(scenario.topology):
+        ticks = clock.mean_rate(entity) * scenario.horizon
         if ticks > MOST_TICKS:
             raise ScenarioError(
                 "network.activation",
-                f"must make at most {MOST_TICKS:g} ticks of a link up to the horizon",
-                f"{ticks:.3g} ticks of link {link}",
+                f"must make at most {MOST_TICKS:g} ticks of a {what} up to the horizon",
+                f"{ticks:.3g} ticks of {what} {entity[0] if len(entity) == 1 else entity}",
                 "lower the rate or shorten the horizon",
             )
 

@@ -15,7 +15,7 @@ from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.core.errors import ScenarioError, nearest, quote
 from netkf.core.fields import Part
-from netkf.network import channels, clocks, graphs, matchings
+from netkf.network import channels, clocks, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
@@ -61,13 +61,14 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "renewal": clocks.Renewal,
         "periodic": clocks.Periodic,
         "recorded": clocks.RecordedClock,
+        "readings": clocks.OnReadings,
     },
     "loss": {
         "none": channels.NoLoss,
         "bernoulli": channels.Bernoulli,
         "per-link": channels.PerLink,
         "gilbert-elliott": channels.GilbertElliott,
-        "recorded": channels.RecordedLoss,
+        "recorded": recorded.RecordedLoss,
     },
     "delay": {
         "none": channels.NoDelay,
@@ -75,6 +76,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "exponential": channels.ExponentialDelay,
         "uniform": channels.UniformDelay,
         "lognormal": channels.LognormalDelay,
+        "recorded": recorded.RecordedDelay,
     },
     "filter": {
         "hybrid": Hybrid,

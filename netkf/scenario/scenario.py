@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -408,11 +409,19 @@ class Scenario(Part):
         nan where that is not known beforehand.
         """
         clock, loss = self.network.activation, self.network.channel.loss
-        rates: dict[Link, float] = {}
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
-            return rates
-        for i, j in self.topology.links:
-            for link in ((i, j), (j, i)):
-                delivered = loss.mean_delivery(link, self.measured(link))
-                rates[link] = clock.mean_rate((i, j)) * delivered
-        return rates
+            return {}
+        return {
+            link: self._send_rate(clock, link) * loss.mean_delivery(link, self.measured(link))
+            for link in self.topology.directions
+        }
+
+    def _send_rate(self, clock: LinkClock, direction: Link) -> float:
+        sender, receiver = direction
+        entities = {
+            "links": (min(sender, receiver), max(sender, receiver)),
+            "directions": direction,
+            "nodes": (sender,),
+        }
+        entity = entities.get(clock.at)
+        return math.nan if entity is None else clock.mean_rate(entity)

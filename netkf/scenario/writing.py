@@ -76,7 +76,7 @@ def _kind(family: str, part: Part, defaults: bool) -> dict[str, Any]:
 
 def _fields(part: Part, defaults: bool) -> dict[str, Any]:
     table: dict[str, Any] = {}
-    for field in dataclasses.fields(part):
+    for field in (field for field in dataclasses.fields(part) if field.init):
         value = getattr(part, field.name)
         is_default = field.default is not dataclasses.MISSING and (
             value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
