@@ -29,7 +29,6 @@ from netkf.core.fields import (
 from netkf.core.tables import read_columns, read_header, whole
 from netkf.network.graphs import Topology, demand_links, demand_nodes
 
-
 AT = ("links", "directions", "nodes")
 """What has a clock: every link, every direction of every link, or every node."""
 
@@ -114,8 +113,9 @@ class Poisson(LinkClock):
         length, rule = (2, _node_rate) if self.at == "nodes" else (3, _link_rate)
         for k, given in enumerate(self.rates):
             if len(given) != length:
-                words = f'{rule.words}, because at = "{self.at}"'
-                raise ScenarioError(f"rates[{k}]", words, list(given), rule.remedy)
+                shown = [int(value) if value.is_integer() else value for value in map(float, given)]
+                remedy = f'{rule.remedy}, because at = "{self.at}"'
+                raise ScenarioError(f"rates[{k}]", rule.words, shown, remedy)
 
     @cached_property
     def _own(self) -> dict[Entity, float]:

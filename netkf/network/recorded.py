@@ -85,7 +85,8 @@ def read_messages(
     for (sender, receiver, message), value in zip(keys, table[column].tolist(), strict=True):
         listed = values.setdefault((sender, receiver), {})
         if not allowed(value) or listed.setdefault(message, value) != value:
-            row = [sender, receiver, message, value]
+            shown = int(value) if value.is_integer() else value
+            row = [sender, receiver, message, shown]
             raise ScenarioError("path", f"{source.name}: {words}", row, "mend the row")
     return MessageTable(source, values)
 

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import SourceFile
 from netkf.core.streams import Streams
-from netkf.network.clocks import Periodic, Poisson, Renewal
+from netkf.network.clocks import LinkClock, OnReadings, Periodic, Poisson, RecordedClock, Renewal
+from netkf.network.graphs import Edges, PathGraph
 
 LINK = (0, 1)
 
@@ -73,3 +76,68 @@ def test_phase_and_jitter():
     assert scipy.stats.kstest(starts, scipy.stats.uniform(0, 2).cdf).pvalue > 1e-4
     late = ticks(Periodic(period=1.0, jitter=0.5), 1000) - np.arange(1, 1001)
     assert scipy.stats.kstest(late, scipy.stats.uniform(0, 0.5).cdf).pvalue > 1e-4
+
+
+def test_every_entity_has_a_clock():
+    path, directed = PathGraph(3).build(0), Edges(edges=[[0, 1], [2, 1]], directed=True).build(0)
+    expected = {
+        "links": ((0, 1), (1, 2)),
+        "directions": ((0, 1), (1, 0), (1, 2), (2, 1)),
+        "nodes": ((0,), (1,), (2,)),
+    }
+    for at, entities in expected.items():
+        assert Poisson(rate=1.0, at=at).entities(path) == entities
+    assert Periodic(period=1.0, at="directions").entities(directed) == ((0, 1), (2, 1))
+    assert OnReadings().entities(path) == ()
+    assert OnReadings().at == "readings"
+    with pytest.raises(TypeError):
+        OnReadings(at="nodes")
+    assert directed.receivers(0) == directed.receivers(2) == (1,)
+    assert directed.senders(1) == (0, 2)
+    assert directed.receivers(1) == ()
+    assert path.receivers(1) == path.senders(1) == (0, 2)
+
+
+def test_rates_of_directions_and_nodes():
+    ways = Poisson(rate=1.0, rates=[[1, 0, 5.0]], at="directions")
+    assert (ways.mean_rate((0, 1)), ways.mean_rate((1, 0))) == (1.0, 5.0)
+    nodes = Poisson(rates=[[2, 3.0]], rate=1.0, at="nodes")
+    assert (nodes.mean_rate((0,)), nodes.mean_rate((2,))) == (1.0, 3.0)
+    nodes.check(PathGraph(3).build(0))
+    with pytest.raises(ScenarioError, match="must name a node of the graph; got \\[2\\]"):
+        nodes.check(PathGraph(2).build(0))
+    again = Poisson(rate=1.0, rates=[[1, 0, 5.0], [1, 0, 6.0]], at="directions")
+    with pytest.raises(ScenarioError, match="names a direction again"):
+        again.check(PathGraph(2).build(0))
+    with pytest.raises(ScenarioError, match=r'pair \[i, rate\]; got .*, because at = "nodes"'):
+        Poisson(rates=[[0, 1, 3.0]], at="nodes")
+    with pytest.raises(ScenarioError, match=r'triple .*; got \[0, 3\]; .*, because at = "links"'):
+        Poisson(rates=[[0, 3.0]])
+
+
+def recorded(folder, text, **settings):
+    (folder / "ticks.csv").write_text(text)
+    return RecordedClock(SourceFile("ticks.csv", folder), **settings)
+
+
+def test_recorded_ticks_of_links_directions_and_nodes(tmp_path):
+    text = "t,node,peer\n0.5,1,0\n0.25,0,1\n0.5,0,1\n"
+    random = np.random.default_rng()
+    links = recorded(tmp_path, text)
+    assert links.ticks((0, 1), 0.0, 0, 0.0, random, 9).tolist() == [0.25, 0.5]
+    assert links.rows.tolist() == [0.25, 0.5, 0.5]
+    ways = recorded(tmp_path, text, at="directions")
+    assert ways.ticks((0, 1), 0.0, 0, 0.0, random, 9).tolist() == [0.25, 0.5]
+    assert ways.ticks((1, 0), 0.0, 0, 0.0, random, 9).tolist() == [0.5]
+    nodes = recorded(tmp_path, "t,node\n0.5,1\n0.25,1\n0.5,0\n", at="nodes")
+    assert nodes.ticks((1,), 0.0, 0, 0.0, random, 9).tolist() == [0.25, 0.5]
+    assert nodes.ticks((2,), 0.0, 0, 0.0, random, 9).tolist() == []
+
+
+def test_a_clock_of_ones_own_needs_no_at():
+    class Own(LinkClock):
+        def ticks(self, link, origin, index, now, random, count):
+            return np.arange(index + 1.0, index + 1.0 + count)
+
+    assert Own().at == "links"
+    assert Own().entities(PathGraph(2).build(0)) == ((0, 1),)

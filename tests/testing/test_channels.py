@@ -15,7 +15,8 @@ def tables(tmp_path):
 
     (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n0,1,2,0\n0,1,3,1\n")
     (tmp_path / "ticks.csv").write_text("t,node,peer\n0.5,0,1\n0.75,1,0\n0.75,1,2\n")
-    return {name: SourceFile(f"{name}.csv", tmp_path) for name in ("lost", "ticks")}
+    (tmp_path / "delays.csv").write_text("sender,receiver,message,seconds\n0,1,2,0.25\n")
+    return {name: SourceFile(f"{name}.csv", tmp_path) for name in ("lost", "ticks", "delays")}
 
 
 def losses(tables):
@@ -41,6 +42,10 @@ DELAYS = {
 }
 
 
+def delays(tables):
+    return {**DELAYS, "recorded": [parts.RecordedDelay(tables["delays"])]}
+
+
 def clocks(tables):
     return {
         "poisson": [parts.Poisson(rate=3.0), parts.Poisson(rates=[[1, 0, 5.0]])],
@@ -56,14 +61,16 @@ def clocks(tables):
             parts.Periodic(period=0.3, phase="random", jitter=0.2),
         ],
         "recorded": [parts.RecordedClock(tables["ticks"])],
+        "readings": [parts.OnReadings()],
     }
 
 
 def test_our_own_channels_keep_the_contract(tables):
     ours = losses(tables)
     assert set(ours) == set(KINDS["loss"])
-    assert set(DELAYS) == set(KINDS["delay"])
-    for part in [part for table in (ours, DELAYS) for listed in table.values() for part in listed]:
+    late = delays(tables)
+    assert set(late) == set(KINDS["delay"])
+    for part in [part for table in (ours, late) for listed in table.values() for part in listed]:
         assert check_channel(part) is None
     assert check_channel(parts.Channel(loss=parts.Bernoulli(0.5))) is None
 

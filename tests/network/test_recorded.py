@@ -1,0 +1,98 @@
+"""Recorded losses and delays, message by message."""
+
+import math
+
+import pytest
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import SourceFile
+from netkf.network.channels import Channel, ExponentialDelay, Fates, NoDelay, by_message, outcome
+from netkf.network.recorded import MessageUse, RecordedDelay, RecordedLoss
+
+WAY, BACK = (0, 1), (1, 0)
+FINE = (0.0, False, 0.0)
+
+
+@pytest.fixture
+def record(tmp_path):
+    def make(cls, rows, **settings):
+        column = "delivered" if cls is RecordedLoss else "seconds"
+        lines = [f"sender,receiver,message,{column}", *rows]
+        (tmp_path / "record.csv").write_text("\n".join(lines) + "\n")
+        return cls(SourceFile("record.csv", tmp_path), **settings)
+
+    return make
+
+
+def chances(loss, count, link=WAY):
+    return [loss.chance(link, k, False, 1.0) for k in range(count)]
+
+
+def seconds(delay, count, link=WAY):
+    return [delay.message_delay(link, k, 0.0) for k in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("after", "expected"),
+    [
+        ("deliver", [1.0, 0.0, 1.0, 1.0, 1.0]),
+        ("lose", [1.0, 0.0, 0.0, 0.0, 0.0]),
+        ("repeat", [1.0, 0.0, 1.0, 0.0, 1.0]),
+    ],
+)
+def test_losses_after_the_record(record, after, expected):
+    assert chances(record(RecordedLoss, ["0,1,0,1", "0,1,1,0"], after=after), 5) == expected
+
+
+def test_delays_after_the_record(record):
+    rows = ["0,1,0,0.5", "0,1,2,0.25"]
+    assert seconds(record(RecordedDelay, rows), 4) == [0.5, 0.0, 0.25, 0.0]
+    # Message 1 is a hole: the table that starts again does not list it either.
+    again = record(RecordedDelay, rows, after="repeat")
+    assert seconds(again, 6) == [0.5, 0.0, 0.25, 0.5, 0.0, 0.25]
+    assert seconds(again, 3, BACK) == [0.0, 0.0, 0.0]
+    lost = seconds(record(RecordedDelay, rows, after="lose"), 4)
+    assert [math.isnan(value) for value in lost] == [False, True, False, True]
+
+
+@pytest.mark.parametrize(("cls", "key"), [(RecordedLoss, "loss"), (RecordedDelay, "delay")])
+def test_a_message_beyond_the_record_may_be_refused(record, cls, key):
+    part = record(cls, ["0,1,0,1"], after="refuse")
+    channel = Channel(**{key: part})
+    assert outcome(channel, WAY, 0, FINE, 1.0) == (1.0 if key == "delay" else 0.0)
+    with pytest.raises(ScenarioError) as caught:
+        outcome(channel, WAY, 1, FINE, 1.0)
+    line = str(caught.value)
+    assert line.startswith(f"network.channel.{key}.path: record.csv must list every message")
+    assert "message 1 from node 0 to node 1" in line
+    assert len(line.splitlines()) == 1
+
+
+@pytest.mark.parametrize("cls", [RecordedLoss, RecordedDelay])
+def test_what_is_used_of_a_record(record, cls):
+    table = record(cls, ["0,1,0,1", "0,1,3,1", "0,1,9,1", "1,0,0,1"]).table
+    assert table.use({WAY: 5, (2, 0): 2}) == MessageUse(rows=4, unused=2, beyond=5)
+    assert table.use({}) == MessageUse(rows=4, unused=4, beyond=0)
+
+
+def test_nothing_is_drawn_for_recorded_delays(record):
+    asked = []
+    channel = Channel(delay=record(RecordedDelay, ["0,1,0,0.5"]))
+    fates = Fates(channel, asked.append)
+    assert fates.draw() == FINE
+    assert [column.tolist() for column in fates.draws(2)] == [[0.0, 0.0], [False, False], [0.0] * 2]
+    assert asked == []
+    assert channel.delay.fixed is None
+    assert not channel.delay.drawn
+    assert by_message(channel.delay)
+    assert not by_message(NoDelay())
+    assert ExponentialDelay(1.0).drawn
+
+
+def test_negative_delays_are_refused(record):
+    class Early(NoDelay):
+        def message_delay(self, link, message, drawn):
+            return -1.0
+
+    with pytest.raises(ScenarioError, match=r"Early: the delay of message 3 .* not be negative"):
+        outcome(Channel(delay=Early()), WAY, 3, FINE, 1.0)
