@@ -9,6 +9,7 @@ from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryErro
 
 if TYPE_CHECKING:
     from netkf import parts, testing, theory
+    from netkf.experiments.checking.check import check
     from netkf.experiments.ensembles.monte_carlo import Ensemble, monte_carlo
     from netkf.experiments.run import save
     from netkf.experiments.simulate import simulate

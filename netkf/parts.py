@@ -1,23 +1,69 @@
 """Everything that a scenario is built from in Python, under one roof.
 
 ``Scenario``, ``Network``, ``Filtering``, ``Belief`` and ``Channel``; the class of every kind that a
-scenario file can name (``kinds()`` lists them); the contracts that classes of one's own derive
-from; ``setting`` and the rules of its fields.
+scenario file can name (``kinds()`` lists them); the contracts that users' own classes derive from;
+``setting`` and the rules of its fields.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-from netkf.core import fields
-from netkf.network.channels import Channel
-from netkf.scenario.registry import FAMILIES, KINDS
+from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
+from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
+from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
+from netkf.core.clock import Clock
+from netkf.core.fields import (
+    boolean,
+    integer,
+    matrix,
+    number,
+    positive,
+    probability,
+    setting,
+    vector,
+)
+from netkf.network.channels import (
+    Bernoulli,
+    Channel,
+    ConstantDelay,
+    Delay,
+    ExponentialDelay,
+    GilbertElliott,
+    LognormalDelay,
+    Loss,
+    NoDelay,
+    NoLoss,
+    PerLink,
+    UniformDelay,
+)
+from netkf.network.clocks import LinkClock, OnReadings, Periodic, Poisson, RecordedClock, Renewal
+from netkf.network.graphs import (
+    Complete,
+    CsvGraph,
+    Cycle,
+    Edges,
+    ErdosRenyi,
+    Geometric,
+    Graph,
+    Grid,
+    PathGraph,
+    Regular,
+    Star,
+    Topology,
+)
+from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
+from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.plants.diffusion import Diffusion
+from netkf.plants.linear import LinearPlant
+from netkf.plants.plant import Plant
+from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
-
-_CLASSES = [Scenario, Network, Filtering, Belief, Channel, *FAMILIES.values()]
-_CLASSES += [cls for names in KINDS.values() for cls in names.values()]
-_RULES = ("setting", "number", "positive", "probability", "integer", "boolean", "matrix", "vector")
-_HERE = {cls.__name__: cls for cls in _CLASSES} | {name: getattr(fields, name) for name in _RULES}
 
 
 def kinds() -> dict[str, dict[str, type]]:
@@ -25,14 +71,76 @@ def kinds() -> dict[str, dict[str, type]]:
     return {family: dict(names) for family, names in KINDS.items()}
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HERE:
-        raise AttributeError(f"module 'netkf.parts' has no attribute {name!r}")
-    return _HERE[name]
-
-
-def __dir__() -> list[str]:
-    return sorted([*_HERE, "kinds"])
-
-
-__all__ = __dir__()  # noqa: PLE0605 - as it was made
+__all__ = [
+    "Belief",
+    "Bernoulli",
+    "Broadcast",
+    "Central",
+    "Channel",
+    "Clock",
+    "Complete",
+    "ConstantDelay",
+    "CovarianceIntersection",
+    "CsvGraph",
+    "Cycle",
+    "Delay",
+    "Diffusion",
+    "DiffusionFilter",
+    "Edges",
+    "ErdosRenyi",
+    "ExponentialDelay",
+    "Filtering",
+    "FlowFilter",
+    "Geometric",
+    "GilbertElliott",
+    "Gossip",
+    "Graph",
+    "Grid",
+    "Hybrid",
+    "Intermittent",
+    "LinearPlant",
+    "LinearSensor",
+    "LinkClock",
+    "Local",
+    "LognormalDelay",
+    "Loss",
+    "Matching",
+    "Network",
+    "NoDelay",
+    "NoLoss",
+    "OnReadings",
+    "PathGraph",
+    "PerLink",
+    "Periodic",
+    "Plant",
+    "Poisson",
+    "PushSum",
+    "RecordedClock",
+    "RecordedDelay",
+    "RecordedLoss",
+    "RecordedPlant",
+    "RecordedSensor",
+    "RecordedSlots",
+    "RegressorSensor",
+    "Regular",
+    "Renewal",
+    "Scenario",
+    "Sensor",
+    "SlotActivation",
+    "SlotCentral",
+    "SlotFilter",
+    "SlotLocal",
+    "Star",
+    "Topology",
+    "UniformDelay",
+    "UnknownPlant",
+    "boolean",
+    "integer",
+    "kinds",
+    "matrix",
+    "number",
+    "positive",
+    "probability",
+    "setting",
+    "vector",
+]
