@@ -12,10 +12,13 @@ import numpy as np
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import matrix, positive, setting, square
 from netkf.plants.laws import Laws
-from netkf.plants.paths import DiffusionPath, DiffusionPaths
+from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
+from netkf.plants.transitions import Transitions, frame_period
+from netkf.plants.truth import SampledTruth, multiples
 
 LONGEST_STEP = 8.0
+NO_TIMES = np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,24 +54,72 @@ class Diffusion(Plant):
         norm = float(np.abs(self.A).sum(axis=0).max())
         return LONGEST_STEP / norm if norm > 0.0 else math.inf
 
+    @cached_property
+    def moves(self) -> Transitions:
+        """Exact discretisation over any gap."""
+        return Transitions(self.A, self.B)
+
     def path(
-        self, random: np.random.Generator, probing: np.random.Generator, shown: FloatArray
+        self,
+        random: np.random.Generator,
+        probing: np.random.Generator,
+        shown: FloatArray,
+        sampling: np.random.Generator | None = None,
+        sampled: FloatArray = NO_TIMES,
+        horizon: float = 0.0,
+        frames: bool = False,
     ) -> DiffusionPath:
         """A path of its own that can be asked for its state on the sensing grid and at the times
-        ``shown`` (increasing); ``probing`` is used only for those off the grid.
+        ``sampled`` and ``shown`` (increasing). ``sampling`` is used only for times sampled off the
+        grid, ``probing`` only for those shown off both. With ``frames``, states are local, see
+        ``truth``, in frames that begin before the ``horizon``.
         """
-        return DiffusionPath(self.paths([random], [probing], shown))
+        samplings = [] if sampling is None else [sampling]
+        paths = self.paths([random], [probing], shown, samplings, sampled, frames)
+        return DiffusionPath(paths, horizon)
 
     def paths(
         self,
         randoms: Sequence[np.random.Generator],
         probings: Sequence[np.random.Generator],
         shown: FloatArray,
+        samplings: Sequence[np.random.Generator] = (),
+        sampled: FloatArray = NO_TIMES,
+        frames: bool = False,
     ) -> DiffusionPaths:
-        """The paths of several runs together."""
-        normals = np.stack([random.standard_normal(self.n) for random in randoms])
-        start = self.start_mean + (normals[:, None] @ square_root(self.start_cov).T)[:, 0]
-        return DiffusionPaths(self.laws, start, randoms, probings, shown)
+        """The paths of several runs together, which are sampled and shown at the same times."""
+        start = np.stack([self.start(random) for random in randoms])
+        cuts = [Cuts(sampled, samplings)] if len(sampled) else []
+        steps = self.frame_steps if frames else None
+        return DiffusionPaths(self.laws, start, randoms, [*cuts, Cuts(shown, probings)], steps)
+
+    def start(self, random: np.random.Generator) -> FloatArray:
+        """(n,) x(0), drawn."""
+        normals = random.standard_normal((1, self.n))
+        return np.asarray(self.start_mean + (normals @ square_root(self.start_cov).T)[0])
+
+    @property
+    def frame_steps(self) -> int | None:
+        """Steps of the sensing grid between two frames; None for a plant that is not unstable."""
+        period = frame_period(self.A)
+        assert self.sensing_period is not None
+        return None if period is None else max(1, int(period / self.sensing_period))
+
+    def sampled_truth(
+        self,
+        random: np.random.Generator,
+        probing: np.random.Generator,
+        samples: FloatArray,
+        probes: FloatArray,
+        horizon: float,
+        frames: bool = False,
+    ) -> SampledTruth:
+        """A path that needs no sensing grid: it can be asked for its state at ``samples``,
+        ``probes`` and frame times, up to the ``horizon``.
+        """
+        marks = multiples(frame_period(self.A), horizon)
+        start = self.start(random)
+        return SampledTruth(self.moves, start, random, probing, samples, probes, marks, frames)
 
 
 def default_sensing_period(

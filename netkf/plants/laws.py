@@ -28,7 +28,7 @@ class Laws:
 
     def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
         self.n, self.period = len(A), period
-        self._B = B
+        self.A, self.B = A, B
         self.to_end, self.to_moments = _response_series(A, period)
         self.response = self.responses(period)
         self.spread = _factor(self._noise(period))
@@ -63,9 +63,9 @@ class Laws:
         length ``gap``.
         """
         if s >= end:
-            return np.zeros((3 * self.n, self._B.shape[1]))
+            return np.zeros((3 * self.n, self.B.shape[1]))
         since = max(s, start)
-        entry = self.responses(since - s)[0] @ self._B
+        entry = self.responses(since - s)[0] @ self.B
         rest = end - since
         to_end, plain, tilted = self.responses(rest)
         share = rest / gap  # P_1 of the whole interval is (1 - share) + share P_1 of the rest

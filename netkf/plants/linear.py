@@ -17,6 +17,7 @@ from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import covariance, positive, setting, square
 from netkf.plants.plant import Plant
 from netkf.plants.recursion import Recursion
+from netkf.plants.transitions import frame_slots
 
 BLOCK = 64  # slots drawn at once
 
@@ -49,10 +50,11 @@ class LinearPlant(Plant):
         """Whether a slot begins at the horizon or later; 3 * 0.1 is 0.3."""
         return self.slot_time(slot) >= horizon - 1e-9 * self.period
 
-    def truth(self, random: np.random.Generator) -> Truth:
-        """The truth of one run."""
+    def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
+        """The truth of one run; ``frames``: in frames, where the plant is unstable."""
         start = self.start_mean + square_root(self.start_cov) @ random.standard_normal(self.n)
-        return LinearPath(self._steps, square_root(self.Q), start, random)
+        slots = frame_slots(self.F) if frames else None
+        return LinearPath(self._steps, square_root(self.Q), start, random, slots)
 
     @cached_property
     def _steps(self) -> Recursion:
@@ -60,10 +62,28 @@ class LinearPlant(Plant):
 
 
 class Truth(Protocol):
-    """The state of one run in slots."""
+    """The state of one run in slots, asked for in their order.
+
+    On frames see ``truth``: after ``rebase`` of a slot its local state is zero.
+    """
+
+    @property
+    def frame_slots(self) -> int | None:
+        """Slots between two frames, the first of which begins at slot 0; None without frames."""
+
+    def local(self, slot: int) -> FloatArray:
+        """(n,) x in the present frame."""
+
+    def absolute(self, slot: int) -> FloatArray:
+        """(n,) x."""
 
     def state(self, slot: int) -> FloatArray:
-        """(n,) at a slot not before the last one asked for."""
+        """The same as ``absolute``."""
+
+    def rebase(self, slot: int) -> FloatArray:
+        """(n,) by which estimates are to be lowered at a slot that begins a frame: its local state.
+        Called once for each of them, when that slot's state has been sampled.
+        """
 
 
 class Readings(Protocol):
@@ -81,22 +101,76 @@ class Readings(Protocol):
 
 class LinearPath:
     """The path of one run, slot by slot, from ``start`` (n,) on; what each step adds is ``root``
-    (n, q) times standard normals.
+    (n, q) times standard normals. With ``frame_slots``, a frame begins every so many slots.
     """
 
     def __init__(
-        self, steps: Recursion, root: FloatArray, start: FloatArray, random: np.random.Generator
+        self,
+        steps: Recursion,
+        root: FloatArray,
+        start: FloatArray,
+        random: np.random.Generator,
+        frame_slots: int | None = None,
     ) -> None:
         self._steps, self._root, self._random = steps, root, random
-        self._first, self._x = 0, start[None]
+        self.frame_slots = frame_slots
+        # States of some slots before any rebase, and the one that the next slot starts from.
+        self._first, self._x, self._last = 0, start[None], start
+        self._rebased = 0
+        self._origins = {0: np.zeros(len(start))}  # absolute, by the slot at which a frame begins
 
-    def state(self, slot: int) -> FloatArray:
-        """X at a slot not before the last one asked for."""
+    def local(self, slot: int) -> FloatArray:
+        """(n,) x in the present frame, at a slot not before the last one asked for."""
+        x = self._before(slot)
+        return np.zeros(len(x)) if slot == self._rebased > 0 else x
+
+    def _before(self, slot: int) -> FloatArray:
         while slot >= self._first + len(self._x):
             noise = self._random.standard_normal((BLOCK, self._root.shape[1])) @ self._root.T
             self._first += len(self._x) - 1
-            self._x = self._steps.states(self._x[-1:], noise[None, None])[0]
+            self._x = self._following(noise)
         return np.asarray(self._x[slot - self._first])
+
+    def _following(self, noise: FloatArray) -> FloatArray:
+        """(BLOCK + 1, n) states before any rebase, of which the first is known."""
+        frame, first = self.frame_slots, self._first
+        if frame is None:
+            return np.asarray(self._steps.states(self._x[-1:], noise[None, None])[0])
+        begun = max(slot for slot in self._origins if slot <= first)
+        self._origins = {slot: x for slot, x in self._origins.items() if slot >= begun - frame}
+        parts, start = [self._x[-1:]], 0
+        for end in [*range(frame - first % frame, len(noise), frame), len(noise)]:
+            x = self._steps.states(self._last[None], noise[None, None, start:end])[0]
+            parts.append(x[1:])
+            self._last, start = x[-1], end
+            if (first + end) % frame == 0:
+                self._origins[first + end] = self._moved_origin(first + end) + x[-1]
+                self._last = np.zeros(len(x[-1]))
+        return np.concatenate(parts)
+
+    def _moved_origin(self, slot: int) -> FloatArray:
+        """(n,) absolute position in a slot of the origin of the frame that holds its state before
+        any rebase.
+        """
+        assert self.frame_slots is not None
+        begun = max(slot - 1, 0) // self.frame_slots * self.frame_slots
+        x = self._origins[begun]
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(slot - begun if x.any() else 0):
+                x = self._steps.F @ x
+        return np.asarray(x)
+
+    def rebase(self, slot: int) -> FloatArray:
+        """(n,) the local state of a slot that begins a frame, which is zero from now on."""
+        self._rebased = slot
+        return self._before(slot)
+
+    def absolute(self, slot: int) -> FloatArray:
+        """(n,) x, at a slot not before the last one asked for."""
+        x = self._before(slot)
+        return x if self.frame_slots is None else self._moved_origin(slot) + x
+
+    state = absolute
 
 
 class SlotReadings:

@@ -5,8 +5,9 @@ two moments of x over the step (core/legendre), all from one stream and whatever
 Between grid points, filters that are woken by the network need part of a step. There the path is
 the response to the state at the grid point plus the cubic that agrees with the step's end and with
 its two moments; what that leaves out of a reading is of third order in h and less than 1e-4 h^3 of
-the noise intensity. Where a state is to be *shown* off the grid, the step is cut there beforehand:
-state and moments are drawn from their exact law given the step, from a second stream.
+the noise intensity. Where a state is *sampled* or *shown* off the grid, the step is cut there
+beforehand: state and moments are drawn from their exact law given the step, from streams of their
+own, the sampled ones first. On frames see ``truth``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from netkf.core.compiling import in_place
 from netkf.core.series import fill_polynomial, polynomial
 from netkf.core.small import added, applied
 from netkf.plants.laws import Laws, grid_time
+from netkf.plants.transitions import Transitions
 
 BLOCK = 64  # steps drawn at once, or a multiple of it
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -65,9 +67,19 @@ class Block(NamedTuple):
         )
 
 
+class Cuts(NamedTuple):
+    """Increasing ``times`` at which steps are cut, and the generator of each run."""
+
+    times: FloatArray
+    randoms: Sequence[np.random.Generator]
+
+
 class DiffusionPaths:
-    """The paths of B runs, which are cut at the same times: ``start`` (B, n), the sources of each,
-    and the times ``shown`` (increasing) at which states are shown.
+    """The paths of B runs, which are cut at the same times: ``start`` (B, n), the generator of
+    each, and where states are sampled or shown (``cuts``, one after the other).
+
+    With ``frame_steps``, states are local: they start again from zero every so many steps, so that
+    a piece may end at a state that the next one does not start from.
 
     Each path is to the last bit what it is alone, and however many steps are drawn at once.
     """
@@ -77,10 +89,11 @@ class DiffusionPaths:
         laws: Laws,
         start: FloatArray,
         randoms: Sequence[np.random.Generator],
-        probings: Sequence[np.random.Generator],
-        shown: FloatArray,
+        cuts: Sequence[Cuts],
+        frame_steps: int | None = None,
     ) -> None:
-        self.laws, self._randoms, self._probings, self._shown = laws, randoms, probings, shown
+        self.laws, self._randoms, self._cuts = laws, randoms, cuts
+        self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
 
     def following(self, blocks: int = 1) -> Block:
@@ -92,36 +105,65 @@ class DiffusionPaths:
         noise = (normals @ laws.spread.T).reshape(count * blocks, BLOCK, 3, n)
         cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
         onwards = noise[:, :, 0].reshape(count, blocks, BLOCK, n)
-        x = laws.steps.states(self._x, onwards)
-        self._x = x[:, -1]
-        before = x[:, :-1].reshape(count * blocks, BLOCK, n)
-        moments = _moved(laws.response[1:], before) + noise[:, :, 1:]
+        before, after = self._states(onwards)
+        moments = _moved(laws.response[1:], before.reshape(count * blocks, BLOCK, n))
+        moments += noise[:, :, 1:]
         times = laws.grid(self._drawn, total + 1)
         self._drawn += total
-        whole = Block(
+        block = Block(
             start=times[:-1],
             end=times[1:],
-            x_start=x[:, :-1],
-            x_end=x[:, 1:],
+            x_start=before,
+            x_end=after,
             moments=moments.reshape(count, total, 2, n),
             cubic=cubic.reshape(count, total, 4, n),
             step=np.arange(total),
             ends=times[1:],
         )
-        first, last = np.searchsorted(self._shown, times[[0, -1]], side="right")
-        shown = self._shown[first:last]
-        inside = shown[~np.isin(shown, whole.ends)]
-        return self._cut(whole, inside) if len(inside) else whole
+        for cuts in self._cuts:
+            first, last = np.searchsorted(cuts.times, times[[0, -1]], side="right")
+            shown = cuts.times[first:last]
+            inside = shown[~np.isin(shown, block.end)]
+            if len(inside):
+                block = self._cut(block, inside, cuts.randoms)
+        return block
 
-    def _cut(self, block: Block, shown: FloatArray) -> Block:
-        """The block with pieces that end at the times ``shown``, which are inside its steps."""
-        steps = np.searchsorted(block.ends, shown)
+    def _states(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(B, S, n) states at the starts and ends of the next S steps, to which the noise
+        (B, blocks, BLOCK, n) is added.
+        """
+        count, _, _, n = noise.shape
+        steps, frame = self.laws.steps, self.frame_steps
+        if frame is None:
+            x = steps.states(self._x, noise)
+            self._x = x[:, -1]
+            return x[:, :-1], x[:, 1:]
+        flat = noise.reshape(count, 1, -1, n)
+        total = flat.shape[2]
+        before, after = np.empty((count, total, n)), np.empty((count, total, n))
+        # Parts end where frames or blocks do, so that they do not depend on ``blocks``.
+        ends = set(range(BLOCK, total, BLOCK)) | {total}
+        ends |= set(range(frame - self._drawn % frame, total, frame))
+        first = 0
+        for end in sorted(ends):
+            x = steps.states(self._x, flat[:, :, first:end])
+            before[:, first:end], after[:, first:end] = x[:, :-1], x[:, 1:]
+            rebased = (self._drawn + end) % frame == 0
+            self._x = np.zeros((count, n)) if rebased else x[:, -1]
+            first = end
+        return before, after
+
+    def _cut(
+        self, block: Block, shown: FloatArray, randoms: Sequence[np.random.Generator]
+    ) -> Block:
+        """The block with pieces that also end at the times ``shown``, inside its own pieces."""
+        owners = np.searchsorted(block.end, shown)
         size = len(shown), 3 * self.laws.n
-        normals = np.stack([probing.standard_normal(size) for probing in self._probings])
-        counts = 1 + np.bincount(steps, minlength=len(block.ends))
-        # A step that is cut twice is cut at the first time, and what is left of it at the second.
-        turn = np.arange(len(shown)) - np.searchsorted(steps, steps)
-        which = np.repeat(block.step, counts)
+        normals = np.stack([random.standard_normal(size) for random in randoms])
+        counts = 1 + np.bincount(owners, minlength=len(block.end))
+        # A piece cut twice is cut at the first time, and what is left of it at the second.
+        turn = np.arange(len(shown)) - np.searchsorted(owners, owners)
+        which = np.repeat(np.arange(len(block.end)), counts)
         pieces = Block(
             start=block.start[which],
             end=block.end[which],
@@ -129,10 +171,11 @@ class DiffusionPaths:
             x_end=block.x_end[:, which],
             moments=block.moments[:, which],
             cubic=block.cubic[:, which],
-            step=which,
+            step=block.step[which],
             ends=block.ends,
         )
-        rows = (np.cumsum(counts) - counts)[steps] + turn
+        firsts = np.cumsum(counts) - counts
+        rows, stops = firsts[owners] + turn, (firsts + counts)[owners]
         for k in range(int(turn.max()) + 1):
             chosen = turn == k
             lengths = np.round(pieces.end[rows[chosen]] - pieces.start[rows[chosen]], 12)
@@ -140,18 +183,19 @@ class DiffusionPaths:
             laws = np.unique(np.stack([lengths, lefts]), axis=1, return_inverse=True)[1].ravel()
             for law in range(int(laws.max()) + 1):
                 same = np.flatnonzero(chosen)[laws == law]
-                self._split(pieces, rows[same], shown[same], normals[:, same])
+                self._split(pieces, rows[same], stops[same], shown[same], normals[:, same])
         return pieces
 
     def _split(
         self,
         pieces: Block,
         rows: np.ndarray,
+        stops: np.ndarray,
         times: FloatArray,
         normals: FloatArray,
     ) -> None:
         """Draw the paths at ``times`` given the pieces in ``rows``, all of one length and cut at
-        the same place, and divide each with all rows of its step that come after it.
+        the same place, and divide each with the rows after it up to its ``stops``.
         """
         n, laws = self.laws.n, self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
@@ -175,7 +219,6 @@ class DiffusionPaths:
         rest = _cubics(length - left, later[:, :, 0], later[:, :, 1:])
         pieces.end[rows], pieces.x_end[:, rows] = times, middle
         pieces.moments[:, rows], pieces.cubic[:, rows] = first, cubics
-        stops = np.searchsorted(pieces.step, pieces.step[rows], side="right")
         for k, (row, stop) in enumerate(zip(rows.tolist(), stops.tolist(), strict=True)):
             after = slice(row + 1, stop)
             pieces.start[after], pieces.x_start[:, after] = times[k], middle[:, k, None]
@@ -185,8 +228,11 @@ class DiffusionPaths:
 class DiffusionPath:
     """The path of one run, asked for step by step."""
 
-    def __init__(self, paths: DiffusionPaths) -> None:
+    def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
         self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
+        self.frame_times = self._frame_times(horizon)
+        self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
+        self._frame, self._origin = 0, np.zeros(self.laws.n)  # of the present frame, at its start
         self._block: Block | None = None
         self._first = self._piece = 0  # of the present step, and the one last asked for
         self._step, self._step_end = Step(0.0, 0.0, *[np.empty(0)] * 4), 0.0
@@ -220,11 +266,55 @@ class DiffusionPath:
         step = self._at(end)
         return seen(self.laws, step, start, end)
 
-    def state(self, time: float) -> FloatArray:
-        """x(time) on the sensing grid or at a time shown, not before the last one asked for."""
+    def _frame_times(self, horizon: float) -> FloatArray:
+        steps = self._paths.frame_steps
+        if steps is None:
+            return np.empty(0)
+        count = int(horizon / (steps * self.period)) + 2
+        times = np.array([self.grid(steps * k) for k in range(1, count)])
+        return np.asarray(times[times < horizon])
+
+    def local(self, time: float) -> FloatArray:
+        """(n,) x in the present frame, on the sensing grid or at a time sampled or shown, not
+        before the last one asked for; 0 at a frame time.
+        """
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor shown"
+        if self._begins_frame(time):
+            return np.zeros(self.laws.n)
         return step.x_end if time == step.end else step.x_start
+
+    def _begins_frame(self, time: float) -> bool:
+        k = int(np.searchsorted(self.frame_times, time))
+        return k < len(self.frame_times) and bool(self.frame_times[k] == time)
+
+    def rebase(self, k: int) -> FloatArray:
+        """(n,) by which estimates are to be lowered at ``frame_times[k]``, k = 0, 1, ...: the local
+        state just before.
+        """
+        time = float(self.frame_times[k])
+        step = self._at(time)
+        start = 0.0 if k == 0 else float(self.frame_times[k - 1])
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._origin = self._moved_origin(time - start) + step.x_end
+        self._frame = k + 1
+        return step.x_end
+
+    def _moved_origin(self, gap: float) -> FloatArray:
+        """(n,) the origin of the present frame so many seconds after its start."""
+        if self._moves is None or not self._origin.any():
+            return self._origin
+        return np.asarray(self._moves.transitions(np.array([gap]))[0] @ self._origin)
+
+    def absolute(self, time: float) -> FloatArray:
+        """(n,) x, as ``local``; ``rebase`` must have been called for all frame times so far."""
+        x = self.local(time)
+        if not self._frame:
+            return x
+        with np.errstate(over="ignore", invalid="ignore"):
+            return x + self._moved_origin(time - float(self.frame_times[self._frame - 1]))
+
+    state = absolute
 
 
 def _moved(responses: FloatArray, x: FloatArray) -> FloatArray:

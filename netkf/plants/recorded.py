@@ -39,7 +39,7 @@ class UnknownPlant(LinearPlant):
     drawn: ClassVar[bool] = False
     shown: ClassVar[bool] = False
 
-    def truth(self, random: np.random.Generator) -> RecordedPath:
+    def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """Nan."""
         return RecordedPath({}, np.full(self.n, math.nan))
 
@@ -71,7 +71,7 @@ class RecordedPlant(LinearPlant):
         """Raise ScenarioError where the table lacks one of the slots."""
         _demand(self.path, self.table, slots, self.period, "state")
 
-    def truth(self, random: np.random.Generator) -> RecordedPath:
+    def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """The states of the table."""
         return RecordedPath(self.table, np.full(self.n, math.nan))
 
@@ -79,12 +79,20 @@ class RecordedPlant(LinearPlant):
 class RecordedPath:
     """States by slot, or ``otherwise``."""
 
+    frame_slots: int | None = None
+
     def __init__(self, states: Table, otherwise: FloatArray) -> None:
         self._states, self._otherwise = states, otherwise
 
     def state(self, slot: int) -> FloatArray:
         """(n,) the state of any slot."""
         return self._states.get(slot, self._otherwise)
+
+    local = absolute = state
+
+    def rebase(self, slot: int) -> FloatArray:
+        """There are no frames."""
+        raise IndexError(slot)
 
 
 @dataclass(frozen=True, eq=False)

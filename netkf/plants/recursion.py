@@ -11,7 +11,7 @@ class Recursion:
     """What all paths of one ``F`` (n, n) share: its powers."""
 
     def __init__(self, F: FloatArray) -> None:
-        self._powers = F[None]
+        self.F, self._powers = F, F[None]
 
     def states(self, start: FloatArray, noise: FloatArray) -> FloatArray:
         """(B, blocks L + 1, n) the states of B paths from ``start`` (B, n) on, each step of which
