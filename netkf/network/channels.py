@@ -207,6 +207,11 @@ class Delay(Part):
         return None
 
     @property
+    def longest(self) -> float:
+        """The longest delay there can be, seconds; inf if there is no bound."""
+        return math.inf if self.fixed is None else self.fixed
+
+    @property
     def drawn(self) -> bool:
         """Whether ``draw`` is called."""
         return self.fixed is None
@@ -273,6 +278,11 @@ class UniformDelay(Delay):
         super().__post_init__()
         if self.high < self.low:
             raise ScenarioError("high", "must be at least low", self.high, "swap the two")
+
+    @property
+    def longest(self) -> float:
+        """``high``."""
+        return self.high
 
     def draw(self, random: np.random.Generator) -> float:
         """One draw."""

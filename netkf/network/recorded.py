@@ -165,6 +165,12 @@ class RecordedDelay(Delay):
         """False."""
         return False
 
+    @property
+    def longest(self) -> float:
+        """The largest recorded delay."""
+        listed = [value for link in self.table.values.values() for value in link.values()]
+        return max(listed, default=0.0)
+
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
         """The recorded seconds."""
         value = _at("network.channel.delay", self.table, link, message, self.after)

@@ -6,7 +6,15 @@ import pytest
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
-from netkf.network.channels import Channel, ExponentialDelay, Fates, NoDelay, by_message, outcome
+from netkf.network.channels import (
+    Channel,
+    ExponentialDelay,
+    Fates,
+    NoDelay,
+    UniformDelay,
+    by_message,
+    outcome,
+)
 from netkf.network.recorded import MessageUse, RecordedDelay, RecordedLoss
 
 WAY, BACK = (0, 1), (1, 0)
@@ -86,6 +94,10 @@ def test_nothing_is_drawn_for_recorded_delays(record):
     assert not channel.delay.drawn
     assert by_message(channel.delay)
     assert not by_message(NoDelay())
+    assert channel.delay.longest == 0.5
+    assert UniformDelay(0.1, 0.4).longest == 0.4
+    assert ExponentialDelay(1.0).longest == math.inf
+    assert NoDelay().longest == 0.0
     assert ExponentialDelay(1.0).drawn
 
 
