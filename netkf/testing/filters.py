@@ -82,16 +82,28 @@ def systems(inverts: bool) -> list[System]:
 
 def check_estimate(
     watched: Watched, state: Any, n: int, after: str
-) -> tuple[FloatArray, FloatArray]:
-    """``estimate`` after a method: shapes, finite, symmetric, positive semidefinite."""
+) -> tuple[FloatArray, FloatArray | None]:
+    """``estimate`` after a method: shapes, finite; P None, or symmetric, positive semidefinite."""
     where = f"{watched.name}.estimate after {after}"
     pair = watched.call("estimate", state)
     demand(isinstance(pair, tuple) and len(pair) == 2, where, "must be (xhat, P)", pair)
-    xhat, P = (np.asarray(part) for part in pair)
-    for name, array, shape in (("xhat", xhat, (n,)), ("P", P, (n, n))):
-        demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
-        demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
-        demand(np.isfinite(array).all(), where, f"{name} must be finite", array)
+    xhat = np.asarray(pair[0])
+    _check_array(where, "xhat", xhat, (n,))
+    if pair[1] is None:
+        return xhat, None
+    P = np.asarray(pair[1])
+    _check_array(where, "P", P, (n, n))
+    _check_covariance(where, P)
+    return xhat, P
+
+
+def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
+    demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
+    demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
+    demand(np.isfinite(array).all(), where, f"{name} must be finite", array)
+
+
+def _check_covariance(where: str, P: FloatArray) -> None:
     size = max(float(np.abs(P).max()), np.finfo(float).tiny)
     skew = float(np.abs(P - P.T).max())
     demand(
@@ -109,7 +121,6 @@ def check_estimate(
         f"least eigenvalue {least:.4g}",
         "look for a sign, or for weights that sum to more than 1",
     )
-    return xhat, P
 
 
 def check_state_pickles(watched: Watched, state: Any) -> None:

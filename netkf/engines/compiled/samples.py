@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.engines.base import Progress, broken
+from netkf.engines.base import Progress
+from netkf.engines.soundness import sound
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
@@ -26,23 +27,24 @@ def recorded(
     pass_rows_on: Callable[[int], None],
 ) -> bool:
     """Record the states x (T, n), xhat (T, H, n) and P (T, H, n, n) of H hosts at these times up to
-    the first that is not finite; whether there is none. ``pass_rows_on`` is given the place of that
+    the first that is not sound; whether there is none. ``pass_rows_on`` is given the place of that
     one: what happened after it did not happen.
     """
     if not len(times):
         return True
+    intact = sound(xhat, P).all(axis=1)
     if scenario.filter.algorithm.pooled:
         nodes = len(scenario.nodes)
         xhat, P = np.repeat(xhat, nodes, axis=1), np.repeat(P, nodes, axis=1)
-    finite = np.isfinite(P).all(axis=(1, 2, 3)) & np.isfinite(xhat).all(axis=(1, 2))
-    last = len(times) - 1 if finite.all() else int(np.argmin(finite))
+    last = len(times) - 1 if intact.all() else int(np.argmin(intact))
     after, time = last + 1, float(times[last])
     error = x[:after, None] - xhat[:after]
     recorder.samples(times[:after], x[:after], xhat[:after], P[:after], error)
     progress(time)
-    if finite.all():
+    if intact.all():
         return True
     pass_rows_on(last)
-    for node in broken(scenario, xhat[last], P[last]):
+    lost = ~sound(xhat[last], P[last])
+    for node in (scenario.nodes[k] for k in np.flatnonzero(lost)):
         recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
     return False
