@@ -1,6 +1,7 @@
-"""Plants and sensors in slots whose truth or readings come from tables.
+"""Plants and sensors whose truth or readings come from tables, in both kinds of time.
 
-``demand`` refuses, before a run starts, a table that lacks a slot that the run needs.
+``demand`` refuses, before a run starts, a table that lacks a state that the run needs. Readings
+may be missing: a node without a row for a slot has no reading then.
 """
 
 from __future__ import annotations
@@ -25,11 +26,15 @@ from netkf.core.fields import (
     source_file,
 )
 from netkf.core.tables import finite_numbers, read_columns, read_header, read_rows, whole
+from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.sampling import RecordedSamples
 from netkf.plants.sensors import Sensor
+from netkf.plants.truth import TOLERANCE, RecordedTruth, demand_rows
 
 Table = dict[int, FloatArray]
 """What is recorded, by slot."""
+NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +66,8 @@ class RecordedPlant(LinearPlant):
     @cached_property
     def table(self) -> Table:
         """The states (n,) by slot."""
-        names = [f"x{k}" for k in range(self.n)]
-        columns = read_columns(self.path, ("t", *names))
-        states = np.stack([columns[name] for name in names], axis=1)
-        rows = list(zip(columns["t"].tolist(), states, strict=True))
+        times, states = _states(self.path, self.n)
+        rows = list(zip(times.tolist(), states, strict=True))
         return by_slot(self.path, rows, self.period, "")
 
     def demand(self, slots: Iterable[int]) -> None:
@@ -74,6 +77,69 @@ class RecordedPlant(LinearPlant):
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """The states of the table."""
         return RecordedPath(self.table, np.full(self.n, math.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownDiffusion(Diffusion):
+    """Nobody knows the state in continuous time; ``A``, ``B``, ``mean`` and ``cov`` are the
+    filters' model of it.
+    """
+
+    drawn: ClassVar[bool] = False
+    shown: ClassVar[bool] = False
+
+    @property
+    def recorded_truth(self) -> RecordedTruth:
+        """Nan."""
+        return RecordedTruth(NOTHING, np.empty((0, self.n)), self.n)
+
+    def demand(self, times: FloatArray, what: str) -> None:
+        """Nothing is demanded of a state that nobody knows."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedDiffusion(Diffusion):
+    """The state is read from a table ``t,x0,x1,...``, t in seconds, and exists at its rows only;
+    ``A``, ``B``, ``mean`` and ``cov`` are the filters' model of it.
+    """
+
+    drawn: ClassVar[bool] = False
+
+    path: SourceFile = setting(source_file)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self.table  # a bad file is refused now
+
+    @cached_property
+    def table(self) -> tuple[FloatArray, FloatArray]:
+        """Times (K,), increasing, and states (K, n)."""
+        times, states = _states(self.path, self.n)
+        order = np.argsort(times, kind="stable")
+        times, states = times[order], states[order]
+        twice = np.flatnonzero(np.diff(times) <= TOLERANCE)
+        if twice.size:
+            words = f"{self.path.name}: there may be one row a time"
+            raise ScenarioError("path", words, f"two at t = {times[twice[0]]:g}", "remove one")
+        return times, states
+
+    @property
+    def recorded_truth(self) -> RecordedTruth:
+        """The states of the table."""
+        return RecordedTruth(*self.table, self.n)
+
+    def demand(self, times: FloatArray, what: str) -> None:
+        """Raise ScenarioError where the table lacks a state at one of the times; ``what`` says what
+        needs it.
+        """
+        demand_rows(self.path, self.table[0], times, what)
+
+
+def _states(source: SourceFile, n: int) -> tuple[FloatArray, FloatArray]:
+    """Times (K,) and states (K, n) of a table ``t,x0,x1,...``, row by row."""
+    names = [f"x{k}" for k in range(n)]
+    columns = read_columns(source, ("t", *names))
+    return columns["t"], np.stack([columns[name] for name in names], axis=1)
 
 
 class RecordedPath:
@@ -97,7 +163,8 @@ class RecordedPath:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSensor(Sensor):
-    """Readings from a table ``t,node,y0,...``, one row a slot and node, t in seconds.
+    """Readings from a table ``t,node,y0,...``, t in seconds: in slots at most one row a slot and
+    node, over a diffusion samples ``y = H x + v`` at the node's own times.
 
     ``H`` (p, n) and ``R`` (p, p) are what the filters take them to be. A table with columns
     ``phi0,...`` (one for each state, p = 1) holds the H of every reading; ``H`` may then be left
@@ -193,10 +260,50 @@ class RecordedSensor(Sensor):
         return by_slot(self.path, self._rows[node], period, f" of node {node}")
 
     def demand(self, slots: Iterable[int], period: float) -> None:
-        """Raise ScenarioError where the table lacks one of the slots for one of the nodes."""
+        """Raise ScenarioError where the table does not fit slots of that ``period``; it may lack
+        some of the ``slots``.
+        """
         for node in self.nodes:
-            table = self.table(node, period)
-            _demand(self.path, table, slots, period, f"reading of node {node}")
+            self.table(node, period)
+
+    def sample_times(
+        self,
+        node: int,
+        ordinal: int,
+        generator: Callable[[str], np.random.Generator],
+        horizon: float,
+    ) -> FloatArray:
+        """(K,) the times of the table."""
+        times = self.rows(node)[0]
+        return times[: int(np.searchsorted(times, horizon))]
+
+    def recorded_times(self, node: int) -> FloatArray:
+        """(K,) the times of all rows of a node, in the order of the table."""
+        return np.array([t for t, _ in self._rows[node]])
+
+    def rows(self, node: int) -> tuple[FloatArray, FloatArray]:
+        """Times (K,), increasing, and readings (K, p) of a node, each with its regressor where
+        there are any; raises ScenarioError for times below 0 or that are there twice.
+        """
+        given = sorted(self._rows[node], key=lambda row: row[0])
+        times = np.array([t for t, _ in given])
+        values = np.array([y for _, y in given]).reshape(
+            len(given), self._outputs + len(self._regressors)
+        )
+        if len(times) and times[0] < 0.0:
+            words = f"{self.path.name}: t must be at least 0"
+            raise ScenarioError("path", words, float(times[0]), "mend the row")
+        twice = np.flatnonzero(np.diff(times) <= 0.0)
+        if twice.size:
+            words = f"{self.path.name}: there may be one row of node {node} a time"
+            raise ScenarioError("path", words, f"two at t = {times[twice[0]]:g}", "remove one")
+        return times, values
+
+    def samples(
+        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
+    ) -> RecordedSamples:
+        """Those of the table; nothing is drawn."""
+        return RecordedSamples(self.H, self.rows(node)[1])
 
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
@@ -212,18 +319,25 @@ class RecordedReadings:
         self._H, self._table = H, table
 
     def matrix(self, slot: int) -> FloatArray:
-        """H (p, n) as the filters take it to be, or as it is recorded."""
-        phi = self._table[slot][len(self._H) :]
+        """H (p, n) as the filters take it to be, or as it is recorded; (0, n) without a row."""
+        row = self._table.get(slot)
+        if row is None:
+            return self._H[:0]
+        phi = row[len(self._H) :]
         return phi[None] if phi.size else self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """(p,) the reading of a slot."""
-        return self._table[slot][: len(self._H)]
+        """(p,) the reading of a slot; (0,) without a row."""
+        return self._table.get(slot, NOTHING)[: len(self._H)]
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both, (S, p) and (S, p, n), of some slots."""
-        made = [(self.reading(slot, x), self.matrix(slot)) for slot in slots]
-        y, H = (np.stack(column) for column in zip(*made, strict=True))
+        """Both, (S, p) and (S, p, n), of some slots; zeros without a row, which tell a filter as
+        little.
+        """
+        y, H = np.zeros((len(slots), len(self._H))), np.zeros((len(slots), *self._H.shape))
+        for k, slot in enumerate(slots):
+            if slot in self._table:
+                y[k], H[k] = self.reading(slot, x), self.matrix(slot)
         return y, H
 
 

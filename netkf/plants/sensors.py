@@ -12,11 +12,13 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from netkf.core.arrays import FloatArray
+from netkf.core.clock import Clock, all_ticks
 from netkf.core.compiling import in_place
 from netkf.core.fields import (
     Part,
@@ -29,6 +31,7 @@ from netkf.core.fields import (
 from netkf.core.small import added, product
 from netkf.plants.linear import Readings, SlotReadings
 from netkf.plants.paths import BLOCK, DiffusionPath
+from netkf.plants.sampling import DrawnSamples, Samples, sampling
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +56,54 @@ class Sensor(Part):
         ``generator`` makes the streams of that sensor by purpose.
         """
 
+    def sample_times(
+        self,
+        node: int,
+        ordinal: int,
+        generator: Callable[[str], np.random.Generator],
+        horizon: float,
+    ) -> FloatArray:
+        """(K,) the times in continuous time at which one of the nodes samples, below the
+        ``horizon``; sensors in slots and of increments have none.
+        """
+        return np.empty(0)
+
+    def samples(
+        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
+    ) -> Samples:
+        """The samples of one of the nodes at these times in one run."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True, eq=False)
 class LinearSensor(Sensor):
-    """In continuous time ``dy = H x dt + dv``, cov(dv) = R dt, H (3); in slots ``y = H x + v``,
-    cov(v) = R.
+    """In continuous time ``dy = H x dt + dv``, cov(dv) = R dt, H (3), or with a clock as
+    ``sampling`` ``y = H x + v``, cov(v) = R, whenever it ticks; in slots the latter in every slot.
 
     ``H`` (p, n), ``R`` (p, p).
     """
 
     H: FloatArray = setting(matrix)
     R: FloatArray = setting(definite_covariance)
+    sampling: Clock | None = setting(sampling, default=None)
+
+    def sample_times(
+        self,
+        node: int,
+        ordinal: int,
+        generator: Callable[[str], np.random.Generator],
+        horizon: float,
+    ) -> FloatArray:
+        """(K,) from the streams "sampling" and "sampling phase"."""
+        assert self.sampling is not None
+        entity, phase = (node, ordinal), partial(generator, "sampling phase")
+        return all_ticks(self.sampling, entity, phase, generator("sampling"), horizon, "sampling")
+
+    def samples(
+        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
+    ) -> DrawnSamples:
+        """From the stream "noise"."""
+        return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
         """The readings of one of the nodes in one run in continuous time."""

@@ -140,8 +140,6 @@ GOOD = "".join(f"{k * PERIOD:.1f},2,0.5,-0.25\n" for k in range(SLOTS + 1))
     [
         ("r.csv", "t,y0,y1\n", "r.csv must have the columns t, node, y0, y1"),
         ("r.csv", "t,node,y0\n" + GOOD, "add the column y1"),
-        ("r.csv", "t,node,y0,y1\n", "r.csv has no reading of node 2 for slot 1, t = 0.1"),
-        ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,1"), "node 2 for slot 7, t = 0.7"),
         ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,9"), "r.csv names a node that"),
         ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,2.5"), "node must hold integers"),
         ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,two"), "node must be a finite"),

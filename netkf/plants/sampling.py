@@ -1,0 +1,134 @@
+"""Sensors over a diffusion that sample it: when, and what they read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.core.clock import Clock, Entity
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import Rule, SourceFile, setting, source_file
+from netkf.core.tables import read_columns, whole
+from netkf.plants.linear import SlotReadings
+
+
+class Samples(Protocol):
+    """The samples of one sensor on one node in one run, k = 0, 1, ... in order of time."""
+
+    def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``y`` (p,) and ``H`` (p, n) of sample k, not before the last one asked for, at which the
+        state is x (n,).
+        """
+
+    def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Both, (S, p) and (S, p, n), of samples that ascend, at which the states are x (S, n)."""
+
+
+class DrawnSamples:
+    """``y = H x + v``, cov(v) = R: v is the Cholesky factor of R times p standard normals of
+    ``random`` a sample, in order.
+    """
+
+    def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
+        self._readings = SlotReadings(H, R, random)
+
+    def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``y`` (p,) and ``H`` (p, n) of sample k."""
+        return self._readings.reading(k, x), self._readings.matrix(k)
+
+    def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Both, (S, p) and (S, p, n), of some samples."""
+        return self._readings.several(ks, x)
+
+
+class RecordedSamples:
+    """Samples from ``rows`` (K, p) of a table, or (K, 1 + n) with the row of H of each."""
+
+    def __init__(self, H: FloatArray, rows: FloatArray) -> None:
+        self._H, self._rows = H, rows
+
+    def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``y`` (p,) and ``H`` (p, n) of sample k, whatever x."""
+        p = len(self._H)
+        phi = self._rows[k, p:]
+        return self._rows[k, :p], phi[None] if phi.size else self._H
+
+    def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Both, (S, p) and (S, p, n), of some samples."""
+        p, rows = len(self._H), self._rows[list(ks)]
+        if rows.shape[1] > p:
+            return rows[:, :p], rows[:, None, p:]
+        return rows, np.broadcast_to(self._H, (len(rows), *self._H.shape))
+
+
+def joined(
+    parts: Sequence[tuple[FloatArray, FloatArray]], noise: Sequence[FloatArray], n: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``y`` (p,), ``H`` (p, n) and ``R`` (p, p) of the readings (y, H) that sensors with noise R
+    take at one instant; a sensor without a reading (no rows) takes no part. p may be 0.
+    """
+    y = np.concatenate([np.empty(0), *(values for values, _ in parts)])
+    H = np.concatenate([np.empty((0, n)), *(rows for _, rows in parts)])
+    here = [R for (values, _), R in zip(parts, noise, strict=True) if len(values)]
+    return y, H, block_diagonal(here)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSampling(Clock):
+    """Samples at the times of a table ``t,node`` (seconds, above 0); several rows of a node at one
+    time are one sample.
+    """
+
+    path: SourceFile = setting(source_file)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self._times  # a bad file is refused now
+
+    @cached_property
+    def _times(self) -> dict[int, FloatArray]:
+        table = read_columns(self.path, ("t", "node"))
+        nodes = np.array(whole(self.path, "node", table["node"]), dtype=np.int64)
+        early = np.flatnonzero(table["t"] <= 0.0)
+        if early.size:
+            words = f"{self.path.name}: t must be above 0, the first sample comes after the start"
+            remedy = "shift the times or remove the row"
+            raise ScenarioError("path", words, float(table["t"][early[0]]), remedy)
+        return {node: np.unique(table["t"][nodes == node]) for node in np.unique(nodes).tolist()}
+
+    @property
+    def listed(self) -> tuple[int, ...]:
+        """Ids of all nodes in the table."""
+        return tuple(self._times)
+
+    def ticks(
+        self,
+        entity: Entity,
+        origin: float,
+        index: int,
+        now: float,
+        random: np.random.Generator,
+        count: int,
+    ) -> FloatArray:
+        """The recorded times of the node ``entity[0]``."""
+        return self._times.get(entity[0], np.empty(0))[index : index + count]
+
+
+def _sampling(value: object) -> Clock | None:
+    if isinstance(value, str) and value == "continuous":
+        return None
+    if not isinstance(value, Clock):
+        raise TypeError
+    return value
+
+
+sampling = Rule(
+    'must be "continuous" or a clock',
+    _sampling,
+    'write sampling = { kind = "periodic", period = ... }',
+)

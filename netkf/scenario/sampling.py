@@ -1,0 +1,235 @@
+"""Sampled sensors and the truth of one run in continuous time, as engines and theory ask for them.
+
+A sensor over a diffusion gives increments, or it samples: with a clock of its own (``sampling``),
+or at the times of its table (``recorded``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.errors import ScenarioError
+from netkf.core.streams import Streams
+from netkf.plants.linear import LinearPlant
+from netkf.plants.recorded import RecordedDiffusion, RecordedSensor, UnknownDiffusion
+from netkf.plants.sampling import RecordedSampling, Samples
+from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.plants.truth import ContinuousTruth
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Placed, Scenario
+
+MOST_SAMPLES = 1e9
+Places = dict[int, tuple["Placed", ...]]
+
+
+def samples(sensor: Sensor) -> bool:
+    """Whether a sensor over a diffusion samples it, else it gives increments."""
+    return isinstance(sensor, RecordedSensor) or (
+        isinstance(sensor, LinearSensor) and sensor.sampling is not None
+    )
+
+
+def _chosen(scenario: Scenario, sampled: bool) -> Places:
+    if scenario.slotted:
+        return {}
+    found = {
+        node: tuple(p for p in places if samples(scenario.sensors[p.entry]) == sampled)
+        for node, places in scenario.placed.items()
+    }
+    return {node: places for node, places in found.items() if places}
+
+
+def increment_sensors(scenario: Scenario) -> Places:
+    """The sensors of each node that give increments; empty in slots."""
+    return _chosen(scenario, False)
+
+
+def sampled_sensors(scenario: Scenario) -> Places:
+    """The sensors of each node that sample a diffusion; empty in slots."""
+    return _chosen(scenario, True)
+
+
+def sample_times(scenario: Scenario, streams: Streams) -> dict[tuple[int, int], FloatArray]:
+    """The increasing times below the horizon at which each sensor (node, ordinal) samples."""
+    found = {}
+    for node, place in _placed(scenario):
+        sensor, generator = scenario.sensors[place.entry], _generator(streams, node, place)
+        try:
+            times = sensor.sample_times(node, place.ordinal, generator, scenario.horizon)
+        except ScenarioError as error:
+            raise error.under(f"sensors[{place.entry}]") from None
+        found[node, place.ordinal] = times
+    return found
+
+
+def sample_path(scenario: Scenario, streams: Streams, node: int, place: Placed) -> Samples:
+    """The samples of one sensor of a node in one run."""
+    sensor = scenario.sensors[place.entry]
+    return sensor.samples(node, _generator(streams, node, place), scenario.horizon)
+
+
+def _placed(scenario: Scenario) -> Iterator[tuple[int, Placed]]:
+    for node, places in sampled_sensors(scenario).items():
+        for place in places:
+            yield node, place
+
+
+def _generator(streams: Streams, node: int, place: Placed) -> Callable[[str], np.random.Generator]:
+    return lambda purpose: streams.generator(purpose, node, place.ordinal)
+
+
+def all_sample_times(times: dict[tuple[int, int], FloatArray]) -> FloatArray:
+    """(K,) the instants at which anything samples, increasing."""
+    return np.unique(np.concatenate([np.empty(0), *times.values()]))
+
+
+def uses_grid(scenario: Scenario) -> bool:
+    """Whether the truth in continuous time is drawn on a sensing grid: where sensors give
+    increments, or there are no sensors at all.
+    """
+    drawn = not scenario.slotted and scenario.plant.drawn
+    return drawn and (bool(increment_sensors(scenario)) or not sampled_sensors(scenario))
+
+
+def may_use_frames(scenario: Scenario) -> bool:
+    """Whether errors can be simulated in frames, given a filter that commutes with a shift: the
+    truth and all readings are drawn, and the filters have the plant's A (in slots F).
+    """
+    if not scenario.drawn:
+        return False
+    plant = scenario.plant
+    if isinstance(plant, LinearPlant):
+        return np.array_equal(scenario.slot_belief[0], plant.F)
+    return np.array_equal(scenario.belief[0], scenario.truth.A)
+
+
+def continuous_truth(
+    scenario: Scenario,
+    streams: Streams,
+    frames: bool = False,
+    times: dict[tuple[int, int], FloatArray] | None = None,
+) -> ContinuousTruth:
+    """The truth of one run, at sample times, probe times and frame times: of increments a
+    ``DiffusionPath``, else a ``SampledTruth``, or a ``RecordedTruth``.
+
+    ``times`` are those of ``sample_times``, where they are known. Raises ScenarioError where a
+    recorded truth has no row for one of them.
+    """
+    given, plant = sample_times(scenario, streams) if times is None else times, scenario.truth
+    if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
+        demand_states(scenario, given)
+        return plant.recorded_truth
+    sampled, horizon = all_sample_times(given), scenario.horizon
+    random, probing = streams.generator("plant"), streams.generator("probe")
+    if not uses_grid(scenario):
+        return plant.sampled_truth(random, probing, sampled, scenario.times, horizon, frames)
+    sampling = streams.generator("samples") if len(sampled) else None
+    return plant.path(random, probing, scenario.times, sampling, sampled, horizon, frames)
+
+
+def demand_states(scenario: Scenario, times: dict[tuple[int, int], FloatArray]) -> None:
+    """Raise ScenarioError where a recorded truth lacks the state at a probe time, or at the sample
+    time of a sensor that is drawn.
+    """
+    plant = scenario.plant
+    if not isinstance(plant, RecordedDiffusion):
+        return
+    try:
+        plant.demand(scenario.times, "the probe")
+        for node, place in _placed(scenario):
+            if scenario.sensors[place.entry].drawn:
+                plant.demand(times[node, place.ordinal], f"a sample of node {node}")
+    except ScenarioError as error:
+        raise error.under("plant") from None
+
+
+def check_sampling(scenario: Scenario) -> None:
+    """Raise ScenarioError where sampled sensors, or a recorded or unknown diffusion, do not fit the
+    rest of the scenario.
+    """
+    for k, sensor in enumerate(scenario.sensors):
+        key = f"sensors[{k}]"
+        if isinstance(sensor, LinearSensor) and sensor.sampling is not None:
+            _check_clock(scenario, key, sensor)
+        if not scenario.slotted and not scenario.plant.drawn and not samples(sensor):
+            raise ScenarioError(
+                f"{key}.sampling",
+                "must be a clock, since increments of a recorded state are unknown",
+                None,
+                'write sampling = { kind = "periodic", period = ... }',
+            )
+        if isinstance(sensor, RecordedSensor) and not scenario.slotted:
+            for node in sensor.nodes:
+                try:
+                    sensor.rows(node)
+                except ScenarioError as error:
+                    raise error.under(key) from None
+    if not scenario.slotted and isinstance(scenario.plant, RecordedDiffusion):
+        demand_states(scenario, sample_times(scenario, Streams(scenario.seed)))
+
+
+def _check_clock(scenario: Scenario, key: str, sensor: LinearSensor) -> None:
+    clock = sensor.sampling
+    assert clock is not None
+    if scenario.slotted:
+        raise ScenarioError(
+            f"{key}.sampling",
+            "belongs to plants in continuous time, and this plant is in slots",
+            None,
+            "leave it out: there is a reading in every slot",
+        )
+    if isinstance(clock, RecordedSampling):
+        for node in clock.listed:
+            if node not in scenario.topology.index:
+                words = f"{clock.path.name} names a node that the graph does not have"
+                remedy = "mend the row or the graph"
+                raise ScenarioError(f"{key}.sampling.path", words, node, remedy)
+    if getattr(clock, "rates", ()):
+        raise ScenarioError(
+            f"{key}.sampling.rates",
+            "belongs to network.activation",
+            None,
+            "give rate, and another [[sensors]] entry for nodes with another one",
+        )
+    if getattr(clock, "rate", 0.0) is None and getattr(clock, "rates", None) is not None:
+        raise ScenarioError(f"{key}.sampling.rate", "is missing", None, "add rate = ...")
+    if getattr(clock, "at", "links") != "links":
+        words = "belongs to network.activation"
+        raise ScenarioError(f"{key}.sampling.at", words, getattr(clock, "at", None), "remove it")
+    for node in sensor.nodes:
+        count = clock.mean_rate((node, 0)) * scenario.horizon
+        if count > MOST_SAMPLES:
+            raise ScenarioError(
+                f"{key}.sampling",
+                f"must take at most {MOST_SAMPLES:g} samples up to the horizon",
+                f"{count:.3g} samples of node {node}",
+                "lower the rate or shorten the horizon",
+            )
+
+
+def sampling_notes(scenario: Scenario) -> tuple[str, ...]:
+    """One line for each table of readings with rows that no run uses, or without any of a node."""
+    notes: list[str] = []
+    for sensor in scenario.sensors:
+        if not isinstance(sensor, RecordedSensor):
+            continue
+        times = {node: sensor.recorded_times(node) for node in sensor.nodes}
+        empty = [node for node, t in times.items() if not len(t)]
+        if empty:
+            listed = ", ".join(map(str, empty[:3])) + (", ..." if len(empty) > 3 else "")
+            notes.append(f"{sensor.path.name} has no readings of node {listed}")
+        late = sum(int((t >= scenario.ends).sum()) for t in times.values())
+        if late:
+            notes.append(f"{sensor.path.name}: {late} readings at or after the end are not used")
+    return tuple(notes)
+
+
+def believed_samples(scenario: Scenario, node: int) -> list[FloatArray]:
+    """R (p, p) of each sampled sensor of a node, as the filters believe it."""
+    places = sampled_sensors(scenario).get(node, ())
+    return [scenario.noise(place.entry, believed=True) for place in places]
