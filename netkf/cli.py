@@ -75,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     run = _command(commands, "run", _run, "simulate a scenario and keep what happened")
     run.add_argument("--runs", type=_count, help="how many times, with other draws (default: 1)")
     run.add_argument("--seed", type=_seed, help="root seed instead of the scenario's")
-    run.add_argument("--engine", default="auto", choices=["auto", "processes", "compiled"])
+    run.add_argument("--engine", default="auto", choices=["auto", "simpy", "processes", "compiled"])
     run.add_argument("--out", type=Path, help="directory for the run (default: runs/NAME-k)")
     _pool(run)
     run.add_argument(

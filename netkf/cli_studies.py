@@ -51,7 +51,9 @@ def add_commands(
     judged.add_argument("--confidence", type=float, default=0.95, help="of all verdicts together")
     for command in (swept, sized, judged):
         command.add_argument("--seed", type=seed, help="root seed instead of the scenario's")
-        command.add_argument("--engine", default="auto", choices=["auto", "processes", "compiled"])
+        command.add_argument(
+            "--engine", default="auto", choices=["auto", "simpy", "processes", "compiled"]
+        )
         workers = command.add_mutually_exclusive_group()
         workers.add_argument("--workers", type=count, help="processes (default: one a core)")
         workers.add_argument(

@@ -10,10 +10,13 @@ from __future__ import annotations
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
 from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
+from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.fields import (
     boolean,
@@ -65,6 +68,9 @@ from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
 
+SlotLocal, SlotCentral = Local, Central
+"""Their former names in slots."""
+
 
 def kinds() -> dict[str, dict[str, type]]:
     """The classes by family and kind, as scenario files name them."""
@@ -88,7 +94,9 @@ __all__ = [
     "DiffusionFilter",
     "Edges",
     "ErdosRenyi",
+    "Exchange",
     "ExponentialDelay",
+    "Filter",
     "Filtering",
     "FlowFilter",
     "Geometric",
@@ -97,6 +105,7 @@ __all__ = [
     "Graph",
     "Grid",
     "Hybrid",
+    "Increments",
     "Intermittent",
     "LinearPlant",
     "LinearSensor",
@@ -105,9 +114,11 @@ __all__ = [
     "LognormalDelay",
     "Loss",
     "Matching",
+    "Message",
     "Network",
     "NoDelay",
     "NoLoss",
+    "NodeInfo",
     "OnReadings",
     "PathGraph",
     "PerLink",
@@ -115,6 +126,7 @@ __all__ = [
     "Plant",
     "Poisson",
     "PushSum",
+    "Reading",
     "RecordedClock",
     "RecordedDelay",
     "RecordedLoss",

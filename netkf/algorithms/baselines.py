@@ -6,22 +6,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.filter import Exchange, Filter, Message
+from netkf.core.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Local(FlowFilter):
-    """Every node runs a Kalman-Bucy filter on its own readings and never talks."""
+class Local(Filter):
+    """Every node runs a Kalman(-Bucy) filter on its own readings and never talks; samples in slots
+    are filtered.
+    """
 
+    schedule: ClassVar[tuple[str, ...]] = ("predict", "sense")
+    clocks: ClassVar[tuple[str, ...]] = ()
     talks: ClassVar[bool] = False
 
-    def absorb(self, state: Any, messages: Sequence[tuple[float, Any, float]]) -> Any:
+    def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
         """Nothing arrives; the state stays."""
         return state
+
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """Affine."""
+        return super().shift(state, offset)
 
 
 @dataclass(frozen=True, eq=False)
 class Central(Local):
-    """One Kalman-Bucy filter reads all sensors without delay or loss; every node shows it."""
+    """One Kalman(-Bucy) filter reads all sensors without delay or loss; every node shows it."""
 
     pooled: ClassVar[bool] = True

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from netkf.algorithms.flow import FlowState, Payload, predict
+from netkf.algorithms.filter import Exchange, Message, State
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intersection import intersected
 from netkf.core.arrays import FloatArray
@@ -30,19 +31,26 @@ class CovarianceIntersection(Hybrid):
 
     inverts: ClassVar[bool] = True
 
-    def absorb(
-        self, state: FlowState, messages: Sequence[tuple[float, Payload, float]]
-    ) -> FlowState:
+    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
         """D (8) and (9) with values from before the reset."""
-        own = 1.0 - sum(weight for weight, _, _ in messages)
-        parts = [Payload(state.xhat, state.P)]
-        parts += [predict(state.model, payload, age) for _, payload, age in messages]
-        xhat, P = intersected_pairs(
-            np.array([max(own, 0.0), *(weight for weight, _, _ in messages)]),
-            np.stack([part.xhat for part in parts]),
-            np.stack([part.P for part in parts]),
-        )
-        return state._replace(xhat=xhat, P=P)
+        weights, means, roots = self._pairs(state, messages)
+        xhat, root = intersected(weights, means, np.stack([regular_root(S) for S in roots]))
+        return state._replace(xhat=xhat, root=root)
+
+    def shift(self, state: State, offset: FloatArray) -> State:
+        """Affine: the weights sum to one."""
+        return state._replace(xhat=state.xhat + offset)
+
+
+def regular_root(root: FloatArray) -> FloatArray:
+    """The root itself where it can be inverted, else one that can, see ``invertible_root``."""
+    if not np.isfinite(root).all():
+        return root
+    scale = np.sqrt(np.maximum((root * root).sum(axis=1), TINY))
+    values = np.linalg.svd(root / scale[:, None], compute_uv=False)
+    if values[-1] > math.sqrt(SINGULAR) * values[0]:
+        return root
+    return invertible_root(root @ root.T)
 
 
 @compilable

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo
 from netkf.algorithms.intersection import intersection
-from netkf.algorithms.slot import (
-    Messages,
-    Pair,
-    Reading,
-    Role,
-    SlotFilter,
-    SlotModel,
-    update_and_predict,
-)
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.compiling import compilable
 from netkf.core.errors import ScenarioError
@@ -26,19 +19,26 @@ METROPOLIS = "metropolis"
 
 
 class DiffusionState(NamedTuple):
-    """Prediction ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, and the weight that
-    the node gives to itself when all messages arrive.
+    """``xhat`` (n,), ``root`` (n, n) of its covariance, the model, and the weight that the node
+    gives to itself when all messages arrive.
     """
 
     xhat: FloatArray
     root: FloatArray
-    model: SlotModel
+    model: Any
     own: float
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
 
 
 @dataclass(frozen=True, eq=False)
-class DiffusionFilter(SlotFilter):
-    """D Algorithm 1, (6)-(9), with any F in place of D's identity; samples are predictions.
+class DiffusionFilter(Filter):
+    """D Algorithm 1, (6)-(9), with any F in place of D's identity; in slots samples are predictions.
+
+    Under clocks a node combines what it heard at one instant, predicted to now where it took time.
 
     weights entry [l][i] is the weight node i gives to what node l sends, in the order of node ids:
             columns sum to 1, and D's theorems want the rows to (balanced); or "metropolis",
@@ -55,7 +55,9 @@ class DiffusionFilter(SlotFilter):
     )
     on_loss: str = setting(choice("renormalise", "keep-own"), default="renormalise")
 
-    programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
+    schedule: ClassVar[tuple[str, ...]] = ("sense", "predict", "exchange")
+    clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
+    predicts: ClassVar[bool] = True
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
 
@@ -86,35 +88,27 @@ class DiffusionFilter(SlotFilter):
         """``weights`` where they are a matrix."""
         return None if isinstance(self.weights, str) else self.weights
 
-    def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> DiffusionState:
-        """A node by itself."""
-        return DiffusionState(mean, square_root(cov), model, 1.0)
-
-    def place(self, state: DiffusionState, role: Role) -> DiffusionState:
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> DiffusionState:
         """The node knows its own weight."""
-        return state._replace(own=role.own)
+        return DiffusionState(mean, square_root(cov), model, node.own_weight)
 
-    def sense(self, state: DiffusionState, reading: Reading) -> DiffusionState:
-        """Adapt, D (6) and (7), with the prediction to the next slot."""
-        xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
-        return state._replace(xhat=xhat, root=root)
-
-    def emit(self, state: DiffusionState, phase: int) -> Pair:
-        """The adapted estimate and its covariance."""
-        return Pair(state.xhat, state.root)
-
-    def absorb(self, state: DiffusionState, phase: int, messages: Messages) -> DiffusionState:
+    def absorb(
+        self, state: DiffusionState, messages: Sequence[Message], exchange: Exchange
+    ) -> DiffusionState:
         """Combine, D (8) and (9)."""
-        arrived = [weight for weight, _, _ in messages]
-        own, heard = self.share(state.own, arrived)
-        if own == 1.0:
+        own, heard = self.share(state.own, [message.weight for message in messages])
+        if own == 1.0 or not messages:
             return state
         parts = [(own, state.xhat, state.root)]
-        parts += [
-            (w, pair.xhat, pair.root) for w, (_, pair, _) in zip(heard, messages, strict=True)
-        ]
+        for weight, message in zip(heard, messages, strict=True):
+            pair = message.payload
+            parts.append((weight, *state.model.extrapolate(pair.xhat, pair.root, message.age)))
         xhat, root = intersection(parts)
         return state._replace(xhat=xhat, root=root)
+
+    def shift(self, state: DiffusionState, offset: FloatArray) -> DiffusionState:
+        """Affine: the weights sum to one."""
+        return state._replace(xhat=state.xhat + offset)
 
     def share(self, own: float, arrived: list[float]) -> tuple[float, list[float]]:
         """The own weight and those of the messages that arrived, which sum to 1, from the nominal

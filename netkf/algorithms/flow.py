@@ -1,75 +1,30 @@
-"""Flow filters: node algorithms that live in continuous time and may be interrupted at any instant.
+"""Flow filters: the former contract of filters in continuous time, for classes of users.
 
-A flow filter is a frozen dataclass of parameters. Its state is a NamedTuple of arrays that nothing
+New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a flow
+filter. A flow filter is a frozen dataclass of parameters. Its state is a NamedTuple of arrays that nothing
 changes in place; every method returns a new one. The host calls ``flow`` and then, where the node
 has sensors, ``measure`` for the interval that just passed, and ``emit``/``absorb`` for messages.
 """
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.gains import GainTable, gain_table, gain_update
-from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
+from netkf.algorithms.filter import Increments
+from netkf.algorithms.gains import gain_update
+from netkf.algorithms.models import FlowModel, usable
+from netkf.algorithms.riccati import riccati_step
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import in_place
 from netkf.core.fields import Part
 
-STRETCH = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class FlowModel:
-    """What one node believes: ``dx = A x dt + dw``, ``cov(dw) = Q dt``; ``dy = H x dt + dv``,
-    ``cov(dv) = R dt``.
-
-    ``A, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0; ``horizon`` is the longest gap and
-    ``interval`` the longest stretch of readings used at once, both in seconds.
-    """
-
-    A: FloatArray
-    Q: FloatArray
-    H: FloatArray
-    R: FloatArray
-    horizon: float
-    interval: float
-
-    @cached_property
-    def information(self) -> FloatArray:
-        """``G = H' R^-1 H`` (n, n)."""
-        return np.asarray(self.H.T @ np.linalg.solve(self.R, self.H))
-
-    @cached_property
-    def riccati(self) -> RiccatiTable:
-        """The flow of P with this node's readings."""
-        return riccati_table(self.A, self.Q, self.information, self.horizon)
-
-    @cached_property
-    def prediction(self) -> RiccatiTable:
-        """The flow of P without readings."""
-        return riccati_table(self.A, self.Q, np.zeros_like(self.A), self.horizon)
-
-    @cached_property
-    def gains(self) -> GainTable:
-        """How this node's readings are used."""
-        return gain_table(self.A, self.Q, self.H, self.R, self.interval)
-
-
-class Reading(NamedTuple):
-    """What the sensors of a node (p rows in all) saw over the last ``gap`` seconds.
-
-    moments : (2 p,) ``int dy`` and then ``int (2 (s - a) / gap - 1) dy``, see core/legendre
-    """
-
-    moments: FloatArray
-    gap: float
+Reading = Increments
+"""What the sensors of a node saw over the last ``gap`` seconds."""
 
 
 class FlowState(NamedTuple):
@@ -145,14 +100,6 @@ class FlowFilter(Part):
     def largest_degree(self) -> float:
         """The largest number of links a node may have for the weights to make sense."""
         return np.inf
-
-
-@in_place
-def usable(rate: float) -> float:
-    """Seconds of readings that may be used at once from a P on with ``rate = trace(P G)``, see
-    FlowFilter.stretch.
-    """
-    return STRETCH / rate if rate > 0.0 else math.inf
 
 
 @in_place

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
-from netkf.algorithms.flow import FlowFilter, FlowState, Payload, predict
+import numpy as np
+
+from netkf.algorithms.filter import Exchange, Filter, Message, State
+from netkf.algorithms.square_root import lower_triangular
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable_as, in_place
 from netkf.core.fields import number, setting
 
 
 @dataclass(frozen=True, eq=False)
-class Hybrid(FlowFilter):
-    """Convex resets of estimate and covariance with weight ``epsilon`` for each active neighbour.
+class Hybrid(Filter):
+    """Convex resets of estimate and covariance with weight ``epsilon`` for each neighbour heard.
 
     ``epsilon`` is the off-diagonal entry of ``Pi = I - epsilon L``, H (5): 0 < epsilon <= 1/max
     degree. A message that took its time is predicted to its arrival first.
@@ -21,16 +25,23 @@ class Hybrid(FlowFilter):
 
     epsilon: float = setting(number(above=0.0, high=1.0))
 
-    def absorb(
-        self, state: FlowState, messages: Sequence[tuple[float, Payload, float]]
-    ) -> FlowState:
+    schedule: ClassVar[tuple[str, ...] | None] = None
+
+    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
         """H (7) and (9): all right-hand sides are values from before the reset."""
-        own = 1.0 - sum(weight for weight, _, _ in messages)
-        xhat, P = own * state.xhat, own * state.P
-        for weight, payload, age in messages:
-            other, other_P = predict(state.model, payload, age)
-            add_neighbour(xhat[None], P[None], 0, weight, other[None], other_P[None], 0)
-        return state._replace(xhat=xhat, P=P)
+        weights, means, roots = self._pairs(state, messages)
+        xhat, root = combined(weights, means, roots)
+        return state._replace(xhat=xhat, root=root)
+
+    def _pairs(
+        self, state: State, messages: Sequence[Message]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Weights (k,), estimates (k, n) and roots (k, n, n) at this instant, the own ones first."""
+        own = max(0.0, 1.0 - sum(message.weight for message in messages))
+        pairs = [(state.xhat, state.root)]
+        pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]
+        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
+        return np.array([own, *(message.weight for message in messages)]), means, roots
 
     def weight(self, degree: int, peer_degree: int) -> float:
         """``epsilon`` on every link."""
@@ -39,6 +50,20 @@ class Hybrid(FlowFilter):
     def largest_degree(self) -> float:
         """``1 / epsilon``: beyond it a node's own weight would be negative."""
         return (1.0 + 1e-12) / self.epsilon
+
+    def shift(self, state: State, offset: FloatArray) -> State:
+        """Affine: the weights sum to one."""
+        return state._replace(xhat=state.xhat + offset)
+
+
+def combined(
+    weights: FloatArray, means: FloatArray, roots: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``sum w xhat`` (n,) and the root (n, n) of ``sum w P``, of weights (k,), means (k, n) and
+    roots (k, n, n).
+    """
+    scaled = np.sqrt(weights)[:, None, None] * roots
+    return weights @ means, lower_triangular(np.concatenate(list(scaled), axis=1))
 
 
 @in_place

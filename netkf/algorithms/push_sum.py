@@ -8,14 +8,18 @@ keep the mass; the stop rule of step 2.3 fires when all links of a node are down
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.slot import Messages, Reading, Role, SlotFilter, SlotModel
-from netkf.algorithms.square_root import lower_triangular, predict_root
+from netkf.algorithms import running_sums
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.models import SlotModel
+from netkf.algorithms.running_sums import Offer, RunningSums
+from netkf.algorithms.square_root import lower_triangular
 from netkf.algorithms.stopping import RULES, stops
 from netkf.core.arrays import FloatArray, square_root, symmetric
 from netkf.core.compiling import compilable
@@ -47,16 +51,22 @@ class PushSumState(NamedTuple):
 
     xhat: FloatArray
     root: FloatArray
-    model: SlotModel
+    model: Any
     mass: FloatArray
     network: Network
     stopped: bool
     degree: int
 
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
 
 @dataclass(frozen=True, eq=False)
-class PushSum(SlotFilter):
-    """P Fig. 1, steps 1-6, samples are filtered.
+class PushSum(Filter):
+    """In slots P Fig. 1, steps 1-6, samples are filtered; under node clocks broadcast rounds by
+    running sums (algorithms.running_sums), which need none of the settings.
 
     gamma      averaging steps a slot
     delta      the averaging gain is 1 / delta, P (9)
@@ -69,54 +79,62 @@ class PushSum(SlotFilter):
                were up and its weight positive
     """
 
-    gamma: int = setting(integer(low=1, high=MOST_STEPS))
-    delta: float = setting(positive)
+    gamma: int | None = setting(integer(low=1, high=MOST_STEPS), default=None)
+    delta: float | None = setting(positive, default=None)
     leader: int = setting(integer(low=0), default=0)
     asymptotic: bool = setting(boolean, default=False)
     links: str = setting(choice("fresh", "held"), default="fresh")
     stop: str = setting(choice(*RULES), default="never")
     tolerance: float = setting(number(low=0.0), default=1e-6)
 
-    programme: ClassVar[tuple[str, ...]] = ("exchange", "sense", "exchange")
+    schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
+    clocks: ClassVar[tuple[str, ...]] = ("nodes",)
     first_slot: ClassVar[int] = 1
-    predicts: ClassVar[bool] = False
+    needs_samples: ClassVar[bool] = True
 
-    def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> PushSumState:
-        """A node by itself: step 1 without the leader."""
-        information = model.information
-        mass = np.concatenate([[0.0, 1.0], information.reshape(-1)])
-        alone = Network(information, 1.0)
-        return PushSumState(mean, square_root(cov), model, mass, alone, False, 0)
-
-    def place(self, state: PushSumState, role: Role) -> PushSumState:
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Step 1: the leader gets the weight; with asymptotic gains every node knows the limits."""
+        if not isinstance(model, SlotModel):
+            return running_sums.start(model, mean, cov, node)
+        information = model.information
+        weight = 1.0 if node.node == self.leader else 0.0
+        mass = np.concatenate([[weight, 1.0], information.reshape(-1)])
+        known = Network(information, 1.0)
         if self.asymptotic:
-            root = asymptotic_root(state.model.F, state.model.Q, role.information)
-            state = state._replace(network=Network(role.information, float(role.nodes), root))
-        if role.node == self.leader:
-            state = state._replace(mass=np.concatenate([[1.0], state.mass[1:]]))
-        return state._replace(degree=role.neighbours)
+            root = asymptotic_root(model.F, model.Q, node.information)
+            known = Network(node.information, float(node.nodes), root)
+        return PushSumState(mean, square_root(cov), model, mass, known, False, node.degree)
+
+    def predict(self, state: Any, gap: float) -> Any:
+        """Estimate, covariance and, in running sums, all information."""
+        if isinstance(state, RunningSums):
+            return running_sums.predict(state, gap)
+        return super().predict(state, gap)
 
     def steps(self, phase: int) -> int:
         """One for the mass, ``gamma`` for the estimates."""
-        return self.gamma if phase == AVERAGE else 1
+        return (self.gamma or 1) if phase == AVERAGE else 1
 
-    def redraws(self, phase: int, step: int) -> bool:
-        """Links that are held keep the fate of the first averaging step."""
+    def redraws_links(self, phase: int, step: int) -> bool:
+        """Links that are held keep the outcome of the first averaging step."""
         return self.links == "fresh" or step == 0
 
-    def emit(self, state: PushSumState, phase: int) -> FloatArray | None:
+    def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
         """Step 2.1, the node's share of its mass, or step 5.1, z."""
-        if phase == AVERAGE:
-            return state.xhat
+        if isinstance(state, RunningSums):
+            return running_sums.offer(state)
+        if exchange.phase == AVERAGE:
+            return state, state.xhat
         silent = self.asymptotic or (self.stop == "paper" and state.stopped)
-        return None if silent else share(state.mass, state.degree)
+        return state, None if silent else share(state.mass, state.degree)
 
-    def absorb(self, state: PushSumState, phase: int, messages: Messages) -> PushSumState:
+    def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
         """Steps 2.2 and 2.3, or step 5.2."""
-        received = [payload for _, payload, _ in messages]
-        if phase == AVERAGE:
-            return state._replace(xhat=averaged(state.xhat, received, self.delta))
+        if isinstance(state, RunningSums):
+            return running_sums.hear(state, messages)
+        received = [message.payload for message in messages]
+        if exchange.phase == AVERAGE:
+            return state._replace(xhat=averaged(state.xhat, received, self.delta or math.nan))
         if self.asymptotic or (self.stop == "paper" and state.stopped):
             return state
         mass = mixed(state.mass, received, state.degree)
@@ -128,27 +146,43 @@ class PushSum(SlotFilter):
         if state.stopped:
             return state
         found = network(state.mass, state.model)
-        told = (*found[:2], *state.network[:2])
+        known = (*found[:2], *state.network[:2])
         rule = RULES.index(self.stop)
-        stopped = stops(rule, self.tolerance, state.mass, before, whole, *told)
+        stopped = stops(rule, self.tolerance, state.mass, before, whole, *known)
         return state._replace(network=found, stopped=stopped)
 
-    def sense(self, state: PushSumState, reading: Reading) -> PushSumState:
-        """Steps 3 and 4, P (7) and (8)."""
-        model, root = state.model, state.network.root
+    def update(self, state: Any, reading: Reading) -> Any:
+        """Steps 3 and 4 after the prediction, P (7) and (8)."""
+        if isinstance(state, RunningSums):
+            return running_sums.add_reading(state, reading)
+        root = state.network.root
         if root is None:
-            ahead = predict_root(state.root, model.F, model.root_Q)
-            root = corrected_root(ahead, state.network.information)
-        xhat = corrected(model.F @ state.xhat, root, state.network.number, *reading)
+            root = corrected_root(state.root, state.network.information)
+        y, H, R = reading[:3]
+        xhat = corrected(state.xhat, root, state.network.number, y, H, R)
         return state._replace(xhat=xhat, root=root)
 
-    def stopped(self, state: PushSumState) -> bool:
+    def stopped(self, state: Any) -> bool:
         """Whether G^(i) and N^(i) are frozen."""
-        return state.stopped
+        return not isinstance(state, RunningSums) and bool(state.stopped)
 
-    def conserved(self, state: PushSumState) -> dict[str, float]:
+    def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
         """The sum of the weights is 1, that of the numbers N."""
+        if isinstance(state, RunningSums):
+            return running_sums.weights(state)
         return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
+
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """Affine: averaging weights sum to one."""
+        if isinstance(state, RunningSums):
+            return running_sums.shift(state, offset)
+        return state._replace(xhat=state.xhat + offset)
+
+    def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
+        """Estimates move, mass does not."""
+        if isinstance(payload, Offer):
+            return running_sums.shift_offer(payload, offset)
+        return payload + offset if len(payload) == len(offset) else payload
 
 
 @compilable

@@ -1,6 +1,7 @@
-"""Slot filters: node algorithms in discrete time.
+"""Slot filters: the former contract of filters in slots, for classes of users; kernels of slots.
 
-Each slot is a short programme of phases that the filter declares, such as ``("exchange",
+New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a slot
+filter. Each slot is a short programme of phases that the filter declares, such as ``("exchange",
 "sense")``. An exchange has one step or several; in each every node may send once and then absorbs
 all that arrived before the inbox closed. In a sense phase it is handed the reading of the slot.
 States are NamedTuples of arrays that nothing changes in place. Covariances are carried as square
@@ -12,42 +13,19 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.filter import Reading
+from netkf.algorithms.models import SlotModel
 from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
-from netkf.core.arrays import FloatArray, block_diagonal, square_root, symmetric
+from netkf.core.arrays import FloatArray, square_root
 from netkf.core.compiling import compilable
 from netkf.core.fields import Part
 from netkf.core.small import applied, product, solution
 
 Messages = Sequence[tuple[float, Any, float]]
-
-
-@dataclass(frozen=True, eq=False)
-class SlotModel:
-    """What one node believes: ``x[k+1] = F x[k] + w``, cov(w) = Q; ``y = H x + v``, cov(v) = R.
-
-    ``F, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0. Where H differs from slot to slot this
-    is the first one; each reading brings its own.
-    """
-
-    F: FloatArray
-    Q: FloatArray
-    H: FloatArray
-    R: FloatArray
-
-    @cached_property
-    def root_Q(self) -> FloatArray:
-        """``root_Q root_Q' = Q``."""
-        return square_root(self.Q)
-
-    @property
-    def information(self) -> FloatArray:
-        """``H' R^-1 H`` (n, n)."""
-        return symmetric(self.H.T @ np.linalg.solve(self.R, self.H))
 
 
 class SlotState(NamedTuple):
@@ -71,14 +49,6 @@ class Role(NamedTuple):
     nodes: int
     information: FloatArray
     own: float = 1.0
-
-
-class Reading(NamedTuple):
-    """One reading: ``y`` (p,), with the ``H`` (p, n) and ``R`` (p, p) that its sender believes."""
-
-    y: FloatArray
-    H: FloatArray
-    R: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +138,7 @@ def update_and_predict(
     xhat: FloatArray, root: FloatArray, model: SlotModel, reading: Reading
 ) -> tuple[FloatArray, FloatArray]:
     """The next prediction and the root of its covariance from a prediction and a reading."""
-    return adapted(xhat, root, model.F, model.root_Q, *reading)
+    return adapted(xhat, root, model.F, model.root_Q, reading.y, reading.H, reading.R)
 
 
 @compilable
@@ -209,91 +179,3 @@ def filtered(
     L = lower_triangular(work)
     gain = solution(L[:p, :p].T, L[p:, :p].T).T
     return xhat + applied(gain, y - applied(H, xhat)), L[p:, p:].copy()
-
-
-class Pair(NamedTuple):
-    """What gossip swaps."""
-
-    xhat: FloatArray
-    root: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Gossip(SlotFilter):
-    """The gossip interactive Kalman filter of Kar and Moura, G (10).
-
-    Paired nodes first swap the pair (xhat, P), then each updates with its own reading and predicts.
-    Nothing is swapped in slot 0. A node whose partner's message is lost keeps its own pair: if only
-    one direction fails, one pair is copied and the other is gone.
-    """
-
-    first_slot: ClassVar[int] = 1
-    pairwise: ClassVar[bool] = True
-
-    def emit(self, state: SlotState, phase: int) -> Pair:
-        """The pair."""
-        return Pair(state.xhat, state.root)
-
-    def absorb(self, state: SlotState, phase: int, messages: Messages) -> SlotState:
-        """The partner's pair in place of the own one."""
-        for _, pair, _ in messages:
-            state = state._replace(xhat=pair.xhat, root=pair.root)
-        return state
-
-    def sense(self, state: SlotState, reading: Reading) -> SlotState:
-        """Update with the own reading and predict."""
-        xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
-        return state._replace(xhat=xhat, root=root)
-
-
-@dataclass(frozen=True, eq=False)
-class Intermittent(SlotFilter):
-    """The Kalman filter with intermittent observations, R (15)-(18).
-
-    Every node sends its reading to its neighbours and updates with its own and with those that
-    arrive in time.
-    """
-
-    programme: ClassVar[tuple[str, ...]] = ("sense", "exchange")
-    one_way: ClassVar[bool] = True
-
-    def sense(self, state: SlotState, reading: Reading) -> SlotState:
-        """Keep the reading."""
-        return state._replace(kept=reading)
-
-    def emit(self, state: SlotState, phase: int) -> Reading | None:
-        """The reading, from nodes that have sensors."""
-        return state.kept if len(state.kept.y) else None
-
-    def absorb(self, state: SlotState, phase: int, messages: Messages) -> SlotState:
-        """Update with all readings together and predict."""
-        readings = [state.kept, *(payload for _, payload, _ in messages)]
-        every = Reading(
-            np.concatenate([r.y for r in readings]),
-            np.concatenate([r.H for r in readings]),
-            block_diagonal([r.R for r in readings]),
-        )
-        xhat, root = update_and_predict(state.xhat, state.root, state.model, every)
-        return state._replace(xhat=xhat, root=root, kept=None)
-
-
-@dataclass(frozen=True, eq=False)
-class SlotLocal(SlotFilter):
-    """Every node runs a Kalman filter on its own readings and never talks; samples are filtered."""
-
-    programme: ClassVar[tuple[str, ...]] = ("sense",)
-    predicts: ClassVar[bool] = False
-    talks: ClassVar[bool] = False
-
-    def sense(self, state: SlotState, reading: Reading) -> SlotState:
-        """Predict from the slot before, then update; called from slot 1 on."""
-        model = state.model
-        xhat, root = filtered(state.xhat, state.root, model.F, model.root_Q, *reading)
-        return state._replace(xhat=xhat, root=root)
-
-
-@dataclass(frozen=True, eq=False)
-class SlotCentral(SlotLocal):
-    """One Kalman filter reads all sensors; every node shows it."""
-
-    pooled: ClassVar[bool] = True

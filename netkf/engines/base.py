@@ -24,15 +24,18 @@ from netkf.trace.recorder import Recorder
 class Rank(IntEnum):
     """Order of kinds of happening at one instant.
 
-    Readings end first; then links activate, and both ends snapshot what they send; then delayed
-    messages arrive; then every node with mail absorbs all of it at once; samples see the result.
+    The origin of coordinates moves first; sensors read, and nodes use all samples of the instant;
+    then clocks tick, and senders snapshot what they send; then delayed messages arrive; then every
+    node with mail absorbs all of it at once; probes see the result.
     """
 
+    REBASE = 0
     SENSE = 1
-    TICK = 2
-    DELIVER = 3
-    ABSORB = 4
-    PROBE = 5
+    UPDATE = 2
+    TICK = 3
+    DELIVER = 4
+    ABSORB = 5
+    PROBE = 6
 
 
 SHORTEST_SHARE, LONGER = 1e-9, 1.02
@@ -68,7 +71,14 @@ class Engine(ABC):
         """Simulate up to the horizon; returns the status, complete or diverged."""
 
 
-def broken(scenario: Scenario, xhat: FloatArray, P: FloatArray) -> list[int]:
-    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is no longer finite."""
-    finite = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(xhat).all(axis=1)
+def broken(
+    scenario: Scenario, xhat: FloatArray, P: FloatArray, without: np.ndarray | None = None
+) -> list[int]:
+    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is no longer finite; those
+    ``without`` (N,) a covariance have none to be looked at.
+    """
+    finite = np.isfinite(P).all(axis=(1, 2))
+    if without is not None:
+        finite |= without
+    finite &= np.isfinite(xhat).all(axis=1)
     return [scenario.nodes[k] for k in np.flatnonzero(~finite)]

@@ -6,34 +6,33 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from netkf.core import compiling
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
 from netkf.trace.schema import EVENT
 
 LOAD = "load it first: netkf.simulate(netkf.load(path))"
-ENGINES = ("auto", "processes", "compiled")
+ENGINES = ("auto", "simpy", "compiled")
 
 
 def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
-    """The engine of a name; ``auto`` is compiled where numba is installed and it can run the
-    scenario, and processes else. Raises EngineError where an engine cannot run it.
+    """The engine of a name: ``simpy`` (or ``processes``), ``compiled``, or ``auto``, which is
+    compiled where that can run the scenario. Raises EngineError where an engine cannot run it.
     """
     if isinstance(name, Engine):
         engine: Engine = name
     elif name in ("auto", "compiled"):
         engine = CompiledEngine()
         if name == "auto" and engine.refusal(scenario) is not None:
-            engine = ProcessesEngine()
-    elif name == "processes":
-        engine = ProcessesEngine(compiled=compiling.available())
+            engine = SimpyEngine()
+    elif name in ("simpy", "processes"):
+        engine = SimpyEngine()
     else:
         raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name!r}")
     refusal = engine.refusal(scenario)

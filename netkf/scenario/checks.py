@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import longest_interval
-from netkf.algorithms.slot import SlotFilter
+from netkf.algorithms.models import FlowModel
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Part
 from netkf.network.clocks import LinkClock
@@ -120,7 +119,7 @@ def _ids(nodes: tuple[int, ...]) -> str:
 
 def _network(scenario: Scenario) -> None:
     network, topology = scenario.network, scenario.topology
-    algorithm = scenario.filter.algorithm
+    algorithm = scenario.hosted
     for key, part in (
         ("network.activation", network.activation),
         ("network.channel.loss", network.channel.loss),
@@ -133,7 +132,7 @@ def _network(scenario: Scenario) -> None:
                 raise error.under(key) from None
     if not algorithm.talks:
         return
-    name = spoken(algorithm)
+    name = spoken(scenario.filter.algorithm)
     if network.activation is None:
         example = "broadcast" if scenario.slotted else "poisson"
         raise ScenarioError(
@@ -144,7 +143,7 @@ def _network(scenario: Scenario) -> None:
         )
     if not scenario.slotted:
         _ticks(scenario)
-    one_way = isinstance(algorithm, SlotFilter) and algorithm.one_way
+    one_way = scenario.slotted and algorithm.one_way
     if topology.directed and not one_way:
         raise ScenarioError(
             "network.graph.directed",
@@ -299,8 +298,7 @@ def _longest(scenario: Scenario, model: FlowModel) -> float:
 
 
 def _slots(scenario: Scenario) -> None:
-    plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
-    assert isinstance(algorithm, SlotFilter)
+    plant, algorithm = scenario.slot_plant, scenario.hosted
     off = [
         t
         for t, k in zip(scenario.times.tolist(), scenario.slots, strict=True)
@@ -316,7 +314,7 @@ def _slots(scenario: Scenario) -> None:
     activation = scenario.network.activation
     if not algorithm.talks:
         return
-    name = spoken(algorithm)
+    name = spoken(scenario.filter.algorithm)
     pairs = isinstance(activation, Matching) or (
         isinstance(activation, RecordedSlots) and activation.matching
     )
@@ -328,7 +326,7 @@ def _slots(scenario: Scenario) -> None:
             _told(activation),
             "choose another activation or another filter",
         )
-    exchanges = algorithm.programme.count("exchange")
+    exchanges = (algorithm.schedule or ()).count("exchange")
     if exchanges * scenario.phase_length >= plant.period * (1.0 - 1e-9):
         raise ScenarioError(
             "network.activation.phase",

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.registry import spoken
@@ -38,8 +37,7 @@ def check_regressor(scenario: Scenario, key: str, sensor: RegressorSensor) -> No
 
 def check_weights(scenario: Scenario) -> None:
     """Raise ScenarioError where weights given pair by pair do not fit nodes and links."""
-    algorithm, nodes = scenario.filter.algorithm, scenario.nodes
-    given = algorithm.pair_weights if isinstance(algorithm, SlotFilter) else None
+    given, nodes = scenario.hosted.pair_weights, scenario.nodes
     if given is None:
         return
     demand_shape("filter.weights", given, (len(nodes),) * 2, f"there are {len(nodes)} nodes")

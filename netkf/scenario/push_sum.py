@@ -46,7 +46,7 @@ def check_push_sum(scenario: Scenario) -> None:
                 "use linear sensors or another filter",
             )
     F, Q = scenario.slot_belief
-    if algorithm.asymptotic and asymptotic_root(F, Q, scenario.roles[0].information) is None:
+    if algorithm.asymptotic and asymptotic_root(F, Q, scenario.node_infos[0].information) is None:
         raise ScenarioError(
             "filter.asymptotic",
             "needs a steady covariance of the centralised filter, and there is none",

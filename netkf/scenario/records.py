@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedPlant, RecordedSensor
@@ -61,8 +60,7 @@ def _readings(scenario: Scenario, key: str, sensor: RecordedSensor) -> None:
 
 def _sensed(scenario: Scenario) -> range:
     """The slots in which a run hands readings to its filters."""
-    plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
-    assert isinstance(algorithm, SlotFilter)
+    plant, algorithm = scenario.slot_plant, scenario.hosted
     end = max(int(scenario.horizon / plant.period) - 1, 0)
     while not plant.over(end, scenario.horizon):
         end += 1
@@ -72,11 +70,10 @@ def _sensed(scenario: Scenario) -> range:
 
 
 def _exchanges(scenario: Scenario) -> None:
-    activation, algorithm = scenario.network.activation, scenario.filter.algorithm
-    assert isinstance(algorithm, SlotFilter)
+    activation, algorithm = scenario.network.activation, scenario.hosted
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
-    phases = algorithm.programme.count("exchange")
+    phases = (algorithm.schedule or ()).count("exchange")
     for slot, phase, step in activation.recorded:
         steps = algorithm.steps(phase) if phase < phases else 0
         if step >= steps:
@@ -91,8 +88,8 @@ def _exchanges(scenario: Scenario) -> None:
 
 def record_notes(scenario: Scenario) -> tuple[str, ...]:
     """One line where recorded exchanges are in slots in which nothing is exchanged."""
-    activation, algorithm = scenario.network.activation, scenario.filter.algorithm
-    if not isinstance(activation, RecordedSlots) or not isinstance(algorithm, SlotFilter):
+    activation, algorithm = scenario.network.activation, scenario.hosted
+    if not isinstance(activation, RecordedSlots) or not scenario.slotted:
         return ()
     used = range(algorithm.first_slot, _sensed(scenario).stop)
     unused = sorted({slot for slot, _, _ in activation.recorded} - set(used))

@@ -9,10 +9,13 @@ from pathlib import Path
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.filter import Filter
 from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
+from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError, nearest, quote
 from netkf.core.fields import Part
 from netkf.network import channels, clocks, graphs, matchings, recorded
@@ -30,11 +33,14 @@ FAMILIES: dict[str, type[Part]] = {
     "activation": clocks.LinkClock,
     "loss": channels.Loss,
     "delay": channels.Delay,
-    "filter": FlowFilter,
+    "filter": Filter,
     "slot activation": matchings.SlotActivation,
-    "slot filter": SlotFilter,
+    "slot filter": Filter,
 }
 """The contract that the classes of each family keep."""
+
+FORMER: dict[str, type[Part]] = {"filter": FlowFilter, "slot filter": SlotFilter}
+"""Contracts that classes of users may still keep (algorithms.adapters)."""
 
 KINDS: dict[str, dict[str, type[Part]]] = {
     "plant": {
@@ -81,6 +87,10 @@ KINDS: dict[str, dict[str, type[Part]]] = {
     "filter": {
         "hybrid": Hybrid,
         "covariance-intersection": CovarianceIntersection,
+        "gossip": Gossip,
+        "intermittent": Intermittent,
+        "diffusion": DiffusionFilter,
+        "push-sum": PushSum,
         "local": Local,
         "central": Central,
     },
@@ -94,8 +104,8 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "intermittent": Intermittent,
         "diffusion": DiffusionFilter,
         "push-sum": PushSum,
-        "local": SlotLocal,
-        "central": SlotCentral,
+        "local": Local,
+        "central": Central,
     },
 }
 """Plants that live in slots take the slot activations and slot filters."""
@@ -152,7 +162,8 @@ def _imported(family: str, kind: str, folder: Path) -> type[Part]:
     finally:
         sys.path[: len(places)] = []
     contract = FAMILIES[family]
-    if not (isinstance(found, type) and issubclass(found, contract)):
+    former = FORMER.get(family, contract)
+    if not (isinstance(found, type) and issubclass(found, (contract, former))):
         raise ScenarioError(
             "kind",
             f"must be a subclass of netkf's {contract.__name__}",

@@ -10,11 +10,15 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg
 
-from netkf.algorithms.flow import FlowFilter, FlowModel
+from netkf.algorithms.adapters import AnyFilter, adapted
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.gains import longest_interval
-from netkf.algorithms.slot import Role, SlotFilter, SlotModel
-from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.algorithms.models import FlowModel, SlotModel
+from netkf.algorithms.slot import SlotFilter
+from netkf.core.arrays import FloatArray, block_diagonal, symmetric
 from netkf.core.errors import TheoryError
 from netkf.core.fields import (
     Part,
@@ -84,7 +88,7 @@ class Filtering(Part):
     order of node ids; both default to the plant's.
     """
 
-    algorithm: FlowFilter | SlotFilter = setting(instance(FlowFilter, SlotFilter))
+    algorithm: AnyFilter = setting(instance(Filter, FlowFilter, SlotFilter))
     mean: FloatArray | tuple[FloatArray, ...] | None = setting(
         either(vector, several(vector, "vectors, one per node"), nested(2)), default=None
     )
@@ -212,20 +216,18 @@ class Scenario(Part):
         """When the last thing may happen: the horizon, or the end of the slot that begins there
         where a sample shows what is known after the exchanges of its slot.
         """
-        algorithm = self.filter.algorithm
-        if not isinstance(algorithm, SlotFilter) or algorithm.predicts:
+        if not self.slotted or self.hosted.predicts:
             return self.horizon
         return self.horizon + self.slot_plant.period
 
     @property
     def phase_length(self) -> float:
         """Seconds that an exchange of a slot lasts; its steps share them evenly."""
-        activation, algorithm = self.network.activation, self.filter.algorithm
+        activation = self.network.activation
         assert isinstance(activation, SlotActivation)
-        assert isinstance(algorithm, SlotFilter)
         if activation.phase is not None:
             return activation.phase
-        return 0.5 * self.slot_plant.period / max(1, algorithm.programme.count("exchange"))
+        return 0.5 * self.slot_plant.period / max(1, (self.hosted.schedule or ()).count("exchange"))
 
     @cached_property
     def slot_belief(self) -> tuple[FloatArray, FloatArray]:
@@ -240,23 +242,49 @@ class Scenario(Part):
     def slot_models(self) -> tuple[SlotModel, ...]:
         """What each node believes, in the order of ``nodes``; H of slot 0 where H is random."""
         return tuple(
-            SlotModel(*self.slot_belief, *self._stacked(self.placed.get(node, ()), believed=True))
+            self._slot_model(self._stacked(self.placed.get(node, ()), believed=True))
             for node in self.nodes
         )
 
+    def _slot_model(self, observation: tuple[FloatArray, FloatArray]) -> SlotModel:
+        return SlotModel(*self.slot_belief, *observation, self.slot_plant.period)
+
     @cached_property
-    def roles(self) -> tuple[Role, ...]:
-        """What each node may be told about the network, in the order of ``nodes``."""
+    def hosted(self) -> Filter:
+        """The filter of every node, as engines call it."""
+        return adapted(self.filter.algorithm)
+
+    @cached_property
+    def node_infos(self) -> tuple[NodeInfo, ...]:
+        """What each node may know about itself and the network, in the order of ``nodes``."""
         information = np.zeros((self.plant.n, self.plant.n))
-        for model in self.slot_models:
-            information = information + model.information
+        for node in self.nodes:
+            H, R = self._stacked(self.placed.get(node, ()), believed=True)
+            information = information + symmetric(H.T @ np.linalg.solve(R, H))
         degrees, own, size = self.topology.degrees, self.own_weights, len(self.nodes)
-        return tuple(Role(node, degrees[node], size, information, own[node]) for node in self.nodes)
+        receivers = dict.fromkeys(self.nodes, 0)
+        for sender, _ in self.topology.directions:
+            receivers[sender] += 1
+        delay = 0.0 if self.slotted else self.network.channel.delay.longest
+        return tuple(
+            NodeInfo(node, degrees[node], receivers[node], size, own[node], information, delay)
+            for node in self.nodes
+        )
+
+    @property
+    def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:
+        """What each node believes, in the order of ``nodes``."""
+        return self.slot_models if self.slotted else self.models
+
+    @property
+    def believed_pooled_model(self) -> SlotModel | FlowModel:
+        """The model of a filter that reads the sensors of all nodes at once."""
+        return self.pooled_slot_model if self.slotted else self.pooled_model
 
     @cached_property
     def pooled_slot_model(self) -> SlotModel:
         """The model of a filter that reads the sensors of all nodes at once."""
-        return SlotModel(*self.slot_belief, *self._stacked(self._everywhere, believed=True))
+        return self._slot_model(self._stacked(self._everywhere, believed=True))
 
     @cached_property
     def truth(self) -> Diffusion:
@@ -284,6 +312,44 @@ class Scenario(Part):
                 here = found.setdefault(node, [])
                 here.append(Placed(entry, len(here)))
         return {node: tuple(found[node]) for node in sorted(found)}
+
+    @cached_property
+    def increment_sensors(self) -> dict[int, tuple[Placed, ...]]:
+        """Increment sensors."""
+        return {} if self.slotted else self.placed
+
+    @cached_property
+    def sampled_sensors(self) -> dict[int, tuple[Placed, ...]]:
+        """Sampled sensors."""
+        return {}
+
+    def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
+        """Sample times."""
+        return {}
+
+    def continuous_truth(self, streams: Streams) -> Any:
+        """Truth in continuous time."""
+        from netkf.plants.paths import DiffusionPath
+
+        paths = self.truth.paths(
+            [streams.generator("plant")], [streams.generator("probe")], self.times
+        )
+        return DiffusionPath(paths, self.horizon)
+
+    def slot_truth(self, streams: Streams) -> Any:
+        """The state of one run in slots, in frames where they are used."""
+        return self.slot_plant.truth(streams.generator("plant"), self.exact_errors)
+
+    @cached_property
+    def exact_errors(self) -> bool:
+        """Frames."""
+        return False
+
+    def moved_back(self, offset: FloatArray, age: float) -> FloatArray:
+        """The state (n,) from which the plant alone would come to ``offset`` in ``age`` seconds."""
+        if self.slotted:
+            return offset
+        return np.asarray(scipy.linalg.expm(-age * self.truth.A) @ offset)
 
     @property
     def sensing(self) -> tuple[int, ...]:
@@ -385,8 +451,8 @@ class Scenario(Part):
 
     def weight(self, receiver: int, sender: int) -> float:
         """The weight a node gives to a message: pi_ij of H (7), a_ji of D (8)."""
-        algorithm, topology = self.filter.algorithm, self.topology
-        given = algorithm.pair_weights if isinstance(algorithm, SlotFilter) else None
+        algorithm, topology = self.hosted, self.topology
+        given = algorithm.pair_weights
         if given is not None:
             return float(given[topology.index[sender], topology.index[receiver]])
         return algorithm.weight(topology.degrees[receiver], topology.degrees[sender])

@@ -42,16 +42,14 @@ class Coupled(NamedTuple):
 
 STEPS = (
     "init",
-    "place",
-    "flow",
-    "measure",
-    "sense",
+    "predict",
+    "update",
     "emit",
     "absorb",
     "share",
-    "stretch",
+    "max_measurement_interval",
     "steps",
-    "redraws",
+    "redraws_links",
     "estimate",
 )
 

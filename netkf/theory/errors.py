@@ -18,8 +18,8 @@ import scipy.linalg
 
 from netkf.algorithms.baselines import Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.models import FlowModel
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.riccati import hamiltonians
 from netkf.core.arrays import FloatArray, symmetric

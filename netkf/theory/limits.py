@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
@@ -66,7 +65,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
 
 def _slot_central(scenario: Scenario) -> FloatArray:
     plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
-    if isinstance(algorithm, SlotFilter) and algorithm.predicts:
+    if scenario.slotted and algorithm.predicts:
         raise TheoryError("the filter's samples are predictions, the central filter's are not")
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError("H differs from slot to slot: there is no steady covariance")

@@ -7,7 +7,8 @@ import itertools
 import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.slot import Gossip, Intermittent
+from netkf.algorithms.gossip import Gossip
+from netkf.algorithms.intermittent import Intermittent
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario

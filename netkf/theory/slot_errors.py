@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
+from netkf.algorithms.gossip import Gossip
+from netkf.algorithms.intermittent import Intermittent
 from netkf.core.arrays import FloatArray, block_diagonal, symmetric
 from netkf.core.errors import TheoryError
 from netkf.core.streams import Streams
@@ -22,8 +24,8 @@ from netkf.theory.coupled import own_steps
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-KNOWN = (DiffusionFilter, Gossip, Intermittent, SlotCentral, SlotLocal)
-STEPS = ("init", "place", "sense", "emit", "absorb", "share", "estimate")
+KNOWN = (DiffusionFilter, Gossip, Intermittent, Central, Local)
+STEPS = ("init", "predict", "update", "emit", "absorb", "share", "estimate")
 Arrived = dict[int, list[int]]
 
 
@@ -36,7 +38,7 @@ def stacked_slot_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, Float
     algorithm = scenario.filter.algorithm
     known = next((k for k in KNOWN if isinstance(algorithm, k)), None)
     name = type(algorithm).__name__
-    if known is None or not isinstance(algorithm, SlotFilter):
+    if known is None:
         raise TheoryError(f"no exact error covariance for {name}")
     own = own_steps(algorithm, known, STEPS)
     if own:

@@ -18,6 +18,7 @@ KINDS = (
     "crash",
     "restart",
     "diverged",
+    "transmit",
 )
 """Event kinds; a row stores the place of its kind in this tuple.
 

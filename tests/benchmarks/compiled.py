@@ -38,7 +38,7 @@ from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.compiled.poisson import schedule
 from netkf.engines.compiled.schedule import LinkDraws, Window
 from netkf.engines.compiled.tables import host_tables, link_tables
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.theory import intermittent
 from netkf.trace.recorder import MemorySink, Recorder
 from tests.benchmarks import peers
@@ -198,7 +198,7 @@ def engines(name, case, runs, fast):
         seen.add((fingerprint, ticks))
         return total
 
-    compared(name, runs, lambda: events(fast), lambda: events(ProcessesEngine()))
+    compared(name, runs, lambda: events(fast), lambda: events(SimpyEngine()))
     assert len(seen) == 1, "the same events"
 
 
@@ -291,7 +291,7 @@ def main():
     short = big.replace({"horizon": max(4.0 * share, 1.0), "probe": 1.0})
     engines("SimPy, 1000 nodes, 4000 links", short, runs, CompiledEngine())
     fifty = peers.planar(50, 5.0).replace({"horizon": 40.0 * share, "probe": 4.0 * share})
-    mixed = ProcessesEngine(compiled=True)
+    mixed = SimpyEngine(compiled=True)
     engines("SimPy, its filters compiled, n = 4", fifty, runs, mixed)
     blind = fifty.replace({"sensors": []})
     compared(

@@ -19,7 +19,7 @@ import netkf
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.streams import Streams
 from netkf.engines.base import silent
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.trace.recorder import MemorySink, Recorder
 
 RING = Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml"
@@ -36,7 +36,7 @@ def engine_run(case):
     """Seconds inside the engine, started processes included, and the number of events."""
     recorder = Recorder([MemorySink()])
     began = time.perf_counter()
-    status = ProcessesEngine().run(case, Streams(case.seed), recorder, silent)
+    status = SimpyEngine().run(case, Streams(case.seed), recorder, silent)
     seconds = time.perf_counter() - began
     assert status == "complete"
     return seconds, recorder.total

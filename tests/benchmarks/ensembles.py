@@ -12,16 +12,16 @@ import time
 import numpy as np
 
 import netkf
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from tests.conftest import SCENARIOS
 
 TOGETHER = 4096
-SIMPY = ProcessesEngine()  # with nothing compiled
+SIMPY = SimpyEngine()  # with nothing compiled
 
 
 def outside(scenario, runs):
     """Share of processor time that is not spent in the engine."""
-    plain, inside = ProcessesEngine.run, 0.0
+    plain, inside = SimpyEngine.run, 0.0
 
     def timed(*arguments):
         nonlocal inside
@@ -32,10 +32,10 @@ def outside(scenario, runs):
             inside += time.process_time() - began
 
     netkf.monte_carlo(scenario, 10, workers=1, engine=SIMPY)
-    ProcessesEngine.run = timed
+    SimpyEngine.run = timed
     began = time.process_time()
     netkf.monte_carlo(scenario, runs, workers=1, engine=SIMPY)
-    ProcessesEngine.run = plain
+    SimpyEngine.run = plain
     return 1.0 - inside / (time.process_time() - began)
 
 

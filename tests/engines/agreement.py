@@ -3,13 +3,13 @@
 import numpy as np
 
 import netkf
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 
 
 def assert_agree(scenario, replica=0, engine="compiled"):
     """Run an engine and SimPy with nothing compiled; returns the run of the former."""
     fast = netkf.simulate(scenario, replica=replica, engine=engine)
-    slow = netkf.simulate(scenario, replica=replica, engine=ProcessesEngine())
+    slow = netkf.simulate(scenario, replica=replica, engine=SimpyEngine())
     assert (fast.engine, slow.engine) == (engine, "processes")
     assert netkf.first_difference(fast, slow) is None
     assert fast.fingerprint == slow.fingerprint

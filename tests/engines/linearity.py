@@ -8,7 +8,7 @@ import numpy as np
 
 from netkf import simulate
 from netkf.core.streams import Streams
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.trace.recorder import MemorySink, Recorder
 
 GAUSSIAN = {"plant", "noise", "cut", "probe"}
@@ -47,7 +47,7 @@ class OneDraw(Streams):
 
 def run(scenario, streams):
     memory = MemorySink()
-    ProcessesEngine().run(scenario, streams, Recorder([memory]), lambda time: None)
+    SimpyEngine().run(scenario, streams, Recorder([memory]), lambda time: None)
     return np.concatenate([error for *_, error in memory.samples])
 
 

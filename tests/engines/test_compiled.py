@@ -17,7 +17,7 @@ from netkf.core import compiling, small
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.streams import Streams
 from netkf.engines.compiled import lots
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.network.channels import Bernoulli, Fates
 from netkf.network.clocks import Poisson
 from netkf.scenario.reading import from_table
@@ -39,7 +39,7 @@ def test_every_scenario_agrees(file):
 
 def test_clocks_of_processes_with_compiled_filters_agree(ring, monkeypatch):
     """Also where a block ends among ticks of one instant, and where nothing ticks."""
-    monkeypatch.setattr("netkf.engines.processes.ticking.TOGETHER", 4)
+    monkeypatch.setattr("netkf.engines.simpy.ticking.TOGETHER", 4)
     clock = {"kind": "periodic", "period": 0.25}
     delay = {"kind": "exponential", "mean": 0.3}
     for changes in (
@@ -390,7 +390,7 @@ def test_covariances_beyond_all_bounds_take_their_time_and_no_more(build):
     )
     run = netkf.simulate(far, engine="compiled")
     assert run.P[-1, 7].max() > 1e25 > 1e3 > run.P[-1, 0].max()
-    assert run.fingerprint == netkf.simulate(far, engine=ProcessesEngine()).fingerprint
+    assert run.fingerprint == netkf.simulate(far, engine=SimpyEngine()).fingerprint
 
 
 def test_replicas_side_by_side_are_those_one_after_the_other(ring):
@@ -445,7 +445,7 @@ class Stuck(Poisson):
         return np.minimum(times, 1.5)
 
 
-@pytest.mark.parametrize("engine", [ProcessesEngine(), "compiled", "processes"], ids=str)
+@pytest.mark.parametrize("engine", [SimpyEngine(), "compiled", "processes"], ids=str)
 def test_parts_of_ones_own_that_break_the_rules_are_refused_by_name(ring, engine):
     channel = dataclasses.replace(ring.network.channel, loss=Certain(delivery=0.8))
     lossy = dataclasses.replace(ring.network, channel=channel)
@@ -482,7 +482,7 @@ def test_the_first_start_says_that_it_compiles(ring, monkeypatch, capsys, tmp_pa
     assert capsys.readouterr().err.count("netkf: compiling, once") == 2
     monkeypatch.setattr(compiling, "_said", set())
     netkf.simulate(ring, engine="processes")
-    netkf.simulate(ring, engine=ProcessesEngine())
+    netkf.simulate(ring, engine=SimpyEngine())
     assert capsys.readouterr().err.count("netkf: compiling, once") == 1
 
 

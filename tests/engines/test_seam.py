@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.trace.schema import CODES
 
 GRID = {"kind": "grid", "rows": 3, "columns": 3}
@@ -59,8 +59,8 @@ def test_order_in_which_processes_start_does_not_matter(ring, seed):
         return random.Random(seed).sample(processes, len(processes))
 
     scenario = busy(ring)
-    plain = netkf.simulate(scenario, engine=ProcessesEngine())
-    same(plain, netkf.simulate(scenario, engine=ProcessesEngine(shuffled)))
+    plain = netkf.simulate(scenario, engine=SimpyEngine())
+    same(plain, netkf.simulate(scenario, engine=SimpyEngine(shuffled)))
 
 
 def test_simultaneous_events_have_their_order(ring):

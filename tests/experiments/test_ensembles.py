@@ -15,7 +15,7 @@ import pytest
 
 import netkf
 from netkf.cli import main
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.experiments.ensembles import pools
 from netkf.experiments.ensembles.blocks import Grove, tree
 from netkf.experiments.ensembles.directory import runs_to_directory
@@ -227,7 +227,7 @@ def test_a_users_class_travels_and_its_failure_is_one_line(tmp_path, workers):
         netkf.monte_carlo(netkf.load(tmp_path / "Bad.toml"), 2, workers=workers)
     fine = netkf.monte_carlo(netkf.load(tmp_path / "Fine.toml"), 2, workers=workers)
     plain = netkf.load(SCENARIOS / "poisson_ring.toml").replace({"horizon": 1.0})
-    assert_same_bits(fine, netkf.monte_carlo(plain, 2, workers=1, engine=ProcessesEngine()))
+    assert_same_bits(fine, netkf.monte_carlo(plain, 2, workers=1, engine=SimpyEngine()))
 
 
 @pytest.mark.parametrize(
@@ -351,7 +351,7 @@ def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
     short = ring.replace({"horizon": 2.0})
     here = netkf.monte_carlo(short, 20)
     assert here.runs.max() == 20
-    for asked in ({"workers": 2}, {"engine": ProcessesEngine()}):
+    for asked in ({"workers": 2}, {"engine": SimpyEngine()}):
         with pytest.raises(AssertionError, match="2 processes were started"):
             netkf.monte_carlo(short, 20, **asked)
     with pytest.raises(AssertionError, match="2 processes were started"):

@@ -9,7 +9,7 @@ import pytest
 
 import netkf
 from netkf.cli import main
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.experiments.files import new_directory, written_beside
 from netkf.experiments.run import run_to_directory
 from tests.conftest import SCENARIOS, scenario_files
@@ -67,7 +67,7 @@ def test_summary_is_what_the_states_say(ring, finished):
     assert sent["sent"] == sent["delivered"] + sent["lost"] + sent["in_flight"]
 
 
-@pytest.mark.parametrize("engine", [ProcessesEngine(), "compiled"], ids=str)
+@pytest.mark.parametrize("engine", [SimpyEngine(), "compiled"], ids=str)
 def test_tables_are_written_in_pieces(ring, tmp_path, monkeypatch, engine):
     monkeypatch.setattr("netkf.trace.recorder.BLOCK", 100)
     monkeypatch.setattr("netkf.engines.compiled.flow.FIRST_ROWS", 100)
@@ -85,7 +85,7 @@ def test_tables_are_written_in_pieces(ring, tmp_path, monkeypatch, engine):
     assert events.seq.tolist() == list(range(len(events)))
 
 
-@pytest.mark.parametrize("engine", [ProcessesEngine(), "compiled"], ids=str)
+@pytest.mark.parametrize("engine", [SimpyEngine(), "compiled"], ids=str)
 def test_an_interrupted_run_keeps_what_it_had(ring, tmp_path, monkeypatch, engine):
     monkeypatch.setattr("netkf.engines.compiled.flow.MOST_SAMPLES", 5)
 
@@ -247,7 +247,7 @@ def test_half_a_row_group_gets_no_name(ring, tmp_path, monkeypatch):
 def test_an_error_in_a_class_of_netkf_is_not_covered_up(ring, tmp_path, monkeypatch):
     monkeypatch.setattr("netkf.algorithms.hybrid.Hybrid.absorb", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        run_to_directory(ring, tmp_path / "out", engine=ProcessesEngine())
+        run_to_directory(ring, tmp_path / "out", engine=SimpyEngine())
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["status"] == "failed"
 
 
@@ -294,7 +294,7 @@ def test_a_run_stopped_before_its_first_sample_has_a_summary(ring, tmp_path, mon
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("netkf.engines.processes.engine.ProcessesEngine.run", stop)
+    monkeypatch.setattr("netkf.engines.simpy.engine.SimpyEngine.run", stop)
     with pytest.raises(KeyboardInterrupt):
         run_to_directory(ring, tmp_path / "out", "processes")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.scenario.reading import from_table, load
 from netkf.scenario.writing import as_table, resolved, to_toml
 from tests.conftest import scenario_files
@@ -126,7 +126,7 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
     assert sorted(set(ticks.t)) == [0.3, 0.6, 1.2, 2.4, 4.8, 9.6, 19.2]
     assert resolved(scenario)["filter"]["kind"] == "fusion:Timid"
     plain = scenario.replace({"filter.kind": "hybrid", "filter.epsilon": 0.2})
-    np.testing.assert_array_equal(netkf.simulate(plain, engine=ProcessesEngine()).P, run.P)
+    np.testing.assert_array_equal(netkf.simulate(plain, engine=SimpyEngine()).P, run.P)
     exact = netkf.theory.error_covariance(scenario, run)  # other weights are understood
     assert np.linalg.eigvalsh(run.P - exact).min() > -1e-9
     with pytest.raises(netkf.TheoryError, match="Loud defines absorb itself"):

@@ -9,7 +9,6 @@ import numpy as np
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.slot import SlotFilter
 from netkf.core import compiling
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
@@ -43,9 +42,9 @@ class CompiledEngine(Engine):
 
     def refusal(self, scenario: Scenario) -> str | None:
         """Why this engine cannot run the scenario, with the remedy; None where it can."""
-        remedy = 'use engine="processes", or "auto", which chooses'
+        remedy = 'use engine="simpy", or "auto", which chooses'
         if not compiling.available():
-            remedy = 'install it (pip install "netkf[fast]") or use engine="processes"'
+            remedy = 'install it (pip install "netkf[fast]") or use engine="simpy"'
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
         parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
@@ -60,7 +59,7 @@ class CompiledEngine(Engine):
     def announce(self, scenario: Scenario) -> None:
         """That code is compiled, where it is not kept from before."""
         algorithm = scenario.filter.algorithm
-        if isinstance(algorithm, SlotFilter):
+        if scenario.slotted:
             compiling.announce(KERNELS[type(algorithm)])
         else:
             compiling.announce(replay_for(scenario))

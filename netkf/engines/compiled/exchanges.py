@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
-from netkf.algorithms.slot import Intermittent, SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.compiled.masses import stopping
@@ -81,8 +81,7 @@ class Programme(ABC):
     """Goes through the slots of one run: what is ``_done``, in order, for the ``_slots`` here."""
 
     def __init__(self, scenario: Scenario) -> None:
-        algorithm = scenario.filter.algorithm
-        assert isinstance(algorithm, SlotFilter)
+        algorithm = scenario.hosted
         self._scenario, self._algorithm = scenario, algorithm
         self._length = scenario.phase_length if algorithm.talks else 0.0
         self._samples = set(scenario.slots)
@@ -132,7 +131,9 @@ class Programme(ABC):
 
     def _phases(self, slot: int, start: float) -> None:
         algorithm, phase, now = self._algorithm, 0, start
-        for kind in algorithm.programme:
+        for kind in algorithm.schedule or ():
+            if kind == "predict":  # the kernels predict where they sense
+                continue
             if kind == "sense":
                 if slot > 0 or algorithm.predicts:
                     # Else a filtered estimate starts from what is known before any reading.
@@ -234,7 +235,7 @@ class Exchanges(Programme):
                 up |= {(j, i) for i, j in listed}
         if broadcast:
             self._note((now, ROUND, -1, -1, -1, phase, NAN))
-        fresh = self._algorithm.redraws(phase, step)
+        fresh = self._algorithm.redraws_links(phase, step)
         for i, j in pairs:
             if not broadcast:
                 self._note((now, TICK, i, j, -1, phase, NAN))

@@ -37,8 +37,8 @@ def first_masses(scenario: Scenario) -> tuple[Masses, FloatArray | None]:
     algorithm = scenario.filter.algorithm
     assert isinstance(algorithm, PushSum)
     states = [
-        algorithm.place(algorithm.init(model, *scenario.start(role.node)), role)
-        for role, model in zip(scenario.roles, scenario.slot_models, strict=True)
+        algorithm.init(model, *scenario.start(info.node), info)
+        for info, model in zip(scenario.node_infos, scenario.slot_models, strict=True)
     ]
     masses = Masses(
         mass=np.stack([state.mass for state in states]),

@@ -87,7 +87,7 @@ class PlainExchanges(Programme):
         self._known = np.zeros(len(links), dtype=bool)
         self._sent = np.zeros(self._sender.shape, dtype=np.int64)
         quiet = silent(scenario)
-        phases = range(algorithm.programme.count("exchange"))
+        phases = range((algorithm.schedule or ()).count("exchange"))
         talks = [[(node, phase) not in quiet for node in scenario.nodes] for phase in phases]
         self._talks = np.array(talks, dtype=bool).reshape(len(phases), len(scenario.nodes))
         steps = sum(algorithm.steps(phase) for phase in phases)
@@ -117,7 +117,10 @@ class PlainExchanges(Programme):
         return len(self._done)
 
     def _exchange(self, now: float, end: float, slot: int, phase: int, step: int) -> None:
-        fresh, activation = self._algorithm.redraws(phase, step), self._scenario.network.activation
+        fresh, activation = (
+            self._algorithm.redraws_links(phase, step),
+            self._scenario.network.activation,
+        )
         made = Exchange(len(self._done), now, end, phase, fresh, self._noted)
         self._exchanges.append(made)
         if isinstance(activation, Matching):

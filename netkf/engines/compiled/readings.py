@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.flow import stretch_end, usable
+from netkf.algorithms.flow import stretch_end
 from netkf.algorithms.gains import gain_move
+from netkf.algorithms.models import usable
 from netkf.algorithms.riccati import move_part, move_units
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import in_place

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.filter import Filter
+from netkf.algorithms.gossip import Gossip
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.slot import Gossip, Intermittent, SlotCentral, SlotFilter, SlotLocal
 from netkf.algorithms.stopping import RULES
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.compiling import demanded
@@ -35,13 +38,13 @@ from netkf.plants.linear import Truth
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 
-KERNELS: dict[type[SlotFilter], Callable[..., None]] = {
+KERNELS: dict[type[Filter], Callable[..., None]] = {
     Gossip: gossip,
     Intermittent: intermittent,
     DiffusionFilter: diffusion,
     PushSum: push_sum,
-    SlotLocal: local,
-    SlotCentral: local,
+    Local: local,
+    Central: local,
 }
 
 
@@ -53,7 +56,6 @@ class SlotRun:
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         algorithm = scenario.filter.algorithm
-        assert isinstance(algorithm, SlotFilter)
         self._kernel, self._pooled = demanded(KERNELS[type(algorithm)]), algorithm.pooled
         self._exchanges = make_exchanges(scenario, streams)
         self._truth: Truth = scenario.slot_plant.truth(streams.generator("plant"))
@@ -147,9 +149,9 @@ def _nodes(scenario: Scenario, pooled: bool) -> Nodes:
 
 def _extra(scenario: Scenario) -> tuple[tuple[Any, ...], FloatArray]:
     """What the function of this filter is given besides, and the mass of the nodes."""
-    algorithm, roles, n = scenario.filter.algorithm, scenario.roles, scenario.plant.n
+    algorithm, infos, n = scenario.filter.algorithm, scenario.node_infos, scenario.plant.n
     if isinstance(algorithm, DiffusionFilter):
-        own = np.array([role.own for role in roles], dtype=np.float64)
+        own = np.array([info.own_weight for info in infos], dtype=np.float64)
         return (own, algorithm.on_loss == "keep-own"), np.empty((0, 2))
     if not isinstance(algorithm, PushSum):
         return (), np.empty((0, 2))

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.flow import FlowModel
 from netkf.algorithms.gains import GainTable
+from netkf.algorithms.models import FlowModel
 from netkf.core.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 

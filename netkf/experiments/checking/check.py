@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.slot import Gossip, Intermittent
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
 from netkf.engines.base import Engine
-from netkf.engines.processes.engine import ProcessesEngine
+from netkf.engines.simpy.engine import SimpyEngine
 from netkf.experiments.checking import diffusion, gossip, hybrid, intermittent, push_sum
 from netkf.experiments.checking.evidence import (
     BROKEN,
@@ -112,7 +113,7 @@ def witness(scenario: Scenario, seed: int, replica: int, engine: str | Engine = 
     run, promised = simulate(scenario, seed, replica, engine), stand_in(scenario)
     apart = math.nan
     if promised is not scenario and replica < TWINS:
-        twin = simulate(promised, seed, replica, ProcessesEngine())
+        twin = simulate(promised, seed, replica, SimpyEngine())
         both = min(len(run.times), len(twin.times))
         size = np.sqrt(np.trace(twin.P[:both], axis1=-2, axis2=-1))[..., None]
         gap = np.abs(run.xhat[:both] - twin.xhat[:both]) / np.maximum(size, 1e-300)

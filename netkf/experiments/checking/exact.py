@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.fields import Part
@@ -122,20 +120,20 @@ def promised_filter(algorithm: Any) -> Any:
 
 def _flow_kind(algorithm: Any) -> type[Part] | None:
     """By its settings: a weight for all links makes a hybrid filter."""
-    known = isinstance(algorithm, FlowFilter) and hasattr(algorithm, "epsilon")
+    known = not scenario.slotted and hasattr(algorithm, "epsilon")
     return KINDS["filter"]["hybrid"] if known else None
 
 
 def _slot_kind(algorithm: Any) -> type[Part] | None:
     """By its settings and its programme."""
-    if not isinstance(algorithm, SlotFilter):
+    if not scenario.slotted:
         return None
     name = None
     if hasattr(algorithm, "gamma") and hasattr(algorithm, "delta"):
         name = "push-sum"
     elif algorithm.pairwise:
         name = "gossip"
-    elif algorithm.programme == ("sense", "exchange") and algorithm.predicts:
+    elif scenario.hosted.schedule == ("sense", "exchange", "predict") and algorithm.predicts:
         name = "diffusion" if hasattr(algorithm, "weights") else "intermittent"
     return None if name is None else KINDS["slot filter"][name]
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.chains import Letters, advance, alphabet
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray, block_diagonal, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -47,7 +46,7 @@ def look_at(scenario: Scenario) -> tuple[int, ...]:
     """
     period, algorithm = scenario.slot_plant.period, scenario.filter.algorithm
     last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
-    if isinstance(algorithm, SlotFilter) and not algorithm.predicts:
+    if scenario.slotted and not algorithm.predicts:
         last = max(1, int(np.ceil(scenario.horizon / period - 1e-9)) - 1)
     return tuple(sorted({min(2, last), min(5, last), max(1, last // 2), last}))
 

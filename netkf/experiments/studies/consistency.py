@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy.special
 
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
@@ -87,7 +86,7 @@ def _innovations(
     """
     nothing = np.full(len(run.nodes), np.nan)
     algorithm = scenario.filter.algorithm
-    if not isinstance(algorithm, SlotFilter):
+    if not scenario.slotted:
         return nothing, nothing
     streams, found, should = Streams(run.seed, run.replica), nothing.copy(), nothing.copy()
     steps = 0 if algorithm.predicts else 1

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.baselines import Central
-from netkf.algorithms.slot import SlotCentral, SlotModel
+from netkf.algorithms.models import SlotModel
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.engines.base import Engine
@@ -133,7 +133,7 @@ def central_trace(scenario: Scenario) -> float:
     """The trace of the covariance of a filter that has all readings and the true model, averaged
     over the same samples; of its prediction where the scenario's filter predicts.
     """
-    algorithm = SlotCentral() if scenario.slotted else Central()
+    algorithm = Central()
     central = dataclasses.replace(scenario, filter=Filtering(algorithm=algorithm))
     if not scenario.slotted:
         return float(bound_traces(central)[0])

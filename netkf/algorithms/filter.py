@@ -1,0 +1,319 @@
+"""The contract of node algorithms: one for every kind of time.
+
+A filter is a frozen dataclass of parameters with pure functions on an immutable state (a NamedTuple
+of arrays that nothing changes in place). The engine calls ``predict`` for the time that passes,
+``update`` with the readings of the node, ``emit`` when the node may transmit and ``absorb`` with
+everything that arrived at one instant. In slots the engine follows ``schedule``; under clocks it
+calls the same methods whenever something happens. Covariances are carried as roots,
+``P = root root'``, so that wide and narrow directions keep their digits.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray, square_root
+from netkf.core.fields import Part
+
+CLOCKS = ("links", "directions", "nodes", "readings")
+"""What may make a node transmit in continuous time, see network.clocks."""
+
+
+class Model(Protocol):
+    """What one node believes about the plant and its own sensors (algorithms.models)."""
+
+    @property
+    def information(self) -> FloatArray:
+        """``H' R^-1 H`` (n, n) of the node's sensors."""
+
+    def predict(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Estimate (n,) and root (n, n) of its covariance ``gap`` seconds later. With increment
+        sensors the root counts the readings of the gap already.
+        """
+
+    def extrapolate(
+        self, xhat: FloatArray, root: FloatArray, age: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same for another node's estimate, which has no readings: ``age`` seconds later."""
+
+    def gain_update(
+        self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
+    ) -> FloatArray:
+        """The estimate (n,) once the increments of the gap that just passed are used."""
+
+    def max_interval(self, root: FloatArray) -> float:
+        """Seconds of increments that may be used at once from this root on."""
+
+
+class NodeInfo(NamedTuple):
+    """What a node may know about itself and the network before anything happens.
+
+    node: its id; degree: nodes that it can hear when no link fails; receivers: nodes that can hear
+    it; nodes: how many there are in all; own_weight: what is left to it when the messages of all
+    neighbours arrive; information (n, n): the sum of H' R^-1 H over all sensors, as the filters
+    believe it; max_delay: the longest time a message may take, seconds (inf where unbounded).
+    """
+
+    node: int
+    degree: int
+    receivers: int
+    nodes: int
+    own_weight: float
+    information: FloatArray
+    max_delay: float = 0.0
+
+
+class Exchange(NamedTuple):
+    """When something is sent or absorbed: simulated ``time`` in seconds; under clocks the nodes
+    that may hear (``receivers``, of ``emit``); in slots the ``slot`` and which exchange of it
+    (``phase``) and which repetition of that (``step``), both from 0.
+    """
+
+    time: float = 0.0
+    phase: int = -1
+    step: int = -1
+    slot: int = -1
+    receivers: tuple[int, ...] = ()
+
+
+class Message(NamedTuple):
+    """What arrived: from whom, the weight it is given, what it carries, and how many seconds ago
+    it was sent.
+    """
+
+    sender: int
+    weight: float
+    payload: Any
+    age: float
+
+
+class Reading(NamedTuple):
+    """A sample ``y = H x + v``, cov(v) = R: y (p,), H (p, n), R (p, p) as the node believes them,
+    p may be 0; taken at ``time`` seconds.
+    """
+
+    y: FloatArray
+    H: FloatArray
+    R: FloatArray
+    time: float = math.nan
+
+
+class Increments(NamedTuple):
+    """What increment sensors (p rows in all) saw over the last ``gap`` seconds: ``moments`` (2 p,)
+    ``int dy`` and then ``int (2 (s - a) / gap - 1) dy``, see core/legendre.
+    """
+
+    moments: FloatArray
+    gap: float
+
+
+class State(NamedTuple):
+    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, and the model they move by."""
+
+    xhat: FloatArray
+    root: FloatArray
+    model: Any
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+
+class Estimate(NamedTuple):
+    """What a message carries: the sender's estimate and the root of its covariance."""
+
+    xhat: FloatArray
+    root: FloatArray
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+
+STEPS = ("init", "predict", "update", "emit", "absorb", "estimate")
+"""The methods that make up what a filter does."""
+
+FORMER = {
+    "flow": "predict(state, gap)",
+    "measure": "update(state, reading)",
+    "sense": "update(state, reading), and predict(state, gap) as a phase of the schedule",
+    "place": "init(model, mean, cov, node)",
+    "stretch": "max_measurement_interval(state)",
+    "programme": "schedule",
+    "redraws": "redraws_links(phase, step)",
+}
+"""Methods of FlowFilter and SlotFilter, and what a Filter defines in their place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Filter(Part):
+    """What a node does with its readings and with what it hears.
+
+    The base class is a Kalman filter on the node's own readings; a filter that talks defines at
+    least ``absorb``. Class variables say where it runs:
+
+    schedule  phases of a slot in their order, of "predict", "sense" and "exchange"; None: not in
+              slots. A filtered one predicts to a slot first, a prediction filter last
+    clocks    what may make its nodes transmit in continuous time, of CLOCKS; (): nothing
+    predicts  a sample in slots shows the prediction with which a slot begins, else what is known
+              after the slot's exchanges
+    first_slot  the first slot in which nodes exchange
+    pairwise  in slots nodes exchange in pairs (a matching), else all with all neighbours
+    one_way   links may go one way, and nodes need not all be joined, in slots
+    inverts   covariances must never be singular
+    talks     nodes exchange messages
+    pooled    one filter reads the sensors of all nodes at once
+    needs_samples  increment sensors mean nothing to it
+    newest_only    of several messages of one sender at one instant the newest counts
+    """
+
+    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
+    clocks: ClassVar[tuple[str, ...]] = CLOCKS
+    predicts: ClassVar[bool] = False
+    first_slot: ClassVar[int] = 0
+    pairwise: ClassVar[bool] = False
+    one_way: ClassVar[bool] = False
+    inverts: ClassVar[bool] = False
+    talks: ClassVar[bool] = True
+    pooled: ClassVar[bool] = False
+    needs_samples: ClassVar[bool] = False
+    newest_only: ClassVar[bool] = True
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        for name, present in FORMER.items():
+            if name in cls.__dict__:
+                raise TypeError(f"{cls.__name__}.{name} is now {present}, see netkf.parts.Filter")
+        for name in ("init", "emit", "absorb"):
+            wanted = inspect.signature(getattr(Filter, name)).parameters
+            given = inspect.signature(getattr(cls, name)).parameters
+            if len(given) < len(wanted):
+                arguments = ", ".join(k for k in wanted if k != "self")
+                raise TypeError(f"{cls.__name__}.{name} must take ({arguments})")
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
+        """The state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
+        return State(mean, square_root(cov), model)
+
+    def predict(self, state: Any, gap: float) -> Any:
+        """The state ``gap`` > 0 seconds later (in slots a period). Where the node has increment
+        sensors its covariance counts their readings already, its estimate does not yet.
+        """
+        xhat, root = state.model.predict(state.xhat, state.root, gap)
+        return state._replace(xhat=xhat, root=root)
+
+    def update(self, state: Any, reading: Any) -> Any:
+        """The state once a reading is used: a sample at this instant (``Reading``; in slots every
+        node gets one a slot, of no rows where it has no sensor), or the increments of the interval
+        that just passed (``Increments``).
+        """
+        from netkf.algorithms.models import sample_update
+
+        if isinstance(reading, Increments):
+            return state._replace(
+                xhat=state.model.gain_update(state.xhat, state.root, reading.moments, reading.gap)
+            )
+        if not len(reading.y):
+            return state
+        xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
+        return state._replace(xhat=xhat, root=root)
+
+    def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
+        """The state after sending, and what is sent to all ``exchange.receivers`` (in slots: in
+        this step); None: nothing is sent.
+        """
+        return state, Estimate(state.xhat, state.root)
+
+    @abstractmethod
+    def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
+        """The state after all messages of this instant, in the order of their senders, are used
+        together. In slots it is called for every node when the inbox of a step closes, with no
+        message too. Payloads are left as they are.
+        """
+
+    def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
+        """``xhat`` (n,) and ``P`` (n, n) of the node now; None where the filter has no P."""
+        return state.xhat, state.root @ state.root.T
+
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """The state with ``offset`` (n,) added to the estimate and to all that is like one.
+
+        Filters that are affine in readings and payloads commute with such a shift of the truth,
+        and their errors are then simulated to all digits on unstable plants (``commutes``). A class
+        that defines one of STEPS itself says so by defining ``shift`` too.
+        """
+        return state._replace(xhat=state.xhat + offset)
+
+    def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
+        """The same for what is under way; ``offset`` refers to the time it was sent."""
+        return payload._replace(xhat=payload.xhat + offset)
+
+    def accepts(self, payload: Any, age: float) -> bool:
+        """Under clocks: whether a message that took ``age`` seconds is of use; else it is late."""
+        return True
+
+    def max_measurement_interval(self, state: Any) -> float:
+        """Seconds of increments that ``update`` may use at once from this state on.
+
+        A large covariance shrinks fast, and the weights of readings change as fast: on the time
+        scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
+        """
+        return float(state.model.max_interval(state.root))
+
+    def steps(self, phase: int) -> int:
+        """How often exchange number ``phase`` of a slot is repeated; its time is shared evenly."""
+        return 1
+
+    def redraws_links(self, phase: int, step: int) -> bool:
+        """Whether the links draw new outcomes in a step, else each keeps its last one; True in the
+        first.
+        """
+        return True
+
+    def stopped(self, state: Any) -> bool:
+        """Whether the node has permanently frozen what it learned from the others."""
+        return False
+
+    def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
+        """Quantities by name, as one number or as terms of a sum, whose sums over all nodes no
+        exchange should change; a run reports how far the sums have drifted.
+        """
+        return {}
+
+    def weight(self, degree: int, peer_degree: int) -> float:
+        """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
+        return 1.0 / (1.0 + max(degree, peer_degree))
+
+    @property
+    def pair_weights(self) -> FloatArray | None:
+        """(N, N) in the order of node ids: entry [l, i] is the weight node i gives to a message of
+        node l. None where ``weight`` says it.
+        """
+        return None
+
+    def largest_degree(self) -> float:
+        """The largest number of neighbours a node may have for the weights to make sense."""
+        return np.inf
+
+
+def commutes(algorithm: Filter) -> bool:
+    """Whether the filter commutes with a shift of the truth, as far as its class says so: ``shift``
+    is defined by the class that defines the last of its STEPS, or by one derived from that.
+    """
+    order = type(algorithm).__mro__
+
+    def owner(name: str) -> int:
+        return next((k for k, cls in enumerate(order) if name in cls.__dict__), len(order))
+
+    return owner("shift") <= min(owner(name) for name in STEPS)

@@ -1,0 +1,184 @@
+"""The Kalman filter with intermittent observations, R (15)-(18), with late readings used exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.models import sample_update
+from netkf.core.arrays import FloatArray, square_root
+from netkf.core.fields import choice, positive, setting
+
+SLACK = 1.0 + 1e-6
+"""Ages are rounded."""
+
+SAME = 1e-14
+"""Times that differ by less, relative to now, are one: a state's own time is a sum of gaps."""
+
+
+class Past(NamedTuple):
+    """One thing that happened at ``time``: a ``reading`` was used, or the frame of coordinates was
+    shifted by ``offset``; the estimate and root right after it, and the ``before`` of it.
+    """
+
+    time: float
+    reading: Reading | None
+    offset: FloatArray | None
+    xhat: FloatArray
+    root: FloatArray
+    before: Past | None
+
+
+class IntermittentState(NamedTuple):
+    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model; the own reading of
+    this instant, which has not been sent yet; the ``time`` that the state is at and the ``past`` as
+    far back as a late reading may reach (``lag`` seconds; 0: none is kept).
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: Any
+    unsent: Reading | None
+    time: float
+    past: Past
+    lag: float
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+
+@dataclass(frozen=True, eq=False)
+class Intermittent(Filter):
+    """Every node sends its reading to its neighbours and uses its own and those that arrive.
+
+    late    under clocks, readings that took time: "exact": the result is that of the filter that
+            had all arrived readings in the order of their times, by going back to before the late
+            one; "drop": they are not used
+    window  seconds that a late reading may be old; older ones are late for good. By default the
+            longest time a message may take
+    """
+
+    late: str = setting(choice("exact", "drop"), default="exact")
+    window: float | None = setting(positive, default=None)
+
+    schedule: ClassVar[tuple[str, ...]] = ("sense", "exchange", "predict")
+    clocks: ClassVar[tuple[str, ...]] = ("readings",)
+    predicts: ClassVar[bool] = True
+    one_way: ClassVar[bool] = True
+    needs_samples: ClassVar[bool] = True
+    newest_only: ClassVar[bool] = False
+
+    def init(
+        self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
+    ) -> IntermittentState:
+        """Nothing has happened yet."""
+        root = square_root(cov)
+        lag = node.max_delay if self.window is None else min(self.window, node.max_delay)
+        start = Past(0.0, None, None, mean, root, None)
+        kept = 0.0 if self.late == "drop" else lag
+        return IntermittentState(mean, root, model, None, 0.0, start, SLACK * kept)
+
+    def predict(self, state: IntermittentState, gap: float) -> IntermittentState:
+        """The reading of an earlier instant is not sent any more."""
+        xhat, root = state.model.predict(state.xhat, state.root, gap)
+        return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
+
+    def update(self, state: IntermittentState, reading: Reading) -> IntermittentState:
+        """R (15)-(18), and keep the reading to be sent."""
+        return _use(state, reading)._replace(unsent=reading if len(reading.y) else None)
+
+    def emit(
+        self, state: IntermittentState, exchange: Exchange
+    ) -> tuple[IntermittentState, Reading | None]:
+        """The reading of this instant, from nodes that have one."""
+        return state, state.unsent
+
+    def absorb(
+        self, state: IntermittentState, messages: Sequence[Message], exchange: Exchange
+    ) -> IntermittentState:
+        """Use all that is of now as it comes, and what is late as if it had come in time."""
+        for message in messages:
+            reading: Reading = message.payload
+            if exchange.slot >= 0 or message.age <= 0.0:
+                state = _use(state, reading)
+            else:
+                state = _use_late(state, reading, exchange.time)
+        return state
+
+    def accepts(self, payload: Reading, age: float) -> bool:
+        """Unless it took longer than the window, or late readings are dropped."""
+        if self.late == "drop":
+            return age <= 0.0
+        return self.window is None or age <= self.window
+
+    def shift(self, state: IntermittentState, offset: FloatArray) -> IntermittentState:
+        """Affine; the past is in the coordinates of its own time."""
+        xhat = state.xhat + offset
+        if state.lag > 0.0:
+            past = Past(state.time, None, offset, xhat, state.root, state.past)
+            state = state._replace(past=past)
+        return state._replace(xhat=xhat)
+
+    def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
+        """A reading stays in the coordinates of its own time."""
+        return payload
+
+
+def _use(state: IntermittentState, reading: Reading) -> IntermittentState:
+    """Update with a reading of now."""
+    if not len(reading.y):
+        return state
+    xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
+    state = state._replace(xhat=xhat, root=root)
+    if state.lag <= 0.0:
+        return state
+    time, past = reading.time, state.past
+    if time // state.lag > past.time // state.lag:  # now and then, so that it costs little
+        past = _recent(past, time - state.lag)
+    return state._replace(time=time, past=Past(time, reading, None, xhat, root, past))
+
+
+def _use_late(state: IntermittentState, reading: Reading, now: float) -> IntermittentState:
+    """Go back to before the reading's time, use it, and do again what came after it."""
+    again: list[Past] = []
+    past = state.past
+    while past.time > reading.time + SAME * now and past.before is not None:
+        again.append(past)
+        past = past.before
+    model = state.model
+    later = Past(reading.time, reading, None, *past[3:5], None)
+    for event in [later, *reversed(again)]:
+        xhat, root = past.xhat, past.root
+        if event.time > past.time:
+            xhat, root = model.predict(xhat, root, event.time - past.time)
+        if event.reading is not None:
+            r = event.reading
+            xhat, root = sample_update(xhat, root, r.y, r.H, r.R)
+        if event.offset is not None:
+            xhat = xhat + event.offset
+        past = Past(event.time, event.reading, event.offset, xhat, root, past)
+    xhat, root = past.xhat, past.root
+    if now > past.time:
+        xhat, root = model.predict(xhat, root, now - past.time)
+    return state._replace(xhat=xhat, root=root, time=now, past=_recent(past, now - state.lag))
+
+
+def _recent(past: Past, since: float) -> Past:
+    """The past without what no late reading can reach: all after ``since``, and one before it."""
+    kept: list[Past] = []
+    event: Past | None = past
+    while event is not None:
+        kept.append(event)
+        if event.time < since:
+            break
+        event = event.before
+    else:
+        return past
+    trimmed = kept[-1]._replace(before=None)
+    for event in reversed(kept[:-1]):
+        trimmed = event._replace(before=trimmed)
+    return trimmed

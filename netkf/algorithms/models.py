@@ -1,0 +1,176 @@
+"""What one node believes about the plant and its own sensors, in both kinds of time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from netkf.algorithms.gains import GainTable, gain_table, gain_update
+from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
+from netkf.algorithms.square_root import lower_triangular, predict_root
+from netkf.core.arrays import FloatArray, square_root, symmetric
+from netkf.core.compiling import in_place
+
+STRETCH = 1.0
+
+
+class Backward(NamedTuple):
+    """How information moves over a gap: ``inverse`` (n, n) e^{-A gap}, ``fading`` the factor that
+    keeps it bounded (algorithms.running_sums).
+    """
+
+    inverse: FloatArray
+    fading: float
+
+
+@dataclass(frozen=True, eq=False)
+class FlowModel:
+    """Continuous time: ``dx = A x dt + dw``, ``cov(dw) = Q dt``; increment sensors
+    ``dy = H x dt + dv``, ``cov(dv) = R dt``.
+
+    ``A, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0; ``horizon`` is the longest gap and
+    ``interval`` the longest stretch of readings used at once, both in seconds.
+    """
+
+    A: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+    horizon: float
+    interval: float
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """``G = H' R^-1 H`` (n, n)."""
+        return np.asarray(self.H.T @ np.linalg.solve(self.R, self.H))
+
+    @cached_property
+    def riccati(self) -> RiccatiTable:
+        """The flow of P with this node's readings."""
+        return riccati_table(self.A, self.Q, self.information, self.horizon)
+
+    @cached_property
+    def prediction(self) -> RiccatiTable:
+        """The flow of P without readings."""
+        return riccati_table(self.A, self.Q, np.zeros_like(self.A), self.horizon)
+
+    @cached_property
+    def gains(self) -> GainTable:
+        """How this node's readings are used."""
+        return gain_table(self.A, self.Q, self.H, self.R, self.interval)
+
+    @cached_property
+    def _forgetting(self) -> float:
+        """The fastest rate at which the plant forgets its state, 1/s; 0 if it never does."""
+        return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
+
+    def backward(self, gap: float) -> Backward:
+        """How information that refers to a state moves to the state ``gap`` seconds later."""
+        if not self.A.any():
+            return Backward(np.eye(len(self.A)), 1.0)
+        inverse = np.asarray(scipy.linalg.expm(-gap * self.A))
+        return Backward(inverse, math.exp(-2.0 * self._forgetting * gap))
+
+    def predict(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """``gap`` seconds later; the root counts the readings of the gap."""
+        P, xhat = riccati_step(self.riccati, root @ root.T, xhat, gap)
+        return xhat, square_root(P)
+
+    def extrapolate(
+        self, xhat: FloatArray, root: FloatArray, age: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """``age`` seconds later without readings."""
+        if age <= 0.0:
+            return xhat, root
+        P, xhat = riccati_step(self.prediction, root @ root.T, xhat, age)
+        return xhat, square_root(P)
+
+    def gain_update(
+        self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
+    ) -> FloatArray:
+        """The estimate once the increments of the gap are used, see algorithms/gains."""
+        return gain_update(self.gains, root @ root.T, xhat, moments, gap)
+
+    def max_interval(self, root: FloatArray) -> float:
+        """See ``Filter.max_measurement_interval``."""
+        return usable(float(((root @ root.T) * self.information).sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class SlotModel:
+    """Slots: ``x[k+1] = F x[k] + w``, cov(w) = Q; ``y = H x + v``, cov(v) = R.
+
+    ``F, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0. Where H differs from slot to slot this
+    is the first one; each reading brings its own. A slot lasts ``period`` seconds.
+    """
+
+    F: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+    period: float = 1.0
+
+    @cached_property
+    def root_Q(self) -> FloatArray:
+        """``root_Q root_Q' = Q``."""
+        return square_root(self.Q)
+
+    @property
+    def information(self) -> FloatArray:
+        """``H' R^-1 H`` (n, n)."""
+        return symmetric(self.H.T @ np.linalg.solve(self.R, self.H))
+
+    def predict(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """One slot for each period of the gap."""
+        for _ in range(round(gap / self.period)):
+            xhat, root = self.F @ xhat, predict_root(root, self.F, self.root_Q)
+        return xhat, root
+
+    def extrapolate(
+        self, xhat: FloatArray, root: FloatArray, age: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same: a message is used in the slot in which it was sent."""
+        return xhat, root
+
+    def gain_update(
+        self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
+    ) -> FloatArray:
+        """There are no increments in slots."""
+        raise TypeError("increments belong to continuous time")
+
+    def max_interval(self, root: FloatArray) -> float:
+        """Unbounded: there are no increments in slots."""
+        return math.inf
+
+
+@in_place
+def usable(rate: float) -> float:
+    """Seconds of readings that may be used at once from a P on with ``rate = trace(P G)``, see
+    ``Filter.max_measurement_interval``.
+    """
+    return STRETCH / rate if rate > 0.0 else math.inf
+
+
+def sample_update(
+    xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Estimate (n,) and root (n, n) after a sample ``y = H x + v``, cov(v) = R, p > 0 rows.
+
+    One triangularisation of [[H S, root(R)], [S, 0]] gives the innovation's root, the gain and the
+    new root (Kailath, Sayed and Hassibi, Linear Estimation, section 12.3).
+    """
+    p, n = H.shape
+    work = np.zeros((p + n, n + p))
+    work[:p, :n], work[:p, n:], work[p:, :n] = H @ root, np.linalg.cholesky(R), root
+    L = lower_triangular(work)
+    innovation = np.linalg.solve(L[:p, :p], y - H @ xhat)
+    return xhat + L[p:, :p] @ innovation, L[p:, p:].copy()

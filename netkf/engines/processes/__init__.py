@@ -1,1 +1,0 @@
-"""The reference engine: SimPy. Every `yield` of a simulated process is in this folder."""

@@ -1,0 +1,1 @@
+"""The definition of what a scenario means, as SimPy processes. Every `yield` is in this folder."""

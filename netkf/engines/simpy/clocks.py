@@ -1,0 +1,196 @@
+"""Clocks of the network in continuous time: each is a process that ticks and lets nodes transmit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from functools import partial
+from typing import Any
+
+import simpy
+
+from netkf.core.clock import next_ticks
+from netkf.core.streams import Streams
+from netkf.engines.base import Rank
+from netkf.engines.simpy.nodes import ClockedNode
+from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.transmission import LinkExchange, Transmitter, stream
+from netkf.network.clocks import LinkClock
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
+
+TICK, TRANSMIT = CODES["tick"], CODES["transmit"]
+FIRST_BLOCK, LONGEST_BLOCK = 8, 1024
+
+Process = Generator[simpy.Event, Any, None]
+Activation = Callable[[float], None]
+"""What happens when a clock ticks, at the time of the tick."""
+
+
+def clock_processes(
+    scenario: Scenario,
+    streams: Streams,
+    timeline: Timeline,
+    recorder: Recorder,
+    transmitter: Transmitter,
+    nodes: dict[int, ClockedNode],
+) -> list[Process]:
+    """One process for each link, direction or node that has a clock; with activation by readings
+    none, since nodes then transmit after their samples.
+    """
+    activation = scenario.network.activation
+    if not scenario.hosted.talks or activation is None:
+        return []
+    make = {"links": _links, "directions": _directions, "nodes": _nodes, "readings": _readings}
+    places = make[activation.at](scenario, recorder, transmitter, nodes, timeline)
+    return [
+        _ticking(scenario, streams, timeline, recorder, entity, k, activate)
+        for k, (entity, activate) in enumerate(places)
+    ]
+
+
+def _ticking(
+    scenario: Scenario,
+    streams: Streams,
+    timeline: Timeline,
+    recorder: Recorder,
+    entity: tuple[int, ...],
+    place: int,
+    activate: Activation,
+) -> Process:
+    """Wait for a tick, activate, and so on until the horizon."""
+    clock = scenario.network.activation
+    assert isinstance(clock, LinkClock)
+    random = streams.generator("clock", *entity)
+    origin = clock.origin(entity, partial(stream, streams, entity, "phase"))
+    now, index, count = 0.0, 0, FIRST_BLOCK
+    while True:
+        times = next_ticks(clock, entity, origin, index, now, random, count).tolist()
+        for now in times:
+            if now >= scenario.horizon:
+                return
+            yield timeline.at(now, Rank.TICK, place)
+            activate(now)
+        if not times:
+            return
+        recorder.flush_if_full()
+        index += len(times)
+        count = min(2 * count, LONGEST_BLOCK)
+
+
+Places = list[tuple[tuple[int, ...], Activation]]
+
+
+def _links(
+    scenario: Scenario,
+    recorder: Recorder,
+    transmitter: Transmitter,
+    nodes: dict[int, ClockedNode],
+    timeline: Timeline,
+) -> Places:
+    """A tick lets both ends of the link exchange."""
+
+    def activation(link: tuple[int, int], entity: int) -> Activation:
+        i, j = link
+        exchange = LinkExchange(scenario, transmitter, nodes, link, entity)
+
+        def activate(now: float) -> None:
+            recorder.append((now, TICK, i, j, -1, -1, NAN))
+            # Both ends decide what they send before either hears the other.
+            exchange.exchange((nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))))
+
+        return activate
+
+    return [(link, activation(link, k)) for k, link in enumerate(scenario.topology.links)]
+
+
+def _directions(
+    scenario: Scenario,
+    recorder: Recorder,
+    transmitter: Transmitter,
+    nodes: dict[int, ClockedNode],
+    timeline: Timeline,
+) -> Places:
+    """A tick lets one end push to the other."""
+
+    def activation(link: tuple[int, int], entity: int) -> Activation:
+        i, j = link
+        way = transmitter.directed(link, entity, nodes[j], transmitter.fates(link))
+
+        def activate(now: float) -> None:
+            recorder.append((now, TICK, i, j, -1, -1, NAN))
+            outcome = way.fates.draw()
+            transmitter.send(way, nodes[i].emit(now, (j,)), outcome)
+
+        return activate
+
+    return [(link, activation(link, k)) for k, link in enumerate(scenario.topology.directions)]
+
+
+def broadcasts(
+    scenario: Scenario,
+    recorder: Recorder,
+    transmitter: Transmitter,
+    nodes: dict[int, ClockedNode],
+) -> dict[int, Activation]:
+    """For each node, one transmission to all that can hear it; each hearer has its own outcome."""
+    ways: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
+    for k, (i, j) in enumerate(scenario.topology.directions):
+        ways[i].append(transmitter.directed((i, j), k, nodes[j], transmitter.fates((i, j))))
+
+    def activation(node: int) -> Activation:
+        hearers, sent = tuple(way.link[1] for way in ways[node]), 0
+
+        def transmit(now: float) -> None:
+            nonlocal sent
+            outcomes = [way.fates.draw() for way in ways[node]]
+            payload = nodes[node].emit(now, hearers)
+            if payload is None:
+                return
+            recorder.append((now, TRANSMIT, node, -1, sent, -1, NAN))
+            sent += 1
+            for way, outcome in zip(ways[node], outcomes, strict=True):
+                transmitter.send(way, payload, outcome)
+
+        return transmit
+
+    return {node: activation(node) for node in scenario.nodes}
+
+
+def _nodes(
+    scenario: Scenario,
+    recorder: Recorder,
+    transmitter: Transmitter,
+    nodes: dict[int, ClockedNode],
+    timeline: Timeline,
+) -> Places:
+    """A tick lets a node broadcast."""
+    transmit = broadcasts(scenario, recorder, transmitter, nodes)
+
+    def activation(node: int) -> Activation:
+        def activate(now: float) -> None:
+            recorder.append((now, TICK, node, -1, -1, -1, NAN))
+            transmit[node](now)
+
+        return activate
+
+    return [((node,), activation(node)) for node in scenario.nodes]
+
+
+def _readings(
+    scenario: Scenario,
+    recorder: Recorder,
+    transmitter: Transmitter,
+    nodes: dict[int, ClockedNode],
+    timeline: Timeline,
+) -> Places:
+    """A node broadcasts after it has used a sample, at the rank of ticks."""
+    transmit = broadcasts(scenario, recorder, transmitter, nodes)
+    for node in scenario.sampled_sensors:
+        carrier = nodes[node]
+
+        def after(now: float, node: int = node, entity: int = carrier.entity) -> None:
+            timeline.call_at(now, Rank.TICK, entity, lambda _: transmit[node](now))
+
+        carrier.after_sample = after
+    return []

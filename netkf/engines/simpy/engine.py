@@ -1,0 +1,251 @@
+"""The engine that defines what a scenario means: SimPy processes for everything that happens."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import simpy
+
+from netkf.algorithms.filter import Filter
+from netkf.core.streams import Streams
+from netkf.engines.base import Engine, Progress, Rank, broken
+from netkf.engines.simpy.clocks import clock_processes
+from netkf.engines.simpy.nodes import ClockedNode, Node
+from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
+from netkf.engines.simpy.slots import (
+    FIRST_RANK,
+    Reader,
+    Schedule,
+    SlotClock,
+    SlotNode,
+)
+from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.transmission import Transmitter
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
+
+DIVERGED = CODES["diverged"]
+Process = Generator[simpy.Event, Any, None]
+
+
+class DivergedError(Exception):
+    """A covariance or an estimate is no longer finite."""
+
+
+@dataclass
+class SimpyEngine(Engine):
+    """Runs every scenario: sensors, clocks and samplers are processes, messages that take time and
+    the mail of a node are events. ``arrange`` may reorder the processes before they start; nothing
+    that happens depends on it. What ran is counted in the recorder's ``stats``.
+    """
+
+    arrange: Callable[[list[Process]], list[Process]] = list
+    name = "simpy"
+
+    def refusal(self, scenario: Scenario) -> str | None:
+        """None: this engine defines what a scenario means."""
+        return None
+
+    def run(
+        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+    ) -> str:
+        """Simulate up to the horizon; returns complete or diverged."""
+        simulation = _Simulation(scenario, streams, recorder, progress)
+        processes = simulation.slots() if scenario.slotted else simulation.clocks()
+        timeline = simulation.timeline
+        for process in self.arrange(processes):
+            timeline.start(process)
+        with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
+            try:
+                timeline.run()
+            except DivergedError:
+                return "diverged"
+            finally:
+                recorder.stats = {"processes": timeline.processes, "events": timeline.events}
+                recorder.flush()
+        return "complete"
+
+
+class _Simulation:
+    """What the processes of one run share."""
+
+    def __init__(
+        self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
+    ) -> None:
+        self.timeline = Timeline()
+        self._scenario, self._streams = scenario, streams
+        self._recorder, self._progress = recorder, progress
+        self._transmitter = Transmitter(scenario, streams, self.timeline, recorder)
+        recorder.exact_errors = scenario.exact_errors
+
+    def clocks(self) -> list[Process]:
+        """The processes of a scenario in continuous time."""
+        scenario, streams, timeline = self._scenario, self._streams, self.timeline
+        truth = scenario.continuous_truth(streams)
+
+        def make(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
+            carriers = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
+            sensors = increment_sensors(scenario, streams, carriers)
+            common = (timeline, self._recorder, truth, sensors)
+            return ClockedNode(*common, *_identity(scenario, node, entity))
+
+        nodes = _nodes(scenario, make)
+        sums = _Sums(_distinct(nodes))
+        shared = (scenario, streams, timeline, self._recorder)
+        return [
+            self._sampling(truth, nodes, sums),
+            self._moving_origin(truth, nodes),
+            *sensor_processes(*shared, truth, nodes),
+            *clock_processes(*shared, self._transmitter, nodes),
+        ]
+
+    def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
+        """Show the states at the probe times."""
+        for time in self._scenario.times.tolist():
+            yield self.timeline.at(time, Rank.PROBE, 0)
+            for node in _distinct(nodes):
+                node.predict_to(time)
+            self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
+
+    def _moving_origin(self, truth: Any, nodes: dict[int, ClockedNode]) -> Process:
+        """Move the origin of the coordinates to the state, before the state becomes so large that
+        errors lose their digits.
+        """
+        for k, time in enumerate(truth.frame_times.tolist()):
+            yield self.timeline.at(time, Rank.REBASE, 0)
+            for node in _distinct(nodes):
+                node.predict_to(time)
+            offset = -truth.rebase(k)
+            for node in _distinct(nodes):
+                node.shift(offset)
+            self._transmitter.shift(self._scenario.hosted, offset)
+
+    def slots(self) -> list[Process]:
+        """The processes of a scenario in slots."""
+        scenario, streams, recorder = self._scenario, self._streams, self._recorder
+        truth = scenario.slot_truth(streams)
+        schedule, period = Schedule(scenario), scenario.slot_plant.period
+
+        def make(node: int, entity: int, sensing: tuple[int, ...]) -> SlotNode:
+            return SlotNode(recorder, schedule, period, *_identity(scenario, node, entity))
+
+        nodes = _nodes(scenario, make)
+        processes = [node.running(self.timeline) for node in _distinct(nodes)]
+        for node, placed in scenario.placed.items():
+            sensors = [scenario.slot_path(streams, node, place) for place in placed]
+            entity = scenario.topology.index[node]
+            reader = Reader(recorder, schedule, node, entity, nodes[node])
+            processes.append(reader.running(self.timeline, truth, sensors))
+        if scenario.hosted.talks:
+            shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)
+            processes.append(SlotClock(*shared).ticking(self.timeline))
+        sums = _Sums(_distinct(nodes))
+        return [self._sampling_slots(truth, schedule, nodes, sums), *processes]
+
+    def _sampling_slots(
+        self, truth: Any, schedule: Schedule, nodes: dict[int, SlotNode], sums: _Sums
+    ) -> Process:
+        """Show the states of slots: predictions at the start, filtered ones at the end."""
+        predicts, recorder, slot = self._scenario.hosted.predicts, self._recorder, 0
+
+        def sample() -> None:
+            if schedule.sampled(slot):
+                time = schedule.start(slot)
+                self._record(time, truth.absolute(slot), truth.local(slot), nodes, sums)
+            if truth.frame_slots and slot and slot % truth.frame_slots == 0:
+                offset = -truth.rebase(slot)
+                for node in _distinct(nodes):
+                    node.shift(offset)
+
+        while True:
+            last = schedule.over(slot)
+            if last and not schedule.sampled(slot):
+                return
+            yield self.timeline.at(schedule.start(slot), FIRST_RANK, 0)
+            if predicts:
+                sample()
+            elif last:
+                recorder.pause()  # the horizon is half open: this slot makes its sample only
+            if not predicts:
+                yield self.timeline.at(*schedule.end(slot), 0)
+                recorder.resume()
+                sample()
+            if last:
+                return
+            recorder.flush_if_full()
+            slot += 1
+
+    def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
+        """Hand one sample on; ``local`` is the state in the coordinates of the estimates."""
+        scenario, recorder = self._scenario, self._recorder
+        shown = {id(n): n.algorithm.estimate(n.state) for n in _distinct(nodes)}
+        estimates = [shown[id(nodes[node])] for node in scenario.nodes]
+        near = np.array([xhat for xhat, _ in estimates])
+        nothing = np.full((len(x), len(x)), math.nan)
+        P = np.array([nothing if P is None else P for _, P in estimates])
+        without = np.array([P is None for _, P in estimates])
+        far = near if x is local else near + (x - local)
+        recorder.sample(time, x, far, P, local - near)
+        if sums.start:
+            recorder.sums = sums.pairs()
+        recorder.flush_if_full()
+        self._progress(time)
+        lost = broken(scenario, near, P, without)
+        for node in lost:
+            recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
+        if lost:
+            raise DivergedError
+
+
+def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any]) -> dict[int, Any]:
+    """The carrier of every node; where the filter is pooled, all nodes share one."""
+    nodes = scenario.nodes
+    if scenario.hosted.pooled:
+        return dict.fromkeys(nodes, make(-1, 0, scenario.sensing))
+    return {node: make(node, entity, (node,)) for entity, node in enumerate(nodes)}
+
+
+def _identity(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
+    """What every node is made from: filter, id, place, model, start and what it may know."""
+    model, first = scenario.believed_models[entity], scenario.nodes[entity]
+    if node < 0:
+        model = scenario.believed_pooled_model
+    return (
+        scenario.hosted,
+        node,
+        entity,
+        model,
+        scenario.start(first),
+        scenario.node_infos[entity],
+    )
+
+
+def _distinct(nodes: dict[int, Any]) -> list[Any]:
+    return list({id(node): node for node in nodes.values()}.values())
+
+
+class _Sums:
+    """What exchanges should conserve, summed over all nodes at the start and now."""
+
+    def __init__(self, nodes: list[Node]) -> None:
+        self._nodes = nodes
+        self.start = self._now()
+
+    def _now(self) -> dict[str, float]:
+        parts = [_terms(node.algorithm, node.state) for node in self._nodes]
+        return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
+
+    def pairs(self) -> dict[str, tuple[float, float]]:
+        """At the start and now, by name."""
+        now = self._now()
+        return {name: (first, now[name]) for name, first in self.start.items()}
+
+
+def _terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
+    found = algorithm.conserved(state)
+    return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in found.items()}

@@ -1,0 +1,170 @@
+"""A node: its filter, its sensors and its inbox."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import simpy
+
+from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
+from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.engines.base import LONGER, SHORTEST_SHARE, Rank
+from netkf.engines.simpy.timeline import Timeline
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
+
+SENSE, ABSORB = CODES["sense"], CODES["absorb"]
+
+
+class Envelope(NamedTuple):
+    """A message: who sent it ``number`` on their directed link, the weight it is given, what it
+    carries, when it was sent, in slots the exchange that it belongs to (-1 under clocks), and once
+    it has arrived how many seconds it took.
+    """
+
+    sender: int
+    number: int
+    weight: float
+    payload: Any
+    sent: float
+    exchange: int = -1
+    age: float = 0.0
+
+
+class Node:
+    """One filter and what it is told. ``entity`` is the node's place among the nodes, ``node`` the
+    id that the trace shows, -1 for a filter that all nodes share.
+    """
+
+    def __init__(
+        self,
+        algorithm: Filter,
+        node: int,
+        entity: int,
+        model: Any,
+        start: tuple[FloatArray, FloatArray],
+        info: NodeInfo,
+    ) -> None:
+        self.node, self.entity, self.info, self.model = node, entity, info, model
+        self.algorithm = algorithm
+        self.state = algorithm.init(model, *start, info)
+        self.inbox: dict[int, list[Envelope]] = {}
+
+    def put(self, envelope: Envelope) -> None:
+        """Put a message into the inbox; of several from one sender the newest counts, unless the
+        filter wants them all.
+        """
+        known = self.inbox.setdefault(envelope.sender, [])
+        if self.algorithm.newest_only and known:
+            if envelope.sent >= known[0].sent:
+                known[0] = envelope
+        else:
+            known.append(envelope)
+
+    def take_mail(self) -> tuple[list[Envelope], list[Message]]:
+        """Empty the inbox: what was in it in the order of senders, and as the filter sees it."""
+        # In the order of senders, so that no sum depends on the order of arrival.
+        envelopes = [envelope for peer in sorted(self.inbox) for envelope in self.inbox[peer]]
+        self.inbox.clear()
+        messages = [Message(e.sender, e.weight, e.payload, e.age) for e in envelopes]
+        return envelopes, messages
+
+    def shift(self, offset: FloatArray) -> None:
+        """Add ``offset`` to the estimate: the origin of the coordinates has moved."""
+        self.state = self.algorithm.shift(self.state, offset)
+
+
+class ClockedNode(Node):
+    """A node in continuous time. It is brought to the present when something happens to it; mail
+    that came at one instant is absorbed in an event of its own, as are samples.
+    """
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        recorder: Recorder,
+        truth: Any,
+        increments: list[Any],
+        *arguments: Any,
+    ) -> None:
+        super().__init__(*arguments)
+        self._timeline, self._recorder, self._truth = timeline, recorder, truth
+        self._increments = increments
+        self._now = 0.0
+        self._samples: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
+        self.after_sample: Any = None
+        """Called once the node has used its samples of an instant, with the nodes that sensed."""
+
+    def predict_to(self, time: float) -> None:
+        """Bring the filter to ``time``, with the increments of the stretch in between."""
+        if self._now >= time:
+            return
+        if not self._increments:
+            self.state = self.algorithm.predict(self.state, time - self._now)
+            self._now = time
+            return
+        least = SHORTEST_SHARE * (time - self._now)
+        while self._now < time:
+            end = time
+            interval = self.algorithm.max_measurement_interval(self.state)
+            if interval < time - self._now:
+                end = self._now + max(interval, least)
+                end = end if self._now < end < time else time
+                least *= LONGER
+            gap = end - self._now
+            self.state = self.algorithm.predict(self.state, gap)
+            moments = self._read(self._now, end)
+            self.state = self.algorithm.update(self.state, Increments(moments, gap))
+            self._now = end
+
+    def _read(self, start: float, end: float) -> FloatArray:
+        truth = self._truth
+        seen = truth.moments(start, end)
+        parts = [sensor.moments(truth, seen, start, end) for sensor in self._increments]
+        whole = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        return np.asarray(whole.reshape(-1))
+
+    def sample(self, node: int, y: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        """Take a sample of one sensor of ``node``; all of this instant are used together."""
+        if not self._samples:
+            self._timeline.call_at(self._timeline.now, Rank.UPDATE, self.entity, self._use_samples)
+        self._samples.append((node, y, H, R))
+
+    def _use_samples(self, _: simpy.Event) -> None:
+        time, samples = self._timeline.now, self._samples
+        self._samples = []
+        self.predict_to(time)
+        sensing = sorted({node for node, *_ in samples})
+        for node in sensing:
+            self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
+        y, H = (np.concatenate(part) for part in list(zip(*samples, strict=True))[1:3])
+        R = block_diagonal([sample[3] for sample in samples])
+        self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
+        if self.after_sample is not None:
+            self.after_sample(time)
+
+    def emit(self, time: float, receivers: tuple[int, ...]) -> Any:
+        """What the node sends at ``time``, from before any reset of that instant."""
+        self.predict_to(time)
+        exchange = Exchange(time=time, receivers=receivers)
+        self.state, payload = self.algorithm.emit(self.state, exchange)
+        return payload
+
+    def accepts(self, envelope: Envelope) -> bool:
+        """Whether a message that arrives now is of use."""
+        return self.algorithm.accepts(envelope.payload, envelope.age)
+
+    def receive(self, envelope: Envelope) -> None:
+        """Keep a message until all of this instant are absorbed."""
+        if not self.inbox:
+            self._timeline.call_at(self._timeline.now, Rank.ABSORB, self.entity, self._absorb)
+        self.put(envelope)
+
+    def _absorb(self, _: simpy.Event) -> None:
+        time = self._timeline.now
+        self.predict_to(time)
+        _, messages = self.take_mail()
+        self.state = self.algorithm.absorb(self.state, messages, Exchange(time=time))
+        oldest = max(message.age for message in messages)
+        self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))

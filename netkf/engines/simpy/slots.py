@@ -1,0 +1,291 @@
+"""Slots: the same timeline with clocks that tick together.
+
+The filter's schedule says what happens in a slot and when: predictions, readings, exchanges in
+steps. Each node is a process that follows it, each node with sensors another one that reads, and
+one clock lets all nodes (or the pairs of a matching) transmit at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any, NamedTuple
+
+import numpy as np
+import simpy
+
+from netkf.algorithms.filter import Exchange, Reading
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams
+from netkf.engines.base import Rank
+from netkf.engines.simpy.nodes import Envelope, Node
+from netkf.engines.simpy.timeline import Timeline
+from netkf.engines.simpy.transmission import LinkExchange, Transmitter
+from netkf.network.matchings import Matching, RecordedSlots
+from netkf.plants.linear import Readings
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
+
+SENSE, TICK, ROUND, SWAP, ABSORB, STOP = (
+    CODES[kind] for kind in ("sense", "tick", "round", "swap", "absorb", "stop")
+)
+FIRST_RANK = Rank.PROBE + 1
+"""What happens in a slot comes after arrivals of that instant, in the order of the schedule."""
+
+Process = Generator[simpy.Event, Any, None]
+
+
+class Stage(NamedTuple):
+    """One thing that a slot's schedule asks of the nodes: "predict", "read" (sensors), "update",
+    "send" or "absorb"; when, as which rank, and in which exchange of the slot (``phase``, ``step``;
+    ``number`` counts all exchanges of the run).
+    """
+
+    kind: str
+    time: float
+    rank: int
+    phase: int = -1
+    step: int = -1
+    number: int = -1
+
+
+class Schedule:
+    """The stages of every slot."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._algorithm, self._plant = scenario.hosted, scenario.slot_plant
+        self.horizon = scenario.horizon
+        phases = self._algorithm.schedule or ()
+        self._exchanges = [
+            self._algorithm.steps(k) if self._algorithm.talks else 0
+            for k in range(phases.count("exchange"))
+        ]
+        self._length = scenario.phase_length if any(self._exchanges) else 0.0
+        self._samples = frozenset(scenario.slots)
+        self._kept: dict[int, list[Stage]] = {}
+
+    def over(self, slot: int) -> bool:
+        """Whether a slot begins at the horizon or later: it makes its sample only."""
+        return self._plant.over(slot, self.horizon)
+
+    def sampled(self, slot: int) -> bool:
+        """Whether the states of a slot are shown."""
+        return slot in self._samples
+
+    def runs(self, slot: int) -> bool:
+        """Whether anything happens in a slot: at the horizon only what its sample shows."""
+        return not self.over(slot) or (self.sampled(slot) and not self._algorithm.predicts)
+
+    def start(self, slot: int) -> float:
+        """When a slot begins, seconds."""
+        return self._plant.slot_time(slot)
+
+    def stages(self, slot: int) -> list[Stage]:
+        """In their order."""
+        if slot not in self._kept:
+            self._kept.pop(slot - 2, None)  # no process is so far behind
+            self._kept[slot] = list(self._made(slot))
+        return self._kept[slot]
+
+    def end(self, slot: int) -> tuple[float, int]:
+        """Time and rank after all stages."""
+        stages = self.stages(slot)
+        return (stages[-1].time, stages[-1].rank + 1) if stages else (self.start(slot), FIRST_RANK)
+
+    def _made(self, slot: int) -> Generator[Stage, None, None]:
+        algorithm, start = self._algorithm, self.start(slot)
+        now, rank, phase = start, FIRST_RANK + 1, 0
+        # A filtered estimate starts from what is known before any reading.
+        waits = slot == 0 and not algorithm.predicts
+        talks = algorithm.talks and slot >= algorithm.first_slot
+        number = (slot - algorithm.first_slot) * sum(self._exchanges)
+        for kind in algorithm.schedule or ():
+            if kind == "exchange":
+                steps = self._exchanges[phase]
+                for step in range(steps if talks else 0):
+                    yield Stage("send", now, rank, phase, step, number)
+                    now = start + (phase + (step + 1) / steps) * self._length
+                    yield Stage("absorb", now, rank + 1, phase, step, number)
+                    rank, number = rank + 2, number + 1
+                phase += 1
+            elif not waits and kind == "sense":
+                yield Stage("read", now, rank)
+                yield Stage("update", now, rank + 1)
+                rank += 2
+            elif not waits:
+                yield Stage("predict", now, rank)
+                rank += 1
+
+
+class SlotNode(Node):
+    """A node in slots; its inbox is open for one exchange at a time."""
+
+    def __init__(self, recorder: Recorder, schedule: Schedule, period: float, *rest: Any) -> None:
+        super().__init__(*rest)
+        self._recorder, self._schedule, self._period = recorder, schedule, period
+        self._open = -1
+        self._stopped = False
+        self._samples: list[tuple[FloatArray, FloatArray]] = []
+
+    def running(self, timeline: Timeline) -> Process:
+        """The node's process: follow the schedule, slot after slot."""
+        slot = 0
+        while self._schedule.runs(slot):
+            for stage in self._schedule.stages(slot):
+                if stage.kind not in ("read", "send"):
+                    yield timeline.at(stage.time, stage.rank, self.entity)
+                    self._do(stage, slot)
+            slot += 1
+
+    def _do(self, stage: Stage, slot: int) -> None:
+        if stage.kind == "predict":
+            self.state = self.algorithm.predict(self.state, self._period)
+        elif stage.kind == "update":
+            self._update(stage.time)
+        else:
+            self._close(stage, slot)
+
+    def read(self, y: FloatArray, H: FloatArray) -> None:
+        """Take the reading of one sensor."""
+        self._samples.append((y, H))
+
+    def _update(self, time: float) -> None:
+        """Use the readings of this slot; without sensors they have no rows."""
+        model, samples = self.model, self._samples
+        y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
+        H = np.concatenate([model.H[:0], *(H for _, H in samples)])
+        present = np.concatenate([np.empty(0, dtype=bool), *(_rows(y, H) for y, H in samples)])
+        R = model.R
+        if not present.all():  # a recorded sensor without a row for this slot
+            y, H, R = y[present], H[present], R[np.ix_(present, present)]
+        self._samples = []
+        self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
+
+    def emit(self, exchange: Exchange) -> Any:
+        """What the node sends in an exchange."""
+        self.state, payload = self.algorithm.emit(self.state, exchange)
+        return payload
+
+    def open(self, number: int) -> None:
+        """Open the inbox for an exchange."""
+        self._open = number
+
+    def accepts(self, envelope: Envelope) -> bool:
+        """Whether the inbox of the message's exchange is still open."""
+        return envelope.exchange == self._open
+
+    def receive(self, envelope: Envelope) -> None:
+        """Keep a message until the inbox closes."""
+        self.put(envelope)
+
+    def _close(self, stage: Stage, slot: int) -> None:
+        """Absorb the inbox, which closes."""
+        append, now, phase = self._recorder.append, stage.time, stage.phase
+        envelopes, messages = self.take_mail()
+        self._open = -1
+        exchange = Exchange(now, phase, stage.step, slot)
+        self.state = self.algorithm.absorb(self.state, messages, exchange)
+        if self.algorithm.pairwise:
+            for envelope in envelopes:
+                peer, number, age = envelope.sender, envelope.number, envelope.age
+                append((now, SWAP, self.node, peer, number, phase, age))
+        elif messages:
+            oldest = max(message.age for message in messages)
+            append((now, ABSORB, self.node, -1, -1, phase, oldest))
+        if not self._stopped and self.algorithm.stopped(self.state):
+            self._stopped = True
+            append((now, STOP, self.node, -1, -1, phase, NAN))
+
+
+def _rows(y: FloatArray, H: FloatArray) -> np.ndarray:
+    return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
+
+
+class Reader:
+    """The sensors of one node: a process that reads the truth once a slot."""
+
+    def __init__(
+        self, recorder: Recorder, schedule: Schedule, node: int, entity: int, carrier: SlotNode
+    ) -> None:
+        self._recorder, self._schedule = recorder, schedule
+        self._node, self._entity, self._carrier = node, entity, carrier
+
+    def running(self, timeline: Timeline, truth: Any, sensors: list[Readings]) -> Process:
+        """Read at the "read" stage of every slot."""
+        slot = 0
+        while self._schedule.runs(slot):
+            for stage in self._schedule.stages(slot):
+                if stage.kind == "read":
+                    yield timeline.at(stage.time, stage.rank, self._entity)
+                    self._recorder.append((stage.time, SENSE, self._node, -1, -1, -1, NAN))
+                    x = truth.local(slot)
+                    for sensor in sensors:
+                        self._carrier.read(sensor.reading(slot, x), sensor.matrix(slot))
+            slot += 1
+
+
+class SlotClock:
+    """The clock that all nodes share: it lets them transmit in every exchange of a slot."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        streams: Streams,
+        recorder: Recorder,
+        schedule: Schedule,
+        transmitter: Transmitter,
+        nodes: dict[int, SlotNode],
+    ) -> None:
+        self._scenario, self._recorder, self._schedule = scenario, recorder, schedule
+        self._nodes, self._algorithm = nodes, scenario.hosted
+        self._matching_random = streams.generator("matching")
+        links = scenario.topology.links if scenario.hosted.talks else ()
+        self._talking = sorted({node for link in links for node in link})
+        self._links = {
+            link: LinkExchange(scenario, transmitter, nodes, link, k)
+            for k, link in enumerate(links)
+        }
+
+    def ticking(self, timeline: Timeline) -> Process:
+        """Tick at every "send" stage."""
+        slot = 0
+        while self._schedule.runs(slot):
+            for stage in self._schedule.stages(slot):
+                if stage.kind == "send":
+                    yield timeline.at(stage.time, stage.rank, 0)
+                    self._exchange(stage, slot)
+            slot += 1
+
+    def _exchange(self, stage: Stage, slot: int) -> None:
+        now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
+        for node in {id(n): n for n in self._nodes.values()}.values():
+            node.open(stage.number)
+        pairs, up = self._pairs(stage, slot, broadcast)
+        senders = self._talking
+        if broadcast:
+            self._recorder.append((now, ROUND, -1, -1, -1, phase, NAN))
+        else:
+            senders = sorted({node for pair in pairs for node in pair})
+        exchange = Exchange(now, phase, stage.step, slot)
+        payloads = {node: self._nodes[node].emit(exchange) for node in senders}
+        fresh = self._algorithm.redraws_links(phase, stage.step)
+        for i, j in pairs:
+            if not broadcast:
+                self._recorder.append((now, TICK, i, j, -1, phase, NAN))
+            here = up is None or (i, j) in up
+            both = payloads[i], payloads[j]
+            self._links[i, j].exchange(both, phase, stage.number, here, fresh)
+
+    def _pairs(self, stage: Stage, slot: int, broadcast: bool) -> tuple[list[Any], set[Any] | None]:
+        """The links that are used, and of those the ones that are up (None: all)."""
+        activation, topology = self._scenario.network.activation, self._scenario.topology
+        links = list(topology.links)
+        if isinstance(activation, Matching):
+            return activation.draw(topology, self._matching_random), None
+        if not isinstance(activation, RecordedSlots):
+            return links, None
+        listed = activation.pairs(slot, stage.phase, stage.step)
+        if not broadcast:
+            return listed, None
+        up = set(listed)
+        return links, up if topology.directed else up | {(j, i) for i, j in listed}

@@ -1,0 +1,175 @@
+"""Transmissions: what becomes of a message between being sent and being received."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+import simpy
+
+from netkf.algorithms.filter import Filter
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams
+from netkf.engines.base import Rank
+from netkf.engines.simpy.nodes import Envelope
+from netkf.engines.simpy.timeline import Timeline
+from netkf.network.channels import Fates, checked_chance
+from netkf.network.graphs import Link
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.schema import CODES
+
+SEND, DELIVER, LOST, LATE = (CODES[kind] for kind in ("send", "deliver", "lost", "late"))
+
+Outcome = tuple[float, bool, float]
+"""A uniform draw, whether the link is in its bad state, and a delay in seconds."""
+
+DOWN: Outcome = (math.inf, False, 0.0)
+"""The outcome of a message on a link that is down."""
+
+
+class Receiver(Protocol):
+    """What takes messages at the end of a link."""
+
+    def accepts(self, envelope: Envelope) -> bool:
+        """Whether the message is in time."""
+
+    def receive(self, envelope: Envelope) -> None:
+        """Take the message."""
+
+
+class DirectedLink:
+    """One direction of a link: who receives, what decides the outcome, how many messages so far."""
+
+    def __init__(
+        self, scenario: Scenario, link: Link, entity: int, receiver: Receiver, fates: Fates
+    ) -> None:
+        self.link, self.entity, self.fates, self.receiver = link, entity, fates, receiver
+        self.measured = scenario.measured(link)
+        self.weight = scenario.weight(link[1], link[0])
+        self.messages = 0
+
+
+class Transmitter:
+    """The air: all messages of a run go through it. Each message that takes time is an event."""
+
+    def __init__(
+        self, scenario: Scenario, streams: Streams, timeline: Timeline, recorder: Recorder
+    ) -> None:
+        self._scenario, self._streams = scenario, streams
+        self._timeline, self._recorder = timeline, recorder
+        self._channel = scenario.network.channel
+        self._horizon, self._until = scenario.horizon, scenario.ends
+        self._flying: dict[tuple[Link, int], Envelope] = {}
+
+    def fates(self, link: Link) -> Fates:
+        """The outcomes of a link (symmetric channel) or of one direction of it."""
+        return Fates(self._channel, partial(stream, self._streams, link))
+
+    def directed(self, link: Link, entity: int, receiver: Receiver, fates: Fates) -> DirectedLink:
+        """One direction."""
+        return DirectedLink(self._scenario, link, entity, receiver, fates)
+
+    def send(
+        self,
+        way: DirectedLink,
+        payload: Any,
+        outcome: Outcome,
+        phase: int = -1,
+        exchange: int = -1,
+    ) -> None:
+        """Send one message with its outcome; None is not sent."""
+        if payload is None:
+            return
+        now, (sender, receiver), number = self._timeline.now, way.link, way.messages
+        way.messages = number + 1
+        append = self._recorder.append
+        append((now, SEND, sender, receiver, number, phase, NAN))
+        draw, bad, drawn = outcome
+        loss = self._channel.loss
+        lost = draw >= checked_chance(loss, way.link, number, bad, way.measured)
+        delay = drawn if lost else self._channel.delay.message_delay(way.link, number, drawn)
+        if lost or math.isnan(delay):
+            append((now, LOST, sender, receiver, number, phase, NAN))
+            return
+        envelope = Envelope(sender, number, way.weight, payload, now, exchange)
+        if delay == 0.0:
+            self._arrive(way, phase, envelope, None)
+        elif now + delay < self._until:
+            self._flying[way.link, number] = envelope
+            callback = partial(self._arrive, way, phase, envelope)
+            self._timeline.call_at(now + delay, Rank.DELIVER, way.entity, callback)
+
+    def _arrive(
+        self, way: DirectedLink, phase: int, envelope: Envelope, _: simpy.Event | None
+    ) -> None:
+        now, (sender, receiver) = self._timeline.now, way.link
+        envelope = self._flying.pop((way.link, envelope.number), envelope)
+        envelope = envelope._replace(age=now - envelope.sent)
+        in_time = way.receiver.accepts(envelope)
+        if now < self._horizon or envelope.sent == now:
+            kind, number = DELIVER if in_time else LATE, envelope.number
+            self._recorder.append((now, kind, receiver, sender, number, phase, envelope.age))
+        if in_time:
+            way.receiver.receive(envelope)
+
+    def shift(self, algorithm: Filter, offset: FloatArray) -> None:
+        """Put all that is under way into coordinates whose origin has moved by ``-offset`` now."""
+        now = self._timeline.now
+        for key, envelope in self._flying.items():
+            earlier = self._scenario.moved_back(offset, now - envelope.sent)
+            payload = algorithm.shift_payload(envelope.payload, earlier)
+            self._flying[key] = envelope._replace(payload=payload)
+
+
+class LinkExchange:
+    """Both directions of one link, or the one that it has where the graph is directed: in each
+    activation every end sends to the other. With a symmetric channel both share one outcome.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        transmitter: Transmitter,
+        receivers: dict[int, Any],
+        link: Link,
+        entity: int,
+    ) -> None:
+        i, j = link
+        self._transmitter, self._shared = transmitter, scenario.network.channel.symmetric
+        self._outcomes: list[Outcome] = []
+        forth = transmitter.fates((i, j))
+        self._ways = [transmitter.directed((i, j), 2 * entity, receivers[j], forth)]
+        if not scenario.topology.directed:
+            back = forth if self._shared else transmitter.fates((j, i))
+            self._ways.append(transmitter.directed((j, i), 2 * entity + 1, receivers[i], back))
+
+    def exchange(
+        self,
+        payloads: tuple[Any, Any],
+        phase: int = -1,
+        exchange: int = -1,
+        up: bool = True,
+        fresh: bool = True,
+    ) -> None:
+        """Send one message each way that there is, of the payloads of both ends; all are lost where
+        the link is not ``up``. Unless they are ``fresh`` the outcomes are those of the last time.
+
+        None is not sent, but its outcome is drawn all the same.
+        """
+        if fresh or not self._outcomes:
+            first, *others = self._ways
+            drawn = first.fates.draw()
+            self._outcomes = [
+                drawn,
+                *(drawn if self._shared else way.fates.draw() for way in others),
+            ]
+        for way, payload, outcome in zip(self._ways, payloads, self._outcomes, strict=False):
+            self._transmitter.send(way, payload, outcome if up else DOWN, phase, exchange)
+
+
+def stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:
+    """The stream of a link or of one direction of it."""
+    return streams.generator(purpose, *ends)
