@@ -1,8 +1,11 @@
-"""Loops compiled on request by numba (extra ``fast``), and only then imported.
+"""Loops compiled by numba, which is imported when the first of them is called.
 
-A function marked with :func:`compilable` may be called by functions that are compiled; it stays
-what it is for Python. Where numpy is the way to say it in Python and loops are what a compiler
-wants (products of small matrices), the loops stand beside it: ``compilable_as(loops)``.
+:func:`kernel` marks a numerical function that is written once, as loops: other kernels may call
+it, and Python may call it too. Its code is kept on disk, so that the next process starts at once.
+
+Older functions are marked with :func:`compilable`: compiled ones may call them, and they stay what
+they are for Python. Where numpy is the way to say it in Python and loops are what a compiler wants
+(products of small matrices), the loops stand beside it: ``compilable_as(loops)``.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import time
 from collections.abc import Callable
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 ROOMS = ("core", "algorithms", "plants", "trace", "engines")
 """Whose code and numbers compiled functions may hold."""
@@ -29,8 +32,39 @@ _UNCOUNTED: Any = {**_OPTIONS, "_nrt": False}
 _marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
 _known: set[Callable[..., Any]] = set()
 _in_place: set[Callable[..., Any]] = set()
+_loops: dict[Callable[..., Any], Callable[..., Any]] = {}
 _said: set[Callable[..., Any]] = set()
 _spent: list[float] = []
+
+
+@overload
+def kernel(function: Function) -> Function: ...
+
+
+@overload
+def kernel(*, allocates: bool) -> Callable[[Function], Function]: ...
+
+
+def kernel(function: Callable[..., Any] | None = None, *, allocates: bool = False) -> Any:
+    """Mark a numerical function, written as loops over arrays, that is always run compiled.
+
+    Python and other kernels call it alike; it may call kernels and compilable functions. It works
+    in place and makes no arrays, or is marked ``@kernel(allocates=True)``.
+    """
+    if function is None:
+        return lambda loops: _marked_kernel(loops, allocates)
+    return _marked_kernel(function, allocates)
+
+
+def _marked_kernel(loops: Callable[..., Any], allocates: bool) -> Callable[..., Any]:
+    @wraps(loops)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return demanded(loops)(*args, **kwargs)
+
+    if not allocates:
+        _in_place.add(loops)
+    _loops[call] = loops
+    return compilable_as(loops)(call)
 
 
 def compilable(function: Function) -> Function:
@@ -56,13 +90,17 @@ def in_place(function: Function) -> Function:
     return compilable(function)
 
 
-@cache
 def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
     """The compiled form of a function that is made of loops and of compilable functions, or None
     where numba is missing.
 
     Kept on disk, so that the next process starts at once. It runs without the interpreter's lock.
     """
+    return _compiled(_loops.get(function, function))
+
+
+@cache
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
     try:
         import numba
     except ImportError:
@@ -83,7 +121,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
 def demanded(function: Callable[..., Any]) -> Callable[..., Any]:
     """``compiled``, where numba is known to be there."""
     made = compiled(function)
-    assert made is not None, "the extra fast is needed"
+    assert made is not None, "numba is needed"
     return made
 
 
@@ -127,12 +165,12 @@ def available() -> bool:
 
 
 def _introduce() -> None:
-    from numba.extending import overload
+    from numba import extending
 
     for function, loops in _marked:
         if function not in _known:
             _known.add(function)
-            overload(function, jit_options=_options(loops))(_always(loops))
+            extending.overload(function, jit_options=_options(loops))(_always(loops))
 
 
 def _options(function: Callable[..., Any]) -> Any:
