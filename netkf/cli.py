@@ -74,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
     run = _command(commands, "run", _run, "simulate a scenario and keep what happened")
     run.add_argument("--runs", type=_count, help="how many times, with other draws (default: 1)")
+    run.add_argument("--replica", type=_replica, help="which run of an ensemble (default: 0)")
     run.add_argument("--seed", type=_seed, help="root seed instead of the scenario's")
     run.add_argument("--engine", default="auto", choices=["auto", "simpy", "processes", "compiled"])
     run.add_argument("--out", type=Path, help="directory for the run (default: runs/NAME-k)")
@@ -133,6 +134,13 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _replica(text: str) -> int:
+    if not text.isdecimal() or len(text) > 12:
+        words = f"must be an integer of at least 0, got {quote(text)}"
+        raise argparse.ArgumentTypeError(words)
+    return int(text)
+
+
 def _count(text: str) -> int:
     if not text.isdecimal() or len(text) > 12 or int(text) < 1:
         words = f"must be an integer of at least 1, got {quote(text)}"
@@ -164,6 +172,9 @@ def _notes(scenario: Scenario) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     many = (options.runs or 1) > 1
+    if many and options.replica is not None:
+        remedy = "leave out --runs or --replica"
+        raise ScenarioError("--replica", "is for a single run", options.replica, remedy)
     if many and options.workers != 1 and options.scheduler is None:
         from netkf.experiments.ensembles.starting import start_early
 
@@ -183,14 +194,15 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
 
     if options.scheduler is not None:
         raise ScenarioError("--scheduler", "is for several runs", options.scheduler, "add --runs R")
-    if options.resume and not clear_unfinished(options.out, scenario):
+    replica = options.replica or 0
+    if options.resume and not clear_unfinished(options.out, scenario, replica):
         print(f"nothing left to do in {options.out}")
         return 0
     meter = _Meter(scenario.horizon)
     picture = None if options.no_plot else partial(_picture, scenario, "run_picture")
     try:
         finished = run_to_directory(
-            scenario, options.out, options.engine, options.trace or "full", meter, picture
+            scenario, options.out, options.engine, options.trace or "full", meter, picture, replica
         )
     finally:
         meter.close()
@@ -264,10 +276,13 @@ def _divergence(finished: Any) -> str:
     listed = ", ".join(map(str, nodes[:MOST_NODES])) + (", ..." if len(nodes) > MOST_NODES else "")
     several = "s" if len(nodes) > 1 else ""
     blurred = finished.samples.rounding_from
-    left_out = "" if blurred is None else f"; averages are over the samples before {blurred:g} s"
+    left_out = "" if blurred is None else f"; errors are averaged before {blurred:g} s"
+    broken = f"estimate or covariance of node{several} {listed} is no longer finite"
+    if finished.samples.ended_finite:
+        broken = f"covariance of node{several} {listed} is no longer positive semidefinite"
     return (
-        f"{finished.status}, the estimate or covariance of node{several} {listed} is no longer "
-        f"finite at {finished.samples.times[-1]:g} s and the run ended there{left_out}"
+        f"{finished.status}, the {broken} at {finished.samples.times[-1]:g} s and the run ended "
+        f"there{left_out}"
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import platform
 import time
 import traceback
 from collections.abc import Callable
@@ -13,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-import netkf
 from netkf.core import compiling
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import integer
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, silent
 from netkf.experiments.failures import told
@@ -26,6 +25,7 @@ from netkf.experiments.files import (
     write_json,
     write_scenario,
 )
+from netkf.experiments.provenance import machine, versions
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, SummarySink, conserved, promise, summarise
 from netkf.scenario.plugins import in_words
@@ -55,8 +55,10 @@ def run_to_directory(
     trace: str = "full",
     progress: Progress = silent,
     finish: Callable[[Finished], None] | None = None,
+    replica: int = 0,
 ) -> Finished:
-    """Run once and write scenario.toml, manifest.json, the Parquet tables and summary.json.
+    """Run once, as ``replica`` of an ensemble, and write scenario.toml, manifest.json, the Parquet
+    tables and summary.json.
 
     ``trace`` is full, first (the same for a single run) or none (no tables). ``finish`` adds what
     else belongs to the directory, before the manifest says that it is complete. A run that is
@@ -65,18 +67,19 @@ def run_to_directory(
     anything is written, InterruptedRunError (a KeyboardInterrupt) when interrupted, and EngineError
     where a plugged-in class fails.
     """
+    replica = integer(low=0)("replica", replica)
     chosen = choose_engine(engine, scenario)
     check_sources(scenario)
     directory = new_directory(out, scenario.name)
     write_scenario(directory, scenario)
-    samples, tables = SummarySink(), ParquetSink(directory, scenario, 0, trace != "none")
+    samples, tables = SummarySink(), ParquetSink(directory, scenario, replica, trace != "none")
     recorder = Recorder([samples, tables])
-    manifest = Manifest(directory, scenario.name, scenario.seed, 0, chosen.name)
+    manifest = Manifest(directory, scenario.name, scenario.seed, replica, chosen.name)
     # Written at once, so that a run that is killed outright says that it did not finish.
     manifest.write("interrupted", {})
     began, compiled, done = time.perf_counter(), compiling.seconds_spent(), False
     try:
-        status = chosen.run(scenario, Streams(scenario.seed, 0), recorder, progress)
+        status = chosen.run(scenario, Streams(scenario.seed, replica), recorder, progress)
         compiled = compiling.seconds_spent() - compiled
         seconds, done = time.perf_counter() - began - compiled, status == "complete"
         tables.close()
@@ -127,13 +130,15 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
         sink.states(run.times, run.x, run.xhat, run.P, run.error)
     tables.close()
     _summary(folder, scenario, samples, promise(scenario, run.times), run.count, run.sums)
-    totals = {"events": len(run.log), "fingerprint": run.fingerprint}
+    totals: dict[str, Any] = {"events": len(run.log), "fingerprint": run.fingerprint}
+    totals |= {"simpy": run.stats} if run.stats else {}
     manifest.write(run.status, totals, run.status == "complete")
     return folder
 
 
 def _totals(recorder: Recorder) -> dict[str, Any]:
-    return {"events": recorder.total, "fingerprint": recorder.fingerprint}
+    totals: dict[str, Any] = {"events": recorder.total, "fingerprint": recorder.fingerprint}
+    return totals | ({"simpy": recorder.stats} if recorder.stats else {})
 
 
 ENDS = {"failed": "failed", "interrupted": "was interrupted"}
@@ -159,15 +164,6 @@ def _summary(
     return summary
 
 
-def versions() -> dict[str, str]:
-    """Of what decides about the last bit."""
-    return {
-        "netkf": netkf.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
-
-
 @dataclass(frozen=True, eq=False)
 class Manifest:
     """``manifest.json`` of a directory of one run, or of ``wanted`` runs from ``replica`` on."""
@@ -190,6 +186,7 @@ class Manifest:
         manifest: dict[str, Any] = {
             "name": self.name,
             "versions": versions(),
+            "machine": machine(),
             "seed": self.seed,
             "replica": self.replica,
             "runs": {"wanted": self.wanted, "done": int(done)},

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from scipy.special import gammaincinv
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
+from netkf.experiments.transmissions import Transmissions
 from netkf.experiments.words import limit_words, mismatch_words, nees_words
 from netkf.scenario.scenario import Scenario
 from netkf.theory import central_covariance, covariance_bound, limit_covariance
@@ -24,9 +25,10 @@ CONFIDENCE = 0.95
 
 class SummarySink(Sink):
     """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES; and
-    how many messages each link delivered. ``rounding_from`` is the first sample at which the state
-    is so large that rounding blurs the errors (unstable plants over long horizons), ``diverged``
-    are the nodes whose covariance was no longer finite at the last one.
+    how many messages each node sent and each link delivered. ``rounding_from`` is the first sample
+    at which the state is so large that rounding blurs the errors (unstable plants over long
+    horizons, where errors are subtracted), ``diverged`` are the nodes whose estimate or covariance
+    was broken at the last one.
     """
 
     anywhere: ClassVar[bool] = True
@@ -39,9 +41,11 @@ class SummarySink(Sink):
         self.delivered: dict[tuple[int, int], int] = {}
         self.rounding_from: float | None = None
         self.diverged: list[int] = []
+        self.transmissions = Transmissions()
 
     def events(self, rows: np.ndarray) -> None:
         """Deliveries of each link are counted, both directions together."""
+        self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
         arrived = rows[rows["kind"] == CODES["deliver"]]
         ends = np.sort(np.column_stack([arrived["node"], arrived["peer"]]), axis=1)
@@ -63,6 +67,37 @@ class SummarySink(Sink):
         if self.rounding_from is None and not self.exact_errors:
             first = rounding_from(t, x, P, error)
             self.rounding_from = first if first < np.inf else None
+
+    @property
+    def covariance_given(self) -> bool:
+        """Whether the filters give a covariance."""
+        return not self.trace or any(np.isfinite(trace).any() for trace in self.trace)
+
+    @property
+    def ended_finite(self) -> bool:
+        """Whether errors and covariances were finite at the last sample."""
+        return bool(np.isfinite([self.sq_error[-1], self.trace[-1]]).all())
+
+
+NO_COVARIANCE = "the filter gives no covariance"
+
+
+class Used(NamedTuple):
+    """Places of the samples that averages of errors and of covariances are over."""
+
+    errors: np.ndarray
+    covariances: np.ndarray
+
+
+def averaged_samples(times: FloatArray, rounding_from: float, diverged: bool) -> Used:
+    """Those after time 0, or all where none is; without the last one of a run that ``diverged``;
+    of errors, and of covariances that outgrow all bounds, without those that rounding blurs.
+    """
+    kept = times[: len(times) - 1] if diverged and len(times) > 1 else times
+    after = kept > 0.0 if (kept > 0.0).any() else np.ones(len(kept), dtype=bool)
+    clear = after & (kept < rounding_from)
+    covariances = clear if diverged and clear.any() else after
+    return Used(np.flatnonzero(clear), np.flatnonzero(covariances))
 
 
 def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
@@ -129,18 +164,21 @@ def summarise(
     scenario: Scenario, sink: SummarySink, promised: Promise, messages: dict[str, int]
 ) -> dict[str, Any]:
     """Per node and overall: time-averaged RMS error, mean trace of P, bound and their ratio, mean
-    NEES over the samples after time 0 (of a diverged run without those that rounding blurs);
-    messages sent, delivered, lost and still on their way. Nan where there is no sample.
+    NEES over the samples after time 0 (errors and NEES without those that rounding blurs), messages
+    that each node sent, and how often it transmitted; messages sent, delivered, lost and still on
+    their way. Nan where there is no sample or no covariance.
     """
-    used = _used(np.array(sink.times), sink.rounding_from if sink.diverged else None)
+    blurred = np.inf if sink.rounding_from is None else sink.rounding_from
+    used = averaged_samples(np.array(sink.times), blurred, bool(sink.diverged))
+    places = (used.errors, used.covariances, used.errors)
     with np.errstate(all="ignore"):
         mean_square, trace, nees = (
-            np.array(values)[used].mean(axis=0)
-            if len(used)
+            np.array(values)[kept].mean(axis=0)
+            if len(kept)
             else np.full(len(scenario.nodes), np.nan)
-            for values in (sink.sq_error, sink.trace, sink.nees)
+            for kept, values in zip(places, (sink.sq_error, sink.trace, sink.nees), strict=True)
         )
-        bound = None if promised.bound is None else promised.bound[used].mean(axis=0)
+        bound = None if promised.bound is None else promised.bound[used.covariances].mean(axis=0)
         nodes = [
             _row(node, mean_square[k], trace[k], None if bound is None else bound[k], nees[k])
             for k, node in enumerate(scenario.nodes)
@@ -153,6 +191,9 @@ def summarise(
             nees.mean(),
         )
     del overall["node"]
+    counts = sink.transmissions
+    for row in nodes:
+        row |= {"sent": counts.sent[row["node"]], "transmissions": counts.of(row["node"])}
     return {
         "nodes": nodes,
         "overall": overall,
@@ -160,19 +201,24 @@ def summarise(
         "central": promised.central,
         "bound": promised.words or "H(12), promised by H Theorem 2",
         "rounding_from": sink.rounding_from,
+        "notes": notes_of(scenario, sink.rounding_from, sink.covariance_given),
         "messages": {
             **messages,
+            "transmissions": counts.total,
             "in_flight": messages["sent"] - messages["delivered"] - messages["lost"],
         },
     }
 
 
-def _used(times: FloatArray, rounding_from: float | None) -> np.ndarray:
-    """Places of the samples that the averages are over."""
-    for wanted in ((times > 0.0) & (times < (rounding_from or np.inf)), times > 0.0):
-        if wanted.any():
-            return np.flatnonzero(wanted)
-    return np.arange(len(times))
+def notes_of(scenario: Scenario, rounding_from: float | None, covariance_given: bool) -> list[str]:
+    """What to know about the averages of a run or of an ensemble, a line each."""
+    notes = [] if covariance_given else [NO_COVARIANCE]
+    if rounding_from is not None and scenario.plant.shown:
+        notes.append(
+            f"from {rounding_from:g} s on the state is so large that rounding blurs the errors: "
+            "they and NEES are averaged over the samples before; shorten the horizon"
+        )
+    return notes
 
 
 def conserved(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:

@@ -59,12 +59,7 @@ def summary_table(
         )
     if all(row["bound"] is None for row in nodes):
         lines.append(f"bound: {summary['bound']}")
-    if summary["rounding_from"] is not None:
-        lines.append(
-            f"note: from {summary['rounding_from']:g} s on the state is so large that rounding "
-            "blurs the errors; shorten the horizon"
-        )
-    lines += [f"note: {note}" for note in notes]
+    lines += [f"note: {note}" for note in (*summary["notes"], *notes)]
     references = [
         f"{words} {number(value)}"
         for words, value in (
@@ -85,11 +80,17 @@ def summary_table(
     if "conserved" in summary:
         lines.append("mass: " + _conserved(summary["conserved"]))
     lines.append(
-        f"messages: {_count(sent['sent'])} sent, {_count(sent['delivered'])} delivered, "
-        f"{_count(sent['lost'])} lost"
+        f"messages: {_count(sent['sent'])} sent{_transmissions(sent)}, "
+        f"{_count(sent['delivered'])} delivered, {_count(sent['lost'])} lost"
         + (f", {_count(sent['in_flight'])} on their way at the end" if sent["in_flight"] else "")
     )
     return "\n".join(lines)
+
+
+def _transmissions(sent: dict[str, Any]) -> str:
+    """Where a message that is broadcast is sent to several and transmitted once."""
+    count = sent.get("transmissions")
+    return "" if count is None or count == sent["sent"] else f" in {_count(count)} transmissions"
 
 
 def _conserved(found: dict[str, Any]) -> str:

@@ -32,7 +32,9 @@ absorb   node used all that had arrived at t in one reset; ``age`` is that of th
 swap     node put what it got from peer in place of its own
 round    a step of exchange number ``phase`` of the slot begins, in which every node sends
 stop     node has stopped learning from the others in exchange number ``phase``
-diverged the covariance or the estimate of node was no longer finite
+diverged the estimate of node was no longer finite, or its covariance no longer finite and positive
+         semidefinite
+transmit node transmitted once, as its transmission number ``message``, to all that may hear it
 """
 
 CODES = {kind: code for code, kind in enumerate(KINDS)}

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import netkf.experiments.run as one
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, integer
 from netkf.experiments.ensembles.kept import KeptBlocks
@@ -31,6 +30,8 @@ from netkf.experiments.files import (
     write_scenario,
     write_table,
 )
+from netkf.experiments.provenance import versions
+from netkf.experiments.run import Manifest
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, promise
 from netkf.scenario.scenario import Scenario
@@ -103,7 +104,7 @@ def runs_to_directory(
     size = min(size, LARGEST_TRACED) if trace == "full" else size
     plan = _Plan(scenario_digest(scenario), runs, trace, size)
     directory, plan = _directory(scenario, out, resume, plan, chosen)
-    manifest = one.Manifest(directory, scenario.name, scenario.seed, 0, chosen, runs)
+    manifest = Manifest(directory, scenario.name, scenario.seed, 0, chosen, runs)
     blocks = KeptBlocks(directory)
     if resume and is_finished(directory):
         blocks.remove()
@@ -171,7 +172,7 @@ def _write(
 class _Keeper:
     """Keeps blocks as they come, and the manifest up to date."""
 
-    def __init__(self, manifest: one.Manifest, blocks: KeptBlocks, plan: _Plan) -> None:
+    def __init__(self, manifest: Manifest, blocks: KeptBlocks, plan: _Plan) -> None:
         self._manifest, self._blocks, self._plan = manifest, blocks, plan
         self.before = blocks.numbers()
         self._done = sum(map(self._runs, self.before))
@@ -211,7 +212,7 @@ def _directory(
         "scenario": (plan.scenario, "give the same scenario, seed and settings"),
         "trace": (plan.trace, "give the same --trace"),
         "engine": (engine, "give the same --engine"),
-        "versions": (one.versions(), "go on with the versions that it was begun with"),
+        "versions": (versions(), "go on with the versions that it was begun with"),
     }
     if found.get("runs", {}).get("wanted") != plan.runs:
         words, value = "the run was begun with another number of runs", found.get("runs")
@@ -230,16 +231,20 @@ def is_finished(directory: Path) -> bool:
     return read_manifest(directory).get("status") in ("complete", "diverged")
 
 
-def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
+def clear_unfinished(directory: Path, scenario: Scenario, replica: int = 0) -> bool:
     """Make room for a single run that was stopped to be done again; False where it is finished.
 
-    Raises ScenarioError where the directory holds a run of another scenario.
+    Raises ScenarioError where the directory holds a run of another scenario or replica.
     """
     if not (directory / "manifest.json").exists():
         return True
     kept = directory / "scenario.toml"
     words = to_toml(resolved(scenario))
-    if read_manifest(directory).get("runs", {}).get("wanted") != 1:
+    found = read_manifest(directory)
+    if found.get("replica", replica) != replica:
+        rule, remedy = f"{directory} holds another replica", "give the same --replica"
+        raise ScenarioError("--resume", rule, found["replica"], remedy)
+    if found.get("runs", {}).get("wanted") != 1:
         remedy = "give the same --runs"
         raise ScenarioError("--resume", "the run was begun with several runs", 1, remedy)
     if kept.exists() and kept.read_text(encoding="utf-8") != words:

@@ -36,7 +36,9 @@ class Ensemble:
     and ``se_average`` (N + 1, 3): mean square error, mean trace of P and mean NEES, each averaged
     over the samples after time 0, of the nodes in their order and, last, of all of them together.
     ``messages``: how many were sent, delivered, lost and still in flight in all runs; ``diverged``:
-    how many runs did. ``fingerprint`` is that of replica 0.
+    how many runs did. ``fingerprint`` is that of replica 0. From ``rounding_from`` on, inf in most
+    cases, rounding of the state blurs the errors: they and NEES are nan there and left out of
+    averages. P and NEES are nan where the filter gives no covariance.
     """
 
     times: FloatArray
@@ -57,6 +59,7 @@ class Ensemble:
     engine: str
     fingerprint: str
     shown: bool = True
+    rounding_from: float = np.inf
 
     def __repr__(self) -> str:
         return (
@@ -119,7 +122,9 @@ def ensemble_of(scenario: Scenario, tally: Tally, seed: int, engine: str) -> Ens
         means = np.where(samples.size > 0.0, samples.mean, np.nan)
     mean_P, mean_error, mean_nees = _unpacked(means, n)
     se_P, se_error, se_nees = _unpacked(samples.standard_error(), n)
-    totals = np.rint(tally.messages.mean * tally.messages.size).astype(int).tolist()
+    for errors in (mean_error, mean_nees, se_error, se_nees):
+        errors[scenario.times >= tally.rounding_from] = np.nan
+    totals = tally.messages.mean * tally.messages.size
     return Ensemble(
         scenario.times,
         scenario.nodes,
@@ -132,13 +137,18 @@ def ensemble_of(scenario: Scenario, tally: Tally, seed: int, engine: str) -> Ens
         se_nees,
         tally.averages.mean,
         tally.averages.standard_error(),
-        dict(zip(MESSAGES, totals, strict=True)),
+        {
+            name: round(total)
+            for name, total in zip(MESSAGES, totals.tolist(), strict=True)
+            if np.isfinite(total)
+        },
         int(tally.totals[1]),
         int(tally.totals[0]),
         seed,
         engine,
         tally.fingerprint,
         scenario.plant.shown,
+        tally.rounding_from,
     )
 
 

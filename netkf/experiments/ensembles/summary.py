@@ -8,7 +8,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.experiments.ensembles.tallies import MESSAGES, Tally
-from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds
+from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds, notes_of
 from netkf.scenario.scenario import Scenario
 
 
@@ -18,6 +18,7 @@ def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> d
     """
     mean, error = tally.averages.mean, tally.averages.standard_error()
     bound = _bounds(scenario, promised)
+    blurred = tally.rounding_from if np.isfinite(tally.rounding_from) else None
     rows = [_row(*values) for values in zip(mean, error, bound, strict=True)]
     messages = tally.messages.mean.tolist()
     messages_se = tally.messages.standard_error().tolist()
@@ -30,7 +31,8 @@ def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> d
         "limit": promised.limit,
         "central": promised.central,
         "bound": promised.words or "H(12), promised by H Theorem 2",
-        "rounding_from": tally.rounding_from if np.isfinite(tally.rounding_from) else None,
+        "rounding_from": blurred,
+        "notes": notes_of(scenario, blurred, bool(np.isfinite(mean[:, 1]).any())),
         "messages": dict(zip(MESSAGES, messages, strict=True)),
         "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
     }
@@ -47,11 +49,12 @@ def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> d
 def _chi_square(scenario: Scenario, tally: Tally) -> dict[str, float]:
     """Bounds on the mean NEES of one sample over the runs that hold with ``confidence`` where P is
     exact, since the sum is chi-square; over n they bound the ANEES. ``inside``: the share of all
-    samples after time 0 that every run has.
+    samples after time 0 that every run has and that rounding does not blur.
     """
     n, runs = scenario.plant.n, tally.runs
     low, high = nees_bounds(n, runs)
-    kept = (scenario.times > 0.0) & (tally.samples.size[:, 0, 0] == runs)
+    clear = (scenario.times > 0.0) & (scenario.times < tally.rounding_from)
+    kept = clear & (tally.samples.size[:, 0, 0] == runs)
     means = tally.samples.mean[kept, :, -1]
     inside = float(((means >= low) & (means <= high)).mean()) if means.size else np.nan
     return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": inside}

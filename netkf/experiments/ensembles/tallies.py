@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -12,11 +14,12 @@ from netkf.core.streams import Streams
 from netkf.engines.base import Engine, silent
 from netkf.experiments.ensembles.moments import Moments, merge_moments, single
 from netkf.experiments.simulate import choose_engine, collect
+from netkf.experiments.summary import averaged_samples
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder
 from netkf.trace.run import Run, errors
 
-MESSAGES = ("sent", "delivered", "lost", "in_flight")
+MESSAGES = ("sent", "delivered", "lost", "in_flight", "transmissions")
 
 
 class Trace(NamedTuple):
@@ -37,10 +40,10 @@ class Tally(NamedTuple):
     ``samples``: (T, N, 2 u + 1) upper triangles of P and of e e' with the error e, then NEES;
     size (T, 1, 1). ``averages``: (N + 1, 3) of every run: mean square error, mean trace of P and
     mean NEES over the samples after time 0, of the nodes and of all; size (1, 1). ``messages``:
-    (4,) as MESSAGES, size (1,). ``totals`` are events, diverged runs. ``conserved``: of each sum
-    its mean at the start and at the end, then the largest relative drift. ``rounding_from`` is the
-    first sample of any run at which rounding blurs the errors, inf where none. ``fingerprint`` is
-    that of replica 0. ``traces`` are those that were asked for, in order.
+    (5,) as MESSAGES, transmissions nan in slots, size (1,). ``totals`` are events, diverged runs.
+    ``conserved``: of each sum its mean at the start and at the end, then the largest relative
+    drift. ``rounding_from`` is the first sample of any run at which rounding blurs the errors, inf
+    where none. ``fingerprint`` is that of replica 0. ``traces`` are those asked for, in order.
     """
 
     samples: Moments
@@ -101,25 +104,26 @@ def reduced_run(
     recorder = Recorder([memory], counted=not traced and replica > 0)
     status = chosen.run(scenario, Streams(seed, replica), recorder, silent)
     run = collect(scenario, memory, recorder, seed, replica, chosen.name, status)
-    return _tally(run, recorder, scenario.times, traced)
+    return _tally(run, recorder, scenario, traced)
 
 
-def _tally(run: Run, recorder: Recorder, wanted: FloatArray, traced: bool) -> Tally:
-    """A sample at which a node's estimate or covariance is no longer finite is left out."""
+def _tally(run: Run, recorder: Recorder, scenario: Scenario, traced: bool) -> Tally:
+    """A sample at which a node's estimate or covariance is broken is left out."""
     diverged = run.status == "diverged"
     kept = len(run.times) - 1 if diverged else len(run.times)
     P, e = run.P[:kept], run.error[:kept]
     sq_error, nees = errors(e, P)
     trace = np.trace(P, axis1=2, axis2=3)
     blurred = run.rounding_from
-    used = _after_start(run.times[:kept], blurred if diverged else np.inf)
-    averages = _mean(np.stack([sq_error, trace, nees], axis=2)[used])
-    lost = recorder.count("lost") + recorder.count("late")
-    sent, delivered = recorder.count("send"), recorder.count("deliver")
+    used = averaged_samples(run.times, blurred, diverged)
+    averages = np.stack(
+        [_mean(sq_error[used.errors]), _mean(trace[used.covariances]), _mean(nees[used.errors])],
+        axis=1,
+    )
     return Tally(
-        single(*_padded(_columns(P, e, nees), len(wanted))),
+        single(*_padded(_columns(P, e, nees), len(scenario.times))),
         single(np.vstack([averages, averages.mean(axis=0)]), np.ones((1, 1))),
-        single(np.array([sent, delivered, lost, sent - delivered - lost], float), np.ones(1)),
+        single(count_messages(recorder.count, scenario.slotted), np.ones(1)),
         np.array([recorder.total, int(diverged)]),
         {
             name: (single(np.array(sums), np.ones(1)), (sums[1] - sums[0]) / sums[0])
@@ -151,12 +155,11 @@ def _padded(values: FloatArray, length: int) -> tuple[FloatArray, FloatArray]:
     return whole, (np.arange(length) < len(values)).astype(float)[:, None, None]
 
 
-def _after_start(times: FloatArray, end: float) -> np.ndarray:
-    """Places of the samples that averages over time are over, as in the summary of one run."""
-    for wanted in ((times > 0.0) & (times < end), times > 0.0):
-        if wanted.any():
-            return np.flatnonzero(wanted)
-    return np.arange(len(times))
+def count_messages(count: Callable[[str], int], slotted: bool) -> FloatArray:
+    """(5,) as MESSAGES, from the number of events of each kind."""
+    sent, delivered, lost = count("send"), count("deliver"), count("lost") + count("late")
+    transmissions = math.nan if slotted else float(count("transmit") or sent)
+    return np.array([sent, delivered, lost, sent - delivered - lost, transmissions])
 
 
 def _mean(values: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.engines.base import Engine
-from netkf.experiments.ensembles.tallies import reduced_run
+from netkf.experiments.ensembles.tallies import count_messages, reduced_run
 from netkf.experiments.simulate import simulate
 from netkf.scenario.scenario import Filtering, Scenario
 from netkf.theory import covariance_bound, error_covariance, riccati_step
@@ -24,20 +24,23 @@ MOST_ERRORS = 24
 
 class Figures(NamedTuple):
     """Of R runs: ``mean_square`` error and ``trace`` of P (R, N), averaged over the samples after
-    time 0; ``messages`` (R, 4): sent, delivered, lost, in flight; ``diverged`` (R,).
+    time 0; ``messages`` (R, 5) as MESSAGES; ``diverged`` (R,); ``rounding_from`` (R,): when it
+    begins to blur errors, which are averaged over the samples before, nan without one.
     """
 
     mean_square: FloatArray
     trace: FloatArray
     messages: FloatArray
     diverged: FloatArray
+    rounding_from: FloatArray
 
 
 def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Figures:
     """The figures of one replica, for ``replicate``."""
     tally = reduced_run(scenario, seed, replica, engine)
     averages = tally.averages.mean[:-1]
-    return Figures(averages[:, 0], averages[:, 1], tally.messages.mean, tally.totals[1:2])
+    blurred = np.array([tally.rounding_from])
+    return Figures(averages[:, 0], averages[:, 1], tally.messages.mean, tally.totals[1:2], blurred)
 
 
 def together(runs: Sequence[Figures]) -> Figures:
@@ -58,10 +61,8 @@ def one_expected_run(
         averaged(scenario, np.trace(matrices, axis1=2, axis2=3))
         for matrices in (error_covariance(scenario, run), run.P)
     )
-    sent, arrived = run.count("send"), run.count("deliver")
-    lost = run.count("lost") + run.count("late")
-    messages = np.array([sent, arrived, lost, sent - arrived - lost], dtype=np.float64)
-    return Figures(square, trace, messages, np.zeros(1, dtype=np.int64))
+    messages = count_messages(run.count, scenario.slotted)
+    return Figures(square, trace, messages, np.zeros(1, dtype=np.int64), np.full(1, np.inf))
 
 
 def expected_errors_known(scenario: Scenario) -> bool:

@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer
 from netkf.experiments.ensembles.replicas import replicate
@@ -23,7 +25,7 @@ from netkf.experiments.files import (
     write_table,
     write_text,
 )
-from netkf.experiments.run import versions
+from netkf.experiments.provenance import versions
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.studies.figures import (
     Estimate,
@@ -126,10 +128,14 @@ def _row(place: Cell, found: Figures) -> Row:
         row |= {name: value, f"{name}_se": error}
     row["bound"] = _known(lambda: float(bound_traces(place.scenario).mean()))
     row["central"] = _known(lambda: central_trace(place.scenario))
-    sent, delivered, lost, _ = found.messages.mean(axis=0).tolist()
+    sent, delivered, lost = found.messages[:, :3].mean(axis=0).tolist()
     row |= {"sent": sent, "delivered": delivered, "lost": lost}
     diverged = int(found.diverged.sum())
-    row["status"] = f"{diverged} diverged" if diverged else "complete"
+    status = f"{diverged} diverged" if diverged else "complete"
+    blurred = float(found.rounding_from.min())
+    if np.isfinite(blurred) and place.scenario.plant.shown:
+        status += f"; rounding blurs errors from {blurred:g} s on, they are left out"
+    row["status"] = status
     return row
 
 
