@@ -1,33 +1,47 @@
-"""The push-sum filter written plainly along the links of a run: P of every node, and the covariance
-of the errors of all nodes together, given which links were up.
+"""The push-sum filter along the messages of a run: in slots P Fig. 1 with the corrected update of
+the mass, under clocks broadcast rounds by running sums.
+
+Under clocks every total (U, u) of information about x has an error ``u - U x``. Totals refer to now:
+as time passes ``U -> s F^-T U F^-1`` and the error goes ``-> s F^-T`` times itself less ``U w``, s the
+factor with which old information fades. Sums and differences of totals are those of their errors,
+and ``P^-1 += dU``, ``xhat += P (du - dU xhat)`` makes ``e+ = (I - P dU) e - P (du - dU x)``: errors are
+closed, whatever became of x itself.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from typing import NamedTuple
+
 import numpy as np
+import scipy.linalg
 
 from netkf.algorithms.push_sum import PushSum
-from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
+from netkf.theory.moves import Seen, informed
+from netkf.theory.observed import Observed
+from netkf.theory.rules import Rule, Sent
+from netkf.theory.stacked_errors import Errors
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 Up = dict[tuple[int, int, int], FloatArray]
+LEAST = 0.05
+"""Information is used where the least eigenvalue of I + S' dU S is above this."""
 
 
-def stacked_push_sum_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
-    """(T, N n, N n) and (T, N, n, n): P Fig. 1 with the corrected update of the mass.
-
-    At times before the horizon, since exchanges of a slot that begins there are not in the trace.
-    Raises TheoryError for frozen or asymptotic gains and where the filters' F differs from the
-    plant's.
+def known_sums(scenario: Scenario, run: Run) -> None:
+    """Raise TheoryError where the errors in slots are not known: for frozen or asymptotic gains,
+    where the filters' F differs from the plant's, and at the horizon, since the exchanges of a slot
+    that begins there are not in the trace.
     """
-    algorithm = scenario.filter.algorithm
+    algorithm, plant = scenario.filter.algorithm, scenario.slot_plant
     assert isinstance(algorithm, PushSum)
     if algorithm.stop != "never" or algorithm.asymptotic:
         raise TheoryError("the exact errors are known while mass is exchanged in every slot")
-    plant = scenario.slot_plant
     if not np.array_equal(scenario.slot_belief[0], plant.F):
         raise TheoryError("the exact errors are known for filters that have the plant's F")
     if any(sensor.varying for sensor in scenario.sensors):
@@ -36,7 +50,63 @@ def stacked_push_sum_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, F
     if slots and plant.over(slots[-1], scenario.horizon):
         words = "the exchanges of the slot at the horizon are not in the trace"
         raise TheoryError(f"{words}: sample before it")
-    return _Plain(scenario, algorithm, _arrived(scenario, run, algorithm.gamma)).at(slots)
+
+
+class Averages(Rule):
+    """Slots: masses exchanged once, estimates averaged in gamma steps."""
+
+    def __init__(self, scenario: Scenario, errors: Errors, run: Run) -> None:
+        super().__init__(scenario, errors)
+        algorithm = scenario.filter.algorithm
+        assert isinstance(algorithm, PushSum)
+        self._gamma, self._delta = int(algorithm.gamma or 1), float(algorithm.delta or math.nan)
+        self._up = _arrived(scenario, run, self._gamma)
+        self._N, n = len(scenario.nodes), errors.n
+        self._nu = np.array([scenario.topology.degrees[node] + 1 for node in scenario.nodes])
+        models = scenario.slot_models
+        self._own = np.array([m.H.T @ np.linalg.solve(m.R, m.H) for m in models])
+        own = self._own.reshape(self._N, n * n)
+        self._z = np.concatenate([np.zeros((self._N, 1)), np.ones((self._N, 1)), own], axis=1)
+        self._z[scenario.topology.index[algorithm.leader], 0] = 1.0
+
+    def exchange(self, slot: int, phase: int, messages: Sequence[Sent]) -> None:
+        """P (3)-(5), and step 5."""
+        if phase == 0:
+            received = self._received(slot, 0, 0)
+            shares = self._z / self._nu[:, None]
+            kept = (self._nu - received.sum(axis=1))[:, None]
+            self._z = kept * shares + received @ shares
+            return
+        mixing, hosts = np.eye(self._N), range(self._N)
+        for step in range(self._gamma):
+            received = self._received(slot, 1, step)
+            laplacian = np.diag(received.sum(axis=1)) - received
+            mixing = mixing - laplacian @ mixing / self._delta
+        forms = self.errors.stack.forms(hosts)
+        mixed = np.tensordot(mixing, forms, 1)
+        self.errors.stack.put_all(dict(zip(hosts, mixed, strict=True)))
+
+    def _received(self, slot: int, phase: int, step: int) -> FloatArray:
+        return self._up.get((slot, phase, step), np.zeros((self._N, self._N)))
+
+    def sense(self, time: float, seen: Observed) -> None:
+        """Step 4 with what the mass says of the network, P (6)-(8)."""
+        n, errors = self.errors.n, self.errors
+        heard = self._z[:, 0] > 0.0
+        weight = np.where(heard, self._z[:, 0], 1.0)
+        learned = self._z[:, 2:].reshape(self._N, n, n) / weight[:, None, None]
+        G = np.where(heard[:, None, None], learned, self._own)
+        number = np.where(heard, self._z[:, 1] / weight, 1.0)
+        columns = errors.readings(seen)
+        for host in range(self._N):
+            root = informed(errors.roots[host], G[host])
+            if host not in seen:
+                errors.roots[host] = root
+                continue
+            one = seen[host]
+            K = number[host] * root @ root.T @ np.linalg.solve(one.R, one.H).T
+            errors.move(host, np.eye(n) - K @ one.H, root)
+            errors.stack.add(host, columns[host], -K @ one.root)
 
 
 def _arrived(scenario: Scenario, run: Run, gamma: int) -> Up:
@@ -55,65 +125,123 @@ def _arrived(scenario: Scenario, run: Run, gamma: int) -> Up:
     return up
 
 
-class _Plain:
-    """Slot by slot."""
+class Total(NamedTuple):
+    """An amount of mass: weight and information; its error is in the stack."""
 
-    def __init__(self, scenario: Scenario, algorithm: PushSum, up: Up) -> None:
-        self._scenario, self._filter, self._up = scenario, algorithm, up
-        self._n, self._N = scenario.plant.n, len(scenario.nodes)
-        self._models = scenario.slot_models
-        self._nu = np.array([scenario.topology.degrees[node] + 1 for node in scenario.nodes])
+    weight: float
+    U: FloatArray
 
-    def _received(self, slot: int, phase: int, step: int) -> FloatArray:
-        return self._up.get((slot, phase, step), np.zeros((self._N, self._N)))
 
-    def at(self, slots: list[int]) -> tuple[FloatArray, FloatArray]:
-        """At increasing slots."""
-        n, N, scenario = self._n, self._N, self._scenario
-        own = np.array([m.H.T @ np.linalg.solve(m.R, m.H) for m in self._models])
-        z = np.concatenate([np.zeros((N, 1)), np.ones((N, 1)), own.reshape(N, -1)], axis=1)
-        z[scenario.topology.index[self._filter.leader], 0] = 1.0
-        P = np.array([scenario.start(node)[1] for node in scenario.nodes])
-        Sigma = np.tile(scenario.plant.start_cov, (N, N))
-        F, Q = scenario.slot_belief
-        whole, covariances = [], []
-        for slot in range((slots[-1] if slots else 0) + 1):
-            if slot > 0:
-                received = self._received(slot, 0, 0)
-                shares = z / self._nu[:, None]
-                z = (self._nu - received.sum(axis=1))[:, None] * shares + received @ shares
-                heard, weight = z[:, 0] > 0.0, np.where(z[:, 0] > 0.0, z[:, 0], 1.0)
-                learned = z[:, 2:].reshape(N, n, n) / weight[:, None, None]
-                G = np.where(heard[:, None, None], learned, own)
-                ahead = F @ P @ F.T + Q
-                P = np.linalg.solve(np.eye(n) + ahead @ G, ahead)
-                P = 0.5 * (P + np.swapaxes(P, -1, -2))
-                number = np.where(heard, z[:, 1] / weight, 1.0)
-                Sigma = self._averaged(slot, self._sensed(Sigma, P, number))
-            if slot in slots:
-                whole.append(Sigma)
-                covariances.append(P)
-        return np.array(whole), np.array(covariances)
+class RunningTotals(Rule):
+    """Clocks: each node's mass, the total it ever sent to each hearer, the last totals it heard."""
 
-    def _sensed(self, Sigma: FloatArray, P: FloatArray, number: FloatArray) -> FloatArray:
-        """Step 4: x - xhat after the reading of a slot."""
-        n, plant, scenario = self._n, self._scenario.slot_plant, self._scenario
-        moves, noise = [], []
-        for i, model in enumerate(self._models):
-            gain = number[i] * P[i] @ np.linalg.solve(model.R, model.H).T
-            moves.append(np.eye(n) - gain @ model.H)
-            noise.append(gain @ scenario.observation(scenario.nodes[i])[1] @ gain.T)
-        closed = block_diagonal(moves)
-        ahead = np.kron(np.eye(self._N), plant.F)
-        moved = ahead @ Sigma @ ahead.T + np.tile(plant.Q, (self._N, self._N))
-        return np.asarray(closed @ moved @ closed.T + block_diagonal(noise))
+    def __init__(
+        self, scenario: Scenario, errors: Errors, rounds: Mapping[float, Sequence[int]]
+    ) -> None:
+        super().__init__(scenario, errors, rounds)
+        if errors.follows:
+            raise TheoryError("the exact errors are known for filters that have the plant's A")
+        plant, n = scenario.truth, errors.n
+        self._A, self._rounds = plant.A, rounds
+        self._rate = max(0.0, -float(np.linalg.eigvals(plant.A).real.min()))
+        self._totals: dict[Hashable, Total] = {}
+        self._number: dict[tuple[int, int], int] = {}
+        self._receivers = [0] * errors.hosts
+        for sender, _ in scenario.topology.directions:
+            self._receivers[scenario.topology.index[sender]] += 1
+        for host in range(errors.hosts):
+            self._put(("mass", host), Total(1.0, np.zeros((n, n))), np.zeros((n, 0)))
+            for name in ("sent", "used"):
+                self._put((name, host), Total(0.0, np.zeros((n, n))), np.zeros((n, 0)))
 
-    def _averaged(self, slot: int, Sigma: FloatArray) -> FloatArray:
-        """Step 5: gamma averaging steps."""
-        for step in range(self._filter.gamma):
-            received = self._received(slot, 1, step)
-            laplacian = np.diag(received.sum(axis=1)) - received
-            mixing = np.eye(self._N) - laplacian / self._filter.delta
-            whole = np.kron(mixing, np.eye(self._n))
-            Sigma = whole @ Sigma @ whole.T
-        return Sigma
+    def _put(self, name: Hashable, total: Total, form: FloatArray) -> None:
+        self._totals[name] = total
+        self.errors.stack.put(name, form)
+
+    def _sum(self, *parts: tuple[float, Hashable]) -> tuple[Total, FloatArray]:
+        """A combination of totals."""
+        stack, totals = self.errors.stack, self._totals
+        weight = sum(c * totals[name].weight for c, name in parts)
+        U = np.asarray(sum(c * totals[name].U for c, name in parts))
+        form = np.asarray(sum(c * stack.form(name) for c, name in parts))
+        return Total(weight, U), form
+
+    def passed(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
+        """Totals come to refer to now; the plant's noise is in the inputs ``columns``."""
+        if gap <= 0.0 or columns is None or noise is None:
+            return
+        inverse = np.asarray(scipy.linalg.expm(-gap * self._A))
+        fading = math.exp(-2.0 * self._rate * gap)
+        for name, total in self._totals.items():
+            U = fading * (inverse.T @ total.U @ inverse)
+            self._totals[name] = Total(total.weight, U)
+            if U.any():
+                self.errors.stack.put(name, fading * inverse.T @ self.errors.stack.form(name))
+                self.errors.stack.add(name, columns, -U @ noise)
+
+    def sense(self, time: float, seen: Observed) -> None:
+        """Samples enter the mass, and then senders give their shares."""
+        columns = self.errors.readings(seen)
+        for host, one in seen.items():
+            self._add(host, one, columns[host])
+            self._use(host)
+        for host in self._rounds.get(time, ()):
+            self._offer(host)
+
+    def _add(self, host: int, one: Seen, columns: slice) -> None:
+        name, weighted = ("mass", host), np.linalg.solve(one.R, one.H).T
+        weight, U = self._totals[name]
+        self._totals[name] = Total(weight, U + weighted @ one.H)
+        self.errors.stack.add(name, columns, weighted @ one.root)
+
+    def _offer(self, host: int) -> None:
+        count, mass, sent = self._receivers[host], ("mass", host), ("sent", host)
+        if count == 0:
+            return
+        share = 1.0 / (count + 1)
+        offered = self._sum((1.0, sent), (share, mass))
+        kept = self._sum((1.0 - count * share, mass))
+        self._put(sent, *offered)
+        self._put(mass, *kept)
+
+    def send(self, messages: Sequence[Sent]) -> None:
+        """What will arrive is kept: a total as it was when it was sent."""
+        for message in messages:
+            self._put(message, *self._sum((1.0, ("sent", message.sender))))
+
+    def arrive(self, time: float, messages: Sequence[Sent]) -> None:
+        """A hearer gains what a total grew by; an older one brings nothing."""
+        ordered = sorted(messages, key=lambda m: (m.receiver, m.sender, m.number))
+        for message in ordered:
+            link, heard = (message.sender, message.receiver), ("heard", *message[:2])
+            if message.number > self._number.get(link, -1):
+                mass = ("mass", message.receiver)
+                parts = [(1.0, mass), (1.0, message)]
+                if heard in self._totals:
+                    parts.append((-1.0, heard))
+                gained = self._sum(*parts)
+                self._put(heard, *self._sum((1.0, message)))
+                self._put(mass, *gained)
+                self._number[link] = message.number
+        for message in messages:
+            del self._totals[message]
+        self.errors.stack.drop(messages)
+        for host in sorted({message.receiver for message in messages}):
+            self._use(host)
+
+    def _use(self, host: int) -> None:
+        """Put what is new into the estimate where that leaves a covariance."""
+        errors, n = self.errors, self.errors.n
+        mass, used = ("mass", host), ("used", host)
+        factor = errors.hosts / self._totals[mass].weight
+        new, form = self._sum((factor, mass), (-1.0, used))
+        S = errors.roots[host]
+        values = np.linalg.eigvalsh(np.eye(n) + S.T @ (0.5 * (new.U + new.U.T)) @ S)
+        if not new.U.any() or not values[0] > LEAST:
+            return
+        root = informed(S, new.U)
+        P = root @ root.T
+        known = self._sum((factor, mass))
+        errors.stack.put(host, (np.eye(n) - P @ new.U) @ errors.stack.form(host) - P @ form)
+        errors.roots[host] = root
+        self._put(used, *known)

@@ -1,0 +1,68 @@
+"""What the nodes of a scenario read: increments, and samples by slot or time, as H, R and the root of
+the true R. The H of random regressors and recorded ones are those of the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams
+from netkf.scenario.scenario import Placed, Scenario
+from netkf.theory.moves import Seen, together
+from netkf.trace.run import Run
+
+Observed = dict[int, Seen]
+"""By the place of the node."""
+
+
+def hosts_of(scenario: Scenario) -> list[tuple[int, ...]]:
+    """The nodes whose readings each filter uses: one filter for all where they are pooled."""
+    if scenario.filter.algorithm.pooled:
+        return [scenario.nodes]
+    return [(node,) for node in scenario.nodes]
+
+
+def _seen(scenario: Scenario, place: Placed, H: FloatArray) -> Seen:
+    R, true = (scenario.noise(place.entry, believed) for believed in (True, False))
+    return Seen(H, R, np.asarray(np.linalg.cholesky(true), dtype=np.float64))
+
+
+def increments(scenario: Scenario) -> list[Seen]:
+    """Of each host, p may be 0."""
+    placed, n = scenario.placed, scenario.plant.n
+    found = []
+    for nodes in hosts_of(scenario):
+        places = [place for node in nodes for place in placed.get(node, ())]
+        sensors = [_seen(scenario, p, scenario.sensors[p.entry].H) for p in places]
+        found.append(together(sensors, n))
+    return found
+
+
+def in_slots(scenario: Scenario, run: Run) -> Callable[[int], Observed]:
+    """The readings of a slot, by host; slots must be asked for in their order."""
+    streams, n = Streams(run.seed, run.replica), scenario.plant.n
+    hosts = [
+        [
+            (place, scenario.slot_path(streams, node, place))
+            for node in nodes
+            for place in scenario.placed.get(node, ())
+        ]
+        for nodes in hosts_of(scenario)
+    ]
+
+    def seen(slot: int) -> Observed:
+        return {
+            host: together([_seen(scenario, p, path.matrix(slot)) for p, path in paths], n)
+            for host, paths in enumerate(hosts)
+            if paths
+        }
+
+    return seen
+
+
+def sampled(scenario: Scenario, run: Run) -> dict[float, Observed]:
+    """The samples of a run in continuous time, by their time."""
+    return {}
