@@ -5,9 +5,9 @@ from where the plant's differs; :class:`Drift` makes such a :class:`Gap` of a di
 increments each error has a transition of its own, which :class:`Flow` gives: with ``[X; Y](s) =
 E(s) [I; P]`` and ``E(s) = exp(M s)``, M the Hamiltonian, ``Phi(g, s) = X(g)^-T X(s)^T`` and
 ``Phi(g, s) L(s) = X(g)^-T Y(s)^T H' R^-1`` are entire functions of s, which eight Gauss-Legendre
-nodes integrate to machine precision over steps of |M| g <= 1/2. Covariances enter and leave as roots
-``P = S S'``, since ``(I + P G)^-1`` has no digits left where P is wide: with ``G_g = Gamma' Gamma``
-from the same nodes and ``[I; Gamma S] = Z U``, it is ``I - (S Z_1)(Z_2' Gamma)``.
+nodes integrate to machine precision over steps of |M| g <= 1/2. Covariances enter and leave as
+roots ``P = S S'``, since ``(I + P G)^-1`` has no digits left where P is wide: with ``G_g = Gamma'
+Gamma`` from the same nodes and ``[I; Gamma S] = Z U``, it is ``I - (S Z_1)(Z_2' Gamma)``.
 """
 
 from __future__ import annotations
@@ -59,6 +59,8 @@ class Exponential:
 def lower_root(parts: FloatArray) -> FloatArray:
     """(..., n, n) lower triangular S with ``S S' = parts parts'``, parts (..., n, k)."""
     n, k = parts.shape[-2:]
+    if k == 0:
+        return np.zeros((*parts.shape[:-1], n))
     if k < n:
         widths = [(0, 0)] * (parts.ndim - 1) + [(0, n - k)]
         parts = np.pad(parts, widths)
@@ -116,8 +118,8 @@ class _Linear:
 
 class Moved(NamedTuple):
     """What becomes of K errors over a gap: transition (K, n, n), follow (K, n, n) of x, response
-    (K, n, k) to the plant's k inputs, own (K, n, n) to readings' noises of their own, root (K, n,
-    n) of P.
+    (K, n, k) to the plant's k inputs, own (K, n, q) to q noises of their readings, at most n, root
+    (K, n, n) of P.
     """
 
     transition: FloatArray
@@ -183,8 +185,10 @@ class Flow:
             response = response + self._through_state(FJ, FC, gap)
         gains = (FJ[:, None] @ T21[:-1] + FC[:, None] @ T22[:-1]) @ self._noise
         own = _side_by_side(at * gains)
+        if own.shape[2] > self._n:
+            own = lower_root(own)
         root = self._root(F, F @ SZ, T11[:-1], T21[:-1], at)
-        return Moved(FJ, follow, _side_by_side(at * response), lower_root(own), root)
+        return Moved(FJ, follow, _side_by_side(at * response), own, root)
 
     def _gained(
         self, roots: FloatArray, pieces: FloatArray
@@ -195,8 +199,7 @@ class Flow:
         if not len(Gamma):
             return eye, roots @ np.swapaxes(roots, 1, 2), roots
         Z, _ = np.linalg.qr(np.concatenate([eye, Gamma @ roots], axis=1))
-        SZ = roots @ Z[:, :n] * 1.0
-        # Z_1 = U^-1 whatever the signs of U
+        SZ = roots @ Z[:, :n]  # Z_1 = U^-1 whatever the signs of U
         J = eye - SZ @ (np.swapaxes(Z[:, n:], 1, 2) @ Gamma)
         return J, SZ @ np.swapaxes(SZ, 1, 2), SZ
 

@@ -1,5 +1,5 @@
 """What filters do with readings and with what they hear, for roots of P and for errors: each move
-of an estimate is ``e+ = sum W_j e_j - K v``, and the functions here give the W, K and the root of P.
+of an estimate is ``e+ = sum W_j e_j - K v``, and the functions here give W, K and the root of P.
 """
 
 from __future__ import annotations
@@ -7,7 +7,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.theory.gaps import lower_root
@@ -25,6 +24,8 @@ class Seen(NamedTuple):
 
 def together(readings: list[Seen], n: int) -> Seen:
     """As one."""
+    if len(readings) == 1:
+        return readings[0]
     H = np.concatenate([np.zeros((0, n)), *(seen.H for seen in readings)])
     R, root = (block_diagonal([seen[k] for seen in readings]) for k in (1, 2))
     return Seen(H, R, root)
@@ -35,11 +36,11 @@ def kalman(root: FloatArray, seen: Seen) -> tuple[FloatArray, FloatArray, FloatA
     p, n = seen.H.shape
     if not p:
         return np.eye(n), np.zeros((n, 0)), root
-    S = np.concatenate([np.concatenate([np.linalg.cholesky(seen.R), seen.H @ root], axis=1)])
-    whole = np.concatenate([S, np.concatenate([np.zeros((n, p)), root], axis=1)])
+    whole = np.zeros((p + n, p + n))
+    whole[:p, :p], whole[:p, p:], whole[p:, p:] = np.linalg.cholesky(seen.R), seen.H @ root, root
     L = lower_root(whole)
-    K = scipy.linalg.solve_triangular(L[:p, :p], L[p:, :p].T, lower=True, trans="T").T
-    return np.eye(n) - K @ seen.H, K, L[p:, p:]
+    K = np.linalg.solve(L[:p, :p].T, L[p:, :p].T).T
+    return np.eye(n) - K @ seen.H, np.asarray(K, dtype=np.float64), L[p:, p:]
 
 
 def convex(weights: list[float], roots: list[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:

@@ -1,5 +1,5 @@
-"""What the nodes of a scenario read: increments, and samples by slot or time, as H, R and the root of
-the true R. The H of random regressors and recorded ones are those of the run.
+"""What the nodes of a scenario read: increments, and samples by slot or time, as H, R and the root
+of the true R. The H of random regressors and recorded ones are those of the run.
 """
 
 from __future__ import annotations

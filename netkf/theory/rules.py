@@ -1,7 +1,7 @@
 """What each filter does with readings and messages, as moves of stacked errors.
 
-A rule is told what happens in the order in which it happens: ``sense`` at the samples of an instant,
-``send`` when messages leave, ``arrive`` when they are there.
+A rule is told what happens in its order: ``sense`` at the samples of an instant, ``send`` when
+messages leave, ``arrive`` when they are there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.moves import convex, intersected
 from netkf.theory.observed import Observed
-from netkf.theory.stacked_errors import Errors
+from netkf.theory.stacked_errors import Errors, Part
 
 
 class Sent(NamedTuple):
@@ -82,7 +82,7 @@ class Estimates(Rule):
         inboxes: dict[int, dict[int, Sent]] = {}
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
             inboxes.setdefault(message.receiver, {})[message.sender] = message
-        changes = {
+        changes: dict[Hashable, tuple[FloatArray, Sequence[Part]]] = {
             receiver: self._used(receiver, list(inbox.values()))
             for receiver, inbox in inboxes.items()
         }

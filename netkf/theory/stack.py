@@ -48,7 +48,7 @@ class Stack:
         rows = sorted(self._place.values())
         whole = self._forms[rows, :, : self._used].reshape(len(rows) * self._n, self._used)
         if whole.shape[1] > whole.shape[0]:
-            whole = np.linalg.qr(whole.T, mode="r").T
+            whole = np.asarray(np.linalg.qr(whole.T, mode="r")).T
         self._used = whole.shape[1]
         room = max(self._used + count + ROOM, len(self._forms) * self._n + count + ROOM)
         forms = np.zeros((len(self._forms), self._n, room))

@@ -1,4 +1,4 @@
-"""Errors of all estimates of a run in one stack, with the roots of their P, and how time moves them.
+"""Errors of all estimates of a run in one stack, the roots of their P, and how time moves them.
 
 An estimate is a node's, a copy of it under way, or what a node's will be once a reading has come;
 names are any hashable values, a node's is its place. The state itself is kept where the errors
@@ -15,7 +15,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
-from netkf.theory.gaps import Drift, Flow, Gap, state_over
+from netkf.theory.gaps import Drift, Flow, Gap, lower_root, state_over
 from netkf.theory.moves import Seen, kalman
 from netkf.theory.stack import Stack
 
@@ -133,7 +133,7 @@ class Errors:
 
 def _predicted(S: FloatArray, gap: Gap) -> FloatArray:
     whole = np.concatenate([gap.error @ S, gap.root], axis=1)
-    return np.asarray(np.linalg.qr(whole.T, mode="r").T)
+    return lower_root(whole)
 
 
 class Increments(NamedTuple):
@@ -192,7 +192,7 @@ class Clock:
             forms[:, :, shared] += moved.response
             for k, name in enumerate(names):
                 # a version of a node's estimate has the increments of the node
-                forms[k, :, place : place + n] += moved.own[k]
+                forms[k, :, place : place + moved.own.shape[2]] += moved.own[k]
                 place += n
                 errors.roots[name] = moved.root[k]
             errors.stack.put_all(dict(zip(names, forms, strict=True)))
