@@ -32,7 +32,7 @@ def _seen(scenario: Scenario, place: Placed, H: FloatArray) -> Seen:
 
 def increments(scenario: Scenario) -> list[Seen]:
     """Of each host, p may be 0."""
-    placed, n = scenario.placed, scenario.plant.n
+    placed, n = getattr(scenario, "increment_sensors", scenario.placed), scenario.plant.n
     found = []
     for nodes in hosts_of(scenario):
         places = [place for node in nodes for place in placed.get(node, ())]
@@ -64,5 +64,26 @@ def in_slots(scenario: Scenario, run: Run) -> Callable[[int], Observed]:
 
 
 def sampled(scenario: Scenario, run: Run) -> dict[float, Observed]:
-    """The samples of a run in continuous time, by their time."""
-    return {}
+    """The samples of a run in continuous time, by their time and host; those of one node or one
+    pooled filter at one instant are one reading.
+    """
+    streams, n = Streams(run.seed, run.replica), scenario.plant.n
+    by_node: dict[int, tuple[Placed, ...]] = getattr(scenario, "sampled_sensors", {})
+    if not by_node:
+        return {}
+    times = getattr(scenario, "sample_times")(streams)
+    sample_path = getattr(scenario, "sample_path")
+    found: dict[float, dict[int, list[Seen]]] = {}
+    for host, nodes in enumerate(hosts_of(scenario)):
+        for node in nodes:
+            for place in by_node.get(node, ()):
+                sensor = scenario.sensors[place.entry]
+                path = sample_path(streams, node, place) if sensor.varying else None
+                for k, time in enumerate(times[node, place.ordinal].tolist()):
+                    H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
+                    here = found.setdefault(time, {})
+                    here.setdefault(host, []).append(_seen(scenario, place, H))
+    return {
+        time: {host: together(readings, n) for host, readings in here.items()}
+        for time, here in found.items()
+    }
