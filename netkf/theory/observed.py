@@ -10,6 +10,12 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
+from netkf.scenario.sampling import (
+    increment_sensors,
+    sample_path,
+    sample_times,
+    sampled_sensors,
+)
 from netkf.scenario.scenario import Placed, Scenario
 from netkf.theory.moves import Seen, together
 from netkf.trace.run import Run
@@ -32,13 +38,18 @@ def _seen(scenario: Scenario, place: Placed, H: FloatArray) -> Seen:
 
 def increments(scenario: Scenario) -> list[Seen]:
     """Of each host, p may be 0."""
-    placed, n = getattr(scenario, "increment_sensors", scenario.placed), scenario.plant.n
+    placed, n = increment_sensors(scenario), scenario.plant.n
     found = []
     for nodes in hosts_of(scenario):
         places = [place for node in nodes for place in placed.get(node, ())]
         sensors = [_seen(scenario, p, scenario.sensors[p.entry].H) for p in places]
         found.append(together(sensors, n))
     return found
+
+
+def _here(scenario: Scenario, rows: list[tuple[Placed, FloatArray]]) -> list[Seen]:
+    """Without sensors that have no reading now."""
+    return [_seen(scenario, place, H) for place, H in rows if len(H)]
 
 
 def in_slots(scenario: Scenario, run: Run) -> Callable[[int], Observed]:
@@ -55,7 +66,7 @@ def in_slots(scenario: Scenario, run: Run) -> Callable[[int], Observed]:
 
     def seen(slot: int) -> Observed:
         return {
-            host: together([_seen(scenario, p, path.matrix(slot)) for p, path in paths], n)
+            host: together(_here(scenario, [(p, path.matrix(slot)) for p, path in paths]), n)
             for host, paths in enumerate(hosts)
             if paths
         }
@@ -68,17 +79,14 @@ def sampled(scenario: Scenario, run: Run) -> dict[float, Observed]:
     pooled filter at one instant are one reading.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
-    by_node: dict[int, tuple[Placed, ...]] = getattr(scenario, "sampled_sensors", {})
-    if not by_node:
-        return {}
-    times = getattr(scenario, "sample_times")(streams)
-    sample_path = getattr(scenario, "sample_path")
+    by_node = sampled_sensors(scenario)
+    times = sample_times(scenario, streams)
     found: dict[float, dict[int, list[Seen]]] = {}
     for host, nodes in enumerate(hosts_of(scenario)):
         for node in nodes:
             for place in by_node.get(node, ()):
                 sensor = scenario.sensors[place.entry]
-                path = sample_path(streams, node, place) if sensor.varying else None
+                path = sample_path(scenario, streams, node, place) if sensor.varying else None
                 for k, time in enumerate(times[node, place.ordinal].tolist()):
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
                     here = found.setdefault(time, {})

@@ -4,8 +4,8 @@ the mass, under clocks broadcast rounds by running sums.
 Under clocks every total (U, u) of information about x has an error ``u - U x``. Totals refer to
 now: as time passes ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times itself less
 ``U w``, s the factor with which old information fades. Sums and differences of totals are those of
-their errors, and ``P^-1 += dU``, ``xhat += P (du - dU xhat)`` makes ``e+ = (I - P dU) e - P (du - dU
-x)``: errors are closed, whatever became of x itself.
+their errors, and ``P^-1 += dU``, ``xhat += P (du - dU xhat)`` makes
+``e+ = (I - P dU) e - P (du - dU x)``: errors are closed, whatever became of x itself.
 """
 
 from __future__ import annotations

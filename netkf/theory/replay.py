@@ -11,9 +11,10 @@ import numpy as np
 from netkf.algorithms.baselines import Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.slot import Gossip, Intermittent, SlotLocal
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
@@ -33,7 +34,6 @@ KNOWN = (
     Gossip,
     Intermittent,
     PushSum,
-    SlotLocal,
     Local,
 )
 """Filters whose equations are known here, a class before the one that it derives from."""
@@ -43,7 +43,7 @@ PHASES = {
     Gossip: ("exchange", "sense", "predict"),
     Intermittent: ("sense", "exchange", "predict"),
     PushSum: ("exchange", "predict", "sense", "exchange"),
-    SlotLocal: ("predict", "sense"),
+    Local: ("predict", "sense"),
 }
 """What happens in a slot, in its order."""
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
@@ -195,8 +196,6 @@ class Readings(Rule):
 
 def estimates_rule(scenario: Scenario, errors: Errors) -> Rule:
     """The rule of a filter whose messages are estimates, or that sends none."""
-    from netkf.algorithms.slot import Gossip
-
     algorithm = scenario.filter.algorithm
     if not algorithm.talks:
         return Rule(scenario, errors)
