@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,6 +11,7 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Message, State
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intersection import intersected
+from netkf.algorithms.root_update import intersect_roots
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.small import fill_square, product
@@ -34,23 +34,12 @@ class CovarianceIntersection(Hybrid):
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
         """D (8) and (9) with values from before the reset."""
         weights, means, roots = self._pairs(state, messages)
-        xhat, root = intersected(weights, means, np.stack([regular_root(S) for S in roots]))
+        xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
 
     def shift(self, state: State, offset: FloatArray) -> State:
         """Affine: the weights sum to one."""
         return state._replace(xhat=state.xhat + offset)
-
-
-def regular_root(root: FloatArray) -> FloatArray:
-    """The root itself where it can be inverted, else one that can, see ``invertible_root``."""
-    if not np.isfinite(root).all():
-        return root
-    scale = np.sqrt(np.maximum((root * root).sum(axis=1), TINY))
-    values = np.linalg.svd(root / scale[:, None], compute_uv=False)
-    if values[-1] > math.sqrt(SINGULAR) * values[0]:
-        return root
-    return invertible_root(root @ root.T)
 
 
 @compilable

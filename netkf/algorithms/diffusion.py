@@ -9,8 +9,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo
-from netkf.algorithms.intersection import intersection
-from netkf.core.arrays import FloatArray, square_root
+from netkf.algorithms.models import first_root
+from netkf.algorithms.root_update import intersect_roots
+from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, either, nested, setting, square
@@ -90,7 +91,7 @@ class DiffusionFilter(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> DiffusionState:
         """The node knows its own weight."""
-        return DiffusionState(mean, square_root(cov), model, node.own_weight)
+        return DiffusionState(mean, first_root(cov), model, node.own_weight)
 
     def absorb(
         self, state: DiffusionState, messages: Sequence[Message], exchange: Exchange
@@ -99,11 +100,12 @@ class DiffusionFilter(Filter):
         own, heard = self.share(state.own, [message.weight for message in messages])
         if own == 1.0 or not messages:
             return state
-        parts = [(own, state.xhat, state.root)]
-        for weight, message in zip(heard, messages, strict=True):
+        pairs = [(state.xhat, state.root)]
+        for message in messages:
             pair = message.payload
-            parts.append((weight, *state.model.extrapolate(pair.xhat, pair.root, message.age)))
-        xhat, root = intersection(parts)
+            pairs.append(state.model.extrapolate(pair.xhat, pair.root, message.age))
+        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
+        xhat, root = intersect_roots(np.array([own, *heard]), means, roots)
         return state._replace(xhat=xhat, root=root)
 
     def shift(self, state: DiffusionState, offset: FloatArray) -> DiffusionState:

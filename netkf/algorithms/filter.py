@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, square_root
+from netkf.core.arrays import FloatArray
 from netkf.core.fields import Part
 
 CLOCKS = ("links", "directions", "nodes", "readings")
@@ -204,7 +204,9 @@ class Filter(Part):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """The state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
-        return State(mean, square_root(cov), model)
+        from netkf.algorithms.models import first_root
+
+        return State(mean, first_root(cov), model)
 
     def predict(self, state: Any, gap: float) -> Any:
         """The state ``gap`` > 0 seconds later (in slots a period). Where the node has increment

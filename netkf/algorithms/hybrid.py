@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
-from netkf.algorithms.square_root import lower_triangular
+from netkf.algorithms.root_update import combine_roots
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable_as, in_place
 from netkf.core.fields import number, setting
@@ -30,7 +30,7 @@ class Hybrid(Filter):
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
         """H (7) and (9): all right-hand sides are values from before the reset."""
         weights, means, roots = self._pairs(state, messages)
-        xhat, root = combined(weights, means, roots)
+        xhat, root = combine_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
 
     def _pairs(
@@ -54,16 +54,6 @@ class Hybrid(Filter):
     def shift(self, state: State, offset: FloatArray) -> State:
         """Affine: the weights sum to one."""
         return state._replace(xhat=state.xhat + offset)
-
-
-def combined(
-    weights: FloatArray, means: FloatArray, roots: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """``sum w xhat`` (n,) and the root (n, n) of ``sum w P``, of weights (k,), means (k, n) and
-    roots (k, n, n).
-    """
-    scaled = np.sqrt(weights)[:, None, None] * roots
-    return weights @ means, lower_triangular(np.concatenate(list(scaled), axis=1))
 
 
 @in_place

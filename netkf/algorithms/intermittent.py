@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.models import sample_update
-from netkf.core.arrays import FloatArray, square_root
+from netkf.algorithms.models import first_root, sample_update
+from netkf.core.arrays import FloatArray
 from netkf.core.fields import choice, positive, setting
 
 SLACK = 1.0 + 1e-6
@@ -76,7 +76,7 @@ class Intermittent(Filter):
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> IntermittentState:
         """Nothing has happened yet."""
-        root = square_root(cov)
+        root = first_root(cov)
         lag = node.max_delay if self.window is None else min(self.window, node.max_delay)
         start = Past(0.0, None, None, mean, root, None)
         kept = 0.0 if self.late == "drop" else lag

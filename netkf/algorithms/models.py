@@ -10,9 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.gains import GainTable, gain_table, gain_update
-from netkf.algorithms.riccati import RiccatiTable, riccati_step, riccati_table
-from netkf.algorithms.square_root import lower_triangular, predict_root
+from netkf.algorithms.gains import GainTable, gain_table
+from netkf.algorithms.riccati import RiccatiTable, riccati_table
+from netkf.algorithms.root_flow import FlowTable, flow_root, flow_table, gain_update_root
+from netkf.algorithms.root_update import lower_root, update_with_sample
+from netkf.algorithms.square_root import predict_root
 from netkf.core.arrays import FloatArray, square_root, symmetric
 from netkf.core.compiling import in_place
 
@@ -65,6 +67,17 @@ class FlowModel:
         return gain_table(self.A, self.Q, self.H, self.R, self.interval)
 
     @cached_property
+    def flow(self) -> FlowTable:
+        """How the root of P moves with this node's readings."""
+        return flow_table(self.A, self.Q, self.H, self.R, self.horizon)
+
+    @cached_property
+    def blind_flow(self) -> FlowTable:
+        """How the root of P moves without readings."""
+        nothing = np.zeros((0, len(self.A)))
+        return flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
+
+    @cached_property
     def _forgetting(self) -> float:
         """The fastest rate at which the plant forgets its state, 1/s; 0 if it never does."""
         return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
@@ -80,8 +93,8 @@ class FlowModel:
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
         """``gap`` seconds later; the root counts the readings of the gap."""
-        P, xhat = riccati_step(self.riccati, root @ root.T, xhat, gap)
-        return xhat, square_root(P)
+        root, xhat = flow_root(self.flow, root, xhat, gap)
+        return xhat, root
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
@@ -89,18 +102,19 @@ class FlowModel:
         """``age`` seconds later without readings."""
         if age <= 0.0:
             return xhat, root
-        P, xhat = riccati_step(self.prediction, root @ root.T, xhat, age)
-        return xhat, square_root(P)
+        root, xhat = flow_root(self.blind_flow, root, xhat, age)
+        return xhat, root
 
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
         """The estimate once the increments of the gap are used, see algorithms/gains."""
-        return gain_update(self.gains, root @ root.T, xhat, moments, gap)
+        return gain_update_root(self.gains, root, xhat, moments, gap)
 
     def max_interval(self, root: FloatArray) -> float:
         """See ``Filter.max_measurement_interval``."""
-        return usable(float(((root @ root.T) * self.information).sum()))
+        seen = self.flow.seen[0] @ root
+        return usable(float((seen * seen).sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,17 +174,15 @@ def usable(rate: float) -> float:
     return STRETCH / rate if rate > 0.0 else math.inf
 
 
+def first_root(cov: FloatArray) -> FloatArray:
+    """The lower triangular root (n, n) of a first covariance."""
+    return lower_root(square_root(cov))
+
+
 def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Estimate (n,) and root (n, n) after a sample ``y = H x + v``, cov(v) = R, p > 0 rows.
-
-    One triangularisation of [[H S, root(R)], [S, 0]] gives the innovation's root, the gain and the
-    new root (Kailath, Sayed and Hassibi, Linear Estimation, section 12.3).
-    """
-    p, n = H.shape
-    work = np.zeros((p + n, n + p))
-    work[:p, :n], work[:p, n:], work[p:, :n] = H @ root, np.linalg.cholesky(R), root
-    L = lower_triangular(work)
-    innovation = np.linalg.solve(L[:p, :p], y - H @ xhat)
-    return xhat + L[p:, :p] @ innovation, L[p:, p:].copy()
+    """Estimate (n,) and root (n, n) after a sample ``y = H x + v``, cov(v) = R, p > 0 rows."""
+    noise = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
+    root, xhat, _ = update_with_sample(root, xhat, y, H, noise)
+    return xhat, root

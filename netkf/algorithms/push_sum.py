@@ -17,7 +17,7 @@ import numpy as np
 
 from netkf.algorithms import running_sums
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.models import SlotModel
+from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.running_sums import Offer, RunningSums
 from netkf.algorithms.square_root import lower_triangular
 from netkf.algorithms.stopping import RULES, stops
@@ -103,7 +103,7 @@ class PushSum(Filter):
         if self.asymptotic:
             root = asymptotic_root(model.F, model.Q, node.information)
             known = Network(node.information, float(node.nodes), root)
-        return PushSumState(mean, square_root(cov), model, mass, known, False, node.degree)
+        return PushSumState(mean, first_root(cov), model, mass, known, False, node.degree)
 
     def predict(self, state: Any, gap: float) -> Any:
         """Estimate, covariance and, in running sums, all information."""

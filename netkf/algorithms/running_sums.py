@@ -24,8 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Message, NodeInfo, Reading
-from netkf.algorithms.models import Backward
-from netkf.core.arrays import FloatArray, square_root
+from netkf.algorithms.models import Backward, first_root
+from netkf.algorithms.root_update import lower_root
+from netkf.core.arrays import FloatArray
 
 LEAST = 0.05
 """Least eigenvalue of I + root' dU root that is used: a reading looks N times as precise at its own
@@ -100,7 +101,7 @@ def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Runn
     mass[0] = 1.0
     return RunningSums(
         xhat=mean,
-        root=square_root(cov),
+        root=first_root(cov),
         model=model,
         mass=mass,
         sent=np.zeros_like(mass),
@@ -163,7 +164,7 @@ def _use(state: RunningSums) -> RunningSums:
     if not values[0] > LEAST:
         return state
     # (P^-1 + dU)^-1 = S (I + S' dU S)^-1 S'
-    root = S @ (vectors / np.sqrt(values))
+    root = lower_root(S @ (vectors / np.sqrt(values)))
     xhat = state.xhat + root @ (root.T @ (du - dU @ state.xhat))
     return state._replace(xhat=xhat, root=root, used=known)
 

@@ -102,40 +102,17 @@ def _replaced(scenario: Scenario) -> Scenario:
 
 
 def promised_filter(algorithm: Any) -> Any:
-    """A filter of this package: the given one, or what it is derived from, or what its settings
-    make of it. Raises TheoryError where nothing is promised of it.
+    """A filter of this package: the given one, or the one that its class is derived from. Raises
+    TheoryError for a class that is derived from none, of which nothing is promised.
     """
     for kind in type(algorithm).__mro__:
         if any(kind in family.values() for family in (KINDS["filter"], KINDS["slot filter"])):
             return algorithm if not own_steps(algorithm, kind) else _like(kind, algorithm)
-    resembled = _flow_kind(algorithm) or _slot_kind(algorithm)
-    if resembled is not None:
-        return _like(resembled, algorithm)
     name = type(algorithm).__name__
     raise TheoryError(
         f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which one "
         "it should be"
     )
-
-
-def _flow_kind(algorithm: Any) -> type[Part] | None:
-    """By its settings: a weight for all links makes a hybrid filter."""
-    known = not scenario.slotted and hasattr(algorithm, "epsilon")
-    return KINDS["filter"]["hybrid"] if known else None
-
-
-def _slot_kind(algorithm: Any) -> type[Part] | None:
-    """By its settings and its programme."""
-    if not scenario.slotted:
-        return None
-    name = None
-    if hasattr(algorithm, "gamma") and hasattr(algorithm, "delta"):
-        name = "push-sum"
-    elif algorithm.pairwise:
-        name = "gossip"
-    elif scenario.hosted.schedule == ("sense", "exchange", "predict") and algorithm.predicts:
-        name = "diffusion" if hasattr(algorithm, "weights") else "intermittent"
-    return None if name is None else KINDS["slot filter"][name]
 
 
 def _like(kind: type[Part], algorithm: Any) -> Part:
