@@ -259,10 +259,8 @@ class RecordedSensor(Sensor):
         """
         return by_slot(self.path, self._rows[node], period, f" of node {node}")
 
-    def demand(self, slots: Iterable[int], period: float) -> None:
-        """Raise ScenarioError where the table does not fit slots of that ``period``; it may lack
-        some of the ``slots``.
-        """
+    def demand(self, period: float) -> None:
+        """Raise ScenarioError where the table does not fit slots of that ``period``."""
         for node in self.nodes:
             self.table(node, period)
 
@@ -319,20 +317,21 @@ class RecordedReadings:
         self._H, self._table = H, table
 
     def matrix(self, slot: int) -> FloatArray:
-        """H (p, n) as the filters take it to be, or as it is recorded; (0, n) without a row."""
+        """H (p, n) as the filters take it to be, or as it is recorded; zeros without a row."""
         row = self._table.get(slot)
         if row is None:
-            return self._H[:0]
+            return np.zeros_like(self._H)
         phi = row[len(self._H) :]
         return phi[None] if phi.size else self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """(p,) the reading of a slot; (0,) without a row."""
-        return self._table.get(slot, NOTHING)[: len(self._H)]
+        """(p,) the reading of a slot; nan without a row."""
+        row = self._table.get(slot)
+        return np.full(len(self._H), math.nan) if row is None else row[: len(self._H)]
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both, (S, p) and (S, p, n), of some slots; zeros without a row, which tell a filter as
-        little.
+        """Both, (S, p) and (S, p, n), of some slots; without a row zeros of both, which tell a
+        filter nothing.
         """
         y, H = np.zeros((len(slots), len(self._H))), np.zeros((len(slots), *self._H.shape))
         for k, slot in enumerate(slots):

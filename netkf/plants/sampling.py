@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, block_diagonal
+from netkf.core.arrays import FloatArray
 from netkf.core.clock import Clock, Entity
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Rule, SourceFile, setting, source_file
@@ -64,18 +64,6 @@ class RecordedSamples:
         if rows.shape[1] > p:
             return rows[:, :p], rows[:, None, p:]
         return rows, np.broadcast_to(self._H, (len(rows), *self._H.shape))
-
-
-def joined(
-    parts: Sequence[tuple[FloatArray, FloatArray]], noise: Sequence[FloatArray], n: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``y`` (p,), ``H`` (p, n) and ``R`` (p, p) of the readings (y, H) that sensors with noise R
-    take at one instant; a sensor without a reading (no rows) takes no part. p may be 0.
-    """
-    y = np.concatenate([np.empty(0), *(values for values, _ in parts)])
-    H = np.concatenate([np.empty((0, n)), *(rows for _, rows in parts)])
-    here = [R for (values, _), R in zip(parts, noise, strict=True) if len(values)]
-    return y, H, block_diagonal(here)
 
 
 @dataclass(frozen=True, eq=False)

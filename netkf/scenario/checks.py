@@ -18,6 +18,7 @@ from netkf.scenario.combination import check_invertible, check_regressor, check_
 from netkf.scenario.push_sum import check_push_sum
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import spoken
+from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.shapes import demand_shape
 
 if TYPE_CHECKING:
@@ -36,10 +37,11 @@ def check(scenario: Scenario) -> None:
     _network(scenario)
     _filter(scenario)
     check_records(scenario)
+    check_sampling(scenario)
     if scenario.slotted:
         _slots(scenario)
         check_push_sum(scenario)
-    else:
+    elif uses_grid(scenario):
         _sensing_period(scenario)
 
 

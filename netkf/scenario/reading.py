@@ -177,11 +177,9 @@ def _made(cls: type[Any], values: dict[str, Any]) -> Any:
 
 def _plant(value: Any, folder: Path) -> Any:
     table = _table(value)
-    kind = table.get("kind")
-    if kind in ("recorded", "unknown") and ("A" in table or "B" in table):
-        remedy = "give F, Q and period in place of A and B"
-        raise ScenarioError("kind", "exists in slots only", kind, remedy)
-    return _kind("plant", folder, table)
+    known = table.get("kind") in ("recorded", "unknown")
+    continuous = known and ("A" in table or "B" in table)
+    return _kind("continuous plant" if continuous else "plant", folder, table)
 
 
 def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:
@@ -203,9 +201,16 @@ def _list(value: Any, folder: Path) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     return tuple(
-        _under(f"[{k}]", lambda item: _kind("sensor", folder, item, "linear"), item)
-        for k, item in enumerate(value)
+        _under(f"[{k}]", lambda item: _sensor(item, folder), item) for k, item in enumerate(value)
     )
+
+
+def _sensor(value: Any, folder: Path) -> Any:
+    table = _table(value)
+    if isinstance(table.get("sampling"), Mapping):
+        read = partial(_kind, "sampling", folder)
+        table["sampling"] = _under("sampling", read, table["sampling"])
+    return _kind("sensor", folder, table, "linear")
 
 
 def _network(value: Any, folder: Path, time: str) -> Network:

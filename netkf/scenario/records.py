@@ -44,18 +44,12 @@ def _under(key: str, check: Callable[[], None]) -> None:
 
 
 def _readings(scenario: Scenario, key: str, sensor: RecordedSensor) -> None:
-    if not scenario.slotted:
-        raise ScenarioError(
-            f"{key}.kind",
-            "belongs to plants in slots, and this plant is in continuous time",
-            "recorded",
-            "use a linear, recorded or unknown plant",
-        )
     for node in sensor.listed:
         if node not in scenario.topology.index:
             words = f"{sensor.path.name} names a node that the graph does not have"
             raise ScenarioError(f"{key}.path", words, node, "mend the row or the graph")
-    _under(key, lambda: sensor.demand(_sensed(scenario), scenario.slot_plant.period))
+    if scenario.slotted:
+        _under(key, lambda: sensor.demand(scenario.slot_plant.period))
 
 
 def _sensed(scenario: Scenario) -> range:

@@ -16,19 +16,29 @@ from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import SlotFilter
+from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, nearest, quote
 from netkf.core.fields import Part
 from netkf.network import channels, clocks, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
-from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.recorded import (
+    RecordedDiffusion,
+    RecordedPlant,
+    RecordedSensor,
+    UnknownDiffusion,
+    UnknownPlant,
+)
 from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 
 FAMILIES: dict[str, type[Part]] = {
     "plant": Plant,
+    "continuous plant": Plant,
     "sensor": Sensor,
+    "sampling": Clock,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
     "loss": channels.Loss,
@@ -49,7 +59,14 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "recorded": RecordedPlant,
         "unknown": UnknownPlant,
     },
+    "continuous plant": {"recorded": RecordedDiffusion, "unknown": UnknownDiffusion},
     "sensor": {"linear": LinearSensor, "regressor": RegressorSensor, "recorded": RecordedSensor},
+    "sampling": {
+        "periodic": clocks.Periodic,
+        "poisson": clocks.Poisson,
+        "renewal": clocks.Renewal,
+        "recorded": RecordedSampling,
+    },
     "graph": {
         "cycle": graphs.Cycle,
         "path": graphs.PathGraph,
@@ -195,7 +212,8 @@ def _is_abstract(attribute: object) -> bool:
 
 def name_of(family: str, part: Part) -> str:
     """The ``kind`` that :func:`find` would turn into the class of ``part``."""
-    for table in (KINDS[family], KINDS.get(f"slot {family}", {})):
+    others = (KINDS.get(f"{time} {family}", {}) for time in ("slot", "continuous"))
+    for table in (KINDS[family], *others):
         for name, candidate in table.items():
             if type(part) is candidate:
                 return name

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from netkf.algorithms.filter import commutes
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.core.streams import Streams
@@ -18,6 +19,7 @@ from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import RecordedDiffusion, RecordedSensor, UnknownDiffusion
 from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.plants.transitions import frame_period, frame_slots
 from netkf.plants.truth import ContinuousTruth
 
 if TYPE_CHECKING:
@@ -74,7 +76,7 @@ def sample_path(scenario: Scenario, streams: Streams, node: int, place: Placed) 
 
 
 def _placed(scenario: Scenario) -> Iterator[tuple[int, Placed]]:
-    for node, places in sampled_sensors(scenario).items():
+    for node, places in scenario.sampled_sensors.items():
         for place in places:
             yield node, place
 
@@ -93,19 +95,21 @@ def uses_grid(scenario: Scenario) -> bool:
     increments, or there are no sensors at all.
     """
     drawn = not scenario.slotted and scenario.plant.drawn
-    return drawn and (bool(increment_sensors(scenario)) or not sampled_sensors(scenario))
+    return drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
-def may_use_frames(scenario: Scenario) -> bool:
-    """Whether errors can be simulated in frames, given a filter that commutes with a shift: the
-    truth and all readings are drawn, and the filters have the plant's A (in slots F).
+def exact_errors(scenario: Scenario) -> bool:
+    """Whether errors are simulated in frames, see plants.truth: the plant is unstable, its state
+    and all readings are drawn, the filters have its A (in slots F) and commute with a shift.
     """
-    if not scenario.drawn:
+    if not scenario.drawn or not commutes(scenario.hosted):
         return False
     plant = scenario.plant
     if isinstance(plant, LinearPlant):
-        return np.array_equal(scenario.slot_belief[0], plant.F)
-    return np.array_equal(scenario.belief[0], scenario.truth.A)
+        same = np.array_equal(scenario.slot_belief[0], plant.F)
+        return same and frame_slots(plant.F) is not None
+    same = np.array_equal(scenario.belief[0], scenario.truth.A)
+    return same and frame_period(scenario.truth.A) is not None
 
 
 def continuous_truth(
@@ -227,9 +231,3 @@ def sampling_notes(scenario: Scenario) -> tuple[str, ...]:
         if late:
             notes.append(f"{sensor.path.name}: {late} readings at or after the end are not used")
     return tuple(notes)
-
-
-def believed_samples(scenario: Scenario, node: int) -> list[FloatArray]:
-    """R (p, p) of each sampled sensor of a node, as the filters believe it."""
-    places = sampled_sensors(scenario).get(node, ())
-    return [scenario.noise(place.entry, believed=True) for place in places]

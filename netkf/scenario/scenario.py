@@ -48,7 +48,9 @@ from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sampling import Samples
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario import sampling
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +193,8 @@ class Scenario(Part):
         from netkf.scenario.push_sum import push_sum_notes
         from netkf.scenario.records import record_notes
 
-        return (*self.topology.notes, *push_sum_notes(self), *record_notes(self))
+        notes = (*push_sum_notes(self), *record_notes(self), *sampling.sampling_notes(self))
+        return (*self.topology.notes, *notes)
 
     @property
     def slotted(self) -> bool:
@@ -293,9 +296,9 @@ class Scenario(Part):
         if not isinstance(plant, Diffusion):
             raise TheoryError("this is about scenarios in continuous time, and this one has slots")
         filled = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
-        if filled.sensing_period is not None:
+        if filled.sensing_period is not None or not sampling.uses_grid(self):
             return filled
-        seen = (self.observation(node) for node in self.sensing)
+        seen = (self.observation(node) for node in self.increment_sensors)
         distinct = {(H.tobytes(), R.tobytes()): (H, R) for H, R in seen}.values()
         informations = [H.T @ np.linalg.solve(R, H) for H, R in distinct]
         everything = self._stacked(self._everywhere, believed=False)
@@ -313,28 +316,11 @@ class Scenario(Part):
                 here.append(Placed(entry, len(here)))
         return {node: tuple(found[node]) for node in sorted(found)}
 
-    @cached_property
-    def increment_sensors(self) -> dict[int, tuple[Placed, ...]]:
-        """Increment sensors."""
-        return {} if self.slotted else self.placed
-
-    @cached_property
-    def sampled_sensors(self) -> dict[int, tuple[Placed, ...]]:
-        """Sampled sensors."""
-        return {}
-
-    def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
-        """Sample times."""
-        return {}
-
     def continuous_truth(self, streams: Streams) -> Any:
-        """Truth in continuous time."""
-        from netkf.plants.paths import DiffusionPath
-
-        paths = self.truth.paths(
-            [streams.generator("plant")], [streams.generator("probe")], self.times
-        )
-        return DiffusionPath(paths, self.horizon)
+        """The state of one run in continuous time, in frames where they are used; asked for at
+        sample times, probe times and frame times, in order (plants.truth.ContinuousTruth).
+        """
+        return sampling.continuous_truth(self, streams, self.exact_errors)
 
     def slot_truth(self, streams: Streams) -> Any:
         """The state of one run in slots, in frames where they are used."""
@@ -357,19 +343,38 @@ class Scenario(Part):
         return tuple(self.placed)
 
     def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
-        """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together; p may be 0. With
-        ``believed``, R is what the filter takes it to be. Raises TheoryError where H differs from
-        slot to slot.
+        """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together, over a diffusion of
+        those that give increments; p may be 0. With ``believed``, R is what the filter takes it to
+        be. Raises TheoryError where H differs from slot to slot.
         """
-        if any(self.sensors[place.entry].varying for place in self.placed.get(node, ())):
+        placed = (self.placed if self.slotted else self.increment_sensors).get(node, ())
+        if any(self.sensors[place.entry].varying for place in placed):
             raise TheoryError(f"node {node} has a regressor sensor, whose H is random")
-        return self._stacked(self.placed.get(node, ()), believed)
+        return self._stacked(placed, believed)
 
     def _stacked(self, placed: tuple[Placed, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
         H = [self.sensors[place.entry].H for place in placed]
         R = [self.noise(place.entry, believed) for place in placed]
         empty = np.zeros((0, self.plant.n))
         return np.concatenate([empty, *H]), block_diagonal(R)
+
+    @cached_property
+    def increment_sensors(self) -> dict[int, tuple[Placed, ...]]:
+        """The sensors of each node that give increments of a diffusion; empty in slots."""
+        return sampling.increment_sensors(self)
+
+    @cached_property
+    def sampled_sensors(self) -> dict[int, tuple[Placed, ...]]:
+        """The sensors of each node that sample a diffusion; empty in slots."""
+        return sampling.sampled_sensors(self)
+
+    def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
+        """The increasing times below the horizon at which each sensor (node, ordinal) samples."""
+        return sampling.sample_times(self, streams)
+
+    def sample_path(self, streams: Streams, node: int, place: Placed) -> Samples:
+        """The samples of one sensor of a node in one run in continuous time."""
+        return sampling.sample_path(self, streams, node, place)
 
     def slot_path(self, streams: Streams, node: int, place: Placed) -> Readings:
         """The readings of one sensor of a node in one run in slots."""
@@ -427,7 +432,8 @@ class Scenario(Part):
 
     @property
     def _everywhere(self) -> tuple[Placed, ...]:
-        return tuple(place for node in self.placed for place in self.placed[node])
+        placed = self.placed if self.slotted else self.increment_sensors
+        return tuple(place for places in placed.values() for place in places)
 
     def _model(
         self, observation: tuple[FloatArray, FloatArray], made: dict[bytes, FlowModel]

@@ -11,6 +11,7 @@ import numpy as np
 from netkf.core.fields import Part, SourceFile
 from netkf.network.graphs import RandomGraph
 from netkf.plants.plant import Plant
+from netkf.plants.sensors import Sensor
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Filtering, Scenario
 
@@ -49,7 +50,7 @@ def _filled(scenario: Scenario) -> Plant:
 def _scenario(scenario: Scenario, defaults: bool) -> dict[str, Any]:
     network, table = scenario.network, _fields(scenario, defaults)
     table["plant"] = _kind("plant", scenario.plant, defaults)
-    table["sensors"] = [_kind("sensor", sensor, defaults) for sensor in scenario.sensors]
+    table["sensors"] = [_sensor(sensor, defaults) for sensor in scenario.sensors]
     table["network"] = {"graph": _kind("graph", network.graph, defaults)}
     if network.activation is not None:
         table["network"]["activation"] = _kind("activation", network.activation, defaults)
@@ -59,6 +60,14 @@ def _scenario(scenario: Scenario, defaults: bool) -> dict[str, Any]:
     table["network"]["channel"] = channel
     table["filter"] = _filtering(scenario.filter, defaults)
     return {"format": 1, **table}
+
+
+def _sensor(sensor: Sensor, defaults: bool) -> dict[str, Any]:
+    table, clock = _kind("sensor", sensor, defaults), getattr(sensor, "sampling", None)
+    if clock is not None:
+        told = _kind("sampling", clock, defaults)
+        table["sampling"] = {k: v for k, v in told.items() if k not in ("at", "rates")}
+    return table
 
 
 def _filtering(filtering: Filtering, defaults: bool) -> dict[str, Any]:

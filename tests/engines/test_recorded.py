@@ -182,7 +182,7 @@ def test_tables_with_mistakes_are_refused(name, text, words, tmp_path):
         ({"sensors.0.path": "r.csv"}, "sensors[0].path: is not a key here"),
         ({"plant.kind": "unknown"}, "sensors[0].kind: must be recorded where the plant's state"),
         ({"plant.kind": "recorded"}, "plant.path: is missing"),
-        ({"plant": {"kind": "unknown", "A": [[1.0]], "B": [[1.0]]}}, "plant.kind: exists in slots"),
+        ({"plant": {"kind": "unknown", "A": [[1.0]]}}, "plant.B: is missing"),
         ({"plant": {"kind": "unknown", "F": F, "Q": Q}}, "plant.period: is missing"),
         ({"plant.kind": "unknown", "filter.kind": "hybrid"}, "belongs to plants in continuous"),
     ],
@@ -192,13 +192,6 @@ def test_parts_that_do_not_go_together_are_refused(changes, words, tmp_path):
     with pytest.raises(netkf.ScenarioError) as caught:
         base.replace(changes)
     assert words in str(caught.value)
-
-
-def test_recorded_readings_are_for_slots(build, tmp_path):
-    (tmp_path / "r.csv").write_text("t,node,y0\n0.5,0,1.0\n")
-    entry = {"kind": "recorded", "path": "r.csv", "H": [[1.0]], "R": [[0.5]]}
-    with pytest.raises(netkf.ScenarioError, match="belongs to plants in slots"):
-        build(sensors=[entry])
 
 
 def test_recorded_exchanges_that_no_slot_has_are_noted(tmp_path):

@@ -9,7 +9,7 @@ from netkf.core.clock import all_ticks
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import Periodic, Poisson, Renewal
 from netkf.plants.recorded import RecordedReadings, RecordedSensor
-from netkf.plants.sampling import DrawnSamples, RecordedSampling, joined
+from netkf.plants.sampling import DrawnSamples, RecordedSampling
 from netkf.plants.sensors import LinearSensor
 
 H, R = np.array([[1.0, 0.0], [1.0, 1.0]]), np.array([[0.5, 0.1], [0.1, 0.3]])
@@ -135,21 +135,9 @@ def test_recorded_readings_with_regressors(tmp_path):
 
 def test_slots_without_a_row_have_no_reading():
     path = RecordedReadings(H, {0: np.array([1.0, 2.0]), 2: np.array([3.0, 4.0])})
-    assert path.reading(1, None).shape == (0,)
-    assert path.matrix(1).shape == (0, 2)
+    np.testing.assert_array_equal(path.reading(1, None), [np.nan, np.nan])
+    np.testing.assert_array_equal(path.matrix(1), 0.0 * H)
     np.testing.assert_array_equal(path.reading(2, None), [3.0, 4.0])
     y, rows = path.several([0, 1, 2], None)
     np.testing.assert_array_equal(y, [[1.0, 2.0], [0.0, 0.0], [3.0, 4.0]])
     np.testing.assert_array_equal(rows, [H, 0.0 * H, H])
-
-
-def test_readings_of_one_instant_are_joined():
-    one = np.array([1.0]), np.array([[1.0, 0.0]])
-    two = np.array([2.0, 3.0]), H
-    nothing = np.empty(0), np.empty((0, 2))
-    y, rows, noise = joined([one, nothing, two], [np.eye(1), 5.0 * np.eye(2), R], 2)
-    np.testing.assert_array_equal(y, [1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(rows, [[1.0, 0.0], *H])
-    np.testing.assert_array_equal(noise, [[1.0, 0.0, 0.0], [0.0, *R[0]], [0.0, *R[1]]])
-    y, rows, noise = joined([nothing], [np.eye(1)], 2)
-    assert (y.shape, rows.shape, noise.shape) == ((0,), (0, 2), (0, 0))

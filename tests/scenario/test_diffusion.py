@@ -139,7 +139,6 @@ def test_regressors_and_diffusion_belong_to_slots(build):
             ["0.0,0,1.0,1.0,1.0,"],
             "line 2: phi2 must be a finite number",
         ),
-        ("t,node,y0,phi0,phi1,phi2", ["0.0,0,1.0,1.0,1.0,0.0"], "no reading of node 0 for slot 1"),
     ],
 )
 def test_recorded_regressors_are_checked(regression, tmp_path, header, rows, words):
