@@ -1,7 +1,7 @@
 """Flow filters: the former contract of filters in continuous time, for classes of users.
 
-New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a flow
-filter. A flow filter is a frozen dataclass of parameters. Its state is a NamedTuple of arrays that nothing
+New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a
+flow filter. It is a frozen dataclass of parameters, its state a NamedTuple of arrays that nothing
 changes in place; every method returns a new one. The host calls ``flow`` and then, where the node
 has sensors, ``measure`` for the interval that just passed, and ``emit``/``absorb`` for messages.
 """

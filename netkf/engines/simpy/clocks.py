@@ -41,8 +41,12 @@ def clock_processes(
     activation = scenario.network.activation
     if not scenario.hosted.talks or activation is None:
         return []
-    make = {"links": _links, "directions": _directions, "nodes": _nodes, "readings": _readings}
-    places = make[activation.at](scenario, recorder, transmitter, nodes, timeline)
+    air = (scenario, recorder, transmitter, nodes)
+    if activation.at == "readings":
+        _transmit_after_samples(timeline, *air)
+        return []
+    make = {"links": _links, "directions": _directions, "nodes": _nodes}
+    places = make[activation.at](*air)
     return [
         _ticking(scenario, streams, timeline, recorder, entity, k, activate)
         for k, (entity, activate) in enumerate(places)
@@ -86,7 +90,6 @@ def _links(
     recorder: Recorder,
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
-    timeline: Timeline,
 ) -> Places:
     """A tick lets both ends of the link exchange."""
 
@@ -109,7 +112,6 @@ def _directions(
     recorder: Recorder,
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
-    timeline: Timeline,
 ) -> Places:
     """A tick lets one end push to the other."""
 
@@ -162,7 +164,6 @@ def _nodes(
     recorder: Recorder,
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
-    timeline: Timeline,
 ) -> Places:
     """A tick lets a node broadcast."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
@@ -177,13 +178,13 @@ def _nodes(
     return [((node,), activation(node)) for node in scenario.nodes]
 
 
-def _readings(
+def _transmit_after_samples(
+    timeline: Timeline,
     scenario: Scenario,
     recorder: Recorder,
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
-    timeline: Timeline,
-) -> Places:
+) -> None:
     """A node broadcasts after it has used a sample, at the rank of ticks."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
     for node in scenario.sampled_sensors:
@@ -193,4 +194,3 @@ def _readings(
             timeline.call_at(now, Rank.TICK, entity, lambda _: transmit[node](now))
 
         carrier.after_sample = after
-    return []

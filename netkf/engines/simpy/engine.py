@@ -131,7 +131,7 @@ class _Simulation:
         truth = scenario.slot_truth(streams)
         schedule, period = Schedule(scenario), scenario.slot_plant.period
 
-        def make(node: int, entity: int, sensing: tuple[int, ...]) -> SlotNode:
+        def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
             return SlotNode(recorder, schedule, period, *_identity(scenario, node, entity))
 
         nodes = _nodes(scenario, make)
