@@ -264,7 +264,26 @@ class DiffusionPath:
         one before the last one asked for.
         """
         step = self._at(end)
-        return seen(self.laws, step, start, end)
+        if start >= step.start:
+            return seen(self.laws, step, start, end)
+        return self._over_pieces(start, end)
+
+    def _over_pieces(self, start: float, end: float) -> FloatArray:
+        """``moments`` over several pieces of a step, which samples of other nodes may cut."""
+        block, k, gap = self._block, self._piece, end - start
+        assert block is not None
+        total = np.zeros((2, self.laws.n))
+        while True:
+            step = Step(*(part[k] for part in block[:6]))
+            first, last = max(start, step.start), min(end, step.end)
+            part = seen(self.laws, step, first, last)
+            # P_1 of the whole interval on this part of it.
+            middle = ((first - start) - (end - last)) / gap
+            total[0] += part[0]
+            total[1] += middle * part[0] + (last - first) / gap * part[1]
+            if step.start <= start:
+                return total
+            k -= 1
 
     def _frame_times(self, horizon: float) -> FloatArray:
         steps = self._paths.frame_steps

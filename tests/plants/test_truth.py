@@ -1,5 +1,7 @@
 """Paths drawn from sample to sample, with their laws worked out exactly from unit normals."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -182,6 +184,30 @@ def test_samples_cut_into_the_sensing_grid_have_their_exact_law(samples, probes,
         return np.array([path.state(t) for t in samples])
 
     np.testing.assert_array_equal(sampled(probes), sampled([]))
+
+
+def test_moments_span_the_cuts_of_other_nodes():
+    plant = Diffusion(A, B, mean=[1.0, 0.0], cov=COV, sensing_period=0.2)
+    samples = np.array([0.25, 0.27, 0.36])
+
+    def path():
+        seeds = [np.random.default_rng(k) for k in range(3)]
+        return plant.path(*seeds[:2], np.array([0.31]), seeds[2], samples)
+
+    grid = plant.path(*[np.random.default_rng(k) for k in range(2)], np.empty(0))
+    grid.state(0.2)
+    np.testing.assert_allclose(path().moments(0.2, 0.4), grid.moments(0.2, 0.4), rtol=1e-9)
+    whole, parts = path(), path()
+    for start, end in ((0.2, 0.26), (0.26, 0.33), (0.33, 0.4)):
+        joined = whole.moments(start, end)
+        cuts = [start, *(t for t in (0.25, 0.27, 0.31, 0.36) if start < t < end), end]
+        some = [parts.moments(a, b) for a, b in pairwise(cuts)]
+        np.testing.assert_allclose(sum(part[0] for part in some), joined[0], rtol=1e-12)
+        tilted = sum(
+            (a + b - start - end) / (end - start) * part[0] + (b - a) / (end - start) * part[1]
+            for a, b, part in zip(cuts[:-1], cuts[1:], some, strict=True)
+        )
+        np.testing.assert_allclose(tilted, joined[1], rtol=0, atol=1e-14)
 
 
 def test_recorded_states_are_found_by_their_times():
