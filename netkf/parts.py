@@ -62,8 +62,15 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
-from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.recorded import (
+    RecordedDiffusion,
+    RecordedPlant,
+    RecordedSensor,
+    UnknownDiffusion,
+    UnknownPlant,
+)
 from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
@@ -129,8 +136,10 @@ __all__ = [
     "Reading",
     "RecordedClock",
     "RecordedDelay",
+    "RecordedDiffusion",
     "RecordedLoss",
     "RecordedPlant",
+    "RecordedSampling",
     "RecordedSensor",
     "RecordedSlots",
     "RegressorSensor",
@@ -145,6 +154,7 @@ __all__ = [
     "Star",
     "Topology",
     "UniformDelay",
+    "UnknownDiffusion",
     "UnknownPlant",
     "boolean",
     "integer",
