@@ -60,7 +60,7 @@ class FlowTable(NamedTuple):
     reach  : (M, terms) up to which gap the terms so far are enough, see core/series
     series : (M, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g) and,
              where something is observed, F
-    gamma  : (M, blocks, terms, q n + 1) those of ``c_j / (g^j sqrt(2 j + 1))`` and their reach
+    gamma  : (M, blocks, terms, 1 + q n) the reach of ``c_j / (g^j sqrt(2 j + 1))``, and its terms
     bound  : (M, blocks) bounds of ``|row block j of Gamma|^2 / g^(2 j + 1)``
     levels : (M, levels, 4, n, n) ``exp(A g)``, F, Gamma (upper) and T (lower triangular) for
              ``g = unit 2^level``
@@ -128,7 +128,8 @@ def flow_table(
         parts.append(F.reshape(TERMS, -1))
     series = with_reach(np.concatenate(parts, axis=1).astype(np.float64), unit)
     blocks, bound = information_blocks(seen, F, unit)
-    gamma = [with_reach(block.astype(np.float64), unit) for block in blocks]
+    # The reach comes first: a table that is padded to a common width still has it there.
+    gamma = [np.roll(with_reach(block.astype(np.float64), unit), 1, axis=1) for block in blocks]
     levels = doubled(E, F, grown, blocks, scale, unit, max(1, int(longest / unit).bit_length()))
     sizes = (len(seen), len(blocks), int(bool(np.any(Q))), len(levels))
     return FlowTable(
@@ -416,7 +417,6 @@ def use_readings(
     """Use the information Gamma' Gamma of a gap of less than a unit."""
     n, q, rows, observed = root.shape[1], table.sizes[m, 0], room.rows, room.observed
     gamma, width = table.gamma, q * n
-    reach = gamma.shape[3] - 1
     size = 0.0
     for i in range(n):
         for j in range(i + 1):
@@ -426,13 +426,14 @@ def use_readings(
         if table.bound[m, block] * factor * factor * size < UNSEEN:
             break
         for j in range(width):
-            rows[j] = gamma[m, block, 0, j]
+            rows[j] = gamma[m, block, 0, j + 1]
         term, even = 0, 1.0
-        while gap > gamma[m, block, term, reach]:
+        while gap > gamma[m, block, term, 0]:
             odd = even * gap
             even = odd * gap
             for j in range(width):
-                rows[j] += odd * gamma[m, block, term + 1, j] + even * gamma[m, block, term + 2, j]
+                rows[j] += odd * gamma[m, block, term + 1, j + 1]
+                rows[j] += even * gamma[m, block, term + 2, j + 1]
             term += 2
         for r in range(q):
             for j in range(n):
@@ -568,6 +569,34 @@ def gain_root(
 # For Python.
 
 
+@kernel
+def move_alone(
+    unit: FloatArray,
+    sizes: np.ndarray,
+    reach: FloatArray,
+    series: FloatArray,
+    gamma: FloatArray,
+    bound: FloatArray,
+    levels: FloatArray,
+    seen: FloatArray,
+    values: FloatArray,
+    work: FloatArray,
+    root: FloatArray,
+    x: FloatArray,
+    gap: float,
+) -> None:
+    """``move_root`` of one node and a table of one model, ``work`` (2 n + 2, n): numba takes plain
+    arrays from Python ten times faster than it takes named ones.
+    """
+    n = x.shape[1]
+    rows = values[series.shape[2] :]
+    parts = work[:n], work[n : 2 * n], work[2 * n : 2 * n + 1], work[2 * n + 1 : 2 * n + 2]
+    table = FlowTable(unit, sizes, reach, series, gamma, bound, levels, seen)
+    move_root(
+        table, 0, root, x, 0, gap, FlowRoom(values, parts[0], parts[1], rows, parts[2], parts[3])
+    )
+
+
 def flow_root(
     table: FlowTable, root: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -575,7 +604,8 @@ def flow_root(
     n = len(x)
     roots, means = root.reshape(1, n, n).copy(), x.reshape(1, n).copy()
     if gap > 0.0:
-        move_root(table, 0, roots, means, 0, gap, flow_room(table))
+        values = np.empty(table.series.shape[2] + table.seen.shape[1] * n)
+        move_alone(*table, values, np.empty((2 * n + 2, n)), roots, means, gap)
     return roots[0], means[0]
 
 

@@ -97,7 +97,7 @@ def test_single_gaps(kind, noise, n, R, size):
         ("random", "full", 4, 1e-3, 1e8, 1e-9),
         ("random", "rank one", 6, 1e-9, 1e10, 1e-3),
         ("zero", "none", 3, 1.0, 1e12, 1e-6),
-        ("zero", "rank one", 8, 1e-6, 1e8, 1e-9),
+        ("zero", "rank one", 8, 1e-6, 1e10, 1e-8),
         ("chain", "rank one", 5, 1e6, 1e12, 1e-3),
         ("chain", "none", 8, 1e-3, 1e10, 1e-6),
         ("unstable", "full", 5, 1e-9, 1e12, 1e6),
@@ -129,9 +129,11 @@ def test_hundreds_of_short_gaps_mixed_with_samples(kind, noise, n, R, size, samp
             P, mean = exact.flow(P, mean, gap, reads)
         worst = max(worst, distance(root, P))
         off = x - reference.rounded(mean)
-        far = max(far, np.linalg.norm(off) / np.linalg.norm(x))
+        # Rounding tells a fraction e of a wide variance, and so sqrt(e) of its spread.
+        spread = np.linalg.norm(np.tril(root))
+        far = max(far, np.linalg.norm(off) / (np.linalg.norm(x) + spread))
     assert worst < allowed(size)
-    assert far < 100.0 * allowed(size)
+    assert far < np.sqrt(allowed(size))
 
 
 @pytest.mark.parametrize("size", [1e8, 1e10, 1e12])
