@@ -223,11 +223,17 @@ class RecordedSensor(Sensor):
         return tuple(sorted(set(self._ids)))
 
     @cached_property
-    def _ids(self) -> list[int]:
+    def row_times(self) -> list[tuple[int, float]]:
+        """Node and time of every row."""
         header, lines = self._lines
         places = [header.index("t"), header.index("node")]
         read = [finite_numbers(self.path, line, header, row, places) for line, row in lines]
-        return whole(self.path, "node", np.array([node for _, node in read]))
+        nodes = whole(self.path, "node", np.array([node for _, node in read]))
+        return list(zip(nodes, (t for t, _ in read), strict=True))
+
+    @property
+    def _ids(self) -> list[int]:
+        return [node for node, _ in self.row_times]
 
     @cached_property
     def _rows(self) -> dict[int, list[tuple[float, FloatArray]]]:

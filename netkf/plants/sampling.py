@@ -94,6 +94,10 @@ class RecordedSampling(Clock):
         """Ids of all nodes in the table."""
         return tuple(self._times)
 
+    def recorded_times(self, node: int) -> FloatArray:
+        """(K,) the instants at which a node samples, increasing."""
+        return self._times.get(node, np.empty(0))
+
     def ticks(
         self,
         entity: Entity,

@@ -15,6 +15,7 @@ from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.combination import check_invertible, check_regressor, check_weights
+from netkf.scenario.compatibility import check_activation, check_readings, check_time
 from netkf.scenario.push_sum import check_push_sum
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import spoken
@@ -34,6 +35,8 @@ def check(scenario: Scenario) -> None:
     _times(scenario)
     _plant(scenario)
     _sensors(scenario)
+    check_time(scenario)
+    check_readings(scenario)
     _network(scenario)
     _filter(scenario)
     check_records(scenario)
@@ -144,15 +147,16 @@ def _network(scenario: Scenario) -> None:
             f'add activation = {{ kind = "{example}", ... }}',
         )
     if not scenario.slotted:
+        check_activation(scenario)
         _ticks(scenario)
-    one_way = scenario.slotted and algorithm.one_way
-    if topology.directed and not one_way:
+    elif topology.directed and not algorithm.one_way:
         raise ScenarioError(
             "network.graph.directed",
-            f"must be false for the {name} filter, whose links work both ways",
+            f"must be false for the {name} filter, whose links work both ways in slots",
             True,
             "give an undirected graph",
         )
+    one_way = algorithm.one_way or topology.directed
     if len(topology.components) > 1 and not one_way:
         smallest = sorted(topology.components[-1])
         raise ScenarioError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,11 @@ def check_push_sum(scenario: Scenario) -> None:
             algorithm.leader,
             f"node ids here are {ids}",
         )
+    for name in ("gamma", "delta"):
+        if getattr(algorithm, name) is None:
+            words = "is missing for a plant in slots"
+            raise ScenarioError(f"filter.{name}", words, None, f"add {name} = ...")
+    assert algorithm.delta is not None
     radius = laplacian_radius(scenario.topology)
     if algorithm.delta <= 0.5 * radius * (1.0 + 1e-12):
         raise ScenarioError(
@@ -56,10 +62,13 @@ def check_push_sum(scenario: Scenario) -> None:
 
 
 def push_sum_notes(scenario: Scenario) -> tuple[str, ...]:
-    """One line where delta is below rho(L)."""
+    """One line each: delta is below rho(L); settings of slots are not used under clocks."""
     algorithm = scenario.filter.algorithm
     if not isinstance(algorithm, PushSum):
         return ()
+    if not scenario.slotted:
+        return _unused(algorithm)
+    assert algorithm.delta is not None
     radius = laplacian_radius(scenario.topology)
     if algorithm.delta >= radius:
         return ()
@@ -67,6 +76,14 @@ def push_sum_notes(scenario: Scenario) -> tuple[str, ...]:
         f"filter.delta = {algorithm.delta:g} is below rho(L) = {radius:.6g}: averaging contracts, "
         "but P Theorems 3, 5 and 6 ask for more than rho(L)",
     )
+
+
+def _unused(algorithm: PushSum) -> tuple[str, ...]:
+    given = [f for f in dataclasses.fields(algorithm) if getattr(algorithm, f.name) != f.default]
+    if not given:
+        return ()
+    names = ", ".join(f"filter.{f.name}" for f in given)
+    return (f"{names}: not used under clocks, where push-sum keeps running sums",)
 
 
 def laplacian_radius(topology: Topology) -> float:

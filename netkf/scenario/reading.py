@@ -122,7 +122,7 @@ def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
     readers: dict[str, Callable[[Any], Any]] = {
         "sensors": lambda value: _list(value, folder),
         "network": lambda value: _network(value, folder, time),
-        "filter": lambda value: _filtering(value, folder, time),
+        "filter": lambda value: _filtering(value, folder),
     }
     for key, reader in readers.items():
         if key in table:
@@ -187,7 +187,7 @@ def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> 
     kind = table.pop("kind", default)
     if kind is None:
         raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
-    others = ("kind", "mean", "cov", "model") if family.endswith("filter") else ("kind",)
+    others = ("kind", "mean", "cov", "model") if family == "filter" else ("kind",)
     return _part(find(family, kind, folder), table, folder, others)
 
 
@@ -233,7 +233,7 @@ def _channel(value: Any, folder: Path) -> Channel:
     return channel
 
 
-def _filtering(value: Any, folder: Path, time: str) -> Filtering:
+def _filtering(value: Any, folder: Path) -> Filtering:
     table = _table(value)
     shared: dict[str, Any] = {
         key: table.pop(key) for key in ("mean", "cov", "model") if key in table
@@ -242,6 +242,6 @@ def _filtering(value: Any, folder: Path, time: str) -> Filtering:
         shared["model"] = _under(
             "model", lambda v: _part(Belief, _table(v), folder), shared["model"]
         )
-    algorithm = _kind(f"{time}filter", folder, table)
+    algorithm = _kind("filter", folder, table)
     filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, folder)
     return filtering

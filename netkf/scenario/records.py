@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from netkf.core.errors import ScenarioError
+from netkf.core.streams import Streams
 from netkf.network.matchings import RecordedSlots
-from netkf.plants.recorded import RecordedPlant, RecordedSensor
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
+from netkf.plants.truth import TOLERANCE
+from netkf.scenario.sampling import all_sample_times, sample_times
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -28,10 +33,7 @@ def check_records(scenario: Scenario) -> None:
             )
     plant = scenario.plant
     if isinstance(plant, RecordedPlant):
-        wanted = set(scenario.slots)
-        if any(sensor.drawn for sensor in scenario.sensors):
-            wanted |= set(_sensed(scenario))
-        _under("plant", lambda: plant.demand(sorted(wanted)))
+        _under("plant", lambda: plant.demand(sorted(_wanted(scenario))))
     if scenario.slotted and scenario.filter.algorithm.talks:
         _exchanges(scenario)
 
@@ -52,7 +54,7 @@ def _readings(scenario: Scenario, key: str, sensor: RecordedSensor) -> None:
         _under(key, lambda: sensor.demand(scenario.slot_plant.period))
 
 
-def _sensed(scenario: Scenario) -> range:
+def sensed_slots(scenario: Scenario) -> range:
     """The slots in which a run hands readings to its filters."""
     plant, algorithm = scenario.slot_plant, scenario.hosted
     end = max(int(scenario.horizon / plant.period) - 1, 0)
@@ -80,12 +82,45 @@ def _exchanges(scenario: Scenario) -> None:
             )
 
 
+def exchange_slots(scenario: Scenario) -> range:
+    """The slots in which nodes exchange."""
+    return range(scenario.hosted.first_slot, sensed_slots(scenario).stop)
+
+
+def used_states(scenario: Scenario) -> tuple[str, int, int] | None:
+    """File, rows and used rows of recorded states; None if the states are not recorded."""
+    plant = scenario.plant
+    if isinstance(plant, RecordedDiffusion):
+        return plant.path.name, len(plant.table[0]), _used_rows(scenario, plant)
+    if not isinstance(plant, RecordedPlant):
+        return None
+    return plant.path.name, len(plant.table), len(_wanted(scenario) & plant.table.keys())
+
+
+def _used_rows(scenario: Scenario, plant: RecordedDiffusion) -> int:
+    """Rows at probe times, and at the sample times of sensors that are drawn, in replica 0."""
+    times = [scenario.times]
+    if any(sensor.drawn for sensor in scenario.sensors):
+        times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))
+    asked, rows = np.unique(np.concatenate(times)), plant.table[0]
+    near = np.searchsorted(asked, rows - TOLERANCE)
+    return int(
+        (asked[np.minimum(near, len(asked) - 1)] <= rows + TOLERANCE)[near < len(asked)].sum()
+    )
+
+
+def _wanted(scenario: Scenario) -> set[int]:
+    """The slots in which a run needs the state."""
+    drawn = any(sensor.drawn for sensor in scenario.sensors)
+    return {*scenario.slots, *(sensed_slots(scenario) if drawn else ())}
+
+
 def record_notes(scenario: Scenario) -> tuple[str, ...]:
     """One line where recorded exchanges are in slots in which nothing is exchanged."""
-    activation, algorithm = scenario.network.activation, scenario.hosted
+    activation = scenario.network.activation
     if not isinstance(activation, RecordedSlots) or not scenario.slotted:
         return ()
-    used = range(algorithm.first_slot, _sensed(scenario).stop)
+    used = exchange_slots(scenario)
     unused = sorted({slot for slot, _, _ in activation.recorded} - set(used))
     if not unused:
         return ()

@@ -116,16 +116,13 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "broadcast": matchings.Broadcast,
         "recorded": matchings.RecordedSlots,
     },
-    "slot filter": {
-        "gossip": Gossip,
-        "intermittent": Intermittent,
-        "diffusion": DiffusionFilter,
-        "push-sum": PushSum,
-        "local": Local,
-        "central": Central,
-    },
 }
-"""Plants that live in slots take the slot activations and slot filters."""
+KINDS["slot filter"] = {
+    name: cls for name, cls in KINDS["filter"].items() if getattr(cls, "schedule", None)
+}
+"""The classes by family and kind. "slot activation" is for plants in slots; "slot filter" is the
+part of "filter" that runs in slots.
+"""
 
 SLOTTED = (LinearPlant,)
 
@@ -135,9 +132,13 @@ def other_time(family: str, kind: object) -> str | None:
     other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
     if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
         return None
-    slots = "in slots (linear)"
-    flow = "in continuous time (diffusion)"
-    needs, has = (flow, slots) if family.startswith("slot ") else (slots, flow)
+    return time_words(slotted=family.startswith("slot "))
+
+
+def time_words(slotted: bool) -> str:
+    """Words about a part that belongs to the other kind of time than that of the plant."""
+    slots, flow = "in slots (linear)", "in continuous time (diffusion)"
+    needs, has = (flow, slots) if slotted else (slots, flow)
     return f"belongs to plants {needs}, and this plant is {has}"
 
 

@@ -115,7 +115,7 @@ def test_regressors_and_diffusion_belong_to_slots(build):
         netkf.ScenarioError, match=r"sensors\[0\]\.kind: belongs to plants in slots"
     ):
         build(plant=CONTINUOUS, sensors=[sensor])
-    with pytest.raises(netkf.ScenarioError, match=r"filter\.kind: belongs to plants in slots"):
+    with pytest.raises(netkf.ScenarioError, match=r"activation\.at: must be one that"):
         build(plant=CONTINUOUS, filter={"kind": "diffusion"})
     with pytest.raises(netkf.ScenarioError, match=r"filter\.kind: belongs to plants in continuous"):
         netkf.load(

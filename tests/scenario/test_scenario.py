@@ -100,7 +100,7 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
 
 
             class Loud(Timid):
-                def absorb(self, state, messages):
+                def absorb(self, state, messages, exchange):
                     return state
 
 

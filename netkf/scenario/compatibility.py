@@ -1,0 +1,103 @@
+"""Which filters, activations, graphs and sensors can be run together; each refusal is one line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.push_sum import PushSum
+from netkf.algorithms.slot import SlotFilter
+from netkf.core.errors import ScenarioError
+from netkf.network.clocks import LinkClock
+from netkf.network.matchings import SlotActivation
+from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.registry import spoken, time_words
+from netkf.scenario.sampling import samples
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+SAMPLING = 'sampling = { kind = "periodic", period = ... }'
+
+
+def check_time(scenario: Scenario) -> None:
+    """Raise ScenarioError if the filter or the activation belongs to the other kind of time."""
+    given, hosted, slotted = scenario.filter.algorithm, scenario.hosted, scenario.slotted
+    name = spoken(given)
+    only_clocks = isinstance(given, FlowFilter) or hosted.schedule is None
+    only_slots = isinstance(given, SlotFilter) or (hosted.talks and not hosted.clocks)
+    if only_clocks if slotted else only_slots:
+        remedy = "change the plant or choose another kind"
+        raise ScenarioError("filter.kind", time_words(slotted), name, remedy)
+    activation = scenario.network.activation
+    if activation is not None and isinstance(activation, SlotActivation) != slotted:
+        kind = spoken(activation, "activation")
+        remedy = "change the plant or choose another kind"
+        raise ScenarioError("network.activation.kind", time_words(slotted), kind, remedy)
+
+
+def check_activation(scenario: Scenario) -> None:
+    """Raise ScenarioError if the filter cannot run under the clocks, or these not on the graph."""
+    clock, hosted, topology = scenario.network.activation, scenario.hosted, scenario.topology
+    if not isinstance(clock, LinkClock) or not hosted.talks:
+        return
+    name = spoken(scenario.filter.algorithm)
+    if topology.directed and (clock.at == "links" or hosted.clocks == ("links",)):
+        others = [f'at = "{at}"' for at in ("directions", "nodes") if at in hosted.clocks]
+        raise ScenarioError(
+            "network.graph.directed",
+            f"must be false for the {name} filter at links, which work both ways",
+            True,
+            " or ".join(["give an undirected graph", *others]),
+        )
+    if clock.at not in hosted.clocks:
+        _wrong_at(clock.at, hosted.clocks, name)
+    if clock.at == "readings" and not any(map(samples, scenario.sensors)):
+        raise ScenarioError(
+            "network.activation.kind",
+            "needs a sensor that takes samples, and there is none",
+            "readings",
+            f"add {SAMPLING} to a sensor, or choose clocks",
+        )
+
+
+def _wrong_at(at: str, clocks: tuple[str, ...], name: str) -> None:
+    kinds = [f'at = "{one}"' for one in clocks if one != "readings"]
+    kinds += ['kind = "readings"'] if "readings" in clocks else []
+    listed = " or ".join(kinds)
+    key = "kind" if at == "readings" else "at"
+    words = f"must be one that the {name} filter runs under: {listed}"
+    raise ScenarioError(f"network.activation.{key}", words, at, "write that, or change the filter")
+
+
+def check_readings(scenario: Scenario) -> None:
+    """Raise ScenarioError if the filter cannot use the readings of a sensor."""
+    if not scenario.slotted:
+        for k, sensor in enumerate(scenario.sensors):
+            _readings(scenario, f"sensors[{k}]", sensor)
+
+
+def _readings(scenario: Scenario, key: str, sensor: Sensor) -> None:
+    algorithm, hosted = scenario.filter.algorithm, scenario.hosted
+    name = spoken(algorithm)
+    if isinstance(algorithm, FlowFilter) and samples(sensor):
+        raise ScenarioError(
+            f"{key}.sampling" if isinstance(sensor, LinearSensor) else f"{key}.kind",
+            f"must be continuous for the {name} filter, a FlowFilter, which takes no samples",
+            None,
+            "remove it, or derive the class from netkf.parts.Filter",
+        )
+    if hosted.needs_samples and sensor.varying and isinstance(algorithm, PushSum):
+        raise ScenarioError(
+            key,
+            f"must have a fixed H for the {name} filter, which adds up information",
+            None,
+            "leave out the columns phi0, ..., or use another filter",
+        )
+    if hosted.needs_samples and not samples(sensor):
+        raise ScenarioError(
+            f"{key}.sampling",
+            f"is missing, and the {name} filter uses samples, no continuous increments",
+            None,
+            f"add {SAMPLING}",
+        )

@@ -1,0 +1,116 @@
+"""What a finished run has used of the tables that its scenario names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from netkf.network.clocks import RecordedClock
+from netkf.network.graphs import Link
+from netkf.network.matchings import RecordedSlots
+from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.plants.recorded import RecordedSensor
+from netkf.plants.sampling import RecordedSampling
+from netkf.plants.sensors import LinearSensor
+from netkf.scenario.records import exchange_slots, sensed_slots, used_states
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+Use = dict[str, Any]
+OUTCOMES = {
+    "deliver": "were delivered at once",
+    "lose": "were lost",
+    "repeat": "followed the record from its start again",
+}
+"""What became of messages beyond a record, by its ``after``."""
+
+
+def record_usage(scenario: Scenario, sent: Mapping[Link, int]) -> dict[str, Use]:
+    """What one run to the horizon used of each table, by the key path of the part that names it.
+
+    ``sent`` counts the messages of each directed link, lost ones included. Each entry has ``path``,
+    ``rows`` of the table and how many of them were ``unused``; those of losses and delays also have
+    ``beyond``, the messages that the table does not list, and ``after``. Of a table that several
+    sensors name a row is used if one of them uses it; the first one names the entry.
+    """
+    found = {"network.activation": _activation(scenario)}
+    channel = scenario.network.channel
+    for key, part in (("loss", channel.loss), ("delay", channel.delay)):
+        if isinstance(part, RecordedLoss | RecordedDelay):
+            use = part.table.use(sent)
+            beyond = {"beyond": use.beyond, "after": part.after}
+            found[f"network.channel.{key}"] = _use(part.path.name, use.rows, use.unused) | beyond
+    found |= _sensors(scenario)
+    states = used_states(scenario)
+    if states is not None:
+        path, rows, used = states
+        found["plant"] = _use(path, rows, rows - used)
+    return {key: use for key, use in found.items() if use is not None}
+
+
+def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
+    """One line for each table with rows that were not used, or with messages beyond it."""
+    notes = []
+    for key, use in usage.items():
+        if use["unused"]:
+            was = "row was" if use["rows"] == 1 else "rows were"
+            notes.append(f"{key}: {use['unused']} of {use['rows']} {was} not used ({use['path']})")
+        if use.get("beyond"):
+            count, outcome = use["beyond"], OUTCOMES.get(use["after"], "were refused")
+            what = "message is" if count == 1 else "messages are"
+            outcome = outcome.replace("were", "was", 1) if count == 1 else outcome
+            notes.append(f"{key}: {count} {what} not listed and {outcome} ({use['path']})")
+    return tuple(notes)
+
+
+def _use(path: str, rows: int, unused: int) -> Use:
+    return {"path": path, "rows": rows, "unused": unused}
+
+
+def _activation(scenario: Scenario) -> Use | None:
+    activation, talks = scenario.network.activation, scenario.filter.algorithm.talks
+    if isinstance(activation, RecordedClock):
+        rows = activation.rows
+        used = int((rows < scenario.horizon).sum()) if talks else 0
+        return _use(activation.path.name, len(rows), len(rows) - used)
+    if isinstance(activation, RecordedSlots):
+        slots = exchange_slots(scenario) if talks else range(0)
+        counts = {key: len(activation.pairs(*key)) for key in activation.recorded}
+        unused = sum(count for (slot, _, _), count in counts.items() if slot not in slots)
+        return _use(activation.path.name, sum(counts.values()), unused)
+    return None
+
+
+def _sensors(scenario: Scenario) -> dict[str, Use]:
+    """Sampling times and readings; tables are told apart by their files."""
+    nodes: dict[tuple[str, Any], set[int]] = {}
+    parts: dict[tuple[str, Any], tuple[str, RecordedSampling | RecordedSensor]] = {}
+    for k, sensor in enumerate(scenario.sensors):
+        part: RecordedSampling | RecordedSensor
+        if isinstance(sensor, RecordedSensor):
+            key, part = f"sensors[{k}]", sensor
+        elif isinstance(sensor, LinearSensor) and isinstance(sensor.sampling, RecordedSampling):
+            key, part = f"sensors[{k}].sampling", sensor.sampling
+        else:
+            continue
+        table = (type(part).__name__, part.path)
+        parts.setdefault(table, (key, part))
+        nodes.setdefault(table, set()).update(sensor.nodes)
+    return {key: _times(scenario, part, nodes[table]) for table, (key, part) in parts.items()}
+
+
+def _times(scenario: Scenario, part: RecordedSampling | RecordedSensor, nodes: set[int]) -> Use:
+    if isinstance(part, RecordedSensor):
+        listed = part.row_times
+    else:
+        listed = [(node, t) for node in part.listed for t in part.recorded_times(node).tolist()]
+    times = np.array([t for node, t in listed if node in nodes])
+    if scenario.slotted:
+        slots = np.round(times / scenario.slot_plant.period)
+        used = int(np.isin(slots, list(sensed_slots(scenario))).sum())
+    else:
+        used = int((times < scenario.horizon).sum())
+    return _use(part.path.name, len(listed), len(listed) - used)
