@@ -6,6 +6,7 @@ or at the times of its table (``recorded``).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
@@ -83,6 +84,16 @@ def _placed(scenario: Scenario) -> Iterator[tuple[int, Placed]]:
 
 def _generator(streams: Streams, node: int, place: Placed) -> Callable[[str], np.random.Generator]:
     return lambda purpose: streams.generator(purpose, node, place.ordinal)
+
+
+def sample_rate(scenario: Scenario, node: int) -> float:
+    """Instants a second at which a node samples, in the long run; nan if it is not known."""
+    places = scenario.sampled_sensors.get(node, ())
+    if len(places) != 1:  # several may sample at one instant
+        return math.nan if places else 0.0
+    sensor = scenario.sensors[places[0].entry]
+    clock = sensor.sampling if isinstance(sensor, LinearSensor) else None
+    return math.nan if clock is None else clock.mean_rate((node, 0))
 
 
 def all_sample_times(times: dict[tuple[int, int], FloatArray]) -> FloatArray:

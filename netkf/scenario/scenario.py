@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -490,10 +489,11 @@ class Scenario(Part):
 
     def _send_rate(self, clock: LinkClock, direction: Link) -> float:
         sender, receiver = direction
+        if clock.at == "readings":
+            return sampling.sample_rate(self, sender)
         entities = {
             "links": (min(sender, receiver), max(sender, receiver)),
             "directions": direction,
             "nodes": (sender,),
         }
-        entity = entities.get(clock.at)
-        return math.nan if entity is None else clock.mean_rate(entity)
+        return clock.mean_rate(entities[clock.at])
