@@ -1,19 +1,20 @@
 """Push-sum in continuous time: broadcast rounds by running sums, each node by its own clock.
 
-Every node holds mass: a weight w, which starts at 1, and the information (U, u) that samples bring,
-``U += H' R^-1 H`` and ``u += H' R^-1 y``. A round offers each of the d nodes that can hear the share
-1 / (d + 1) of all of it. What travels is not the share but the total ``sent`` that was ever offered;
-a hearer gains the difference to the last total it ``heard``, so a lost message only postpones, and
-the mass in nodes and under way stays what it was (running-sum push-sum; P has no such form).
+The network's information is a mass that is spread over the nodes. Node i holds the weight w_i, which
+starts at 1, and with N nodes its share of the information is ``(w_i / N) P_i^-1`` and
+``(w_i / N) P_i^-1 xhat_i``: an estimate is a ratio of masses. A sample adds ``H' R^-1 H`` and
+``H' R^-1 y``, so it counts N / w_i times at its own node until it has spread. Between events each
+node predicts its own estimate and covariance.
 
-Information refers to an instant: as time passes it is predicted with the plant, without its noise,
+A round offers each of the d nodes that can hear the share 1 / (d + 1) of all mass. What travels is
+not the share but the total ``sent`` that was ever offered; a hearer gains the difference to the last
+total it ``heard``, so a lost message only postpones, and the weight in nodes and under way stays N
+(running-sum push-sum; P has no such form). As rounds get fast every node is the central filter.
+
+Totals refer to an instant: as time passes they are predicted with the plant, without its noise,
 ``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` with Phi = e^{A gap}. All totals are predicted alike,
 so differences stay what they are. s = e^{-2 r gap} lets old information fade where it would grow
 without bound, with r the fastest rate at which the plant forgets its state (0 if it never does).
-
-With N nodes ``N U / w`` and ``N u / w`` are what a node knows of all samples of the network. It uses
-how these differ from what it ``used`` before, ``P^-1 += dU`` and ``xhat += P (du - dU xhat)``. As
-rounds get fast the differences are the samples themselves, and every node is the central filter.
 """
 
 from __future__ import annotations
@@ -22,15 +23,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from netkf.algorithms.filter import Message, NodeInfo, Reading
-from netkf.algorithms.models import Backward, first_root
+from netkf.algorithms.models import Backward, first_root, sample_update
 from netkf.algorithms.root_update import lower_root
 from netkf.core.arrays import FloatArray
-
-LEAST = 0.05
-"""Least eigenvalue of I + root' dU root that is used: a reading looks N times as precise at its own
-node until it has spread, and taking that back at once could leave no covariance."""
 
 
 class Offer(NamedTuple):
@@ -41,20 +39,19 @@ class Offer(NamedTuple):
 
 
 class RunningSums(NamedTuple):
-    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model; ``mass`` (1 + n n + n,)
-    = (w, U, u); the total ``sent`` to each receiver and how many ``rounds``; by sender the number
-    and total ``heard`` last; ``used`` (n n + n,), the information in the estimate; how many can
-    hear (``receivers``) and how many ``nodes`` there are.
+    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, the ``weight`` w; the
+    total ``sent`` (1 + n n + n,) to each receiver, of w, information U and ``u = U xhat``, and in
+    how many ``rounds``; by sender the number and total ``heard`` last; how many can hear
+    (``receivers``) and how many ``nodes`` there are.
     """
 
     xhat: FloatArray
     root: FloatArray
     model: Any
-    mass: FloatArray
+    weight: float
     sent: FloatArray
     rounds: int
     heard: Mapping[int, Offer]
-    used: FloatArray
     receivers: int
     nodes: int
 
@@ -64,109 +61,92 @@ class RunningSums(NamedTuple):
         return self.root @ self.root.T
 
 
-def predict(state: RunningSums, gap: float) -> RunningSums:
-    """The state ``gap`` seconds later."""
-    xhat, root = state.model.predict(state.xhat, state.root, gap)
-    back = state.model.backward(gap)
-    heard = {sender: aged(offer, back) for sender, offer in state.heard.items()}
-    return state._replace(
-        xhat=xhat,
-        root=root,
-        mass=_moved(state.mass, back, 1),
-        sent=_moved(state.sent, back, 1),
-        used=_moved(state.used, back, 0),
-        heard=heard,
-    )
-
-
-def aged(offer: Offer, back: Backward) -> Offer:
-    """What was offered, in terms of a later state."""
-    return offer._replace(total=_moved(offer.total, back, 1))
-
-
-def _moved(values: FloatArray, back: Backward, first: int) -> FloatArray:
-    inverse, fading = back
-    n = len(inverse)
-    out = values.copy()
-    U = values[first : first + n * n].reshape(n, n)
-    out[first : first + n * n] = (fading * (inverse.T @ U @ inverse)).reshape(-1)
-    out[first + n * n :] = fading * (inverse.T @ values[first + n * n :])
-    return out
-
-
 def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> RunningSums:
-    """Weight 1 and no information yet."""
+    """Weight 1, and nothing sent."""
     n = len(mean)
-    mass = np.zeros(1 + n * n + n)
-    mass[0] = 1.0
     return RunningSums(
         xhat=mean,
         root=first_root(cov),
         model=model,
-        mass=mass,
-        sent=np.zeros_like(mass),
+        weight=1.0,
+        sent=np.zeros(1 + n * n + n),
         rounds=0,
         heard={},
-        used=np.zeros(n * n + n),
         receivers=node.receivers,
         nodes=node.nodes,
     )
 
 
+def predict(state: RunningSums, gap: float) -> RunningSums:
+    """The state ``gap`` seconds later."""
+    xhat, root = state.model.predict(state.xhat, state.root, gap)
+    back = state.model.backward(gap)
+    heard = {sender: aged(offer, back) for sender, offer in state.heard.items()}
+    return state._replace(xhat=xhat, root=root, sent=_moved(state.sent, back), heard=heard)
+
+
+def aged(offer: Offer, back: Backward) -> Offer:
+    """An offer in terms of a later state."""
+    return offer._replace(total=_moved(offer.total, back))
+
+
+def _moved(total: FloatArray, back: Backward) -> FloatArray:
+    inverse, fading = back
+    n, out = len(inverse), total.copy()
+    U = total[1 : 1 + n * n].reshape(n, n)
+    out[1 : 1 + n * n] = (fading * (inverse.T @ U @ inverse)).reshape(-1)
+    out[1 + n * n :] = fading * (inverse.T @ total[1 + n * n :])
+    return out
+
+
 def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
-    """One round: the node gives up exactly what its total grew by, for each receiver."""
+    """One round. Estimate and covariance stay: all masses shrink by one factor."""
     if state.receivers == 0:
         return state, None
-    sent = state.sent + state.mass / (state.receivers + 1)
-    mass = state.mass - state.receivers * (sent - state.sent)
-    state = state._replace(mass=mass, sent=sent, rounds=state.rounds + 1)
-    return state, Offer(state.rounds, sent)
+    n = len(state.xhat)
+    inverse = scipy.linalg.solve_triangular(state.root, np.eye(n), lower=True)
+    U = (state.weight / state.nodes) * (inverse.T @ inverse)
+    mass = np.concatenate([[state.weight], U.reshape(-1), U @ state.xhat])
+    sent = state.sent + mass / (state.receivers + 1)
+    # The node gives up exactly what its total grew by, for each receiver.
+    weight = state.weight - state.receivers * float(sent[0] - state.sent[0])
+    return state._replace(weight=weight, sent=sent, rounds=state.rounds + 1), Offer(
+        state.rounds, sent
+    )
 
 
 def hear(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
     """Gain what each total grew by since it was heard last; an older one brings nothing."""
-    mass, heard = state.mass, dict(state.heard)
+    gained, heard = np.zeros_like(state.sent), dict(state.heard)
     for message in messages:
         news: Offer = message.payload
         if message.age > 0.0:
             news = aged(news, state.model.backward(message.age))
         last = heard.get(message.sender)
-        if last is None:
-            mass = mass + news.total
-        elif news.number > last.number:
-            mass = mass + (news.total - last.total)
-        else:
+        if last is not None and news.number <= last.number:
             continue
+        gained = gained + (news.total if last is None else news.total - last.total)
         heard[message.sender] = news
-    return _use(state._replace(mass=mass, heard=heard))
+    if not gained[0] > 0.0:
+        return state
+    n, weight = len(state.xhat), state.weight + float(gained[0])
+    U, u = gained[1 : 1 + n * n].reshape(n, n), gained[1 + n * n :]
+    # P^-1 <- (w P^-1 + N U) / w+ in roots; what has been gained cannot be less than nothing.
+    scaled = np.sqrt(weight / state.weight) * state.root
+    share = state.nodes / weight
+    values, vectors = np.linalg.eigh(np.eye(n) + 0.5 * share * (scaled.T @ (U + U.T) @ scaled))
+    root = lower_root(scaled @ (vectors / np.sqrt(np.maximum(values, 1.0))))
+    xhat = state.xhat + root @ (root.T @ (share * (u - U @ state.xhat)))
+    return state._replace(xhat=xhat, root=root, weight=weight, heard=heard)
 
 
 def add_reading(state: RunningSums, reading: Reading) -> RunningSums:
-    """``U += H' R^-1 H`` and ``u += H' R^-1 y``."""
+    """``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms of P^-1."""
     if not len(reading.y):
         return state
-    weighted = np.linalg.solve(reading.R, reading.H).T
-    U, u = weighted @ reading.H, weighted @ reading.y
-    return _use(state._replace(mass=state.mass + np.concatenate([[0.0], U.reshape(-1), u])))
-
-
-def _use(state: RunningSums) -> RunningSums:
-    """Put what is new into the estimate, if that leaves a covariance; else later."""
-    n = len(state.xhat)
-    known = state.mass[1:] * (state.nodes / state.mass[0])
-    new = known - state.used
-    dU, du = new[: n * n].reshape(n, n), new[n * n :]
-    if not new.any():
-        return state
-    S = state.root
-    inner = np.eye(n) + S.T @ (0.5 * (dU + dU.T)) @ S
-    values, vectors = np.linalg.eigh(inner)
-    if not values[0] > LEAST:
-        return state
-    # (P^-1 + dU)^-1 = S (I + S' dU S)^-1 S'
-    root = lower_root(S @ (vectors / np.sqrt(values)))
-    xhat = state.xhat + root @ (root.T @ (du - dU @ state.xhat))
-    return state._replace(xhat=xhat, root=root, used=known)
+    R = reading.R * (state.weight / state.nodes)
+    xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, R)
+    return state._replace(xhat=xhat, root=root)
 
 
 def weights(state: RunningSums) -> dict[str, list[float]]:
@@ -175,28 +155,22 @@ def weights(state: RunningSums) -> dict[str, list[float]]:
     """
     heard = [-float(offer.total[0]) for offer in state.heard.values()]
     sent = [float(state.sent[0])] * state.receivers
-    return {"weight": [float(state.mass[0]), *sent, *heard]}
+    return {"weight": [state.weight, *sent, *heard]}
 
 
 def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
     """The estimate, and ``u`` by ``U offset`` wherever there is one."""
     heard = {sender: shift_offer(offer, offset) for sender, offer in state.heard.items()}
-    return state._replace(
-        xhat=state.xhat + offset,
-        mass=_shifted(state.mass, offset, 1),
-        sent=_shifted(state.sent, offset, 1),
-        used=_shifted(state.used, offset, 0),
-        heard=heard,
-    )
+    sent = _shifted(state.sent, offset)
+    return state._replace(xhat=state.xhat + offset, sent=sent, heard=heard)
 
 
 def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
     """``u`` by ``U offset``."""
-    return offer._replace(total=_shifted(offer.total, offset, 1))
+    return offer._replace(total=_shifted(offer.total, offset))
 
 
-def _shifted(values: FloatArray, offset: FloatArray, first: int) -> FloatArray:
-    n = len(offset)
-    out = values.copy()
-    out[first + n * n :] += values[first : first + n * n].reshape(n, n) @ offset
+def _shifted(total: FloatArray, offset: FloatArray) -> FloatArray:
+    n, out = len(offset), total.copy()
+    out[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset
     return out
