@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +15,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import Coupled, coupled
+from netkf.theory.moves import Seen
 from netkf.theory.packed import Packed
 from netkf.theory.taylor import StiffError, followed
 
@@ -31,7 +33,8 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     """(T, N, n, n): the solution of H(12) at ``times`` (increasing seconds), with the effective
     rates of the channel; for filters that do not talk it is their own covariance.
 
-    By H Theorem 2 it bounds E[P_i(t)]. Integrated with relative tolerance 1e-10 and returned only
+    By H Theorem 2 it bounds E[P_i(t)]. Sensors that sample by Poisson clocks or at known times enter
+    as docs/poisson_samples.md derives it. Integrated with relative tolerance 1e-10 and returned only
     when the defect is below that (below 1e-7 with a delay, or where precise sensors hear of large
     covariances). Raises TheoryError where the theorem does not apply, and says why.
     """
@@ -41,7 +44,9 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     if (np.diff(moments) < 0.0).any() or moments[0] < 0.0:
         raise TheoryError("times must be increasing and not negative")
     equations = coupled(scenario)
-    if equations.coupling.nnz == 0:
+    if equations.jumps and moments[-1] > scenario.horizon:
+        raise TheoryError("samples at known times are known up to the horizon")
+    if not equations.talks and not equations.samples and not equations.jumps:
         P = _uncoupled(equations, moments)
     else:
         packed = Packed(equations)
@@ -52,7 +57,8 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
 
 
 def _solution(packed: Packed, times: FloatArray) -> FloatArray:
-    if packed.equations.delay == 0.0:
+    equations = packed.equations
+    if equations.delay == 0.0 and not equations.samples and not equations.jumps:
         with contextlib.suppress(StiffError), np.errstate(over="ignore", invalid="ignore"):
             return followed(packed, times, _scale(packed), EXPLICIT_EVALUATIONS, OVERFLOW)
     pieces = _Pieces(packed)
@@ -88,7 +94,10 @@ class _Pieces:
     def __init__(self, packed: Packed) -> None:
         self._packed = packed
         equations = packed.equations
-        self._silent = Packed(equations._replace(coupling=0.0 * equations.coupling))
+        quiet = tuple(s._replace(heard=0.0 * s.heard) for s in equations.samples)
+        self._silent = Packed(equations._replace(coupling=0.0 * equations.coupling, samples=quiet))
+        self._jumps = _Jumps(packed)
+        self._first = packed.start
         self._ends: list[float] = [0.0]
         self._outputs: list[Callable[[float], FloatArray]] = []
 
@@ -96,6 +105,8 @@ class _Pieces:
         start = self._packed.start
         if t <= 0.0:
             return start
+        if t == self._ends[-1]:
+            return self._first
         # t may lie a rounding error beyond what is known so far.
         piece = min(int(np.searchsorted(self._ends, t)), len(self._outputs)) - 1
         return self._outputs[piece](t).reshape(start.shape)
@@ -106,7 +117,8 @@ class _Pieces:
         With a delay, stretch after stretch: nothing arrives before the first one is over. A stretch
         is one delay long, over which all that arrives is known, or, where the delay is much
         shorter than the times between messages, half such a time; what arrives from within it is
-        then found by iteration (Picard), which gains a factor 2 k in the k-th round.
+        then found by iteration (Picard), which gains a factor 2 k in the k-th round. Stretches end
+        where the solution jumps and where that arrives.
         """
         delay = self._packed.equations.delay
         inflow = float(self._packed.leaving.max())
@@ -117,27 +129,33 @@ class _Pieces:
             elif begin < delay:
                 end = min(last, delay)
             else:
-                end = min(last, begin + max(delay, 0.5 / inflow))
+                end = min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
+            end = self._jumps.before(begin, end)
             f = self._slope(begin)
             if delay == 0.0 or end - begin <= delay * (1.0 + 1e-12):
                 self._append(end, self._integrate(begin, end, f))
             else:
                 self._iterate(begin, end, f)
+            self._first = self._jumps.after(end, self(end))
 
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
         self._outputs.append(output)
         self._ends.append(end)
+        self._first = output(end).reshape(self._packed.start.shape)
 
     def _iterate(
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray]
     ) -> None:
-        first = self(begin).reshape(-1)
+        first = self._first.reshape(-1)
         places = np.linspace(begin, end, 9)[1:]
+        jumped = self._first
         self._append(end, lambda _: first)
         last = np.inf
         for _ in range(MOST_ROUNDS):
             before = np.array([self(t).reshape(-1) for t in places])
+            self._first = jumped
             self._outputs[-1] = self._integrate(begin, end, f)
+            self._first = self._outputs[-1](end).reshape(jumped.shape)
             after = np.array([self(t).reshape(-1) for t in places])
             change = float(np.abs(after - before).max() / np.abs(after).max())
             # What the steps of the solver change from round to round stays.
@@ -185,7 +203,9 @@ class _Pieces:
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], most: float
     ) -> Any:
         with np.errstate(over="ignore", invalid="ignore"):
-            if self._packed.equations.delay > 0.0:  # without delay only what is stiff comes here
+            equations = self._packed.equations
+            # Without delays and samples only what is stiff comes here.
+            if equations.delay > 0.0 or equations.samples or equations.jumps:
                 # An explicit stage that overflows is no word about the solution.
                 with contextlib.suppress(StiffError, TheoryError):
                     return self._solve(begin, end, _limited(f), method="DOP853", max_step=most)
@@ -195,7 +215,7 @@ class _Pieces:
     def _solve(
         self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], **method: Any
     ) -> Any:
-        y = self(begin).reshape(-1)
+        y = self._first.reshape(-1)
         return scipy.integrate.solve_ivp(
             f,
             (begin, end),
@@ -207,9 +227,54 @@ class _Pieces:
         )
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
-        blocks = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
+        linear = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
         # With a delay what arrives is known, only what leaves depends on P.
-        return self._packed.matrix(blocks, arriving=self._packed.equations.delay == 0.0)
+        return linear.matrix(arriving=self._packed.equations.delay == 0.0)
+
+
+class _Jumps:
+    """What happens at known times, and when what was sent then arrives."""
+
+    def __init__(self, packed: Packed) -> None:
+        self._packed = packed
+        equations = packed.equations
+        self._happens = {jump.time: jump for jump in equations.jumps}
+        self._arrives: dict[float, tuple[FloatArray, FloatArray]] = {}
+        delay = equations.delay
+        later = [jump.time + delay for jump in equations.jumps]
+        self._times = sorted({*self._happens, *later})
+
+    def before(self, begin: float, end: float) -> float:
+        """The first of these times after ``begin``, if it is before ``end``."""
+        place = bisect.bisect_right(self._times, begin)
+        return min(end, self._times[place]) if place < len(self._times) else end
+
+    def after(self, time: float, Y: FloatArray) -> FloatArray:
+        """(N, m) once all of that time has happened: samples, and then what arrives."""
+        packed, equations = self._packed, self._packed.equations
+        jump = self._happens.get(time)
+        if jump is not None:
+            P = packed.unpack(Y)
+            for node, seen in jump.seen.items():
+                P[node] = _sampled(P[node], seen)
+            Y = packed.pack(P)
+            if jump.sent is not None:
+                self._arrives[time + equations.delay] = jump.sent, Y
+        arriving = self._arrives.pop(time, None)
+        if arriving is None:
+            return Y
+        weights, sent = arriving
+        if equations.delay > 0.0:
+            sent = packed.predicted(sent)
+        kept = 1.0 - weights.sum(axis=1)
+        return np.asarray(kept[:, None] * Y + weights @ sent)
+
+
+def _sampled(P: FloatArray, seen: Seen) -> FloatArray:
+    """``g(P)``, as ``(I - K H) P (I - K H)' + K R K'``."""
+    K = np.linalg.solve(seen.H @ P @ seen.H.T + seen.R, seen.H @ P).T
+    closed = np.eye(len(P)) - K @ seen.H
+    return np.asarray(closed @ P @ closed.T + K @ seen.R @ K.T)
 
 
 def _limited(

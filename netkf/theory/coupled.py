@@ -2,7 +2,8 @@
 
 d P_i = A P_i + P_i A' + Q - P_i G_i P_i + sum_j c_ij (T P_j T' + q - P_i)
 
-``c_ij`` is the rate at which messages from j arrive at i times the weight they get. A message that
+``c_ij`` is the rate at which messages from j arrive at i times the weight they get. Sensors that
+sample add terms and jumps of their own, see theory/samples.py. A message that
 took a fixed time d is predicted first, ``T = exp(A d)`` and ``q`` the noise of d seconds, and
 P_j is then the one from d seconds ago; without delay ``T = I``, ``q = 0``.
 """
@@ -23,11 +24,21 @@ from netkf.core.errors import TheoryError
 from netkf.network.clocks import LinkClock
 from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
+from netkf.theory.observed import increments
+from netkf.theory.samples import (
+    Jump,
+    Samples,
+    at_random,
+    by_readings,
+    clock_of,
+    jumps,
+    poisson_samples,
+)
 
 
 class Coupled(NamedTuple):
-    """A (n, n), Q (n, n), G (N, n, n), coupling (N, N) sparse, T (n, n), q (n, n), delay (s),
-    start (N, n, n).
+    """A (n, n), Q (n, n), G (N, n, n) of increments, coupling (N, N) sparse, T (n, n), q (n, n),
+    delay (s), start (N, n, n), ``samples`` by Poisson clocks, ``jumps`` at known times.
     """
 
     A: FloatArray
@@ -38,6 +49,32 @@ class Coupled(NamedTuple):
     q: FloatArray
     delay: float
     start: FloatArray
+    samples: tuple[Samples, ...] = ()
+    jumps: tuple[Jump, ...] = ()
+
+    @property
+    def talks(self) -> bool:
+        """Whether any message ever arrives."""
+        sent = any(jump.sent is not None and jump.sent.any() for jump in self.jumps)
+        return bool(self.coupling.nnz or any(s.heard.nnz for s in self.samples) or sent)
+
+    def only(self, node: int) -> Coupled:
+        """The equation of one node, alone."""
+        return self._replace(
+            G=self.G[node : node + 1],
+            start=self.start[node : node + 1],
+            coupling=scipy.sparse.csr_array((1, 1)),
+            samples=tuple(s.only(node) for s in self.samples),
+            jumps=tuple(
+                Jump(jump.time, {0: jump.seen[node]}, None)
+                for jump in self.jumps
+                if node in jump.seen
+            ),
+        )
+
+    def faster(self, factor: float) -> Coupled:
+        """With clocks of links, directions or nodes that tick so many times as often."""
+        return self._replace(coupling=factor * self.coupling)
 
 
 STEPS = (
@@ -71,7 +108,7 @@ def not_promised(scenario: Scenario) -> str | None:
     """Why H Theorem 2 does not speak about the scenario, in words; None where it does."""
     algorithm, network = scenario.filter.algorithm, scenario.network
     if not scenario.slotted and not algorithm.talks:
-        return None
+        return _samples_not_promised(scenario)
     name = type(algorithm).__name__
     if not isinstance(algorithm, Hybrid):
         return f"H(12) is about the hybrid filter in continuous time, not about {spoken(algorithm)}"
@@ -80,15 +117,26 @@ def not_promised(scenario: Scenario) -> str | None:
     if own:
         return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
     assert isinstance(network.activation, LinkClock)
-    if not network.activation.memoryless:
+    if not by_readings(scenario) and not network.activation.memoryless:
         return (
-            "not promised: the link clocks are not Poisson processes, and for other clocks of the "
-            "same rate the mean covariance can lie above H(12)"
+            f"not promised: the clocks of the {network.activation.at} are not Poisson processes, "
+            "and for other clocks of the same rate the mean covariance can lie above H(12)"
         )
     if network.channel.delay.fixed is None:
         return "not promised: H(12) holds for no delay or a fixed one, and the delay is random"
     bursts = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
-    return None if network.channel.loss.independent else bursts
+    return _samples_not_promised(scenario) if network.channel.loss.independent else bursts
+
+
+def _samples_not_promised(scenario: Scenario) -> str | None:
+    for node, place in at_random(scenario):
+        clock = clock_of(scenario.sensors[place.entry])
+        if clock is not None and not clock.memoryless:
+            return (
+                f"not promised: when node {node} samples is random and no Poisson process, and for "
+                "other clocks of the same rate the mean covariance can lie above the bound"
+            )
+    return None
 
 
 def promised(scenario: Scenario) -> None:
@@ -99,16 +147,20 @@ def promised(scenario: Scenario) -> None:
 
 
 def informations(scenario: Scenario) -> FloatArray:
-    """(N, n, n): ``G_i`` as the filters believe it; a pooled filter's is the same at all nodes."""
+    """(N, n, n): ``G_i`` of the increments as the filters believe it; a pooled filter's is the same
+    at all nodes.
+    """
+    seen = [one.H.T @ np.linalg.solve(one.R, one.H) for one in increments(scenario)]
     if scenario.filter.algorithm.pooled:
-        return np.stack([scenario.pooled_model.information] * len(scenario.nodes))
-    return np.stack([model.information for model in scenario.models])
+        seen = seen * len(scenario.nodes)
+    return np.stack(seen)
 
 
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times weight."""
     index, size = scenario.topology.index, len(scenario.nodes)
-    heard = {pair: rate for pair, rate in scenario.effective_rates().items() if rate > 0.0}
+    rates = {} if by_readings(scenario) else scenario.effective_rates()
+    heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
     values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
     places = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
     entries = scipy.sparse.coo_array((values, (places[:, 0], places[:, 1])), shape=(size, size))
@@ -131,7 +183,18 @@ def coupled(scenario: Scenario) -> Coupled:
         q, _ = riccati_step(table, q, np.zeros(n), delay)
         T = np.column_stack([riccati_step(table, q, e, delay)[1] for e in np.eye(n)])
     start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
-    return Coupled(A, Q, informations(scenario), coupling(scenario), T, q, delay, start)
+    return Coupled(
+        A,
+        Q,
+        informations(scenario),
+        coupling(scenario),
+        T,
+        q,
+        delay,
+        start,
+        poisson_samples(scenario),
+        jumps(scenario),
+    )
 
 
 def balanced(scenario: Scenario) -> bool | None:

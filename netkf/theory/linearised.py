@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse.linalg
 
 from netkf.core.arrays import FloatArray
-from netkf.theory.packed import Packed
+from netkf.theory.packed import Linear, Packed
 
 FEW_UNKNOWNS = 2000
 ROUNDS, GAIN = 4, 1e-7  # each round solves for what the one before has left
@@ -25,21 +25,22 @@ def solved(packed: Packed, P: FloatArray, right: FloatArray) -> FloatArray:
     """(N, m): rows X of the equation for gains of P (N, n, n), ``right`` (N, m); nan where it is
     singular.
     """
-    blocks = packed.linear(P)
+    linear = packed.linear(P)
     with np.errstate(all="ignore"):
-        X = None if right.size <= FEW_UNKNOWNS else _iterated(packed, blocks, right)
-        return _eliminated(packed, blocks, right) if X is None else X
+        X = None if right.size <= FEW_UNKNOWNS else _iterated(linear, right)
+        return _eliminated(linear, right) if X is None else X
 
 
-def _eliminated(packed: Packed, blocks: FloatArray, right: FloatArray) -> FloatArray:
+def _eliminated(linear: Linear, right: FloatArray) -> FloatArray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
-        X = scipy.sparse.linalg.spsolve(packed.matrix(blocks), -right.reshape(-1))
+        X = scipy.sparse.linalg.spsolve(linear.matrix(), -right.reshape(-1))
     return np.asarray(X).reshape(right.shape)
 
 
-def _iterated(packed: Packed, blocks: FloatArray, right: FloatArray) -> FloatArray | None:
+def _iterated(linear: Linear, right: FloatArray) -> FloatArray | None:
     """None where it does not converge."""
+    blocks = linear.blocks
     try:
         inverse = np.linalg.inv(blocks)
     except np.linalg.LinAlgError:
@@ -47,7 +48,7 @@ def _iterated(packed: Packed, blocks: FloatArray, right: FloatArray) -> FloatArr
 
     def applied(x: FloatArray) -> FloatArray:
         X = x.reshape(right.shape)
-        return np.asarray(np.einsum("ik,ikl->il", X, blocks) + packed.arriving(X)).reshape(-1)
+        return np.asarray(np.einsum("ik,ikl->il", X, blocks) + linear.arriving(X)).reshape(-1)
 
     def alone(x: FloatArray) -> FloatArray:
         return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)

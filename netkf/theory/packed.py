@@ -7,11 +7,14 @@ small matrix for A P + P A' that is the same at all nodes, and P G P where there
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse
 
 from netkf.core.arrays import FloatArray
 from netkf.theory.coupled import Coupled
+from netkf.theory.samples import Samples
 
 NO_INFORMATION = 1e-15  # eigenvalues of G, its diagonal made 1, that are rounding
 
@@ -35,7 +38,8 @@ class Packed:
         self._predicted = self.pack(equations.T @ self._basis @ equations.T.T)
         self.start = self.pack(equations.start)
         self._Q, self._q = self.pack(equations.Q), self.pack(equations.q)
-        self.leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)
+        flows = [equations.coupling, *(s.heard for s in equations.samples)]
+        self.leaving = np.asarray(sum(flow.sum(axis=1) for flow in flows)).reshape(-1)
         leave = scipy.sparse.diags_array(self.leaving)
         self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
@@ -51,16 +55,37 @@ class Packed:
         n = len(self.equations.A)
         return np.asarray(Y[..., self._places].reshape(*Y.shape[:-1], n, n))
 
+    def predicted(self, Y: FloatArray) -> FloatArray:
+        """(N, m): rows that took the delay to arrive."""
+        return np.asarray(Y @ self._predicted + self._q)
+
     def slope(self, Y: FloatArray, sent: FloatArray | None = None) -> FloatArray:
         """(N, m): the right-hand side where ``sent`` (N, m) arrives; without delay that is Y."""
         if sent is None:
             change = self._exchange @ Y + Y @ self._own + self._Q
         else:
             change = Y @ self._own + self._Q - self.leaving[:, None] * Y
-            change += self.equations.coupling @ (sent @ self._predicted + self._q)
+            change += self.equations.coupling @ self.predicted(sent)
         M = self.unpack(Y[self._sensed]) @ self._C
         change[self._sensed] -= self.pack(M @ np.swapaxes(M, 1, 2))
+        for group in self.equations.samples:
+            self._sample(change, group, self.unpack(Y), None if sent is None else self.unpack(sent))
         return np.asarray(change)
+
+    def _sample(
+        self, change: FloatArray, group: Samples, P: FloatArray, sent: FloatArray | None
+    ) -> None:
+        """Add ``s (g(P) - P)``, and what arrives of estimates sent at samples."""
+        off = self.pack(group.told(P))
+        np.subtract.at(change, group.nodes, group.rate[:, None] * off)
+        if not group.heard.nnz:
+            return
+        if sent is None:
+            arriving = self.pack(P)[group.nodes] - off
+        else:
+            after = self.pack(sent)[group.nodes] - self.pack(group.told(sent))
+            arriving = self.predicted(after)
+        change += group.heard @ arriving
 
     def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
         """(order + 1, N, m): Taylor coefficients of the solution through ``Y``, without delay, in
@@ -93,29 +118,71 @@ class Packed:
             np.multiply(change, span / (k + 1), out=series[k + 1])
         return series
 
-    def linear(self, P: FloatArray) -> FloatArray:
-        """(N, m, m): blocks B with ``X_i B_i`` the packed ``(A - P_i G_i) X_i + X_i (A - P_i
-        G_i)' - c_i X_i``, what H(12) made linear at ``P`` does to each node by itself.
+    def linear(self, P: FloatArray) -> Linear:
+        """H(12) made linear at ``P`` (N, n, n): with its gains, which a change of P leaves alone to
+        first order.
         """
         K = P @ self.equations.G
         change = -(K[:, None] @ self._basis)
         blocks = self.pack(change + np.swapaxes(change, -1, -2)) + self._own
-        return np.asarray(blocks - self.leaving[:, None, None] * np.eye(self.m))
+        blocks = blocks - self.leaving[:, None, None] * np.eye(self.m)
+        heard = [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
+        for group in self.equations.samples:
+            _, closed = group.gains(P)
+            closed = closed[:, None]
+            maps = self.pack(closed @ self._basis @ np.swapaxes(closed, -1, -2))
+            np.add.at(blocks, group.nodes, group.rate[:, None, None] * (maps - np.eye(self.m)))
+            if group.heard.nnz:
+                heard.append((group.heard, group.nodes, maps @ self._predicted))
+        return Linear(np.asarray(blocks), heard)
+
+    def driven(self, P: FloatArray) -> FloatArray:
+        """(N, m): what H(12) made linear at P adds whatever P is: Q, the noises of readings, and
+        those of messages under way.
+        """
+        G, q = self.equations.G, self.equations.q
+        right = self.pack(self.equations.Q + P @ G @ P + self.leaving[:, None, None] * q)
+        for group in self.equations.samples:
+            noise = self.pack(group.noise(P))
+            np.add.at(right, group.nodes, group.rate[:, None] * noise)
+            right += group.heard @ (noise @ self._predicted)
+        return np.asarray(right)
+
+
+class Linear(NamedTuple):
+    """``blocks`` (N, m, m): what becomes of each row by itself, ``X_i B_i``; ``heard``: rates (N,
+    S) of what arrives from nodes (S,), each row times a map (S, m, m) or one map (1, m, m).
+    """
+
+    blocks: FloatArray
+    heard: list[tuple[scipy.sparse.csr_array, np.ndarray, FloatArray]]
 
     def arriving(self, X: FloatArray) -> FloatArray:
-        """(N, m): ``sum_j c_ij T X_j T'`` of rows X (N, m)."""
-        return np.asarray(self.equations.coupling @ (X @ self._predicted))
+        """(N, m): what arrives at each node of rows X (N, m)."""
+        total = np.zeros_like(X)
+        for rates, nodes, maps in self.heard:
+            total += rates @ (X[nodes][:, None] @ maps)[:, 0]
+        return total
 
-    def matrix(self, blocks: FloatArray, arriving: bool = True) -> scipy.sparse.csc_array:
-        """(N m, N m): :meth:`linear` as one sparse matrix, with what is ``arriving`` or without."""
-        size, m = len(blocks), self.m
+    def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
+        """(N m, N m): one sparse matrix, with what is arriving or without."""
+        size, m, _ = self.blocks.shape
         shape = (size * m, size * m)
-        turned = np.ascontiguousarray(np.swapaxes(blocks, 1, 2))
+        turned = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))
         parts = (turned, np.arange(size), np.arange(size + 1))
-        own = scipy.sparse.csr_array(scipy.sparse.bsr_array(parts, shape=shape))
-        if arriving:
-            own = own + scipy.sparse.kron(self.equations.coupling, self._predicted.T, "csr")
-        return scipy.sparse.csc_array(own)
+        whole = scipy.sparse.csr_array(scipy.sparse.bsr_array(parts, shape=shape))
+        for rates, nodes, maps in self.heard if arriving else ():
+            if len(maps) == 1 and len(nodes) == size:
+                whole = whole + scipy.sparse.kron(rates, maps[0].T, "csr")
+                continue
+            entries = scipy.sparse.coo_array(rates)
+            turned = np.swapaxes(maps, 1, 2)[entries.col] * entries.data[:, None, None]
+            rows = entries.row[:, None, None] * m + np.arange(m)[None, :, None]
+            columns = nodes[entries.col][:, None, None] * m + np.arange(m)[None, None, :]
+            places = np.broadcast_arrays(rows, columns)
+            flat = (turned.reshape(-1), tuple(place.reshape(-1) for place in places))
+            whole = whole + scipy.sparse.csr_array(scipy.sparse.coo_array(flat, shape=shape))
+        return scipy.sparse.csc_array(whole)
 
 
 def _factors(G: FloatArray) -> FloatArray:

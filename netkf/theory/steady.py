@@ -17,6 +17,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import Coupled, coupled
 from netkf.theory.linearised import solved
 from netkf.theory.packed import Packed
+from netkf.theory.samples import by_readings
 
 GROWN = 1e9  # a covariance that many times the first is taken to grow for ever
 RESIDUAL = 1e-9
@@ -34,7 +35,7 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     the link rates would have to reach for one to exist.
     """
     equations = coupled(scenario)
-    P = _steady(equations)
+    P = steady_state(equations)
     if P is None:
         raise TheoryError(_no_steady_state(scenario, equations))
     return P
@@ -42,7 +43,7 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
 
 def has_steady_state(scenario: Scenario) -> bool:
     """Whether H(12) has a steady state; raises TheoryError where H(12) does not apply."""
-    return _stabilising(coupled(scenario)) is not None
+    return steady_state(coupled(scenario)) is not None
 
 
 def steady_by_node(scenario: Scenario) -> FloatArray:
@@ -50,23 +51,19 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
     none.
     """
     equations = coupled(scenario)
-    if equations.coupling.nnz:
+    if equations.talks:
         raise TheoryError("the nodes hear each other: their steady state is one for all")
-    every = [
-        _steady(
-            equations._replace(
-                G=equations.G[i : i + 1],
-                start=equations.start[i : i + 1],
-                coupling=equations.coupling[i : i + 1, i : i + 1],
-            )
-        )
-        for i in range(len(equations.G))
-    ]
+    every = [steady_state(equations.only(i)) for i in range(len(equations.G))]
     nothing = np.full_like(equations.A, np.nan)
     return np.stack([nothing if P is None else P[0] for P in every])
 
 
-def _steady(equations: Coupled) -> FloatArray | None:
+def steady_state(equations: Coupled) -> FloatArray | None:
+    """(N, n, n), None where there is none; raises TheoryError where readings come at known times:
+    the bound then comes to a cycle.
+    """
+    if equations.jumps:
+        raise TheoryError("samples at known times lead to a cycle, not to a steady state")
     P = _stabilising(equations)
     if P is None:
         return None
@@ -89,10 +86,7 @@ def _steady(equations: Coupled) -> FloatArray | None:
 
 
 def _newton(packed: Packed, P: FloatArray) -> FloatArray:
-    equations = packed.equations
-    inflow = packed.leaving[:, None, None] * equations.q
-    right = equations.Q + P @ equations.G @ P + inflow
-    return packed.unpack(solved(packed, P, packed.pack(right)))
+    return packed.unpack(solved(packed, P, packed.driven(P)))
 
 
 def _stable(packed: Packed, P: FloatArray) -> bool:
@@ -111,9 +105,10 @@ def _stabilising(equations: Coupled) -> FloatArray | None:
     n = len(equations.A)
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
     P = equations.start + equations.Q + 1e-3 * size * np.eye(n)
-    leaving = float(equations.coupling.sum(axis=1).max())
-    step = 0.1 / (float(np.abs(equations.A).max()) + leaving + 1e-9)
     packed = Packed(equations)
+    sampling = sum(float(group.rate.max(initial=0.0)) for group in equations.samples)
+    leaving = float(packed.leaving.max()) + sampling
+    step = 0.1 / (float(np.abs(equations.A).max()) + leaving + 1e-9)
     for _ in range(MOST_STEPS):
         if _stable(packed, P):
             return P
@@ -131,7 +126,7 @@ def _stabilising(equations: Coupled) -> FloatArray | None:
 
 
 def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
-    if equations.coupling.nnz == 0:
+    if not equations.talks:
         missing = np.isnan(steady_by_node(scenario)[:, 0, 0])
         alone = [str(node) for node, no in zip(scenario.nodes, missing, strict=True) if no]
         listed = ", ".join(alone[:SHOWN]) + (", ..." if len(alone) > SHOWN else "")
@@ -139,12 +134,15 @@ def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
         why = "no message ever arrives" if talks else "the filter does not talk"
         several = "s" if len(alone) > 1 else ""
         return f"{why}, and the covariance of node{several} {listed} alone has no steady state"
+    activation = scenario.network.activation
+    if by_readings(scenario):
+        return "H(12) has no steady state: nodes that sample more often would transmit more often"
     factor = threshold_factor(equations)
     if factor is None:
         return "H(12) has no steady state, and faster links do not give it one"
-    activation = scenario.network.activation
     rate = getattr(activation, "rate", None)
-    words = f"every link rate must be at least {factor:.5g} times what it is"
+    what = {"nodes": "node", "directions": "direction"}.get(getattr(activation, "at", ""), "link")
+    words = f"every {what} rate must be at least {factor:.5g} times what it is"
     if rate is not None and not getattr(activation, "rates", ()):
         words = f"the rate {rate:g} is below the threshold {factor * rate:.5g}"
     return f"H(12) has no steady state: {words}"
@@ -157,8 +155,7 @@ def threshold_factor(equations: Coupled) -> float | None:
     """
 
     def exists(factor: float) -> bool:
-        faster = equations._replace(coupling=factor * equations.coupling)
-        return _stabilising(faster) is not None
+        return _stabilising(equations.faster(factor)) is not None
 
     low, high = 1.0, 2.0
     while not exists(high):
