@@ -33,10 +33,10 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     """(T, N, n, n): the solution of H(12) at ``times`` (increasing seconds), with the effective
     rates of the channel; for filters that do not talk it is their own covariance.
 
-    By H Theorem 2 it bounds E[P_i(t)]. Sensors that sample by Poisson clocks or at known times enter
-    as docs/poisson_samples.md derives it. Integrated with relative tolerance 1e-10 and returned only
-    when the defect is below that (below 1e-7 with a delay, or where precise sensors hear of large
-    covariances). Raises TheoryError where the theorem does not apply, and says why.
+    By H Theorem 2 it bounds E[P_i(t)], and with sensors that sample by Poisson clocks or at known
+    times by docs/poisson_samples.md. Integrated with relative tolerance 1e-10 and returned only
+    when the defect is below that (below 1e-7 with a delay or samples, or where precise sensors hear
+    of large covariances). Raises TheoryError where the theorem does not apply, and says why.
     """
     moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if moments.ndim != 1 or not moments.size or not np.isfinite(moments).all():

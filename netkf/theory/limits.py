@@ -64,8 +64,8 @@ def central_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _slot_central(scenario: Scenario) -> FloatArray:
-    plant, algorithm = scenario.slot_plant, scenario.filter.algorithm
-    if scenario.slotted and algorithm.predicts:
+    plant = scenario.slot_plant
+    if scenario.hosted.predicts:
         raise TheoryError("the filter's samples are predictions, the central filter's are not")
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError("H differs from slot to slot: there is no steady covariance")

@@ -1,7 +1,7 @@
 """Sensors that sample, as the bound H(12) meets them.
 
-A Poisson clock of rate s adds ``s (g(M) - M)`` with ``g(P) = P - P H' (H P H' + R)^-1 H P``, a reading
-at a known time makes M jump to g(M); docs/poisson_samples.md has the proof.
+With ``g(P) = P - P H' (H P H' + R)^-1 H P`` a Poisson clock of rate s adds ``s (g(M) - M)``, and a
+reading at a known time makes M jump to g(M); docs/poisson_samples.md has the proof.
 """
 
 from __future__ import annotations
@@ -134,16 +134,8 @@ def poisson_samples(scenario: Scenario) -> tuple[Samples, ...]:
             for (i, j), weight in weights.items():
                 if j == sender:
                     heard[i, k] = rate * weight
-        nodes, H, R, rates, _ = zip(*entries, strict=True)
-        groups.append(
-            Samples(
-                np.array(nodes),
-                np.array(H),
-                np.array(R),
-                np.array(rates),
-                scipy.sparse.csr_array(heard),
-            )
-        )
+        nodes, H_, R_, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
+        groups.append(Samples(nodes, H_, R_, rates, scipy.sparse.csr_array(heard)))
     return tuple(groups)
 
 

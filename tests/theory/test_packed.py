@@ -65,10 +65,10 @@ def test_the_linear_part_is_the_derivative_of_the_slope(arriving):
     # The right-hand side is quadratic: central differences are exact.
     sent = X if arriving else 0.0 * X
     expected = 0.5 * (plain(e, e.start + X, sent) - plain(e, e.start - X, -sent))
-    blocks, rows = packed.linear(e.start), packed.pack(X)
-    applied = np.einsum("ik,ikl->il", rows, blocks) + arriving * packed.arriving(rows)
+    linear, rows = packed.linear(e.start), packed.pack(X)
+    applied = np.einsum("ik,ikl->il", rows, linear.blocks) + arriving * linear.arriving(rows)
     near(packed.unpack(applied), expected, 1e-11)
-    flat = packed.matrix(blocks, arriving) @ rows.reshape(-1)
+    flat = linear.matrix(arriving) @ rows.reshape(-1)
     near(packed.unpack(flat.reshape(rows.shape)), expected, 1e-11)
 
 

@@ -1,0 +1,129 @@
+"""Stacked errors under clocks: P against the engine's, errors against the engine's own linear map."""
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf import theory
+from netkf.scenario.reading import from_table
+from tests.engines.linearity import engine_covariance
+
+POISSON = {"kind": "poisson", "rate": 2.0}
+SAMPLED = [
+    {
+        "nodes": [0, 2],
+        "H": [[1.0, 0.3]],
+        "R": [[0.4]],
+        "sampling": {"kind": "poisson", "rate": 2.0},
+    },
+    {
+        "nodes": [1],
+        "H": [[0.2, 1.0]],
+        "R": [[0.2]],
+        "sampling": {"kind": "periodic", "period": 0.5, "jitter": 0.2},
+    },
+    {
+        "nodes": [0],
+        "H": [[1.0, 0.0], [0.0, 1.0]],
+        "R": [[0.3, 0.1], [0.1, 0.6]],
+        "sampling": {"kind": "periodic", "period": 0.7},
+    },
+]
+MIXED = [*SAMPLED[:2], {"nodes": [2], "H": [[0.5, 1.0]], "R": [[0.3]]}]
+LATE = {
+    "loss": {"kind": "bernoulli", "delivery": 0.7},
+    "delay": {"kind": "uniform", "low": 0.05, "high": 0.9},
+    "symmetric": False,
+}
+LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.6}, "symmetric": False}
+FILTERS = {
+    "hybrid": {"kind": "hybrid", "epsilon": 0.3},
+    "intersection": {"kind": "covariance-intersection", "epsilon": 0.3},
+    "gossip": {"kind": "gossip"},
+    "intermittent": {"kind": "intermittent"},
+    "dropping": {"kind": "intermittent", "late": "drop"},
+    "window": {"kind": "intermittent", "window": 0.4},
+    "diffusion": {"kind": "diffusion"},
+    "keeping": {"kind": "diffusion", "on_loss": "keep-own"},
+    "push-sum": {"kind": "push-sum"},
+    "local": {"kind": "local"},
+    "central": {"kind": "central"},
+}
+CASES = [
+    *[("hybrid", at) for at in ("links", "directions", "nodes", "readings")],
+    *[("intersection", at) for at in ("links", "directions", "nodes", "readings")],
+    ("gossip", "links"),
+    *[(name, "readings") for name in ("intermittent", "dropping", "window")],
+    *[("diffusion", at) for at in ("nodes", "readings", "directions")],
+    ("keeping", "nodes"),
+    ("push-sum", "nodes"),
+    ("local", None),
+    ("central", None),
+]
+SAMPLES_ONLY = {"intermittent", "dropping", "window", "push-sum"}
+
+
+def scenario_of(name, at, channel, sensors, folder, **other):
+    network = {"graph": {"kind": "cycle", "nodes": 4}}
+    if at == "readings":
+        network["activation"] = {"kind": "readings"}
+    elif at is not None:
+        network["activation"] = {**POISSON, "at": at}
+    if at is not None:
+        network["channel"] = channel
+    plant = {
+        "kind": "diffusion",
+        "A": [[-0.3, 0.5], [-0.6, 0.1]],
+        "B": [[0.8, 0.0], [0.1, 0.5]],
+        "cov": [[1.0, 0.2], [0.2, 2.0]],
+    }
+    table = {
+        "format": 1,
+        "name": "replayed",
+        "horizon": 4.0,
+        "probe": [0.3, 1.1, 2.0, 3.3, 3.9],
+        "plant": plant,
+        "sensors": sensors,
+        "network": network,
+        "filter": FILTERS[name],
+        "seed": 5,
+    }
+    return from_table({**table, **other}, folder)
+
+
+def close(found, expected, tolerance):
+    size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
+    assert (np.abs(found - expected) <= tolerance * size).all()
+
+
+@pytest.mark.parametrize("channel", [{}, LOSSY, LATE], ids=["sure", "lossy", "late"])
+@pytest.mark.parametrize("sensors", [SAMPLED, MIXED], ids=["sampled", "mixed"])
+@pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
+def test_covariances_are_those_of_the_run(name, at, sensors, channel, tmp_path):
+    if sensors is MIXED and name in SAMPLES_ONLY:
+        pytest.skip("samples only")
+    scenario = scenario_of(name, at, channel, sensors, tmp_path)
+    run = netkf.simulate(scenario, engine="simpy")
+    P, stacked = theory.errors.replayed_covariances(scenario, run)
+    close(P, run.P, 1e-9)
+    if name != "push-sum":  # what a node counts twice it takes for certain
+        least = np.linalg.eigvalsh(P - theory.error_covariance(scenario, run))[..., 0]
+        assert (least >= -1e-12 * np.abs(P).max()).all()
+    assert np.linalg.eigvalsh(stacked).min() > -1e-12
+
+
+@pytest.mark.parametrize("channel", [{}, LATE], ids=["sure", "late"])
+@pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
+def test_errors_are_the_linear_map_of_the_engine(name, at, channel, tmp_path):
+    scenario = scenario_of(name, at, channel, SAMPLED, tmp_path, horizon=1.6, probe=[0.4, 0.9, 1.5])
+    expected, run = engine_covariance(scenario)
+    close(theory.error_covariance(scenario, run), expected, 1e-9)
+
+
+def test_filters_with_another_plant_and_other_noises(tmp_path):
+    belief = {"A": [[-0.2, 0.4], [-0.6, 0.0]], "B": [[1.0, 0.0], [0.0, 1.0]], "R": [[[0.5]]] * 2}
+    scenario = scenario_of("hybrid", "nodes", LATE, SAMPLED[:2], tmp_path)
+    scenario = scenario.replace({"filter.model": belief, "horizon": 1.6, "probe": [0.4, 1.5]})
+    expected, run = engine_covariance(scenario)
+    close(theory.error_covariance(scenario, run), expected, 1e-9)
+    close(theory.errors.replayed_covariances(scenario, run)[0], run.P, 1e-9)
