@@ -98,6 +98,7 @@ class _Pieces:
         self._silent = Packed(equations._replace(coupling=0.0 * equations.coupling, samples=quiet))
         self._jumps = _Jumps(packed)
         self._first = packed.start
+        self._jumped: dict[float, FloatArray] = {}
         self._ends: list[float] = [0.0]
         self._outputs: list[Callable[[float], FloatArray]] = []
 
@@ -105,8 +106,8 @@ class _Pieces:
         start = self._packed.start
         if t <= 0.0:
             return start
-        if t == self._ends[-1]:
-            return self._first
+        if t in self._jumped:
+            return self._jumped[t]
         # t may lie a rounding error beyond what is known so far.
         piece = min(int(np.searchsorted(self._ends, t)), len(self._outputs)) - 1
         return self._outputs[piece](t).reshape(start.shape)
@@ -136,7 +137,8 @@ class _Pieces:
                 self._append(end, self._integrate(begin, end, f))
             else:
                 self._iterate(begin, end, f)
-            self._first = self._jumps.after(end, self(end))
+            if self._jumps.happens(end):
+                self._first = self._jumped[end] = self._jumps.after(end, self._first)
 
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
         self._outputs.append(output)
@@ -248,6 +250,10 @@ class _Jumps:
         """The first of these times after ``begin``, if it is before ``end``."""
         place = bisect.bisect_right(self._times, begin)
         return min(end, self._times[place]) if place < len(self._times) else end
+
+    def happens(self, time: float) -> bool:
+        """Whether anything does."""
+        return time in self._happens or time in self._arrives
 
     def after(self, time: float, Y: FloatArray) -> FloatArray:
         """(N, m) once all of that time has happened: samples, and then what arrives."""

@@ -1,4 +1,4 @@
-"""Stacked errors under clocks: P against the engine's, errors against the engine's own linear map."""
+"""Stacked errors under clocks: P against the engine's, errors against its own linear map."""
 
 import numpy as np
 import pytest
