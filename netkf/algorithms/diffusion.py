@@ -37,7 +37,7 @@ class DiffusionState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DiffusionFilter(Filter):
-    """D Algorithm 1, (6)-(9), with any F in place of D's identity; samples in slots are predictions.
+    """D Algorithm 1, (6)-(9), with any F in place of D's identity; slots show predictions.
 
     Under clocks a node combines what it heard at one instant, predicted to now where it took time.
 

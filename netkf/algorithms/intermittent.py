@@ -1,4 +1,4 @@
-"""The Kalman filter with intermittent observations, R (15)-(18), with late readings used exactly."""
+"""The Kalman filter with intermittent observations, R (15)-(18); late readings are used exactly."""
 
 from __future__ import annotations
 

@@ -327,8 +327,10 @@ class Scenario(Part):
 
     @cached_property
     def exact_errors(self) -> bool:
-        """Frames."""
-        return False
+        """Whether errors are simulated in frames, so that they keep their digits however far an
+        unstable plant has gone.
+        """
+        return sampling.exact_errors(self)
 
     def moved_back(self, offset: FloatArray, age: float) -> FloatArray:
         """The state (n,) from which the plant alone would come to ``offset`` in ``age`` seconds."""

@@ -32,7 +32,10 @@ def scenario_file(case, folder, ids=lambda node: node):
     """The scenario of a case, whose nodes may be called otherwise."""
     n = len(case["A"])
     nodes = range(case["nodes"])
-    readings = [[t, ids(node), *np.atleast_1d(np.array(y).ravel()).tolist()] for t, node, *y in case["readings"]]
+    readings = [
+        [t, ids(node), *np.atleast_1d(np.array(y).ravel()).tolist()]
+        for t, node, *y in case["readings"]
+    ]
     p = max(len(sensor["H"]) for sensor in case["sensors"].values())
     table(folder / "readings.csv", ["t", "node", *(f"y{k}" for k in range(p))], readings)
     at, links = case["activation_at"], [[ids(i), ids(j)] for i, j in case["links"]]

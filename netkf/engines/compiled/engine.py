@@ -16,6 +16,7 @@ from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.flow import FlowRun, replay_for
 from netkf.engines.compiled.lots import at_a_desk
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
+from netkf.network.channels import by_message
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
@@ -49,6 +50,14 @@ class CompiledEngine(Engine):
         parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
+        if not scenario.slotted:
+            activation = scenario.network.activation
+            beyond = scenario.sampled_sensors or scenario.exact_errors
+            beyond = beyond or by_message(scenario.network.channel.delay)
+            if beyond or (activation is not None and activation.at != "links"):
+                return f'engine "compiled" cannot run these clocks yet; {remedy}'
+            if type(scenario.hosted) not in (Hybrid, CovarianceIntersection, Local, Central):
+                return f'engine "compiled" cannot run this filter under clocks yet; {remedy}'
         for family, part in parts:
             if type(part) not in KNOWN:
                 return (

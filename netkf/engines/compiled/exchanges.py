@@ -7,6 +7,7 @@ slots are made first and the estimates follow.
 from __future__ import annotations
 
 import heapq
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import partial
@@ -20,9 +21,10 @@ from netkf.algorithms.push_sum import MASS, PushSum
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.compiled.masses import stopping
-from netkf.network.channels import Fates, checked_chance
+from netkf.network.channels import Fates, checked_chance, checked_delay
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
+from netkf.plants.transitions import frame_slots
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
 from netkf.trace.schema import CODES, EVENT
@@ -34,7 +36,7 @@ SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND, STOP = (
         *("late", "absorb", "swap", "round", "stop"),
     )
 )
-SENSING, EXCHANGING, SAMPLING = range(3)
+SENSING, EXCHANGING, SAMPLING, REBASING = range(4)
 FATES = 64  # drawn at once
 MOST_ROWS = 1 << 15
 Row = tuple[float, int, int, int, int, int, float]
@@ -85,6 +87,8 @@ class Programme(ABC):
         self._scenario, self._algorithm = scenario, algorithm
         self._length = scenario.phase_length if algorithm.talks else 0.0
         self._samples = set(scenario.slots)
+        exact = scenario.exact_errors
+        self._frame = frame_slots(scenario.slot_plant.F) if exact else None
         self._slot, self._over, self._noted = 0, False, True
         self._begin()
 
@@ -152,6 +156,8 @@ class Programme(ABC):
         if slot in self._samples:
             self._sampled.append((slot, start, self._reached()))
             self._done.append([SAMPLING, len(self._sampled) - 1, 0, 0])
+        if self._frame and slot and slot % self._frame == 0:
+            self._done.append([REBASING, len(self._slots) - 1, 0, 0])
 
 
 class Exchanges(Programme):
@@ -257,8 +263,12 @@ class Exchanges(Programme):
         if fate is None or fate[0] >= checked_chance(self._loss, link, number, fate[1], measured):
             self._note((now, LOST, sender, receiver, number, phase, NAN))
             return
-        arrival = now + fate[2]
-        if fate[2] == 0.0:
+        delay = checked_delay(self._scenario.network.channel.delay, link, number, fate[2])
+        if math.isnan(delay):
+            self._note((now, LOST, sender, receiver, number, phase, NAN))
+            return
+        arrival = now + delay
+        if delay == 0.0:
             self._note((now, DELIVER, receiver, sender, number, phase, 0.0))
             self._inbox.setdefault(receiver, {})[sender] = (number, way.weight, 0.0)
         elif arrival < self._scenario.ends:

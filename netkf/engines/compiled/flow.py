@@ -235,6 +235,7 @@ class FlowRun:
             self._progress,
             times.copy(),
             x,
+            x,
             taken.xhat[:count].copy(),
             taken.P[:count].copy(),
             lambda k: self._pass_rows_on(int(taken.rows[k])),

@@ -22,12 +22,14 @@ def recorded(
     progress: Progress,
     times: FloatArray,
     x: FloatArray,
+    local: FloatArray,
     xhat: FloatArray,
     P: FloatArray,
     pass_rows_on: Callable[[int], None],
 ) -> bool:
-    """Record the states x (T, n), xhat (T, H, n) and P (T, H, n, n) of H hosts at these times up to
-    the first that is not sound; whether there is none. ``pass_rows_on`` is given the place of that
+    """Record the states x (T, n), which are ``local`` (T, n) in the coordinates of the estimates,
+    xhat (T, H, n) and P (T, H, n, n) of H hosts at these times up to the first that is not sound;
+    whether there is none. ``pass_rows_on`` is given the place of that
     one: what happened after it did not happen.
     """
     if not len(times):
@@ -38,8 +40,9 @@ def recorded(
         xhat, P = np.repeat(xhat, nodes, axis=1), np.repeat(P, nodes, axis=1)
     last = len(times) - 1 if intact.all() else int(np.argmin(intact))
     after, time = last + 1, float(times[last])
-    error = x[:after, None] - xhat[:after]
-    recorder.samples(times[:after], x[:after], xhat[:after], P[:after], error)
+    error = local[:after, None] - xhat[:after]
+    far = xhat[:after] if local is x else xhat[:after] + (x - local)[:after, None]
+    recorder.samples(times[:after], x[:after], far, P[:after], error)
     progress(time)
     if intact.all():
         return True

@@ -18,7 +18,7 @@ from netkf.algorithms.square_root import predict_root
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import compilable
 from netkf.core.small import applied
-from netkf.engines.compiled.exchanges import SAMPLING, SENSING
+from netkf.engines.compiled.exchanges import REBASING, SAMPLING, SENSING
 from netkf.engines.compiled.masses import Masses, exchange_masses
 
 
@@ -36,10 +36,13 @@ class Nodes(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Readings y (S, H, p) and H (S, H, p, n) of the slots here."""
+    """Readings y (S, H, p) and H (S, H, p, n) of the slots here, and by how much the origin of the
+    coordinates moves in a slot, ``offsets`` (S, n).
+    """
 
     y: FloatArray
     H: FloatArray
+    offsets: FloatArray
 
 
 class Steps(NamedTuple):
@@ -71,12 +74,22 @@ def show(nodes: Nodes, shown: Shown, k: int) -> None:
     shown.root[k] = nodes.root
 
 
+@compilable
+def rebase(nodes: Nodes, offset: FloatArray) -> None:
+    """Lower all estimates by ``offset`` (n,)."""
+    for h in range(len(nodes.xhat)):
+        for i in range(len(offset)):
+            nodes.xhat[h, i] -= offset[i]
+
+
 def local(nodes: Nodes, readings: Readings, steps: Steps, shown: Shown) -> None:
     """SlotLocal and, of one node, SlotCentral."""
     for k in range(len(steps.kind)):
         s = steps.number[k]
         if steps.kind[k] == SAMPLING:
             show(nodes, shown, s)
+        elif steps.kind[k] == REBASING:
+            rebase(nodes, readings.offsets[s])
         elif steps.kind[k] == SENSING:
             for h in range(len(nodes.xhat)):
                 p = nodes.rows[h]
@@ -112,6 +125,8 @@ def gossip(nodes: Nodes, readings: Readings, steps: Steps, shown: Shown) -> None
     for k in range(len(steps.kind)):
         if steps.kind[k] == SAMPLING:
             show(nodes, shown, steps.number[k])
+        elif steps.kind[k] == REBASING:
+            rebase(nodes, readings.offsets[steps.number[k]])
         elif steps.kind[k] == SENSING:
             adapt(nodes, readings, steps.number[k])
         elif steps.after[k] > steps.first[k]:
@@ -127,6 +142,9 @@ def intermittent(nodes: Nodes, readings: Readings, steps: Steps, shown: Shown) -
     for k in range(len(steps.kind)):
         if steps.kind[k] == SAMPLING:
             show(nodes, shown, steps.number[k])
+            continue
+        if steps.kind[k] == REBASING:
+            rebase(nodes, readings.offsets[steps.number[k]])
             continue
         if steps.kind[k] == SENSING:
             slot = steps.number[k]
@@ -163,6 +181,9 @@ def diffusion(
     for k in range(len(steps.kind)):
         if steps.kind[k] == SAMPLING:
             show(nodes, shown, steps.number[k])
+            continue
+        if steps.kind[k] == REBASING:
+            rebase(nodes, readings.offsets[steps.number[k]])
             continue
         if steps.kind[k] == SENSING:
             adapt(nodes, readings, steps.number[k])
@@ -205,6 +226,8 @@ def push_sum(
         if steps.kind[k] == SAMPLING:
             show(nodes, shown, s)
             shown.mass[s] = masses.mass[:, :2]
+        elif steps.kind[k] == REBASING:
+            rebase(nodes, readings.offsets[s])
         elif steps.kind[k] == SENSING:
             for h in range(len(nodes.xhat)):
                 root = limit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,17 @@ KERNELS: dict[type[Filter], Callable[..., None]] = {
 }
 
 
+class _Slot(NamedTuple):
+    """The state in one slot: ``absolute`` (n,), and in the coordinates of the estimates when the
+    slot is ``shown`` and when it is ``sensed``; by how much their origin moves (``offset``).
+    """
+
+    absolute: FloatArray
+    shown: FloatArray
+    sensed: FloatArray
+    offset: FloatArray
+
+
 class SlotRun:
     """What one run in slots carries from one lot of slots to the next."""
 
@@ -58,7 +69,8 @@ class SlotRun:
         algorithm = scenario.filter.algorithm
         self._kernel, self._pooled = demanded(KERNELS[type(algorithm)]), algorithm.pooled
         self._exchanges = make_exchanges(scenario, streams)
-        self._truth: Truth = scenario.slot_plant.truth(streams.generator("plant"))
+        recorder.exact_errors = scenario.exact_errors
+        self._truth: Truth = scenario.slot_truth(streams)
         paths = {
             node: [scenario.slot_path(streams, node, p) for p in scenario.placed[node]]
             for node in scenario.sensing
@@ -87,7 +99,7 @@ class SlotRun:
             np.zeros((count, size, n)), np.zeros((count, size, n, n)), np.zeros((count, size, 2))
         )
         # States first: the truth is asked for in the order of the slots.
-        states = {slot: self._truth.state(slot) for slot in slots.slots}
+        states = self._states(slots)
         readings = self._readings(slots, states)
         self._kernel(self._nodes, readings, Steps(*slots[:7]), shown, *self._extra)
         rows = slots.rows
@@ -99,7 +111,8 @@ class SlotRun:
             self._recorder,
             self._progress,
             np.array([time for _, time, _ in slots.samples]),
-            np.array([states[slot] for slot, _, _ in slots.samples]).reshape(-1, n),
+            np.array([states[slot].absolute for slot, _, _ in slots.samples]).reshape(-1, n),
+            np.array([states[slot].shown for slot, _, _ in slots.samples]).reshape(-1, n),
             shown.xhat,
             shown.root @ np.swapaxes(shown.root, -1, -2),
             lambda k: self._recorder.extend(rows[: slots.samples[k][2]]),
@@ -108,7 +121,24 @@ class SlotRun:
             self._recorder.extend(rows)
         return fine
 
-    def _readings(self, slots: Slots, states: dict[int, FloatArray]) -> Readings:
+    def _states(self, slots: Slots) -> dict[int, _Slot]:
+        """The truth in every slot, which is asked for in the order of the slots."""
+        truth = self._truth
+        nothing, zero = np.zeros(self._scenario.plant.n), np.zeros(self._scenario.plant.n)
+        if truth.frame_slots is None:
+            states = ((slot, truth.absolute(slot)) for slot in slots.slots)
+            return {slot: _Slot(x, x, x, nothing) for slot, x in states}
+        found = {}
+        for slot in slots.slots:
+            x, local = truth.absolute(slot), truth.local(slot)
+            moves = slot > 0 and slot % truth.frame_slots == 0
+            offset = truth.rebase(slot) if moves else nothing
+            # Predictions are shown before a slot's readings, filtered estimates after them.
+            sensed = zero if moves and self._scenario.hosted.predicts else local
+            found[slot] = _Slot(x, local, sensed, offset)
+        return found
+
+    def _readings(self, slots: Slots, states: dict[int, _Slot]) -> Readings:
         size, n = self._nodes.xhat.shape
         most = self._nodes.R.shape[1]
         y = np.zeros((len(slots.slots), size, most))
@@ -116,7 +146,7 @@ class SlotRun:
         which = slots.number[slots.kind == SENSING]
         sensed = [slots.slots[k] for k in which.tolist()]
         if sensed:
-            x = np.stack([states[slot] for slot in sensed])
+            x = np.stack([states[slot].sensed for slot in sensed])
             for h, paths in enumerate(self._paths):
                 row = 0
                 for path in paths:
@@ -124,7 +154,8 @@ class SlotRun:
                     after = row + values.shape[1]
                     y[which, h, row:after], H[which, h, row:after] = values, matrices
                     row = after
-        return Readings(y, H)
+        offsets = np.array([states[slot].offset for slot in slots.slots])
+        return Readings(y, H, offsets.reshape(-1, n))
 
 
 SUMS = ((0, "weight"), (1, "number"))

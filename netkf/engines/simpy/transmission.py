@@ -15,7 +15,7 @@ from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope
 from netkf.engines.simpy.timeline import Timeline
-from netkf.network.channels import Fates, checked_chance
+from netkf.network.channels import Fates, checked_chance, checked_delay
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -90,7 +90,7 @@ class Transmitter:
         draw, bad, drawn = outcome
         loss = self._channel.loss
         lost = draw >= checked_chance(loss, way.link, number, bad, way.measured)
-        delay = drawn if lost else self._channel.delay.message_delay(way.link, number, drawn)
+        delay = drawn if lost else checked_delay(self._channel.delay, way.link, number, drawn)
         if lost or math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
