@@ -17,6 +17,7 @@ import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
+from netkf.engines.soundness import sound
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 
@@ -74,11 +75,8 @@ class Engine(ABC):
 def broken(
     scenario: Scenario, xhat: FloatArray, P: FloatArray, without: np.ndarray | None = None
 ) -> list[int]:
-    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is no longer finite; those
-    ``without`` (N,) a covariance have none to be looked at.
+    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is not ``sound``; those
+    ``without`` (N,) a covariance have none to be looked at. They end a run as diverged.
     """
-    finite = np.isfinite(P).all(axis=(1, 2))
-    if without is not None:
-        finite |= without
-    finite &= np.isfinite(xhat).all(axis=1)
-    return [scenario.nodes[k] for k in np.flatnonzero(~finite)]
+    intact = sound(xhat, P, False if without is None else without)
+    return [scenario.nodes[k] for k in np.flatnonzero(~intact)]

@@ -100,7 +100,7 @@ def own_steps(algorithm: object, known: type, steps: tuple[str, ...] = STEPS) ->
     return [
         name
         for name in steps
-        if hasattr(known, name) and getattr(mine, name) is not getattr(known, name)
+        if hasattr(known, name) and getattr(mine, name, None) is not getattr(known, name)
     ]
 
 

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ROUNDING = 4.0 * np.finfo(float).eps
+BLUR, CERTAIN = 100.0, 1e-14
+"""Standard deviations below so many rounding errors are not judged; variances below this share of
+the largest one are rounding themselves.
+"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,6 +77,11 @@ class Run:
         return pd.DataFrame(state_table(self.replica, *samples, self.shown))
 
     @cached_property
+    def rounding(self) -> FloatArray:
+        """(T,) the size of what rounding adds to ``error``; 0 with ``exact_errors``."""
+        return np.zeros(len(self.times)) if self.exact_errors else rounding(self.x)
+
+    @cached_property
     def rounding_from(self) -> float:
         """The first sample time at which rounding of the state blurs ``error``, inf if none does;
         always inf with ``exact_errors``.
@@ -122,14 +131,27 @@ def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray
     with np.errstate(over="ignore", invalid="ignore"):
         least = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
         least = np.where(np.isnan(P).all(axis=(1, 2, 3)), (e * e).mean(axis=(1, 2)), least)
-    deviation = 0.01 * np.sqrt(np.maximum(least, 0.0))
-    blurred = (rounding(x) > deviation) & (deviation > 0.0)
-    return float(times[np.argmax(blurred)]) if blurred.any() else np.inf
+    deviation = np.sqrt(np.maximum(least, 0.0)) / BLUR
+    lost = (rounding(x) > deviation) & (deviation > 0.0)
+    return float(times[np.argmax(lost)]) if lost.any() else np.inf
 
 
 def rounding(x: FloatArray) -> FloatArray:
     """(T,) the size of the error that rounding adds to x - xhat where both are about x (T, n)."""
     return np.asarray(ROUNDING * np.abs(x).max(axis=1))
+
+
+def blurred(run: Run, matrices: FloatArray) -> np.ndarray:
+    """(T, N) samples whose errors rounding blurs in some direction, where their covariances are
+    these (T, N, n, n): directions that are certain do not count, nor do matrices of nan.
+    """
+    if not run.rounding.any():
+        return np.zeros(matrices.shape[:2], dtype=bool)
+    whole = np.asarray(np.isfinite(matrices).all(axis=(2, 3)))
+    values = np.linalg.eigvalsh(np.where(whole[..., None, None], matrices, 0.0))
+    uncertain = values > CERTAIN * values[..., -1:]
+    least = np.where(uncertain, values, np.inf).min(axis=-1)
+    return np.asarray((BLUR * run.rounding[:, None]) ** 2 > least)
 
 
 def state_table(

@@ -34,6 +34,7 @@ from netkf.experiments.checking.evidence import (
     Row,
     identity,
     judge,
+    rounded_away,
 )
 from netkf.experiments.checking.exact import promised_filter, stand_in
 from netkf.experiments.checking.seen import times
@@ -44,6 +45,7 @@ from netkf.experiments.simulate import LOAD, choose_engine, simulate
 from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
+from netkf.trace.run import Run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,12 +102,14 @@ def watched(scenario: Scenario) -> Scenario:
 
 
 class Told(NamedTuple):
-    """What one replica says: to the paper, and how far the estimates are from those of the filter
-    that a user's class should be, on the same readings and messages; nan where none was asked.
+    """What one replica says: to the paper (None of a run that diverged), and how far the estimates
+    are from those of the filter that a user's class should be, on the same readings and messages;
+    nan where none was asked or rounding hides it; and whether the run diverged.
     """
 
     paper: Any
     apart: float
+    diverged: bool = False
 
 
 def witness(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Told:
@@ -114,16 +118,30 @@ def witness(scenario: Scenario, seed: int, replica: int, engine: str | Engine = 
     apart = math.nan
     if promised is not scenario and replica < TWINS:
         twin = simulate(promised, seed, replica, SimpyEngine())
-        both = min(len(run.times), len(twin.times))
-        size = np.sqrt(np.trace(twin.P[:both], axis1=-2, axis2=-1))[..., None]
-        gap = np.abs(run.xhat[:both] - twin.xhat[:both]) / np.maximum(size, 1e-300)
-        apart = float(np.nan_to_num(gap, nan=np.inf).max())
+        apart = _apart(run, twin)
+    if run.status == "diverged":
+        return Told(None, apart, True)
     return Told(paper_of(scenario).witness(scenario, run), apart)
+
+
+def _apart(run: Run, twin: Run) -> float:
+    """The largest difference of the errors of two runs with one truth, in standard deviations,
+    where rounding is far smaller than what is looked for; nan where it nowhere is.
+    """
+    both = min(len(run.times), len(twin.times))
+    size = np.sqrt(np.trace(twin.P[:both], axis1=-2, axis2=-1))[..., None]
+    rounded = np.maximum(run.rounding[:both], twin.rounding[:both])[:, None, None]
+    gap = np.abs(run.error[:both] - twin.error[:both]) / np.maximum(size, 1e-300)
+    clear = np.broadcast_to(rounded <= 0.1 * SAME * size, gap.shape)
+    return float(np.nan_to_num(gap[clear], nan=np.inf).max()) if clear.any() else math.nan
 
 
 def _twin(told: list[Told], level: float) -> Finding:
     """The first replicas against the filter that the class should be."""
-    apart = max(one.apart for one in told[:TWINS])
+    asked = [one.apart for one in told[:TWINS]]
+    if np.isnan(asked).all():
+        return rounded_away(0.0)
+    apart = float(np.nanmax(asked))
     words = f"{min(TWINS, len(told))} runs beside those of the filter that it should be"
     return identity(apart, SAME, words)
 
@@ -137,9 +155,29 @@ TWIN = Promise(
 )
 
 
+def _sound(told: list[Told], level: float) -> Finding:
+    """No run ends early."""
+    diverged = sum(one.diverged for one in told)
+    words = f"{diverged} of {len(told)} runs ended early, so no other promise is looked at"
+    return Finding((-diverged / len(told),) * 3, 0.0, words)
+
+
+SOUND = Promise(
+    "estimates are finite and covariances positive semidefinite",
+    "the class itself",
+    (),
+    _sound,
+    exact=True,
+)
+
+
 def verdict(scenario: Scenario, witnesses: Iterable[Told], seed: int, confidence: float) -> Verdict:
     """The verdict on a watched scenario from what its runs say, in the order of replicas."""
     paper, told = paper_of(scenario), list(witnesses)
+    _demand_covariances(scenario, told)
+    if any(one.diverged for one in told):
+        rows = judge([SOUND], told, [], len(told), 1.0)
+        return Verdict(scenario.name, len(told), seed, confidence, tuple(rows))
     stacked = paper.Witness(*map(np.array, zip(*(one.paper for one in told), strict=True)))
     seen = paper.Observed(scenario, stacked, seed)
     table = [Row(*row) for row in assumptions(stand_in(scenario)).itertuples(index=False)]
@@ -153,6 +191,16 @@ def verdict(scenario: Scenario, witnesses: Iterable[Told], seed: int, confidence
     if stand_in(scenario) is not scenario:
         found = [*judge([TWIN], told, [], len(told), 1.0), *found]
     return Verdict(scenario.name, len(told), seed, confidence, tuple(found))
+
+
+def _demand_covariances(scenario: Scenario, told: list[Told]) -> None:
+    """Raise TheoryError where there is nothing to hold promises against."""
+    diverged = sum(one.diverged for one in told)
+    if diverged and stand_in(scenario) is scenario:
+        words = f"{diverged} of {len(told)} runs diverged, so there are no limits to look at"
+        raise TheoryError(f"{words}; shorten the horizon")
+    if not diverged and all(np.isnan(one.paper.P).all() for one in told):
+        raise TheoryError("the filter gives no covariance, and promises are about covariances")
 
 
 def check(

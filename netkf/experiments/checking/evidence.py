@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not promised"
 MOST_RUNS = 1e9
 VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
@@ -38,13 +40,15 @@ class Evidence:
 
 class Finding(NamedTuple):
     """A margin (value, low, high), how much below 0 is tolerable, and words about it; ``early``
-    where the promise is about a limit and the horizon is too short to tell.
+    where the promise is about a limit and the horizon is too short to tell; ``blurred`` where
+    rounding of a large state has left no errors to judge by.
     """
 
     margin: tuple[float, float, float]
     tolerance: float
     words: str
     early: bool = False
+    blurred: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,9 +97,11 @@ def _needed(promise: Promise, row: Row) -> bool:
 
 
 def _weighed(promise: Promise, finding: Finding, runs: int) -> Evidence:
-    (margin, low, high), tolerance, words, early = finding
+    (margin, low, high), tolerance, words, early, blurred = finding
     needed = None
-    if early:
+    if blurred:
+        verdict = UNDECIDED
+    elif early:
         verdict, words = UNDECIDED, f"{words}; the horizon is too short to tell, lengthen it"
     elif not high >= 0.0:  # also where nothing but nan was seen
         verdict = BROKEN
@@ -123,6 +129,23 @@ def _weighed(promise: Promise, finding: Finding, runs: int) -> Evidence:
 def _not_promised(promise: Promise, why: str) -> Evidence:
     nan = math.nan
     return Evidence(promise.words, promise.source, why, nan, nan, nan, nan, NOT_PROMISED, None, "")
+
+
+def left_out(seen: Any) -> str:
+    """Words about the times at which some errors of ``seen.runs.e`` (R, K, N, n) are left out."""
+    lost = np.isnan(seen.runs.e).any(axis=(0, 2, 3))
+    times = ", ".join(time for time, none in zip(seen.moments, lost, strict=True) if none)
+    return f"; errors that rounding blurs are left out ({times})" if times else ""
+
+
+def rounded_away(tolerance: float) -> Finding:
+    """Where errors have lost their digits at every sample that a promise is about."""
+    nan = math.nan
+    words = (
+        "the state is so large that rounding blurs the errors wherever they are looked at; shorten "
+        "the horizon"
+    )
+    return Finding((nan, nan, nan), tolerance, words, blurred=True)
 
 
 def identity(deviation: float, allowed: float, words: str) -> Finding:

@@ -13,14 +13,14 @@ import numpy as np
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.core.fields import Part
-from netkf.experiments.checking.evidence import Finding, Row, identity
+from netkf.experiments.checking.evidence import Finding, Row, identity, left_out, rounded_away
 from netkf.experiments.checking.laws import NEES, chi_squared, worst
 from netkf.experiments.checking.statistics import mean_ratio, off_by
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import own_steps
 from netkf.theory.errors import diagonal_blocks, replayed_covariances
-from netkf.trace.run import Run, errors
+from netkf.trace.run import BLUR, Run, blurred, errors
 
 MOST = 1000
 """Replicas whose exact covariances are computed; the others show their errors only."""
@@ -34,7 +34,7 @@ SAMPLED, EXACT = 0.02, 1e-8
 class Exact(NamedTuple):
     """What one run says at K times; nan in replicas whose exact covariances are not computed.
 
-    P, e       : (K, N, n, n), (K, N, n) covariances and errors
+    P, e       : (K, N, n, n), (K, N, n) covariances and errors, nan where rounding blurs them
     nees       : (K, N) e' P^-1 e
     replayed   : (K, N, n, n) P as the equations have it
     Sigma      : (K, N, n, n) covariance of the errors given the events
@@ -52,8 +52,9 @@ class Exact(NamedTuple):
 
 def exact(scenario: Scenario, run: Run) -> Exact:
     """Reduce a run."""
-    e = run.error
-    _, nees = errors(e, run.P)
+    _, nees = errors(run.error, run.P)
+    e = np.where(blurred(run, run.P)[..., None], np.nan, run.error)
+    nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
     replayed = Sigma = np.full(run.P.shape, np.nan)
     whole = np.full((len(run.times), 2), np.nan)
     if run.replica < MOST and within_reach(scenario).holds:
@@ -62,7 +63,10 @@ def exact(scenario: Scenario, run: Run) -> Exact:
         except TheoryError:  # rows about them are not promised then
             return Exact(run.P, e, nees, replayed, Sigma, whole)
         Sigma = diagonal_blocks(stacked, len(scenario.nodes))
-        whole = whitened(e, stacked, EXACT if scenario.slotted else SAMPLED)
+        e = np.where(blurred(run, Sigma)[..., None], np.nan, e)
+        nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
+        least = EXACT if scenario.slotted else SAMPLED
+        whole = whitened(run.error, stacked, least, (BLUR * run.rounding) ** 2)
     return Exact(run.P, e, nees, replayed, Sigma, whole)
 
 
@@ -73,12 +77,15 @@ def within_reach(scenario: Scenario) -> Row:
     return Row("exact errors are within reach", "netkf", size <= LARGEST, words)
 
 
-def whitened(e: FloatArray, stacked: FloatArray, least: float) -> FloatArray:
+def whitened(
+    e: FloatArray, stacked: FloatArray, least: float, floor: FloatArray | float = 0.0
+) -> FloatArray:
     """(K, 2): ``e' Sigma^-1 e`` of all nodes together in the directions whose variance is at least
-    that share of the largest, and their number. Small ones show how far nodes disagree.
+    that share of the largest and above ``floor`` (K,), which rounding reaches, and their number.
+    Small ones show how far nodes disagree.
     """
     values, vectors = np.linalg.eigh(stacked)
-    kept = values > least * values[:, -1:]
+    kept = (values > least * values[:, -1:]) & (values > np.reshape(floor, (-1, 1)))
     along = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1))
     square = np.where(kept, along**2 / np.where(kept, values, 1.0), 0.0).sum(axis=1)
     return np.stack([square, kept.sum(axis=1)], axis=1)
@@ -137,10 +144,14 @@ def as_computed(seen: Any, level: float) -> Finding:
     e, Sigma, whole = seen.runs.e[:MOST], seen.runs.Sigma[:MOST], seen.runs.whole[:MOST]
     alone = np.einsum("rkna,rkna->rkn", e, _solved(Sigma, e)).reshape(len(e), -1)
     n = seen.scenario.plant.n
-    ratios = np.concatenate([alone / n, whole[..., 0] / whole[..., 1]], axis=1)
+    if np.isnan(e).all():
+        return rounded_away(NEES)
+    with np.errstate(invalid="ignore"):
+        ratios = np.concatenate([alone / n, whole[..., 0] / whole[..., 1]], axis=1)
     freedom = [n * len(e)] * alone.shape[1] + whole[..., 1].sum(axis=0).tolist()
     places = [*seen.places, *(f"{moment}, all nodes" for moment in seen.moments)]
-    return chi_squared(ratios, freedom, places, level, "e' Sigma^-1 e")
+    found = chi_squared(ratios, freedom, places, level, "e' Sigma^-1 e")
+    return found._replace(words=found.words + left_out(seen))
 
 
 def expected_nees(seen: Any, level: float) -> Finding:
@@ -155,6 +166,8 @@ def expected_nees(seen: Any, level: float) -> Finding:
     mean, square = (values.reshape(len(M), -1).sum(axis=0) for values in (mean, square))
     nees = runs.nees[:MOST].reshape(len(M), -1)
     kept = np.flatnonzero(np.isfinite(nees).all(axis=0) & (mean > 0.0))
+    if np.isnan(runs.e[:MOST]).all():
+        return rounded_away(NEES)
     if not len(kept):
         nan = float("nan")
         return Finding((nan, nan, nan), NEES, "NEES does not exist: P is singular or not finite")
@@ -164,10 +177,11 @@ def expected_nees(seen: Any, level: float) -> Finding:
         ratio = mean_ratio(freedom * nees[:, k].sum() / float(mean[k]), freedom, level / len(kept))
         found.append((off_by(1.0, ratio), f"at {seen.places[k]}"))
     words = (
-        f"mean NEES {nees.mean():.4g}, exact errors say {mean.mean() / len(M):.4g}, n is {n}; "
-        "largest relative difference"
+        f"mean NEES {nees[:, kept].mean():.4g}, exact errors say "
+        f"{mean[kept].mean() / len(M):.4g}, n is {n}; largest relative difference"
     )
-    return worst(found, NEES, words)
+    finding = worst(found, NEES, words)
+    return finding._replace(words=finding.words + left_out(seen))
 
 
 def _solved(Sigma: FloatArray, e: FloatArray) -> FloatArray:

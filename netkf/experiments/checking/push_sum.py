@@ -11,7 +11,7 @@ import scipy.special
 
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
-from netkf.experiments.checking.evidence import Finding, Promise, Row, identity
+from netkf.experiments.checking.evidence import Finding, Promise, Row, identity, rounded_away
 from netkf.experiments.checking.exact import as_computed, exact, stand_in, within_reach
 from netkf.experiments.checking.laws import exact_start, worst
 from netkf.experiments.checking.seen import Seen, relative, replay
@@ -110,6 +110,8 @@ def settled(seen: Observed, level: float) -> Finding:
 def unbiased(seen: Observed, level: float) -> Finding:
     """The mean of the whitened errors at the end is 0 in all directions at once."""
     nodes = seen.scenario.nodes
+    if not np.isfinite(seen.whitened).all():
+        return rounded_away(BIAS)
     found = []
     for i, node in enumerate(nodes):
         e = seen.whitened[:, i]
@@ -131,6 +133,8 @@ def _normal_reach(level: float, n: int) -> float:
 def mean_square(seen: Observed, level: float) -> Finding:
     """The mean square of the whitened errors at the end is 1 on average over directions."""
     nodes, n = seen.scenario.nodes, seen.scenario.plant.n
+    if not np.isfinite(seen.whitened).all():
+        return rounded_away(SQUARE)
     found = []
     for i, node in enumerate(nodes):
         ratio = mean_of((seen.whitened[:, i] ** 2).sum(axis=1) / n, level / len(nodes))

@@ -44,9 +44,9 @@ def look_at(scenario: Scenario) -> tuple[int, ...]:
     """Slots to look at: small ones, half of the horizon and its end; a filtered estimate at the
     horizon itself has seen exchanges that are not in the trace.
     """
-    period, algorithm = scenario.slot_plant.period, scenario.filter.algorithm
+    period = scenario.slot_plant.period
     last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
-    if scenario.slotted and not algorithm.predicts:
+    if scenario.slotted and not scenario.hosted.predicts:
         last = max(1, int(np.ceil(scenario.horizon / period - 1e-9)) - 1)
     return tuple(sorted({min(2, last), min(5, last), max(1, last // 2), last}))
 

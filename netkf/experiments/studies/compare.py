@@ -86,12 +86,22 @@ class Finished:
         states["mean_trace"] = states.filter(regex=r"^P(\d)\1$").sum(axis=1)
         return states[states["t"] > 0.0] if complete else None
 
-    def by_run(self, quantity: str, node: int) -> pd.Series[float] | None:
-        """Averages over time, run by run; of the squared error where it is about errors."""
+    @property
+    def rounding_from(self) -> float:
+        """From when on rounding blurs the errors, inf where it does not."""
+        found = self.summary.get("rounding_from")
+        return math.inf if found is None else float(found)
+
+    def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
+        """Averages over time, run by run; of the squared error where it is about errors, over the
+        samples before ``end``.
+        """
         columns = {"rms_error": "sq_error", "mean_trace": "mean_trace", "mean_nees": "nees"}
         if self.samples is None or quantity not in columns:
             return None
         chosen = self.samples if node < 0 else self.samples[self.samples["node"] == node]
+        if quantity != "mean_trace":
+            chosen = chosen[chosen["t"] < end]
         return chosen.groupby("run")[columns[quantity]].mean()
 
 
@@ -122,13 +132,16 @@ def read(directory: Path) -> Finished:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows side by side; all marks together are right with probability ``confidence``."""
+    """Rows side by side; all marks together are right with probability ``confidence``. ``notes``
+    say of each directory what its averages leave out.
+    """
 
     directories: tuple[str, ...]
     names: tuple[str, ...]
     runs: tuple[int, ...]
     confidence: float
     rows: tuple[Row, ...]
+    notes: tuple[tuple[str, ...], ...] = ()
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -142,6 +155,7 @@ class Comparison:
             "runs": list(self.runs),
             "confidence": self.confidence,
             "rows": rows,
+            "notes": [list(notes) for notes in self.notes],
         }
 
 
@@ -174,6 +188,7 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         tuple(other.runs for other in found),
         sure,
         tuple(rows),
+        tuple(tuple(other.summary.get("notes", ())) for other in found),
     )
 
 
@@ -191,7 +206,8 @@ def _paired(
     first: Finished, other: Finished, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
     """Run by run, where both met the same truth."""
-    one, two = (finished.by_run(quantity, node) for finished in (first, other))
+    end = min(first.rounding_from, other.rounding_from)
+    one, two = (finished.by_run(quantity, node, end) for finished in (first, other))
     if one is None or two is None or not _same_truth(first, other):
         return None
     gaps = np.asarray((two - one).dropna(), dtype=np.float64)

@@ -8,6 +8,7 @@ less for those that are conservative by design, which are then not called wrong.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -25,22 +26,26 @@ from netkf.core.streams import Streams
 from netkf.engines.base import Engine
 from netkf.experiments.ensembles.replicas import replicate
 from netkf.experiments.simulate import choose_engine, simulate
+from netkf.experiments.summary import NO_COVARIANCE
 from netkf.scenario.scenario import Scenario
 from netkf.theory import error_covariance
-from netkf.trace.run import Run, errors
+from netkf.trace.run import Run, blurred, errors
 
 if TYPE_CHECKING:
     import pandas as pd
 
 LOAD = "load it first: netkf.consistency(netkf.load(path))"
 FEWEST = 10
+UNDECIDED = "undecided: rounding blurs the errors of too many samples"
 DESIGN = 0.02
 """Relative distance of the expected value from n that counts as by design."""
 
 
 class Seen(NamedTuple):
-    """Of one run: ``samples`` (T, N) of NEES after time 0; means over them (N,) of NEES, of its
-    expected value, of NIS and of its expected value, nan where they do not exist.
+    """Of one run: ``samples`` (T, N) of NEES after time 0, nan where rounding blurs the errors;
+    means over the others (N,) of NEES, of its expected value, of NIS and of its expected value, nan
+    where they do not exist; ``blurred_from`` (1,): the first time at which some are left out, inf
+    without one; ``given`` (1,): whether the filter gives a covariance.
     """
 
     samples: FloatArray
@@ -48,6 +53,8 @@ class Seen(NamedTuple):
     expected: FloatArray
     nis: FloatArray
     expected_nis: FloatArray
+    blurred_from: FloatArray
+    given: np.ndarray
 
 
 def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Seen:
@@ -59,12 +66,26 @@ def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = 
         sigma = error_covariance(scenario, run)
     except TheoryError:
         sigma = None
-    nis, expected_nis = _innovations(scenario, run, sigma)
-    return Seen(nees[kept], _mean(nees[kept]), _mean(_ratio(run.P, sigma)[kept]), nis, expected_nis)
+    lost = blurred(run, run.P)
+    lost |= False if sigma is None else blurred(run, sigma)
+    nis, expected_nis = _innovations(scenario, run, sigma, lost)
+    times = run.times[lost.any(axis=1) & (run.times > 0.0)]
+    return Seen(
+        np.where(lost, np.nan, nees)[kept],
+        _mean(nees[kept], lost[kept]),
+        _mean(_ratio(run.P, sigma)[kept], lost[kept]),
+        nis,
+        expected_nis,
+        times[:1] if len(times) else np.full(1, np.inf),
+        np.array([np.isfinite(run.P).any()]),
+    )
 
 
-def _mean(values: FloatArray) -> FloatArray:
-    return values.mean(axis=0) if len(values) else np.full(values.shape[1:], np.nan)
+def _mean(values: FloatArray, lost: np.ndarray) -> FloatArray:
+    """(N,) over the samples (T, N) that are not lost; nan where there is none."""
+    count = (~lost).sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(lost, 0.0, values).sum(axis=0) / np.where(count, count, np.nan))
 
 
 def _ratio(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
@@ -79,20 +100,21 @@ def _ratio(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 
 
 def _innovations(
-    scenario: Scenario, run: Run, sigma: FloatArray | None
+    scenario: Scenario, run: Run, sigma: FloatArray | None, lost: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
     """Mean NIS of each node's own readings and its expected value, (N,); in slots only, at slots
-    whose prediction is a sample or follows from the one before.
+    whose prediction is a sample or follows from the one before. An innovation is the reading that
+    the sensor would give of the error, so large states cost it no digits.
     """
     nothing = np.full(len(run.nodes), np.nan)
-    algorithm = scenario.filter.algorithm
     if not scenario.slotted:
         return nothing, nothing
     streams, found, should = Streams(run.seed, run.replica), nothing.copy(), nothing.copy()
-    steps = 0 if algorithm.predicts else 1
+    steps = 0 if scenario.hosted.predicts else 1
     slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
     places = [k for k in range(steps, len(slots)) if slots[k] - slots[k - steps] == steps]
     places = [k for k in places if run.times[k] > 0.0]
+    noise = _plant_noise(scenario, streams, [slots[k] for k in places])
     for i, node in enumerate(run.nodes):
         sensors = [scenario.slot_path(streams, node, p) for p in scenario.placed.get(node, ())]
         if not sensors or not places:
@@ -102,33 +124,54 @@ def _innovations(
             for b in (True, False)
         )
         pairs = []
-        for k in places:
+        for k, w in zip(places, noise, strict=True):
+            if lost[k, i] or lost[k - steps, i]:
+                continue
             H = np.concatenate([sensor.matrix(slots[k]) for sensor in sensors])
-            y = np.concatenate([sensor.reading(slots[k], run.x[k]) for sensor in sensors])
-            xhat, P, error = _predicted(scenario, run, sigma, k - steps, i, steps)
-            v, S = y - H @ xhat, H @ P @ H.T + believed
+            e, P, error = _predicted(scenario, run, sigma, k - steps, i, w if steps else None)
+            v = np.concatenate([sensor.reading(slots[k], e) for sensor in sensors])
+            S = H @ P @ H.T + believed
             truly = (
                 np.nan if error is None else np.trace(np.linalg.solve(S, H @ error @ H.T + true))
             )
             pairs.append((v @ np.linalg.solve(S, v), truly))
-        found[i], should[i] = np.array(pairs).mean(axis=0)
+        if pairs:
+            found[i], should[i] = np.array(pairs).mean(axis=0)
     return found, should
 
 
+def _plant_noise(scenario: Scenario, streams: Streams, slots: list[int]) -> list[FloatArray]:
+    """W (n,) of the steps that end in these slots: the path of a plant with no memory."""
+    plant = scenario.slot_plant
+    forgetful = dataclasses.replace(plant, F=np.zeros_like(plant.F))
+    path = forgetful.truth(streams.generator("plant"))
+    return [path.state(slot) for slot in slots]
+
+
 def _predicted(
-    scenario: Scenario, run: Run, sigma: FloatArray | None, k: int, node: int, steps: int
+    scenario: Scenario,
+    run: Run,
+    sigma: FloatArray | None,
+    k: int,
+    node: int,
+    noise: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Prediction, its P and the covariance of its error from sample k, ``steps`` slots on."""
-    xhat, P = run.xhat[k, node], run.P[k, node]
+    """Error of a prediction, its P and the covariance of its error: those of sample k or, with the
+    plant's ``noise`` (n,) of the step, one slot on.
+    """
+    e, P = run.error[k, node], run.P[k, node]
     error = None if sigma is None else sigma[k, node]
-    if not steps:
-        return xhat, P, error
+    if noise is None:
+        return e, P, error
     F, Q = scenario.slot_belief
     plant = scenario.slot_plant
     if error is not None:
         same = np.array_equal(F, plant.F)
         error = plant.F @ error @ plant.F.T + plant.Q if same else None
-    return F @ xhat, F @ P @ F.T + Q, error
+    ahead = plant.F @ e + noise
+    if not np.array_equal(F, plant.F):
+        ahead = ahead + (plant.F - F) @ run.xhat[k, node]
+    return ahead, F @ P @ F.T + Q, error
 
 
 @dataclass(frozen=True)
@@ -154,6 +197,7 @@ class Consistency:
 
     ``low`` and ``high`` are the chi-square bounds on the mean NEES of one sample over the runs,
     where P is exact, each side missing with (1 - confidence) / 2; over n they bound the ANEES.
+    ``notes`` say what was left out and why, a line each.
     """
 
     scenario: str
@@ -163,6 +207,7 @@ class Consistency:
     low: float
     high: float
     rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return not any(row.verdict.startswith("BROKEN") for row in self.rows)
@@ -209,20 +254,22 @@ def consistency(
 def weighed(scenario: Scenario, runs: Sequence[Seen], confidence: float) -> Consistency:
     """The rows of what several runs say."""
     n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
-    nees, expected, nis, expected_nis = (
-        np.array([run[k] for run in runs]) for k in range(1, len(Seen._fields))
-    )
+    nees, expected, nis, expected_nis = (np.array([run[k] for run in runs]) for k in range(1, 5))
+    blurred_from = float(min(run.blurred_from[0] for run in runs))
+    given = any(run.given[0] for run in runs)
     low, high = (
         2.0 * float(scipy.special.gammaincinv(0.5 * count * n, q)) / count
         for q in (0.5 * level, 1.0 - 0.5 * level)
     )
     shortest = min(len(run.samples) for run in runs)
     means = np.mean([run.samples[:shortest] for run in runs], axis=0)
-    inside = ((means >= low) & (means <= high)).mean(axis=0)
+    clear = np.isfinite(means).sum(axis=0)
+    inside = ((means >= low) & (means <= high)).sum(axis=0) / np.where(clear, clear, np.nan)
     quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))
     rows = []
     for i, node in enumerate(scenario.nodes):
         known = bool(np.isfinite(expected[:, i]).all())
+        lost = given and np.isfinite(blurred_from) and bool(np.isnan(nees[:, i]).any())
         gaps = nees[:, i] - (expected[:, i] if known else n)
         width = quantile * float(gaps.std(ddof=1)) / math.sqrt(count)
         should = float(expected[:, i].mean())
@@ -235,10 +282,18 @@ def weighed(scenario: Scenario, runs: Sequence[Seen], confidence: float) -> Cons
                 float(inside[i]),
                 float(nis[:, i].mean()),
                 float(expected_nis[:, i].mean()),
-                _verdict(float(gaps.mean()), width, should, n, known),
+                NO_COVARIANCE
+                if not given
+                else UNDECIDED
+                if lost
+                else _verdict(float(gaps.mean()), width, should, n, known),
             )
         )
-    return Consistency(scenario.name, n, count, confidence, low, high, tuple(rows))
+    notes = () if given else (NO_COVARIANCE,)
+    if np.isfinite(blurred_from):
+        words = f"from {blurred_from:g} s on rounding of a large state blurs errors"
+        notes = (*notes, f"{words}: those samples are left out; shorten the horizon")
+    return Consistency(scenario.name, n, count, confidence, low, high, tuple(rows), notes)
 
 
 def _verdict(gap: float, width: float, should: float, n: int, known: bool) -> str:

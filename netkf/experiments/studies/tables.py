@@ -109,6 +109,7 @@ def consistency_text(found: Consistency) -> str:
             f"from what NEES should be, all nodes together at confidence {found.confidence:g}",
             f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
             f"chi-square bounds at {found.confidence:g} where P is exact",
+            *(f"note: {note}" for note in found.notes),
         ]
     )
 
@@ -133,6 +134,12 @@ def comparison_text(found: Comparison) -> str:
         left_out = f"({len(rows) - MOST_ROWS} more; --json has all)"
         rows = [*rows[: MOST_ROWS - 3], [left_out, *[""] * len(numbered)], *rows[-3:]]
     lines += ["", table(["", *numbered], rows, left=1)]
+    notes = [
+        f"note: {mark} {note}"
+        for mark, told in zip(numbered, found.notes, strict=True)
+        for note in told
+    ]
+    lines += ["", *notes] if notes else []
     methods = {e.method for row in found.rows for e in row.entries if e.method}
     if methods - {"one run"}:
         how = ", ".join(sorted(methods - {"one run"}))

@@ -106,6 +106,8 @@ def by_simulation(found: Figures, target: Target, level: float, central: float |
     all nodes where it is about the worst; ``central`` is the trace to divide by.
     """
     values = found.mean_square if target.of_errors else found.trace
+    if (np.isnan(values) & ~(found.diverged > 0)).any():
+        return Interval(math.nan, -math.inf, math.inf)  # rounding has left no errors to judge by
     values = np.where(found.diverged > 0, np.inf, values)
     columns = values if target.of_worst else values.mean(axis=1, keepdims=True)
     runs, count = columns.shape
