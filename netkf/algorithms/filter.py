@@ -196,11 +196,9 @@ class Filter(Part):
             if name in cls.__dict__:
                 raise TypeError(f"{cls.__name__}.{name} is now {present}, see netkf.parts.Filter")
         for name in ("init", "emit", "absorb"):
-            wanted = inspect.signature(getattr(Filter, name)).parameters
-            given = inspect.signature(getattr(cls, name)).parameters
-            if len(given) < len(wanted):
-                arguments = ", ".join(k for k in wanted if k != "self")
-                raise TypeError(f"{cls.__name__}.{name} must take ({arguments})")
+            wanted = list(inspect.signature(getattr(Filter, name)).parameters)
+            if not _takes(getattr(cls, name), len(wanted)):
+                raise TypeError(f"{cls.__name__}.{name} must take ({', '.join(wanted[1:])})")
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """The state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
@@ -307,6 +305,14 @@ class Filter(Part):
     def largest_degree(self) -> float:
         """The largest number of neighbours a node may have for the weights to make sense."""
         return np.inf
+
+
+def _takes(method: Any, count: int) -> bool:
+    """Whether a method can be called with so many arguments, and names none as SlotFilter did."""
+    parameters = inspect.signature(method).parameters
+    kinds = [parameter.kind for parameter in parameters.values()]
+    several = inspect.Parameter.VAR_POSITIONAL in kinds
+    return (several or len(kinds) >= count) and "phase" not in parameters
 
 
 def commutes(algorithm: Filter) -> bool:

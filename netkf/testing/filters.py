@@ -1,4 +1,4 @@
-"""Whether a filter keeps its contract: the part that both kinds of time share."""
+"""Whether a filter keeps its contract: what both kinds of time share."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.adapters import FlowAdapter, SlotAdapter, adapted
+from netkf.algorithms.filter import CLOCKS, Filter, commutes
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.arrays import FloatArray
@@ -15,6 +17,11 @@ from netkf.testing.watching import Watched, demand, difference, leaves, made
 
 SYMMETRY, SEMIDEFINITE = 1e-9, 1e-9
 MOST_LINKS = 8
+PHASES = ("predict", "sense", "exchange")
+FLAGS = (
+    *("predicts", "pairwise", "one_way", "inverts", "talks", "pooled"),
+    *("needs_samples", "newest_only"),
+)
 
 
 class System(NamedTuple):
@@ -32,30 +39,46 @@ class System(NamedTuple):
 
 def check_filter(filter: Any, /, **settings: Any) -> None:
     """Check a filter, or a class with its ``settings``, against its contract on small random
-    systems of one to three states.
+    systems of one to three states, in slots and under each clock that the class says it knows.
 
     For every method: what it is given, states, payloads and the filter itself, stays as it was,
     also later; the same arguments give the same result; no global generator is used. Estimates are
-    (n,), covariances (n, n), symmetric and positive semidefinite after every step. Weights are not
-    negative and sum to at most 1. Filter and states survive pickle. In continuous time ``flow``
-    composes over gaps; in slots the programme is sound, an empty inbox is absorbed and what
-    ``conserved`` names is conserved by an exchange without losses.
+    (n,); covariances are None, or (n, n), symmetric and positive semidefinite after every step.
+    Weights are not negative and sum to at most 1. Filter and states survive pickle. ``predict``
+    composes over gaps in continuous time. In slots the schedule is sound and an empty inbox is
+    absorbed. What ``conserved`` names is conserved by an exchange without losses. A class that
+    defines ``shift`` does the same with shifted data, shifted. FlowFilter and SlotFilter classes
+    are checked through their adapters.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    from netkf.testing.flow import check_flow_filter
-    from netkf.testing.slots import check_slot_filter
+    from netkf.testing.shifts import check_shift
+    from netkf.testing.trials import trials
 
-    part = made(filter, (FlowFilter, SlotFilter), settings)
-    watched = Watched(part)
+    part = made(filter, (Filter, FlowFilter, SlotFilter), settings)
+    hosted = adapted(part)
+    watched = Watched(hosted, part, former_names(hosted))
     watched.pickled()
-    if part.talks:
+    _class_variables(watched)
+    if hosted.talks:
         _weights(watched)
-    if isinstance(part, FlowFilter):
-        check_flow_filter(watched)
-    else:
-        check_slot_filter(watched)
+    if hosted.schedule is not None:
+        _schedule(watched)
+    plain = list(trials(watched))
+    for trial in plain:
+        trial.run()
+    if commutes(hosted):
+        check_shift(watched, plain)
     watched.finish()
+
+
+def former_names(hosted: Filter) -> dict[str, str]:
+    """How a class of a former contract calls the methods of the present one."""
+    if isinstance(hosted, FlowAdapter):
+        return {"predict": "flow", "update": "measure", "max_measurement_interval": "stretch"}
+    if isinstance(hosted, SlotAdapter):
+        return {"update": "sense", "schedule": "programme", "redraws_links": "redraws"}
+    return {}
 
 
 def systems(inverts: bool) -> list[System]:
@@ -84,7 +107,7 @@ def check_estimate(
     watched: Watched, state: Any, n: int, after: str
 ) -> tuple[FloatArray, FloatArray | None]:
     """``estimate`` after a method: shapes, finite; P None, or symmetric, positive semidefinite."""
-    where = f"{watched.name}.estimate after {after}"
+    where = f"{watched.name}.estimate after {watched.spoken(after)}"
     pair = watched.call("estimate", state)
     demand(isinstance(pair, tuple) and len(pair) == 2, where, "must be (xhat, P)", pair)
     xhat = np.asarray(pair[0])
@@ -100,7 +123,8 @@ def check_estimate(
 def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
-    demand(np.isfinite(array).all(), where, f"{name} must be finite", array)
+    remedy = "return None where the filter has no P" if name == "P" else ""
+    demand(np.isfinite(array).all(), where, f"{name} must be finite", array, remedy)
 
 
 def _check_covariance(where: str, P: FloatArray) -> None:
@@ -137,11 +161,64 @@ def check_state_pickles(watched: Watched, state: Any) -> None:
     demand(difference(one, other) is None, where, "states must be themselves after pickling")
 
 
+def _class_variables(watched: Watched) -> None:
+    """Where the class says it runs."""
+    part, name = watched.part, watched.name
+    for flag in FLAGS:
+        value = getattr(part, flag)
+        demand(isinstance(value, bool), f"{name}.{flag}", "must be True or False", value)
+    clocks = part.clocks
+    known = isinstance(clocks, tuple) and set(clocks) <= set(CLOCKS)
+    words = ", ".join(f'"{clock}"' for clock in CLOCKS)
+    demand(known, f"{name}.clocks", f"must be a tuple of {words}", clocks)
+    somewhere = bool(clocks) or part.schedule is not None or not part.talks
+    rule = "must name a clock where schedule is None: the filter could not run at all"
+    demand(somewhere, f"{name}.clocks", rule, clocks)
+    first = part.first_slot
+    whole = isinstance(first, int) and first >= 0
+    demand(whole, f"{name}.first_slot", "must be a whole number of at least 0", first)
+
+
+def _schedule(watched: Watched) -> None:
+    part, where = watched.part, f"{watched.name}.{watched.spoken('schedule')}"
+    schedule = part.schedule
+    if isinstance(part, SlotAdapter):
+        sound = set(schedule) <= {"exchange", "sense"} and schedule.count("sense") == 1
+        demand(sound, where, 'must be a tuple of "exchange" and "sense" with one "sense"', schedule)
+    else:
+        known = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
+        words = ", ".join(f'"{phase}"' for phase in PHASES)
+        demand(known, where, f"must be None or a tuple of {words}", schedule)
+        once = max(schedule.count("predict"), schedule.count("sense")) <= 1
+        demand(once, where, 'must have one "predict" and one "sense" at most', schedule)
+        _check_predicts(watched, schedule)
+    for phase in range(schedule.count("exchange")):
+        steps = watched.call("steps", phase)
+        whole = isinstance(steps, int) and steps >= 1
+        demand(whole, f"{watched.name}.steps", "must be a whole number of at least 1", steps)
+        fresh = watched.call("redraws_links", phase, 0)
+        redraws = f"{watched.name}.{watched.spoken('redraws_links')}"
+        demand(fresh is True, redraws, "must be True in step 0", fresh, "links have no outcome yet")
+
+
+def _check_predicts(watched: Watched, schedule: tuple[str, ...]) -> None:
+    if not {"predict", "sense"} <= set(schedule):
+        return
+    ahead = schedule.index("sense") < schedule.index("predict")
+    demand(
+        watched.part.predicts is ahead,
+        f"{watched.name}.predicts",
+        'must be True where the schedule has "predict" after "sense", and False where before',
+        watched.part.predicts,
+        "else estimates are compared with the state of another slot",
+    )
+
+
 def _weights(watched: Watched) -> None:
     part, where = watched.part, f"{watched.name}.weight"
     most = watched.call("largest_degree")
     demand(most >= 1.0, f"{watched.name}.largest_degree", "must be at least 1", most)
-    given = getattr(part, "pair_weights", None)
+    given = part.pair_weights
     if given is not None:
         return _given_weights(watched, np.asarray(given))
     degrees = range(1, int(min(most, MOST_LINKS)) + 1)

@@ -116,16 +116,26 @@ class Watched:
     """A part whose methods are called with everything around them watched.
 
     What a method was given must be as before, also later; the part itself too; a second call must
-    give the same; numpy's and Python's global generators must not be used.
+    give the same; numpy's and Python's global generators must not be used. Where the part is an
+    adapter, its ``owner`` is the object of the user's class, and ``former`` says how that one calls
+    the methods.
     """
 
-    def __init__(self, part: Any) -> None:
-        self.part, self.name = part, type(part).__name__
+    def __init__(
+        self, part: Any, owner: Any = None, former: Mapping[str, str] | None = None
+    ) -> None:
+        self.part, self._owner = part, part if owner is None else owner
+        self.name = type(self._owner).__name__
+        self._former = former or {}
         self._kept: list[tuple[str, Any, Leaves]] = []
+
+    def spoken(self, method: str) -> str:
+        """What the user's class calls the method."""
+        return self._former.get(method, method)
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """The result of a method; ``repeatable`` where it draws nothing."""
-        where = f"{self.name}.{method}"
+        where = f"{self.name}.{self.spoken(method)}"
         before = [dict(leaves(argument)) for argument in arguments]
         itself = self._attributes()
         results = [self._result(where, method, arguments) for _ in range(1 + repeatable)]
@@ -161,9 +171,15 @@ class Watched:
         self._kept.append((where, results[0], found[0]))
         return results[0]
 
+    def once(self) -> Watched:
+        """The same part, each method called once and what is around it left alone: for runs that
+        are only compared with watched ones.
+        """
+        return _Once(self.part, self._owner, self._former)
+
     def _attributes(self) -> Leaves:
         """What the part has, but for properties that it caches."""
-        cls, own = type(self.part), vars(self.part)
+        cls, own = type(self._owner), vars(self._owner)
         kept = {k: v for k, v in own.items() if not isinstance(_static(cls, k), cached_property)}
         return {path.strip("[]'"): leaf for path, leaf in leaves(kept)}
 
@@ -206,7 +222,7 @@ class Watched:
     def pickled(self) -> Any:
         """A copy of the part that went through pickle, as one that goes to a worker process."""
         try:
-            copy = pickle.loads(pickle.dumps(self.part))
+            copy = pickle.loads(pickle.dumps(self._owner))
         except Exception as error:
             fail(
                 self.name,
@@ -214,6 +230,14 @@ class Watched:
                 in_words(error),
                 "define the class at the top level of a module and keep no open files or lambdas",
             )
-        path = difference(dict(leaves(self.part)), dict(leaves(copy)))
+        path = difference(dict(leaves(self._owner)), dict(leaves(copy)))
         demand(path is None, self.name, f"must be itself after pickling, and lost {path}")
         return copy
+
+
+class _Once(Watched):
+    """See ``Watched.once``."""
+
+    def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
+        """The result of a method."""
+        return self._result(f"{self.name}.{self.spoken(method)}", method, arguments)

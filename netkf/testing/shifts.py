@@ -1,0 +1,49 @@
+"""Whether a filter that says so commutes with a shift of the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.testing.trials import Shown, Trial, trials
+from netkf.testing.watching import Watched, demand
+
+SHIFT = np.array([7.0, -11.0, 5.0])
+ROUNDING = 1e-9
+
+
+def check_shift(watched: Watched, plain: Sequence[Trial]) -> None:
+    """Run everything again with a truth that is shifted on the way: estimates must be shifted like
+    it from those of the ``plain`` runs, covariances stay what they are.
+    """
+    for before, shifted in zip(plain, trials(watched.once(), SHIFT), strict=True):
+        shifted.run()
+        _compare(watched, before, shifted)
+
+
+def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
+    # The shift itself shows each node once more.
+    moved = [shown for shown in shifted.shown if shown.after != "shift"]
+    for one, other in zip(plain.shown, moved, strict=True):
+        for name, apart, size in _differences(one, other):
+            demand(
+                apart <= ROUNDING * size,
+                f"{watched.name}.shift",
+                "a class that defines shift must commute with a shift of the truth",
+                f"{name} of node {one.node} after {one.after} that differs by {apart:.3g} "
+                "once truth, states and payloads are shifted",
+                "correct shift or shift_payload, or define neither of them",
+            )
+
+
+def _differences(one: Shown, other: Shown) -> list[tuple[str, float, float]]:
+    found = [("xhat", _apart(one.xhat, other.xhat), 1.0 + one.size + other.size)]
+    if one.P is not None and other.P is not None:
+        found.append(("P", _apart(one.P, other.P), 1.0 + float(np.abs(one.P).max())))
+    return found
+
+
+def _apart(one: FloatArray, other: FloatArray) -> float:
+    return float(np.abs(one - other).max())

@@ -1,0 +1,82 @@
+"""Whether a filter keeps its contract in slots."""
+
+from __future__ import annotations
+
+from netkf.algorithms.filter import Exchange, Message
+from netkf.algorithms.models import SlotModel
+from netkf.testing.trials import Trial
+
+SLOTS, MOST_STEPS, MOST_WAIT = 5, 5, 20
+SHIFTED = 3
+PERIOD = 1.0
+
+
+class SlotTrial(Trial):
+    """The schedule for a few slots; everything is lost in the last one."""
+
+    def model(self, sees: bool) -> SlotModel:
+        """Slots of one second."""
+        return SlotModel(self.system.M, self.system.Q, *self.matrices(sees), PERIOD)
+
+    def run(self) -> None:
+        """Slot after slot, from just before nodes exchange."""
+        part, slots = self.part, min(self.part.first_slot, MOST_WAIT) + SLOTS
+        for slot in range(slots):
+            if part.predicts and slot == slots - SHIFTED:
+                self.shift()
+            self._slot(slot, lost=slot == slots - 1)
+            if not part.predicts and slot == slots - SHIFTED:
+                self.shift()
+
+    def _slot(self, slot: int, lost: bool) -> None:
+        part, phase = self.part, 0
+        for kind in part.schedule:
+            if kind == "exchange":
+                if part.talks and slot >= part.first_slot:
+                    for step in range(min(part.steps(phase), MOST_STEPS)):
+                        self._exchange(Exchange(PERIOD * slot, phase, step, slot), lost)
+                phase += 1
+            elif slot > 0 or part.predicts:  # a filtered one starts from before any reading
+                self._advance(kind, slot)
+
+    def _advance(self, kind: str, slot: int) -> None:
+        """A prediction or readings; the truth moves on where the filter does."""
+        part = self.part
+        alone = kind == "sense" and "predict" not in part.schedule
+        if kind == "predict" or (alone and not part.predicts):
+            self.offset = self.system.M @ self.offset
+        if kind == "predict":
+            for node in self.nodes:
+                self.step(node, "predict", PERIOD)
+            return
+        readings = [self.sample(node, PERIOD * slot) for node in self.nodes]
+        if alone and part.predicts:
+            self.offset = self.system.M @ self.offset
+        for node, reading in zip(self.nodes, readings, strict=True):
+            self.step(node, "update", reading)
+
+    def _exchange(self, exchange: Exchange, lost: bool) -> None:
+        before = self.sums()
+        payloads = {node: self.emit(node, exchange) for node in self._talking(exchange.slot)}
+        for node, senders in enumerate(self._senders(exchange.slot)):
+            inbox = [
+                Message(k, float(self.weights[k, node]), payloads[k], 0.01 * (k + 1))
+                for k in senders
+                if not lost and payloads[k] is not None
+            ]
+            self.absorb(node, inbox, exchange)
+        self.compare(before, "all" if lost else "none")
+
+    def _senders(self, slot: int) -> list[list[int]]:
+        """By receiver: everybody hears everybody, or pairs that change from slot to slot."""
+        if not self.part.pairwise:
+            return [[k for k in self.nodes if k != node] for node in self.nodes]
+        paired = self._talking(slot)
+        return [[k for k in paired if k != n] if n in paired else [] for n in self.nodes]
+
+    def _talking(self, slot: int) -> list[int]:
+        """All nodes, or the pair of this slot."""
+        count = len(self.nodes)
+        if not self.part.pairwise:
+            return list(self.nodes)
+        return sorted({slot % count, (slot + 1) % count})

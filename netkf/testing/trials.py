@@ -1,0 +1,167 @@
+"""Nodes that hear each other, all with the filter that is checked: what slots and clocks share."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.adapters import SlotAdapter
+from netkf.algorithms.filter import Exchange, Message, NodeInfo, Reading
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams
+from netkf.testing.filters import System, check_estimate, check_state_pickles, systems
+from netkf.testing.watching import Watched, demand
+
+CONSERVED = 1e-9
+MAX_DELAY = 1.0
+
+
+class Shown(NamedTuple):
+    """An estimate of a node after something happened; ``xhat`` and ``size`` (its largest entry)
+    before it was moved back by what the truth was shifted.
+    """
+
+    node: int
+    after: str
+    xhat: FloatArray
+    P: FloatArray | None
+    size: float
+
+
+class Trial(ABC):
+    """One run of nodes that hear each other, the second of them blind. With ``shift`` (n,) the
+    truth moves by so much in the middle of the run, with all states and messages under way.
+    """
+
+    def __init__(self, watched: Watched, system: System, shift: FloatArray | None = None) -> None:
+        self.watched, self.part, self.system = watched, watched.part, system
+        self.random = Streams(0).generator("testing")
+        self.shown: list[Shown] = []
+        self._shift = shift
+        self.offset = np.zeros(len(system.M))
+        """What the truth is shifted by now."""
+        self.nodes, self.weights = _network(self.part)
+        models = [self.model(sees=node != 1) for node in self.nodes]
+        information = np.sum([model.information for model in models], axis=0)
+        self.states = [self._start(node, models[node], information) for node in self.nodes]
+        self.models = models
+        check_state_pickles(watched, self.states[0])
+
+    @abstractmethod
+    def model(self, sees: bool) -> Any:
+        """What a node believes."""
+
+    @abstractmethod
+    def run(self) -> None:
+        """Let everything happen that may happen."""
+
+    def _start(self, node: int, model: Any, information: FloatArray) -> Any:
+        others = len(self.nodes) - 1
+        own = max(0.0, 1.0 - float(self.weights[:, node].sum()))
+        info = NodeInfo(node, others, others, others + 1, own, information, MAX_DELAY)
+        state = self.watched.call("init", model, self.system.mean, self.system.cov, info)
+        self.show(node, state, "init")
+        return state
+
+    def show(self, node: int, state: Any, after: str) -> None:
+        """Check what the node shows and keep it."""
+        xhat, P = check_estimate(self.watched, state, len(self.system.M), after)
+        size = float(np.abs(xhat).max())
+        self.shown.append(Shown(node, after, xhat - self.offset, P, size))
+
+    def step(self, node: int, method: str, *arguments: Any, shown: bool = True) -> None:
+        """Call a method that returns the node's next state."""
+        self.states[node] = self.watched.call(method, self.states[node], *arguments)
+        if shown:
+            self.show(node, self.states[node], method)
+
+    def emit(self, node: int, exchange: Exchange) -> Any:
+        """What the node sends."""
+        pair = self.watched.call("emit", self.states[node], exchange)
+        both = type(pair) is tuple and len(pair) == 2
+        where = f"{self.watched.name}.emit"
+        demand(both, where, "must return (state, payload); payload None sends nothing")
+        self.states[node], payload = pair
+        self.show(node, self.states[node], "emit")
+        return payload
+
+    def absorb(self, node: int, messages: Sequence[Message], exchange: Exchange) -> None:
+        """Hand over all messages of one instant."""
+        self.step(node, "absorb", messages, exchange)
+        stopped = self.watched.call("stopped", self.states[node])
+        truth = stopped is True or stopped is False
+        demand(truth, f"{self.watched.name}.stopped", "must be True or False", stopped)
+
+    def sample(self, node: int, time: float) -> Reading:
+        """What the node's sensors see now."""
+        H, R = self.matrices(node != 1)
+        return Reading(self.random.normal(size=len(H)) + H @ self.offset, H, R, time)
+
+    def matrices(self, sees: bool) -> tuple[FloatArray, FloatArray]:
+        """``H`` and ``R`` of a node, without rows where it sees nothing."""
+        system = self.system
+        return (system.H, system.R) if sees else (system.H[:0], system.R[:0, :0])
+
+    def shift(self) -> None:
+        """Move the truth, in the run that does so."""
+        if self._shift is None:
+            return
+        self.offset = self._shift.copy()
+        for node in self.nodes:
+            self.step(node, "shift", self.offset)
+
+    def sums(self) -> dict[str, float]:
+        """What ``conserved`` names, over all nodes."""
+        where = f"{self.watched.name}.conserved"
+        parts = [self.watched.call("conserved", state) for state in self.states]
+        alike = all(isinstance(p, dict) and p.keys() == parts[0].keys() for p in parts)
+        demand(alike, where, "must name the same quantities at every node", parts[0])
+        terms = {name: [np.atleast_1d(part[name]) for part in parts] for name in parts[0]}
+        return {name: math.fsum(np.concatenate(values)) for name, values in terms.items()}
+
+    def compare(self, before: dict[str, float], lost: str) -> None:
+        """Whether what is conserved is what it was before an exchange."""
+        after = self.sums()
+        for name, total in before.items():
+            demand(
+                abs(after[name] - total) <= CONSERVED * max(abs(total), 1.0),
+                f"{self.watched.name}.conserved",
+                f"the sum of {name} over all nodes must survive an exchange with {lost} lost",
+                f"{total:.6g} before and {after[name]:.6g} after",
+                "let absorb give to one node what it takes from another",
+            )
+
+
+def _network(part: Any) -> tuple[range, FloatArray]:
+    """As many nodes as ``pair_weights`` asks for, else three where the weights allow two links, all
+    linked; [l, i] is what node i gives to what l sends.
+    """
+    given = part.pair_weights
+    count = (3 if part.largest_degree() >= 2.0 else 2) if given is None else len(given)
+    if given is None:
+        given = np.full((count, count), part.weight(count - 1, count - 1))
+    return range(count), np.asarray(given) * (1.0 - np.eye(count))
+
+
+def trials(watched: Watched, shift: FloatArray | None = None) -> Iterator[Trial]:
+    """All runs that the class says it can do, on every system."""
+    from netkf.testing.clocked import ClockTrial
+    from netkf.testing.slotted import SlotTrial
+
+    part = watched.part
+    drawn = systems(part.inverts)
+    clocks: list[str | None] = list(part.clocks) if part.talks else [None]
+    if isinstance(part, SlotAdapter):
+        clocks = []
+    for system in drawn:
+        moved = None if shift is None else shift[: len(system.M)]
+        if part.schedule is not None:
+            yield SlotTrial(watched, system, moved)
+        for clock in clocks:
+            # What depends on the system shows under one clock as under another.
+            if clock == clocks[0] or system is drawn[-1]:
+                yield from ClockTrial.each_reading(watched, system, moved, clock)
