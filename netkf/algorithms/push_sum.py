@@ -8,7 +8,6 @@ keep the mass; the stop rule of step 2.3 fires when all links of a node are down
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -79,8 +78,8 @@ class PushSum(Filter):
                were up and its weight positive
     """
 
-    gamma: int | None = setting(integer(low=1, high=MOST_STEPS), default=None)
-    delta: float | None = setting(positive, default=None)
+    gamma: int = setting(integer(low=1, high=MOST_STEPS), default=None)
+    delta: float = setting(positive, default=None)
     leader: int = setting(integer(low=0), default=0)
     asymptotic: bool = setting(boolean, default=False)
     links: str = setting(choice("fresh", "held"), default="fresh")
@@ -113,7 +112,7 @@ class PushSum(Filter):
 
     def steps(self, phase: int) -> int:
         """One for the mass, ``gamma`` for the estimates."""
-        return (self.gamma or 1) if phase == AVERAGE else 1
+        return self.gamma if phase == AVERAGE else 1
 
     def redraws_links(self, phase: int, step: int) -> bool:
         """Links that are held keep the outcome of the first averaging step."""
@@ -134,7 +133,7 @@ class PushSum(Filter):
             return running_sums.hear(state, messages)
         received = [message.payload for message in messages]
         if exchange.phase == AVERAGE:
-            return state._replace(xhat=averaged(state.xhat, received, self.delta or math.nan))
+            return state._replace(xhat=averaged(state.xhat, received, self.delta))
         if self.asymptotic or (self.stop == "paper" and state.stopped):
             return state
         mass = mixed(state.mass, received, state.degree)

@@ -1,20 +1,22 @@
 """Push-sum in continuous time: broadcast rounds by running sums, each node by its own clock.
 
-The network's information is a mass that is spread over the nodes. Node i holds the weight w_i, which
-starts at 1, and with N nodes its share of the information is ``(w_i / N) P_i^-1`` and
+The network's information is a mass that is spread over the nodes. Node i holds the weight w_i,
+which starts at 1, and with N nodes its share of the information is ``(w_i / N) P_i^-1`` and
 ``(w_i / N) P_i^-1 xhat_i``: an estimate is a ratio of masses. A sample adds ``H' R^-1 H`` and
 ``H' R^-1 y``, so it counts N / w_i times at its own node until it has spread. Between events each
 node predicts its own estimate and covariance.
 
-A round offers each of the d nodes that can hear the share 1 / (d + 1) of all mass. What travels is
-not the share but the total ``sent`` that was ever offered; a hearer gains the difference to the last
-total it ``heard``, so a lost message only postpones, and the weight in nodes and under way stays N
-(running-sum push-sum; P has no such form). As rounds get fast every node is the central filter.
+A round offers each of the d nodes that can hear the share 1 / (d + 1) of all mass. What travels
+is not the share but the total ``sent`` that was ever offered; a hearer gains the difference to
+the last total it ``heard``, so a lost message only postpones, and the weight in nodes and under
+way stays N (running-sum push-sum; P has no such form). As rounds get fast every node is the
+central filter.
 
 Totals refer to an instant: as time passes they are predicted with the plant, without its noise,
-``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` with Phi = e^{A gap}. All totals are predicted alike,
-so differences stay what they are. s = e^{-2 r gap} lets old information fade where it would grow
-without bound, with r the fastest rate at which the plant forgets its state (0 if it never does).
+``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` with Phi = e^{A gap}. All totals are predicted
+alike, so differences stay what they are. s = e^{-2 r gap} lets old information fade where it
+would grow without bound, with r the fastest rate at which the plant forgets its state (0 if it
+never does).
 """
 
 from __future__ import annotations

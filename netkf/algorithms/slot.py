@@ -1,11 +1,11 @@
 """Slot filters: the former contract of filters in slots, for classes of users; kernels of slots.
 
-New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a slot
-filter. Each slot is a short programme of phases that the filter declares, such as ``("exchange",
-"sense")``. An exchange has one step or several; in each every node may send once and then absorbs
-all that arrived before the inbox closed. In a sense phase it is handed the reading of the slot.
-States are NamedTuples of arrays that nothing changes in place. Covariances are carried as square
-roots, ``P = root root'``.
+New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a
+slot filter. Each slot is a short programme of phases that the filter declares, such as
+``("exchange", "sense")``. An exchange has one step or several; in each every node may send once
+and then absorbs all that arrived before the inbox closed. In a sense phase it is handed the
+reading of the slot. States are NamedTuples of arrays that nothing changes in place. Covariances
+are carried as square roots, ``P = root root'``.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from netkf.engines.compiled.flow import FlowRun, replay_for
 from netkf.engines.compiled.lots import at_a_desk
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.network.channels import by_message
+from netkf.network.clocks import LinkClock
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
@@ -54,7 +55,7 @@ class CompiledEngine(Engine):
             activation = scenario.network.activation
             beyond = scenario.sampled_sensors or scenario.exact_errors
             beyond = beyond or by_message(scenario.network.channel.delay)
-            if beyond or (activation is not None and activation.at != "links"):
+            if beyond or (isinstance(activation, LinkClock) and activation.at != "links"):
                 return f'engine "compiled" cannot run these clocks yet; {remedy}'
             if type(scenario.hosted) not in (Hybrid, CovarianceIntersection, Local, Central):
                 return f'engine "compiled" cannot run this filter under clocks yet; {remedy}'
@@ -67,9 +68,8 @@ class CompiledEngine(Engine):
 
     def announce(self, scenario: Scenario) -> None:
         """That code is compiled, where it is not kept from before."""
-        algorithm = scenario.filter.algorithm
         if scenario.slotted:
-            compiling.announce(KERNELS[type(algorithm)])
+            compiling.announce(KERNELS[type(scenario.hosted)])
         else:
             compiling.announce(replay_for(scenario))
 

@@ -67,7 +67,7 @@ class SlotRun:
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         algorithm = scenario.filter.algorithm
-        self._kernel, self._pooled = demanded(KERNELS[type(algorithm)]), algorithm.pooled
+        self._kernel, self._pooled = demanded(KERNELS[type(scenario.hosted)]), algorithm.pooled
         self._exchanges = make_exchanges(scenario, streams)
         recorder.exact_errors = scenario.exact_errors
         self._truth: Truth = scenario.slot_truth(streams)

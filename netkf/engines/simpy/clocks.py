@@ -1,4 +1,4 @@
-"""Clocks of the network in continuous time: each is a process that ticks and lets nodes transmit."""
+"""Clocks of the network in continuous time: each is a process that lets nodes transmit."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def clock_processes(
     none, since nodes then transmit after their samples.
     """
     activation = scenario.network.activation
-    if not scenario.hosted.talks or activation is None:
+    if not scenario.hosted.talks or not isinstance(activation, LinkClock):
         return []
     air = (scenario, recorder, transmitter, nodes)
     if activation.at == "readings":

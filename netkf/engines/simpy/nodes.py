@@ -164,7 +164,7 @@ class ClockedNode(Node):
     def _absorb(self, _: simpy.Event) -> None:
         time = self._timeline.now
         self.predict_to(time)
-        _, messages = self.take_mail()
+        messages = self.take_mail()[1]
         self.state = self.algorithm.absorb(self.state, messages, Exchange(time=time))
         oldest = max(message.age for message in messages)
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))

@@ -11,6 +11,7 @@ from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
+from netkf.plants.sensors import LinearSensor, SensorPath
 from netkf.scenario.scenario import Placed, Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
@@ -82,12 +83,12 @@ def _sampling(
 
 def increment_sensors(
     scenario: Scenario, streams: Streams, placed: list[tuple[int, Placed]]
-) -> list[Any]:
+) -> list[SensorPath]:
     """The readings of these increment sensors in one run."""
-    return [
-        scenario.sensors[place.entry].path(
-            streams.generator("noise", node, place.ordinal),
-            streams.generator("cut", node, place.ordinal),
-        )
-        for node, place in placed
-    ]
+    paths = []
+    for node, place in placed:
+        sensor = scenario.sensors[place.entry]
+        assert isinstance(sensor, LinearSensor)
+        noise, cutting = (streams.generator(p, node, place.ordinal) for p in ("noise", "cut"))
+        paths.append(sensor.path(noise, cutting))
+    return paths

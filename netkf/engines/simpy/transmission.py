@@ -170,6 +170,6 @@ class LinkExchange:
             self._transmitter.send(way, payload, outcome if up else DOWN, phase, exchange)
 
 
-def stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:
+def stream(streams: Streams, ends: tuple[int, ...], purpose: str) -> np.random.Generator:
     """The stream of a link or of one direction of it."""
     return streams.generator(purpose, *ends)
