@@ -63,7 +63,7 @@ def intersected(
 
 
 def informed(root: FloatArray, U: FloatArray) -> FloatArray:
-    """A root of ``(P^-1 + U)^-1`` for a U (n, n) that keeps it positive definite."""
+    """A root of ``(P^-1 + U)^-1`` for a positive semidefinite U (n, n)."""
     inner = np.eye(len(root)) + root.T @ (0.5 * (U + U.T)) @ root
     values, vectors = np.linalg.eigh(inner)
-    return np.asarray(root @ (vectors / np.sqrt(values)))
+    return np.asarray(root @ (vectors / np.sqrt(np.maximum(values, 1.0))))

@@ -1,11 +1,12 @@
 """The push-sum filter along the messages of a run: in slots P Fig. 1 with the corrected update of
 the mass, under clocks broadcast rounds by running sums.
 
-Under clocks every total (U, u) of information about x has an error ``u - U x``. Totals refer to
-now: as time passes ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times itself less
-``U w``, s the factor with which old information fades. Sums and differences of totals are those of
-their errors, and ``P^-1 += dU``, ``xhat += P (du - dU xhat)`` makes
-``e+ = (I - P dU) e - P (du - dU x)``: errors are closed, whatever became of x itself.
+Under clocks an estimate is a ratio of masses: a node of weight w among N holds the information
+``(w / N) (P^-1, P^-1 xhat)``. Every total (U, u) that was sent has an error ``u - U x``. Totals refer
+to now: as time passes ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times itself less
+``U w``, s the factor with which old information fades. A node that gains (U, u) and then has the
+weight w goes to ``xhat + (N / w) P (u - U xhat)``, with the error ``e - (N / w) P (U e + u - U x)``:
+errors are closed, whatever became of x itself.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from netkf.algorithms.push_sum import PushSum
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
-from netkf.theory.moves import Seen, informed
+from netkf.theory.moves import informed
 from netkf.theory.observed import Observed
 from netkf.theory.rules import Rule, Sent
 from netkf.theory.stacked_errors import Errors
@@ -29,8 +30,6 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 Up = dict[tuple[int, int, int], FloatArray]
-LEAST = 0.05
-"""Information is used where the least eigenvalue of I + S' dU S is above this."""
 
 
 def known_sums(scenario: Scenario, run: Run) -> None:
@@ -133,7 +132,9 @@ class Total(NamedTuple):
 
 
 class RunningTotals(Rule):
-    """Clocks: each node's mass, the total it ever sent to each hearer, the last totals it heard."""
+    """Clocks: the weight of each node, the total it ever sent to each hearer, the last totals it
+    heard.
+    """
 
     def __init__(
         self, scenario: Scenario, errors: Errors, rounds: Mapping[float, Sequence[int]]
@@ -144,27 +145,18 @@ class RunningTotals(Rule):
         plant, n = scenario.truth, errors.n
         self._A, self._rounds = plant.A, rounds
         self._rate = max(0.0, -float(np.linalg.eigvals(plant.A).real.min()))
+        self._weights = [1.0] * errors.hosts
         self._totals: dict[Hashable, Total] = {}
         self._number: dict[tuple[int, int], int] = {}
         self._receivers = [0] * errors.hosts
         for sender, _ in scenario.topology.directions:
             self._receivers[scenario.topology.index[sender]] += 1
         for host in range(errors.hosts):
-            self._put(("mass", host), Total(1.0, np.zeros((n, n))), np.zeros((n, 0)))
-            for name in ("sent", "used"):
-                self._put((name, host), Total(0.0, np.zeros((n, n))), np.zeros((n, 0)))
+            self._put(("sent", host), Total(0.0, np.zeros((n, n))), np.zeros((n, 0)))
 
     def _put(self, name: Hashable, total: Total, form: FloatArray) -> None:
         self._totals[name] = total
         self.errors.stack.put(name, form)
-
-    def _sum(self, *parts: tuple[float, Hashable]) -> tuple[Total, FloatArray]:
-        """A combination of totals."""
-        stack, totals = self.errors.stack, self._totals
-        weight = sum(c * totals[name].weight for c, name in parts)
-        U = np.asarray(sum(c * totals[name].U for c, name in parts))
-        form = np.asarray(sum(c * stack.form(name) for c, name in parts))
-        return Total(weight, U), form
 
     def passed(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Totals come to refer to now; the plant's noise is in the inputs ``columns``."""
@@ -180,68 +172,63 @@ class RunningTotals(Rule):
                 self.errors.stack.add(name, columns, -U @ noise)
 
     def sense(self, time: float, seen: Observed) -> None:
-        """Samples enter the mass, and then senders give their shares."""
-        columns = self.errors.readings(seen)
+        """A sample counts N / w times; then nodes whose turn it is give their shares."""
+        columns, number = self.errors.readings(seen), self.errors.hosts
         for host, one in seen.items():
-            self._add(host, one, columns[host])
-            self._use(host)
+            counted = one._replace(R=one.R * (self._weights[host] / number))
+            self.errors.update(host, counted, columns[host])
         for host in self._rounds.get(time, ()):
             self._offer(host)
 
-    def _add(self, host: int, one: Seen, columns: slice) -> None:
-        name, weighted = ("mass", host), np.linalg.solve(one.R, one.H).T
-        weight, U = self._totals[name]
-        self._totals[name] = Total(weight, U + weighted @ one.H)
-        self.errors.stack.add(name, columns, weighted @ one.root)
-
     def _offer(self, host: int) -> None:
-        count, mass, sent = self._receivers[host], ("mass", host), ("sent", host)
+        """The node's mass is ``(w / N) (P^-1, P^-1 xhat)``, with the error ``-(w / N) P^-1 e``."""
+        count, name, stack = self._receivers[host], ("sent", host), self.errors.stack
         if count == 0:
             return
-        share = 1.0 / (count + 1)
-        offered = self._sum((1.0, sent), (share, mass))
-        kept = self._sum((1.0 - count * share, mass))
-        self._put(sent, *offered)
-        self._put(mass, *kept)
+        weight, share = self._weights[host], 1.0 / (count + 1)
+        inverse = np.linalg.inv(self.errors.roots[host])
+        U = (share * weight / self.errors.hosts) * (inverse.T @ inverse)
+        before = self._totals[name]
+        sent = Total(before.weight + share * weight, before.U + U)
+        self._put(name, sent, stack.form(name) - U @ stack.form(host))
+        self._weights[host] = weight - count * (sent.weight - before.weight)
 
     def send(self, messages: Sequence[Sent]) -> None:
         """What will arrive is kept: a total as it was when it was sent."""
         for message in messages:
-            self._put(message, *self._sum((1.0, ("sent", message.sender))))
+            name = ("sent", message.sender)
+            self._put(message, self._totals[name], self.errors.stack.form(name))
 
     def arrive(self, time: float, messages: Sequence[Sent]) -> None:
         """A hearer gains what a total grew by; an older one brings nothing."""
-        ordered = sorted(messages, key=lambda m: (m.receiver, m.sender, m.number))
-        for message in ordered:
-            link, heard = (message.sender, message.receiver), ("heard", *message[:2])
-            if message.number > self._number.get(link, -1):
-                mass = ("mass", message.receiver)
-                parts = [(1.0, mass), (1.0, message)]
-                if heard in self._totals:
-                    parts.append((-1.0, heard))
-                gained = self._sum(*parts)
-                self._put(heard, *self._sum((1.0, message)))
-                self._put(mass, *gained)
-                self._number[link] = message.number
+        for host in sorted({message.receiver for message in messages}):
+            mine = [m for m in messages if m.receiver == host]
+            self._gain(host, sorted(mine, key=lambda m: (m.sender, m.number)))
         for message in messages:
             del self._totals[message]
         self.errors.stack.drop(messages)
-        for host in sorted({message.receiver for message in messages}):
-            self._use(host)
 
-    def _use(self, host: int) -> None:
-        """Put what is new into the estimate where that leaves a covariance."""
+    def _gain(self, host: int, messages: Sequence[Sent]) -> None:
         errors, n = self.errors, self.errors.n
-        mass, used = ("mass", host), ("used", host)
-        factor = errors.hosts / self._totals[mass].weight
-        new, form = self._sum((factor, mass), (-1.0, used))
-        S = errors.roots[host]
-        values = np.linalg.eigvalsh(np.eye(n) + S.T @ (0.5 * (new.U + new.U.T)) @ S)
-        if not new.U.any() or not values[0] > LEAST:
+        weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
+        for message in messages:
+            link, heard = (message.sender, host), ("heard", message.sender, host)
+            if message.number <= self._number.get(link, -1):
+                continue
+            self._number[link] = message.number
+            total, news = self._totals[message], errors.stack.form(message)
+            last = self._totals.get(heard, Total(0.0, np.zeros((n, n))))
+            before = errors.stack.form(heard) if heard in errors.stack else 0.0 * news
+            weight, U = weight + total.weight - last.weight, U + total.U - last.U
+            form = form + news - before
+            self._put(heard, total, news)
+        if not weight > 0.0:
             return
-        root = informed(S, new.U)
-        P = root @ root.T
-        known = self._sum((factor, mass))
-        errors.stack.put(host, (np.eye(n) - P @ new.U) @ errors.stack.form(host) - P @ form)
+        after = self._weights[host] + weight
+        share = errors.hosts / after
+        scaled = np.sqrt(after / self._weights[host]) * errors.roots[host]
+        root = informed(scaled, share * U)
+        gain = share * root @ root.T
+        errors.stack.put(host, (np.eye(n) - gain @ U) @ errors.stack.form(host) - gain @ form)
         errors.roots[host] = root
-        self._put(used, *known)
+        self._weights[host] = after

@@ -6,7 +6,7 @@ import pytest
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
-from tests.engines.linearity import engine_covariance
+from tests.engines.linearity import OneDraw, run
 
 POISSON = {"kind": "poisson", "rate": 2.0}
 SAMPLED = [
@@ -94,6 +94,22 @@ def scenario_of(name, at, channel, sensors, folder, **other):
 def close(found, expected, tolerance):
     size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     assert (np.abs(found - expected) <= tolerance * size).all()
+
+
+def engine_covariance(scenario):
+    """(T, N, n, n) of x - xhat, from one SimPy run for each Gaussian draw that matters."""
+    silent = OneDraw(scenario.seed)
+    assert not run(scenario, silent).any()
+    total = 0.0
+    for name, unit in silent.made.items():
+        idle = 0
+        for place in range(unit.count):
+            e = run(scenario, OneDraw(scenario.seed, name, place))
+            total = total + np.einsum("tia,tib->tiab", e, e)
+            idle = 0 if e.any() else idle + 1
+            if idle == 4:  # drawn in blocks, and what follows is after the horizon
+                break
+    return total, netkf.simulate(scenario, engine="simpy")
 
 
 @pytest.mark.parametrize("channel", [{}, LOSSY, LATE], ids=["sure", "lossy", "late"])
