@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse
 
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
+from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
-from netkf.theory.coupled import informations, left_weights, own_steps
+from netkf.theory.coupled import Coupled, informations, left_weights, own_steps, promised
 from netkf.theory.intermittent import filtered_covariance
 from netkf.theory.matrices import algebraic_riccati, lyapunov
+from netkf.theory.samples import Samples, by_readings, jumps, poisson_samples
+from netkf.theory.steady import steady_state
 
 
 def limit_covariance(scenario: Scenario) -> FloatArray:
     """(n, n): S of H(13), to which H(12) comes as the rates grow (H Theorem 3).
 
     Where the two directions of links arrive at different rates the nodes' information is weighted
-    by the left null vector of the coupling instead of 1/N (derived). Raises TheoryError where S
+    by the left null vector of the coupling instead of 1/N (derived). Sensors that sample by Poisson
+    clocks enter as they do in (*) of docs/poisson_samples.md. Raises TheoryError where S
     does not exist.
     """
     A, Q = scenario.belief
@@ -25,8 +30,31 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     if algorithm.talks and (not isinstance(algorithm, Hybrid) or own_steps(algorithm, Hybrid)):
         name = type(algorithm).__name__
         raise TheoryError(f"H(13) is about the hybrid filter, and {name} is another one")
+    if by_readings(scenario) and algorithm.talks:
+        raise TheoryError("S is the limit of fast links, and nodes transmit when they sample")
     w = left_weights(scenario)
-    return algebraic_riccati(A, Q, np.tensordot(w, informations(scenario), 1))
+    G = np.tensordot(w, informations(scenario), 1)
+    if not sampled_sensors(scenario):
+        return algebraic_riccati(A, Q, G)
+    promised(scenario)
+    if jumps(scenario):
+        raise TheoryError("samples at known times lead to a cycle, not to a limit S")
+    S = steady_state(_one(scenario, A, Q, G, w))
+    if S is None:
+        raise TheoryError("S does not exist: the sensors sample too rarely for it")
+    return np.asarray(S[0])
+
+
+def _one(scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: FloatArray) -> Coupled:
+    """The equation of all nodes with one covariance: each sensor counts by its node's weight."""
+    groups = []
+    for group in poisson_samples(scenario):
+        silent = scipy.sparse.csr_array((1, len(group.nodes)))
+        nodes, rate = np.zeros(len(group.nodes), dtype=int), group.rate * w[group.nodes]
+        groups.append(Samples(nodes, group.H, group.R, rate, silent))
+    start = np.asarray(scenario.start(scenario.nodes[0])[1])[None]
+    nothing, eye = scipy.sparse.csr_array((1, 1)), np.eye(len(A))
+    return Coupled(A, Q, G[None], nothing, eye, 0.0 * eye, 0.0, start, tuple(groups))
 
 
 def true_limit_covariance(scenario: Scenario) -> FloatArray:
@@ -37,6 +65,8 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
     Q may differ from the truth, its A may not. Raises TheoryError where the limit does not exist.
     """
     A, _ = scenario.belief
+    if sampled_sensors(scenario):
+        raise TheoryError("sampled sensors: P stays random, and the errors have no known limit")
     if not np.array_equal(A, scenario.truth.A):
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
     S, w = limit_covariance(scenario), left_weights(scenario)
@@ -56,6 +86,10 @@ def central_covariance(scenario: Scenario) -> FloatArray:
     """
     if scenario.slotted:
         return _slot_central(scenario)
+    if sampled_sensors(scenario):
+        raise TheoryError(
+            "sampled sensors: the central covariance goes up and down with the samples"
+        )
     G = np.zeros((scenario.plant.n, scenario.plant.n))
     for node in scenario.sensing:
         H, R = scenario.observation(node)

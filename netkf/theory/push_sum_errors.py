@@ -2,11 +2,11 @@
 the mass, under clocks broadcast rounds by running sums.
 
 Under clocks an estimate is a ratio of masses: a node of weight w among N holds the information
-``(w / N) (P^-1, P^-1 xhat)``. Every total (U, u) that was sent has an error ``u - U x``. Totals refer
-to now: as time passes ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times itself less
-``U w``, s the factor with which old information fades. A node that gains (U, u) and then has the
-weight w goes to ``xhat + (N / w) P (u - U xhat)``, with the error ``e - (N / w) P (U e + u - U x)``:
-errors are closed, whatever became of x itself.
+``(w / N) (P^-1, P^-1 xhat)``. Every total (U, u) that was sent has an error ``u - U x``. Totals
+refer to now: as time passes ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times itself
+less ``U w``, s the factor with which old information fades. A node that gains (U, u) and then has
+the weight w goes to ``xhat + (N / w) P (u - U xhat)``, and its error to ``e - (N / w) P (U e + u -
+U x)``: errors are closed, whatever became of x itself.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import scipy.sparse.linalg
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.network.clocks import Poisson
+from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.steady import steady_covariance_bound
 
@@ -30,6 +31,8 @@ def second_moment_rate(scenario: Scenario) -> float:
     channel = scenario.network.channel
     if not isinstance(scenario.network.activation, Poisson):
         raise TheoryError("the second moments of P are known for Poisson clocks only")
+    if scenario.network.activation.at != "links" or sampled_sensors(scenario):
+        raise TheoryError("the second moments of P are known for clocks of links and increments")
     if not channel.loss.independent or channel.delay.fixed != 0.0:
         raise TheoryError("the second moments of P are known without bursts and delays only")
     nodes, n = len(scenario.nodes), scenario.plant.n

@@ -181,6 +181,20 @@ def test_the_steady_state_is_where_the_bound_settles(build):
     np.testing.assert_allclose(theory.steady_covariance_bound(delayed), late, rtol=1e-6)
 
 
+def test_fast_links_come_to_the_limit(build):
+    scenario = three(build, {"kind": "poisson", "rate": 2.0})
+    S = theory.limit_covariance(scenario)
+    apart = []
+    for rate in (1e3, 1e4):
+        fast = scenario.replace({"network.activation.rate": rate})
+        apart.append(np.abs(theory.steady_covariance_bound(fast) - S).max())
+    assert apart[0] / apart[1] == pytest.approx(10.0, rel=0.05)
+    with pytest.raises(netkf.TheoryError, match="stays random"):
+        theory.true_limit_covariance(scenario)
+    with pytest.raises(netkf.TheoryError, match="up and down"):
+        theory.central_covariance(scenario)
+
+
 def scalar(build, a, activation, sampling, filter_, graph=None, R=1.0):
     return build(
         plant={"kind": "diffusion", "A": [[a]], "B": [[1.0]], "cov": [[1.0]]},

@@ -161,7 +161,7 @@ def _faster(scenario: Scenario, factor: float) -> Scenario:
         raise TheoryError("the clocks have no rate to raise")
     changes = {"network.activation.rate": factor * rate}
     if rates:
-        listed = [[i, j, factor * r] for i, j, r in rates]
+        listed = [[*row[:-1], factor * row[-1]] for row in rates]
         changes["network.activation.rates"] = listed
     return scenario.replace(changes)
 
@@ -196,7 +196,7 @@ PROMISES = (
     ),
     Promise(
         "the mean of P stays below the coupled Riccati bound",
-        "H Theorem 2, (12)",
+        "H Theorem 2, (12); derived, samples",
         ("H(12) speaks", "the covariance has a variance"),
         bounded,
     ),
