@@ -28,8 +28,11 @@ from netkf.experiments.files import (
 from netkf.experiments.provenance import machine, versions
 from netkf.experiments.simulate import choose_engine
 from netkf.experiments.summary import Promise, SummarySink, conserved, promise, summarise
+from netkf.experiments.transmissions import SentPerLink
+from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.plugins import in_words
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.usage import record_usage
 from netkf.trace.recorder import Recorder
 from netkf.trace.run import Run
 
@@ -73,7 +76,8 @@ def run_to_directory(
     directory = new_directory(out, scenario.name)
     write_scenario(directory, scenario)
     samples, tables = SummarySink(), ParquetSink(directory, scenario, replica, trace != "none")
-    recorder = Recorder([samples, tables])
+    links = _link_counts(scenario)
+    recorder = Recorder([samples, tables, *links])
     manifest = Manifest(directory, scenario.name, scenario.seed, replica, chosen.name)
     # Written at once, so that a run that is killed outright says that it did not finish.
     manifest.write("interrupted", {})
@@ -84,7 +88,8 @@ def run_to_directory(
         seconds, done = time.perf_counter() - began - compiled, status == "complete"
         tables.close()
         promised = promise(scenario, np.array(samples.times))
-        summary = _summary(directory, scenario, samples, promised, recorder.count, recorder.sums)
+        counts = recorder.count, recorder.sums, _records(scenario, status, links)
+        summary = _summary(directory, scenario, samples, promised, *counts)
         finished = Finished(
             directory, status, summary, samples, promised, recorder.total, seconds, chosen.name
         )
@@ -124,16 +129,32 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     manifest = Manifest(folder, scenario.name, run.seed, run.replica, run.engine)
     manifest.write("interrupted", {})
     samples, tables = SummarySink(), ParquetSink(folder, scenario, run.replica, True)
-    for sink in (samples, tables):
+    links = _link_counts(scenario)
+    for sink in (samples, tables, *links):
         sink.events(run.log)
         sink.exact_errors = run.exact_errors
         sink.states(run.times, run.x, run.xhat, run.P, run.error)
     tables.close()
-    _summary(folder, scenario, samples, promise(scenario, run.times), run.count, run.sums)
+    counts = run.count, run.sums, _records(scenario, run.status, links)
+    _summary(folder, scenario, samples, promise(scenario, run.times), *counts)
     totals: dict[str, Any] = {"events": len(run.log), "fingerprint": run.fingerprint}
     totals |= {"simpy": run.stats} if run.stats else {}
     manifest.write(run.status, totals, run.status == "complete")
     return folder
+
+
+def _link_counts(scenario: Scenario) -> list[SentPerLink]:
+    """What counts the messages of each link, if a record of losses or delays needs it."""
+    channel = scenario.network.channel
+    by_message = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
+    return [SentPerLink()] if by_message else []
+
+
+def _records(scenario: Scenario, status: str, links: list[SentPerLink]) -> dict[str, Any]:
+    """What the run used of its records; nothing of a run that did not reach the horizon."""
+    if status != "complete":
+        return {}
+    return record_usage(scenario, links[0].sent if links else {})
 
 
 def _totals(recorder: Recorder) -> dict[str, Any]:
@@ -151,6 +172,7 @@ def _summary(
     promised: Promise,
     count: Callable[[str], int],
     sums: dict[str, tuple[float, float]],
+    records: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     messages = {
         "sent": count("send"),
@@ -160,6 +182,8 @@ def _summary(
     summary = summarise(scenario, samples, promised, messages)
     if sums:
         summary["conserved"] = conserved(sums)
+    if records:
+        summary["records"] = records
     write_json(directory / "summary.json", summary)
     return summary
 

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from netkf.scenario.usage import usage_notes
+
 MOST_NODES = 30
 DRIFTED = 1e-9  # far above rounding
 
@@ -84,6 +86,7 @@ def summary_table(
         f"{_count(sent['delivered'])} delivered, {_count(sent['lost'])} lost"
         + (f", {_count(sent['in_flight'])} on their way at the end" if sent["in_flight"] else "")
     )
+    lines += [f"note: {note}" for note in usage_notes(summary.get("records", {}))]
     return "\n".join(lines)
 
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import ClassVar
 
 import numpy as np
 
+from netkf.core.arrays import FloatArray
+from netkf.network.graphs import Link
+from netkf.trace.recorder import Sink
 from netkf.trace.schema import CODES, KINDS
 
 SEND = CODES["send"]
@@ -67,6 +71,28 @@ class Transmissions:
         """How often all nodes transmitted."""
         clocks = self._broadcasts if self._broadcasts else self._under_clocks
         return self._in_slots.total() + clocks.total()
+
+
+class SentPerLink(Sink):
+    """Counts the messages of each directed link, lost ones included."""
+
+    anywhere: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        self.sent: Counter[Link] = Counter()
+
+    def events(self, rows: np.ndarray) -> None:
+        """Sends."""
+        sends = rows[rows["kind"] == SEND]
+        ends = np.column_stack([sends["node"], sends["peer"]])
+        pairs, counts = np.unique(ends, axis=0, return_counts=True)
+        for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+            self.sent[i, j] += count
+
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
+        """Not counted."""
 
 
 def _count(counter: Counter[int], nodes: np.ndarray) -> None:

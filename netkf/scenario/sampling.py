@@ -228,7 +228,7 @@ def _check_clock(scenario: Scenario, key: str, sensor: LinearSensor) -> None:
 
 
 def sampling_notes(scenario: Scenario) -> tuple[str, ...]:
-    """One line for each table of readings with rows that no run uses, or without any of a node."""
+    """One line for each table of readings that has none of a node of its sensor."""
     notes: list[str] = []
     for sensor in scenario.sensors:
         if not isinstance(sensor, RecordedSensor):
@@ -238,7 +238,4 @@ def sampling_notes(scenario: Scenario) -> tuple[str, ...]:
         if empty:
             listed = ", ".join(map(str, empty[:3])) + (", ..." if len(empty) > 3 else "")
             notes.append(f"{sensor.path.name} has no readings of node {listed}")
-        late = sum(int((t >= scenario.ends).sum()) for t in times.values())
-        if late:
-            notes.append(f"{sensor.path.name}: {late} readings at or after the end are not used")
     return tuple(notes)

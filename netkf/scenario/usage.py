@@ -21,17 +21,20 @@ if TYPE_CHECKING:
 
 Use = dict[str, Any]
 OUTCOMES = {
-    "deliver": "were delivered at once",
+    "deliver": "were delivered",
     "lose": "were lost",
     "repeat": "followed the record from its start again",
 }
 """What became of messages beyond a record, by its ``after``."""
+NO_DELAY = "took no time unless lost"
+"""What became of messages beyond a record of delays with ``after`` "deliver"."""
 
 
-def record_usage(scenario: Scenario, sent: Mapping[Link, int]) -> dict[str, Use]:
+def record_usage(scenario: Scenario, sent: Mapping[Link, int] | None) -> dict[str, Use]:
     """What one run to the horizon used of each table, by the key path of the part that names it.
 
-    ``sent`` counts the messages of each directed link, lost ones included. Each entry has ``path``,
+    ``sent`` counts the messages of each directed link, lost ones included; None leaves out the
+    tables of messages, whose use differs from run to run. Each entry has ``path``,
     ``rows`` of the table and how many of them were ``unused``; those of losses and delays also have
     ``beyond``, the messages that the table does not list, and ``after``. Of a table that several
     sensors name a row is used if one of them uses it; the first one names the entry.
@@ -39,7 +42,7 @@ def record_usage(scenario: Scenario, sent: Mapping[Link, int]) -> dict[str, Use]
     found = {"network.activation": _activation(scenario)}
     channel = scenario.network.channel
     for key, part in (("loss", channel.loss), ("delay", channel.delay)):
-        if isinstance(part, RecordedLoss | RecordedDelay):
+        if sent is not None and isinstance(part, RecordedLoss | RecordedDelay):
             use = part.table.use(sent)
             beyond = {"beyond": use.beyond, "after": part.after}
             found[f"network.channel.{key}"] = _use(part.path.name, use.rows, use.unused) | beyond
@@ -60,6 +63,8 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
             notes.append(f"{key}: {use['unused']} of {use['rows']} {was} not used ({use['path']})")
         if use.get("beyond"):
             count, outcome = use["beyond"], OUTCOMES.get(use["after"], "were refused")
+            if key.endswith("delay") and use["after"] == "deliver":
+                outcome = NO_DELAY
             what = "message is" if count == 1 else "messages are"
             outcome = outcome.replace("were", "was", 1) if count == 1 else outcome
             notes.append(f"{key}: {count} {what} not listed and {outcome} ({use['path']})")

@@ -277,7 +277,7 @@ def test_what_a_run_used_of_its_records(build, tmp_path):
         "network.activation: 1 of 3 rows were not used (ticks.csv)",
         "network.channel.loss: 1 of 2 rows were not used (lost.csv)",
         "network.channel.loss: 3 messages are not listed and were lost (lost.csv)",
-        "network.channel.delay: 3 messages are not listed and were delivered at once (late.csv)",
+        "network.channel.delay: 3 messages are not listed and took no time unless lost (late.csv)",
         "sensors[0].sampling: 2 of 3 rows were not used (samples.csv)",
     )
     assert record_usage(build(), {(0, 1): 3}) == {}

@@ -159,7 +159,6 @@ def test_recorded_states_and_readings_over_a_diffusion(make):
     times = scenario.sample_times(Streams(4))
     np.testing.assert_array_equal(times[0, 0], [0.35, 0.5])
     np.testing.assert_array_equal(times[2, 0], [0.7])
-    assert scenario.notes[-1] == "r.csv: 1 readings at or after the end are not used"
     assert as_table(scenario)["plant"]["kind"] == "recorded"
     assert scenario.replace({"seed": 9}).plant == scenario.plant
 
@@ -177,7 +176,7 @@ def test_unknown_states_are_nan(make):
 
 def test_nodes_without_readings_are_noted(make):
     scenario = make([{**RECORDED, "nodes": [0, 1]}])
-    assert scenario.notes[-2] == "r.csv has no readings of node 1"
+    assert scenario.notes[-1] == "r.csv has no readings of node 1"
 
 
 @pytest.mark.parametrize(

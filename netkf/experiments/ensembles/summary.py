@@ -10,6 +10,7 @@ from netkf.core.arrays import FloatArray
 from netkf.experiments.ensembles.tallies import MESSAGES, Tally
 from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds, notes_of
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.usage import record_usage
 
 
 def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> dict[str, Any]:
@@ -43,6 +44,9 @@ def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> d
             name: {"exact": sums.mean[0], "total": sums.mean[1], "drift": drift}
             for name, (sums, drift) in tally.conserved.items()
         }
+    records = {} if tally.totals[1] else record_usage(scenario, None)
+    if records:
+        summary["records"] = records
     return summary
 
 
