@@ -10,12 +10,16 @@ from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.push_sum import PushSum
 from netkf.network.clocks import LinkClock, RecordedClock
+from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
+from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import balanced
+from netkf.theory.evidence import Row, knowledge, of_the_truth
 from netkf.theory.matrices import unobservable
 from netkf.theory.push_sum_assumptions import push_sum_rows
-from netkf.theory.slot_assumptions import Row, slot_rows
+from netkf.theory.samples import at_random, by_readings, clock_of
+from netkf.theory.slot_assumptions import slot_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,7 +33,7 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
     """
     import pandas as pd
 
-    if isinstance(scenario.filter.algorithm, PushSum):
+    if isinstance(scenario.filter.algorithm, PushSum) and scenario.slotted:
         return pd.DataFrame(push_sum_rows(scenario), columns=COLUMNS)
     if scenario.slotted:
         rows = slot_rows(scenario)
@@ -72,40 +76,50 @@ def _plant(scenario: Scenario) -> list[Row]:
     plant = scenario.truth
     lost = unobservable(plant.A.T, plant.Q)
     information = np.zeros((plant.n, plant.n))
-    for node in scenario.sensing:
-        H, R = scenario.observation(node)
-        information += H.T @ np.linalg.solve(R, H)
+    fixed = not any(sensor.varying for sensor in scenario.sensors)
+    for node in scenario.sensing if fixed else ():
+        information += _own_information(scenario, node)
     hidden = unobservable(plant.A, information)
     alone = [
         node
         for node in scenario.nodes
-        if unobservable(plant.A, _own_information(scenario, node)) is None
+        if fixed and unobservable(plant.A, _own_information(scenario, node)) is None
     ]
-    same = scenario.filters_know_the_truth
+    seen = (
+        f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
+        if hidden is None
+        else f"the mode with eigenvalue {hidden:.6g} is not seen"
+    )
+    driven = (
+        "every mode is driven by the noise"
+        if lost is None
+        else f"the mode with eigenvalue {lost:.6g} is not driven"
+    )
+    observable = of_the_truth(scenario, hidden is None, seen)
     return [
-        (
-            "(A, B) is controllable",
-            "H II-A",
-            lost is None,
-            "every mode is driven by the noise"
-            if lost is None
-            else f"the mode with eigenvalue {lost:.6g} is not driven",
-        ),
+        ("(A, B) is controllable", "H II-A", *of_the_truth(scenario, lost is None, driven)),
         (
             "(A, H) is observable, all sensors together",
             "H II-A",
-            hidden is None,
-            f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
-            if hidden is None
-            else f"the mode with eigenvalue {hidden:.6g} is not seen",
+            *(observable if fixed else (None, "H differs from reading to reading")),
         ),
-        (
-            "the filters know the plant and the sensors",
-            "H (4)",
-            same,
-            "same A, B and R" if same else "filter.model differs from the truth",
-        ),
+        knowledge(scenario, "H (4)", "same A, B and R"),
+        *_sampling(scenario),
     ]
+
+
+def _sampling(scenario: Scenario) -> list[Row]:
+    """Of sensors that sample: whether their times are Poisson processes, or known beforehand."""
+    if not sampled_sensors(scenario):
+        return []
+    name = "sensors sample by Poisson clocks or at known times"
+    source = "derived, docs/poisson_samples.md"
+    for node, place in at_random(scenario):
+        clock = clock_of(scenario.sensors[place.entry])
+        if clock is not None and not clock.memoryless:
+            words = f"node {node} samples by another random clock: the bound is not promised"
+            return [(name, source, False, words)]
+    return [(name, source, True, "the bound on the mean of P then has them")]
 
 
 def _own_information(scenario: Scenario, node: int) -> np.ndarray:
@@ -116,7 +130,11 @@ def _own_information(scenario: Scenario, node: int) -> np.ndarray:
 def _clocks(scenario: Scenario) -> list[Row]:
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
-    rates = np.array([clock.mean_rate(link) for link in scenario.topology.links])
+    if by_readings(scenario):
+        words = "nodes transmit when they have sampled, see the row about sensors that sample"
+        return [("nodes transmit at independent Poisson processes", "H II-B b", None, words)]
+    entities, what = clock.entities(scenario.topology), clock.at
+    rates = np.array([clock.mean_rate(entity) for entity in entities])
     known = rates[np.isfinite(rates)]
     unknown = len(known) < len(rates)
     positive = None if unknown else bool((known > 0.0).all())
@@ -125,13 +143,13 @@ def _clocks(scenario: Scenario) -> list[Row]:
     if unknown:
         spread = f"a {name} clock does not tell its rates beforehand"
     elif known.size and np.ptp(known) == 0.0:
-        spread = f"{known[0]:g} per second on every link"
+        spread = f"{known[0]:g} per second at all {what}"
     return [
-        ("the rates of all links are positive", "H II-B b", positive, spread),
+        (f"the rates of all {what} are positive", "H II-B b", positive, spread),
         (
-            "the link clocks are independent Poisson processes",
+            f"the {what[:-1]} clocks are independent Poisson processes",
             "H II-B b, Theorem 2",
-            clock.memoryless,
+            None if record else clock.memoryless,
             "exponential gaps"
             if clock.memoryless
             else "a record is one outcome, not a law: H(12) is not promised"
@@ -139,7 +157,7 @@ def _clocks(scenario: Scenario) -> list[Row]:
             else f"the gaps of a {name} clock are not exponential: H(12) is not promised",
         ),
         (
-            "all links have one rate",
+            f"all {what} have one rate",
             "H Theorem 3",
             None if unknown else not rates.size or bool(np.ptp(rates) == 0.0),
             f"{spread}; the limit does not need it when the rates grow together",
@@ -154,16 +172,16 @@ def _channel(scenario: Scenario) -> list[Row]:
         (
             "losses are independent of each other and of the past",
             "H Theorem 2, derived",
-            channel.loss.independent,
+            None if isinstance(channel.loss, RecordedLoss) else channel.loss.independent,
             "arrivals are Poisson processes of lower rates"
             if channel.loss.independent
-            else "losses are recorded or come in bursts: H(12) is not promised",
+            else "losses are recorded or depend on earlier ones: H(12) is not promised",
         ),
         (
             "messages take no time, or one fixed time",
             "H (7), derived",
-            fixed is not None,
-            "random delay: H(12) is not promised"
+            None if isinstance(channel.delay, RecordedDelay) else fixed is not None,
+            "random or recorded delay: H(12) is not promised"
             if fixed is None
             else "no delay"
             if fixed == 0.0
@@ -193,8 +211,9 @@ def _start(scenario: Scenario) -> list[Row]:
         (
             "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
             _start_source(scenario),
-            worst >= -1e-12,
-            f"least eigenvalue of the difference {worst:.3g}",
+            *of_the_truth(
+                scenario, worst >= -1e-12, f"least eigenvalue of the difference {worst:.3g}"
+            ),
         )
     ]
 

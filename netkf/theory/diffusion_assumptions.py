@@ -7,9 +7,9 @@ import numpy as np
 from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
+from netkf.theory.evidence import RECORDED, UNKNOWN_LAW, Row, recorded_channel
 from netkf.theory.information import information_level
 
-Row = tuple[str, str, bool, str]
 MOST_NODES = 500
 
 
@@ -82,8 +82,10 @@ def _plant(scenario: Scenario) -> list[Row]:
         (
             "the parameter is a random walk: F = I",
             "D (2)",
-            walks,
-            "increments and noises are Gaussian and independent, so bounded in every L_p, as "
+            walks if scenario.plant.drawn else None,
+            UNKNOWN_LAW
+            if not scenario.plant.drawn
+            else "increments and noises are Gaussian and independent, so bounded in every L_p, as "
             "D (29) asks"
             if walks
             else "with another F the filter predicts by it; D's theorems are not about that",
@@ -94,6 +96,8 @@ def _plant(scenario: Scenario) -> list[Row]:
             least > 0.0,
             f"least eigenvalue of Q {least:.3g}; they are the true ones"
             if same
+            else f"least eigenvalue of Q {least:.3g}; {UNKNOWN_LAW}"
+            if not scenario.drawn
             else f"least eigenvalue of Q {least:.3g}; they differ from the true ones, as D allows: "
             "stable all the same, but P need not be the errors' covariance",
         ),
@@ -103,11 +107,11 @@ def _plant(scenario: Scenario) -> list[Row]:
 def _information(scenario: Scenario) -> Row:
     name = "the sensors together excite every direction (sufficient)"
     if len(scenario.sensing) > MOST_NODES:
-        return (name, "D Assumption 3.2", False, f"not looked at beyond {MOST_NODES} sensors")
+        return (name, "D Assumption 3.2", None, f"not looked at beyond {MOST_NODES} sensors")
     try:
         table = information_level(scenario)
     except TheoryError as error:
-        return (name, "D Assumption 3.2", False, f"not decided: {error}")
+        return (name, "D Assumption 3.2", None, f"not decided: {error}")
     whole, alone = table.iloc[0], table.iloc[1:]
     enough = int((alone["level"] > 0.0).sum())
     words = (
@@ -128,6 +132,8 @@ def _arrivals(scenario: Scenario) -> Row:
     ]
     fixed = channel.delay.fixed
     in_time = fixed is not None and fixed < scenario.phase_length
+    if recorded_channel(channel):
+        return ("every message arrives", "D (8)", None, RECORDED)
     whole = in_time and all(rate == 1.0 for rate in rates)
     policy = getattr(scenario.filter.algorithm, "on_loss", "")
     words = f"a message may be lost or late; weights then change ({policy}): P stays consistent"

@@ -10,14 +10,15 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
+from netkf.theory.averaging import Averaging
 from netkf.theory.certified_gamma import Moment, minimum_gamma
 from netkf.theory.disconnection import disconnection_probability
 from netkf.theory.estimation_steps import averaging_law, estimation_steps
+from netkf.theory.evidence import Row, knowledge
 from netkf.theory.matrices import unobservable
 from netkf.theory.mean_square import mean_radius, radius
 from netkf.theory.push_sum import consensus_gain_bound, push_sum_filter
 
-Row = tuple[str, str, bool, str]
 HEAVY = 0.885
 
 
@@ -48,9 +49,7 @@ def _plant(scenario: Scenario) -> list[Row]:
     ]
     if not any(sensor.varying for sensor in scenario.sensors):
         rows.append(_sight(scenario))
-    same = scenario.filters_know_the_truth
-    words = "same F, Q and R" if same else "filter.model differs from the truth"
-    return [*rows, ("the filters know the plant and the sensors", "P (7), (8)", same, words)]
+    return [*rows, knowledge(scenario, "P (7), (8)", "same F, Q and R")]
 
 
 def _sight(scenario: Scenario) -> Row:
@@ -80,10 +79,12 @@ def _links(scenario: Scenario) -> list[Row]:
         )
     ]
     held = filter_.links == "held" and filter_.gamma > 1
+    law: Averaging | None
+    independent: bool | None
     try:
         law, independent, words = averaging_law(scenario), not held, "each link, slot and step anew"
     except TheoryError as error:
-        law, independent, words = None, False, str(error)
+        law, independent, words = None, None, str(error)
     if held and law is not None:
         words = (
             "one draw holds for all steps of a slot: nodes that are cut off stay so, and Theorems "
@@ -106,7 +107,7 @@ def _links(scenario: Scenario) -> list[Row]:
     except TheoryError as error:
         return [
             *rows,
-            ("p_d < 1: the network is whole at times", "P Assumption 3", False, str(error)),
+            ("p_d < 1: the network is whole at times", "P Assumption 3", None, str(error)),
         ]
     words = f"p_d = {float(cut):.6g}" if cut.exact else f"p_d in [{cut.low:.4g}, {cut.high:.4g}]"
     return [*rows, ("p_d < 1: the network is whole at times", "P Assumption 3", cut < 1.0, words)]
@@ -171,7 +172,7 @@ def _exact(name: tuple[str, str], measure: Callable[[], float], heavy: bool = Fa
     try:
         found = measure()
     except TheoryError as error:
-        return *name, False, f"not decided: {error}"
+        return *name, None, f"not decided: {error}"
     words = f"exact radius {found:.6g} at the asymptotic gains; necessary and sufficient"
     if heavy and found >= 1.0:
         words += "; single paths may still stay bounded in probability"

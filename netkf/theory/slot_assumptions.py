@@ -13,6 +13,7 @@ from netkf.core.arrays import FloatArray
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.diffusion_assumptions import diffusion_rows
+from netkf.theory.evidence import RECORDED, Row, knowledge, of_the_truth, recorded_channel
 from netkf.theory.gossip import (
     detecting_walk,
     effective_matching,
@@ -21,7 +22,6 @@ from netkf.theory.gossip import (
 )
 from netkf.theory.intermittent import contraction_radius, critical_probability, unseen
 
-Row = tuple[str, str, bool | None, str]
 SHOWN, MOST_HEARD = 12, 8
 OFTEN = "readings arrive often enough for a bounded mean (sufficient)"
 
@@ -40,36 +40,26 @@ def slot_rows(scenario: Scenario) -> list[Row]:
 
 
 def _plant(scenario: Scenario) -> list[Row]:
-    plant, same = scenario.slot_plant, scenario.filters_know_the_truth
+    plant = scenario.slot_plant
     least = float(np.linalg.eigvalsh(plant.Q)[0])
     idle = unseen(plant.F.T, plant.Q)
+    words = "every mode that does not decay is driven by the noise"
+    if idle is not None:
+        words = f"the mode with eigenvalue {idle:.6g} is not driven"
+    positive = f"least eigenvalue {least:.3g}; sufficient for the uniqueness of the limit law"
     return [
         (
             "(F, Q^1/2) is stabilisable",
             "G S.1, R Theorem 9",
-            idle is None,
-            "every mode that does not decay is driven by the noise"
-            if idle is None
-            else f"the mode with eigenvalue {idle:.6g} is not driven",
+            *of_the_truth(scenario, idle is None, words),
         ),
         (
             "Q is positive definite",
             "G II-A, R Theorem 9",
-            least > 0.0,
-            f"least eigenvalue {least:.3g}; sufficient for the uniqueness of the limit law",
+            *of_the_truth(scenario, least > 0.0, positive),
         ),
-        (
-            "the filters know the plant and the sensors",
-            "G (10), R (15)",
-            same,
-            "same F, Q and R" if same else _other(scenario),
-        ),
+        knowledge(scenario, "G (10), R (15)", "same F, Q and R"),
     ]
-
-
-def _other(scenario: Scenario) -> str:
-    recorded = "the state or readings are recorded, and nobody knows their law"
-    return "filter.model differs from the truth" if scenario.drawn else recorded
 
 
 def _matching(scenario: Scenario) -> list[Row]:
@@ -151,7 +141,7 @@ def _readings(scenario: Scenario) -> list[Row]:
     try:
         sight = _sight(scenario)
     except TheoryError as error:
-        return [(name, "R Theorem 9", False, f"not decided: {error}")]
+        return [(name, "R Theorem 9", None, f"not decided: {error}")]
     blind = [node for node, H in sight.items() if unseen(F, H) is not None]
     words = "its own readings and its neighbours' see every mode that does not decay"
     if blind:
@@ -170,8 +160,14 @@ def _arrivals(scenario: Scenario) -> list[Row]:
         (
             "arrivals are independent of each other and of the past, and not impossible",
             "R (12), Theorem 9",
-            loss.independent and len(known) == len(rates) and least > 0.0,
-            f"delivery from {least:g}" if loss.independent else "losses come in bursts or recorded",
+            None
+            if recorded_channel(scenario.network.channel)
+            else loss.independent and len(known) == len(rates) and least > 0.0,
+            RECORDED
+            if recorded_channel(scenario.network.channel)
+            else f"delivery from {least:g}"
+            if loss.independent
+            else "losses come in bursts",
         )
     ]
     if any(sensor.varying for sensor in scenario.sensors):

@@ -1,0 +1,58 @@
+"""Rows of assumptions under clocks, and "not known" for what a record does not show."""
+
+import pytest
+
+from netkf import theory
+
+PATH = {"kind": "path", "nodes": 2}
+
+
+def holds(scenario):
+    table = theory.assumptions(scenario)
+    return dict(zip(table.assumption, table.holds, strict=True))
+
+
+@pytest.mark.parametrize("at", ["links", "directions", "nodes"])
+def test_clocks_are_named_by_what_has_them(build, at):
+    activation = {"kind": "poisson", "rate": 2.0, "at": at}
+    rows = holds(build(network={"graph": PATH, "activation": activation}))
+    assert rows[f"the rates of all {at} are positive"]
+    assert rows[f"the {at[:-1]} clocks are independent Poisson processes"]
+
+
+def test_sampling_has_a_row(build):
+    name = "sensors sample by Poisson clocks or at known times"
+    for sampling, expected in (
+        ({"kind": "poisson", "rate": 2.0}, True),
+        ({"kind": "periodic", "period": 0.5}, True),
+        ({"kind": "periodic", "period": 0.5, "jitter": 0.1}, False),
+    ):
+        sensors = [{"nodes": [0], "H": [[1.0]], "R": [[0.5]], "sampling": sampling}]
+        rows = holds(build(sensors=sensors))
+        assert rows[name] is expected
+
+
+def test_records_leave_their_law_unknown(build, tmp_path):
+    (tmp_path / "y.csv").write_text("t,node,y0\n0.5,0,1.0\n1.1,0,0.3\n")
+    (tmp_path / "ticks.csv").write_text("t,node,peer\n0.7,0,1\n")
+    (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n0,1,0,1\n")
+    (tmp_path / "delays.csv").write_text("sender,receiver,message,seconds\n0,1,0,0.1\n")
+    scenario = build(
+        plant={"kind": "unknown", "A": [[-0.5]], "B": [[1.0]], "mean": [0.0], "cov": [[1.0]]},
+        sensors=[{"nodes": [0], "kind": "recorded", "path": "y.csv", "H": [[1.0]], "R": [[0.5]]}],
+        network={
+            "graph": PATH,
+            "activation": {"kind": "recorded", "path": "ticks.csv"},
+            "channel": {
+                "loss": {"kind": "recorded", "path": "lost.csv"},
+                "delay": {"kind": "recorded", "path": "delays.csv"},
+            },
+        },
+    )
+    rows = holds(scenario)
+    known = {name for name, value in rows.items() if value is not None}
+    assert known <= {
+        "the graph is undirected and connected",
+        "Pi is doubly stochastic, 0 < epsilon <= 1/max degree",
+        "sensors sample by Poisson clocks or at known times",
+    }
