@@ -143,7 +143,7 @@ def _clocks(scenario: Scenario) -> list[Row]:
     if unknown:
         spread = f"a {name} clock does not tell its rates beforehand"
     elif known.size and np.ptp(known) == 0.0:
-        spread = f"{known[0]:g} per second at all {what}"
+        spread = f"{known[0]:g} per second on every {what[:-1]}"
     return [
         (f"the rates of all {what} are positive", "H II-B b", positive, spread),
         (
