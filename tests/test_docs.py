@@ -8,6 +8,7 @@ import pytest
 
 import netkf
 from netkf.cli import _parser
+from netkf.scenario.reading import from_table
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Belief, Scenario
 from netkf.trace.schema import EVENT_COLUMNS
@@ -82,6 +83,32 @@ def test_the_example_file_is_a_scenario(tmp_path):
     tomllib.loads(example)
     (tmp_path / "example.toml").write_text(example)
     assert netkf.load(tmp_path / "example.toml").filter.algorithm.epsilon == 0.3
+
+
+CSV = {
+    "samples": "t,node\n0.5,0\n1.5,0\n",
+    "ticks": "t,node,peer\n0.5,0,1\n0.7,1,0\n",
+    "lost": "sender,receiver,message,delivered\n0,1,0,1\n1,0,0,1\n",
+    "delays": "sender,receiver,message,seconds\n0,1,0,0.1\n1,0,0,0.2\n",
+    "readings": "t,node,y0\n0.4,0,1.0\n0.9,1,0.5\n",
+}
+
+
+def test_the_examples_in_continuous_time_run(tmp_path):
+    first, *parts = re.findall(r"```toml\n(.*?)```", TEXT, flags=re.DOTALL)
+    assert len(parts) == 6
+    for name, text in CSV.items():
+        (tmp_path / f"{name}.csv").write_text(text)
+    at, kinds = set(), set()
+    for part in parts:
+        scenario = from_table(tomllib.loads(first) | tomllib.loads(part), tmp_path)
+        run = netkf.simulate(scenario, engine="simpy")
+        assert run.status == "complete"
+        assert {"sense", "deliver"} <= set(run.events.kind)
+        at.add(scenario.network.activation.at)
+        kinds |= {type(getattr(s, "sampling", None)).__name__ for s in scenario.sensors}
+    assert at == {"links", "directions", "nodes", "readings"}
+    assert {"Poisson", "Renewal", "Periodic", "RecordedSampling"} <= kinds
 
 
 def test_the_snippets_run(tmp_path, monkeypatch):

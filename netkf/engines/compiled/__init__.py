@@ -1,1 +1,1 @@
-"""The fast engine: numba, an optional extra; same events, same states."""
+"""The compiled engine: the events and states of the SimPy engine, from loops compiled by numba."""
