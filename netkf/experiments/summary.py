@@ -17,7 +17,7 @@ from netkf.theory import central_covariance, covariance_bound, limit_covariance
 from netkf.theory.coupled import not_promised
 from netkf.theory.steady import has_steady_state
 from netkf.trace.recorder import Sink
-from netkf.trace.run import errors, rounding_from
+from netkf.trace.run import carried, errors, rounding_from
 from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95
@@ -64,8 +64,8 @@ class SummarySink(Sink):
         self.sq_error += list(sq_error)
         self.nees += list(nees)
         self.trace += list(np.trace(P, axis1=2, axis2=3))
-        if self.rounding_from is None and not self.exact_errors:
-            first = rounding_from(t, x, P, error)
+        if self.rounding_from is None:
+            first = rounding_from(t, carried(x, error, self.exact_errors), P, error)
             self.rounding_from = first if first < np.inf else None
 
     @property

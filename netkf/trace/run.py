@@ -78,17 +78,14 @@ class Run:
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """(T,) the size of what rounding adds to ``error``; 0 with ``exact_errors``."""
-        return np.zeros(len(self.times)) if self.exact_errors else rounding(self.x)
+        """(T,) the size of what rounding adds to ``error``."""
+        return rounding(carried(self.x, self.error, self.exact_errors))
 
     @cached_property
     def rounding_from(self) -> float:
-        """The first sample time at which rounding of the state blurs ``error``, inf if none does;
-        always inf with ``exact_errors``.
-        """
-        if self.exact_errors:
-            return np.inf
-        return rounding_from(self.times, self.x, self.P, self.error)
+        """The first sample time at which rounding blurs ``error``, inf if none does."""
+        size = carried(self.x, self.error, self.exact_errors)
+        return rounding_from(self.times, size, self.P, self.error)
 
     def count(self, kind: str) -> int:
         """Number of events of a kind."""
@@ -134,6 +131,13 @@ def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray
     deviation = np.sqrt(np.maximum(least, 0.0)) / BLUR
     lost = (rounding(x) > deviation) & (deviation > 0.0)
     return float(times[np.argmax(lost)]) if lost.any() else np.inf
+
+
+def carried(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
+    """(T, n) the size of what a run computes with: states x (T, n), or with exact errors no more
+    than the largest of the errors e (T, N, n), which a node may have passed on to others.
+    """
+    return np.abs(e).max(axis=1) if exact else np.abs(x)
 
 
 def rounding(x: FloatArray) -> FloatArray:
