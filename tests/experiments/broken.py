@@ -5,10 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.flow import FlowFilter, Payload, predict
+from netkf.algorithms.filter import Estimate
+from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import AVERAGE, PushSum, averaged
-from netkf.algorithms.slot import Gossip, Intermittent, SlotFilter, update_and_predict
+from netkf.algorithms.slot import SlotFilter, update_and_predict
 from netkf.core.fields import positive, setting
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
@@ -18,7 +21,7 @@ from netkf.network.matchings import Matching
 class UpdateThenSwap(Gossip):
     """Updates first, then swaps what came of it, from slot 0 on."""
 
-    programme = ("sense", "exchange")
+    schedule = ("sense", "predict", "exchange")
     first_slot = 0
 
 
@@ -26,9 +29,9 @@ class UpdateThenSwap(Gossip):
 class SwapsOnlyP(Gossip):
     """Takes the partner's covariance and keeps its own estimate."""
 
-    def absorb(self, state, phase, messages):
-        for _, pair, _ in messages:
-            state = state._replace(root=pair.root)
+    def absorb(self, state, messages, exchange):
+        for message in messages:
+            state = state._replace(root=message.payload.root)
         return state
 
 
@@ -36,9 +39,9 @@ class SwapsOnlyP(Gossip):
 class SwapsOnlyX(Gossip):
     """Takes the partner's estimate and keeps its own covariance."""
 
-    def absorb(self, state, phase, messages):
-        for _, pair, _ in messages:
-            state = state._replace(xhat=pair.xhat)
+    def absorb(self, state, messages, exchange):
+        for message in messages:
+            state = state._replace(xhat=message.payload.xhat)
         return state
 
 
@@ -66,8 +69,8 @@ class Lossier(Bernoulli):
 class Forgetful(Intermittent):
     """Uses only the first reading that arrives."""
 
-    def absorb(self, state, phase, messages):
-        return super().absorb(state, phase, messages[:1])
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages[:1], exchange)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +86,8 @@ class Overconfident(Intermittent):
 class WrongSign(Hybrid):
     """Moves away from what it hears."""
 
-    def absorb(self, state, messages):
-        right = super().absorb(state, messages)
+    def absorb(self, state, messages, exchange):
+        right = super().absorb(state, messages, exchange)
         return right._replace(xhat=2.0 * state.xhat - right.xhat)
 
 
@@ -92,33 +95,35 @@ class WrongSign(Hybrid):
 class MissingP(Hybrid):
     """Mixes estimates and keeps its covariance."""
 
-    def absorb(self, state, messages):
-        return super().absorb(state, messages)._replace(P=state.P)
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages, exchange)._replace(root=state.root)
 
 
 @dataclass(frozen=True, eq=False)
 class MissingX(Hybrid):
     """Mixes covariances and keeps its estimate."""
 
-    def absorb(self, state, messages):
-        return super().absorb(state, messages)._replace(xhat=state.xhat)
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages, exchange)._replace(xhat=state.xhat)
 
 
 @dataclass(frozen=True, eq=False)
 class WrongWeight(Hybrid):
     """Gives twice the weight."""
 
-    def absorb(self, state, messages):
-        return super().absorb(state, [(2.0 * w, payload, age) for w, payload, age in messages])
+    def absorb(self, state, messages, exchange):
+        return super().absorb(
+            state, [m._replace(weight=2.0 * m.weight) for m in messages], exchange
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class OneAfterTheOther(Hybrid):
     """Resets once for each message of an instant."""
 
-    def absorb(self, state, messages):
+    def absorb(self, state, messages, exchange):
         for message in messages:
-            state = super().absorb(state, [message])
+            state = super().absorb(state, [message], exchange)
         return state
 
 
@@ -126,41 +131,42 @@ class OneAfterTheOther(Hybrid):
 class Stale(Hybrid):
     """Takes old estimates for new ones."""
 
-    def absorb(self, state, messages):
-        return super().absorb(state, [(w, payload, 0.0) for w, payload, _ in messages])
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, [m._replace(age=0.0) for m in messages], exchange)
 
 
 @dataclass(frozen=True, eq=False)
 class ForgottenNoise(Hybrid):
     """Leaves the noise of the plant out of its covariance."""
 
-    def flow(self, state, gap):
-        state = super().flow(state, gap)
-        return state._replace(P=state.P - 0.9 * gap * state.model.Q)
+    def predict(self, state, gap):
+        state = super().predict(state, gap)
+        P = state.P - 0.9 * gap * state.model.Q
+        return state._replace(root=np.linalg.cholesky(P + 1e-12 * np.eye(len(P))))
 
 
 @dataclass(frozen=True, eq=False)
 class SwappedIndex(Hybrid):
     """Sends its first two states exchanged."""
 
-    def emit(self, state):
-        return Payload(state.xhat[::-1].copy(), state.P)
+    def emit(self, state, exchange):
+        return state, Estimate(state.xhat[::-1].copy(), state.root)
 
 
 @dataclass(frozen=True, eq=False)
 class TimeOff(Hybrid):
     """Predicts what it hears too far."""
 
-    def absorb(self, state, messages):
-        late = [(w, predict(state.model, payload, 0.3), age) for w, payload, age in messages]
-        return super().absorb(state, late)
+    def absorb(self, state, messages, exchange):
+        late = [m._replace(age=m.age + 0.3) for m in messages]
+        return super().absorb(state, late, exchange)
 
 
 @dataclass(frozen=True, eq=False)
 class Deaf(Hybrid):
     """Counts readings in its covariance and does not use them."""
 
-    def measure(self, state, reading):
+    def update(self, state, reading):
         return state
 
 
@@ -168,8 +174,8 @@ class Deaf(Hybrid):
 class Eager(Hybrid):
     """Uses every reading twice."""
 
-    def measure(self, state, reading):
-        once = super().measure(state, reading)
+    def update(self, state, reading):
+        once = super().update(state, reading)
         return once._replace(xhat=2.0 * once.xhat - state.xhat)
 
 
@@ -177,11 +183,12 @@ class Eager(Hybrid):
 class TooSure(Hybrid):
     """Fuses estimates as if their errors were independent."""
 
-    def absorb(self, state, messages):
-        for _, payload, _ in messages:
-            gain = np.linalg.solve(state.P + payload.P + 1e-9 * np.eye(len(state.P)), state.P).T
-            P = state.P - gain @ state.P
-            state = state._replace(xhat=state.xhat + gain @ (payload.xhat - state.xhat), P=P)
+    def absorb(self, state, messages, exchange):
+        for message in messages:
+            P, other = state.P, message.payload
+            gain = np.linalg.solve(P + other.P + 1e-9 * np.eye(len(P)), P).T
+            root = np.linalg.cholesky(P - gain @ P + 1e-9 * np.eye(len(P)))
+            state = state._replace(xhat=state.xhat + gain @ (other.xhat - state.xhat), root=root)
         return state
 
 
@@ -189,37 +196,38 @@ class TooSure(Hybrid):
 class LosesMass(PushSum):
     """Does not keep what could not be sent."""
 
-    def absorb(self, state, phase, messages):
-        if phase != AVERAGE:
+    def absorb(self, state, messages, exchange):
+        if exchange.phase != AVERAGE:
             state = state._replace(degree=len(messages))
-        return super().absorb(state, phase, messages)
+        return super().absorb(state, messages, exchange)
 
 
 @dataclass(frozen=True, eq=False)
 class SendsTooMuch(PushSum):
     """Divides its mass by its degree, not by one more."""
 
-    def emit(self, state, phase):
-        sent = super().emit(state, phase)
-        return sent if phase == AVERAGE else sent * (state.degree + 1) / state.degree
+    def emit(self, state, exchange):
+        state, sent = super().emit(state, exchange)
+        much = exchange.phase != AVERAGE
+        return state, sent * (state.degree + 1) / state.degree if much else sent
 
 
 @dataclass(frozen=True, eq=False)
 class NeverAverages(PushSum):
     """Skips the averaging of estimates."""
 
-    def absorb(self, state, phase, messages):
-        return state if phase == AVERAGE else super().absorb(state, phase, messages)
+    def absorb(self, state, messages, exchange):
+        return state if exchange.phase == AVERAGE else super().absorb(state, messages, exchange)
 
 
 @dataclass(frozen=True, eq=False)
 class Overshoots(PushSum):
     """Averages with half of delta."""
 
-    def absorb(self, state, phase, messages):
-        if phase != AVERAGE:
-            return super().absorb(state, phase, messages)
-        received = [payload for _, payload, _ in messages]
+    def absorb(self, state, messages, exchange):
+        if exchange.phase != AVERAGE:
+            return super().absorb(state, messages, exchange)
+        received = [message.payload for message in messages]
         return state._replace(xhat=averaged(state.xhat, received, 0.6 * self.delta))
 
 
@@ -227,21 +235,22 @@ class Overshoots(PushSum):
 class ForgetsN(PushSum):
     """Leaves the factor N out of its gain."""
 
-    def sense(self, state, reading):
+    def update(self, state, reading):
         whole = state.network
         alone = state._replace(network=whole._replace(number=1.0))
-        return super().sense(alone, reading)._replace(network=whole)
+        return super().update(alone, reading)._replace(network=whole)
 
 
 @dataclass(frozen=True, eq=False)
 class Arithmetic(DiffusionFilter):
     """Averages covariances in place of their inverses."""
 
-    def absorb(self, state, phase, messages):
-        own, heard = self.share(state.own, [w for w, _, _ in messages])
+    def absorb(self, state, messages, exchange):
+        own, heard = self.share(state.own, [message.weight for message in messages])
         P = own * state.root @ state.root.T
         xhat = own * state.xhat
-        for weight, (_, pair, _) in zip(heard, messages, strict=True):
+        for weight, message in zip(heard, messages, strict=True):
+            pair = message.payload
             P = P + weight * pair.root @ pair.root.T
             xhat = xhat + weight * pair.xhat
         return state._replace(xhat=xhat, root=np.linalg.cholesky(P))
@@ -259,13 +268,33 @@ class DropsWeight(DiffusionFilter):
 class KeepsX(DiffusionFilter):
     """Combines covariances and keeps its estimate."""
 
-    def absorb(self, state, phase, messages):
-        return super().absorb(state, phase, messages)._replace(xhat=state.xhat)
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages, exchange)._replace(xhat=state.xhat)
+
+
+@dataclass(frozen=True, eq=False)
+class AddsUp(Hybrid):
+    """Forgets its own share and every estimate."""
+
+    def absorb(self, state, messages, exchange):
+        P = state.P + sum(message.weight * message.payload.P for message in messages)
+        return state._replace(root=np.linalg.cholesky(P + 1e-12 * np.eye(len(P))))
+
+
+@dataclass(frozen=True, eq=False)
+class SwapsTooMuch(Gossip):
+    """Takes twice the partner's covariance."""
+
+    def absorb(self, state, messages, exchange):
+        for message in messages:
+            xhat, root = message.payload
+            state = state._replace(xhat=xhat, root=1.4 * root)
+        return state
 
 
 @dataclass(frozen=True, eq=False)
 class OwnReset(FlowFilter):
-    """A reset filter from scratch that forgets its own share."""
+    """A reset filter from scratch, of the former contract, that forgets its own share."""
 
     epsilon: float = setting(positive)
 
@@ -281,7 +310,7 @@ class OwnReset(FlowFilter):
 
 @dataclass(frozen=True, eq=False)
 class OwnSwap(SlotFilter):
-    """A gossip filter from scratch that takes twice the partner's covariance."""
+    """The same, a gossip filter that takes twice the partner's covariance."""
 
     first_slot = 1
     pairwise = True

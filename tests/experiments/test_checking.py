@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 import netkf
+from netkf.core.errors import TheoryError
 from netkf.experiments.checking import statistics
 from netkf.experiments.checking.check import check, verdict, watched, witness
 from netkf.experiments.checking.evidence import BROKEN, NOT_PROMISED, Finding, Promise, judge
@@ -200,11 +201,16 @@ def test_broken_diffusion_is_caught(kind, source, tmp_path):
     assert found[source].verdict == BROKEN
 
 
-def test_filters_written_from_scratch_are_held_to_what_they_resemble(tmp_path):
-    filtering = {"kind": "tests.experiments.broken:OwnReset", "epsilon": 0.3}
+def test_nothing_is_promised_of_filters_written_from_scratch(tmp_path):
+    """They are asked to say which filter they should be; then they are held to it."""
+    for table, kind, settings in ((RING, "OwnReset", {"epsilon": 0.3}), (GOSSIP, "OwnSwap", {})):
+        filtering = {"kind": f"tests.experiments.broken:{kind}", **settings}
+        with pytest.raises(TheoryError, match=f"nothing is promised of {kind}: derive it from"):
+            check(scenario_of(table, tmp_path, filter=filtering), runs=10, workers=1)
+    filtering = {"kind": "tests.experiments.broken:AddsUp", "epsilon": 0.3}
     found = rows_of(check(scenario_of(RING, tmp_path, filter=filtering), runs=10, workers=1))
     assert found["H (4b), (7), (9)"].verdict == BROKEN
-    filtering = {"kind": "tests.experiments.broken:OwnSwap"}
+    filtering = {"kind": "tests.experiments.broken:SwapsTooMuch"}
     found = rows_of(check(scenario_of(GOSSIP, tmp_path, filter=filtering), runs=10, workers=1))
     assert found["G (10), (19), Proposition 7"].verdict == BROKEN
 

@@ -221,15 +221,31 @@ class Hoarder(PushSum):
         return new._replace(mass=new.mass * (1.1 if exchange.phase == MASS else 1.0))
 
 
+class Purse(NamedTuple):
+    xhat: Any
+    root: Any
+    model: Any
+    mass: float
+
+
 @says("Spendthrift.conserved: the sum of weight over all nodes must survive")
-class Spendthrift(PushSum):
+class Spendthrift(Filter):
     """Under clocks it sends mass and keeps it too."""
 
     schedule = None
+    clocks = ("nodes", "links")
+
+    def init(self, model, mean, cov, node):
+        return Purse(*super().init(model, mean, cov, node), 1.0)
 
     def emit(self, state, exchange):
-        after, payload = super().emit(state, exchange)
-        return after._replace(mass=state.mass), payload
+        return state, state.mass / (1 + len(exchange.receivers))
+
+    def absorb(self, state, messages, exchange):
+        return state._replace(mass=state.mass + sum(message.payload for message in messages))
+
+    def conserved(self, state):
+        return {"weight": state.mass}
 
 
 @says("Empty.absorb: failed with IndexError")
