@@ -10,7 +10,16 @@ from __future__ import annotations
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
+from netkf.algorithms.filter import (
+    Estimate,
+    Exchange,
+    Filter,
+    Increments,
+    Message,
+    NodeInfo,
+    Reading,
+    State,
+)
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
@@ -101,6 +110,7 @@ __all__ = [
     "DiffusionFilter",
     "Edges",
     "ErdosRenyi",
+    "Estimate",
     "Exchange",
     "ExponentialDelay",
     "Filter",
@@ -152,6 +162,7 @@ __all__ = [
     "SlotFilter",
     "SlotLocal",
     "Star",
+    "State",
     "Topology",
     "UniformDelay",
     "UnknownDiffusion",

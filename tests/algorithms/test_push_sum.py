@@ -8,6 +8,8 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from netkf.algorithms.filter import Exchange, Message, NodeInfo
+from netkf.algorithms.models import SlotModel
 from netkf.algorithms.push_sum import (
     MASS,
     PushSum,
@@ -17,9 +19,9 @@ from netkf.algorithms.push_sum import (
     mixed,
     share,
 )
-from netkf.algorithms.slot import Role, SlotModel
 from netkf.algorithms.stopping import settled, within
 
+EXCHANGE = Exchange(phase=MASS, step=0, slot=1)
 EDGES = ((0, 1), (1, 2), (0, 2), (2, 3), (3, 4))
 T1 = (
     *((0, 3), (1, 5), (2, 5), (0, 6), (4, 6), (5, 6), (1, 7), (4, 7), (3, 7)),
@@ -154,16 +156,16 @@ def numbers(stop, delivery, rounds, seed, leader=0):
     for node, degree in enumerate(degrees):
         rows = np.array(H.get(node, np.zeros((0, 2))))
         model = SlotModel(np.eye(2), np.eye(2), rows, 0.01 * np.eye(len(rows)))
-        state = filter_.init(model, np.zeros(2), np.eye(2))
-        states.append(filter_.place(state, Role(node, degree, 10, 100.0 * np.eye(2))))
+        info = NodeInfo(node, degree, degree, 10, 1.0, 100.0 * np.eye(2))
+        states.append(filter_.init(model, np.zeros(2), np.eye(2), info))
     for _ in range(rounds):
-        sent = [filter_.emit(state, MASS) for state in states]
+        states, sent = zip(*(filter_.emit(state, EXCHANGE) for state in states), strict=True)
         boxes = [[] for _ in states]
         for i, j in T1:
             if random.random() < delivery:
-                boxes[i] += [] if sent[j] is None else [(0.0, sent[j], 0.0)]
-                boxes[j] += [] if sent[i] is None else [(0.0, sent[i], 0.0)]
-        states = [filter_.absorb(s, MASS, box) for s, box in zip(states, boxes, strict=True)]
+                boxes[i] += [] if sent[j] is None else [Message(j, 0.0, sent[j], 0.0)]
+                boxes[j] += [] if sent[i] is None else [Message(i, 0.0, sent[i], 0.0)]
+        states = [filter_.absorb(s, box, EXCHANGE) for s, box in zip(states, boxes, strict=True)]
     total = math.fsum(state.mass[0] for state in states)
     assert total == pytest.approx(1.0, abs=1e-14)
     return np.array([state.network.number for state in states]), states
@@ -224,9 +226,8 @@ def test_the_safe_rule_waits_for_mass():
     """Far from the leader all links are up and nothing changes while the weight is 0."""
     filter_ = PushSum(gamma=1, delta=4.01, stop="safe")
     model = SlotModel(np.eye(1), np.eye(1), np.zeros((0, 1)), np.zeros((0, 0)))
-    state = filter_.init(model, np.zeros(1), np.eye(1))
-    state = filter_.place(state, Role(3, 1, 10, np.eye(1)))
+    state = filter_.init(model, np.zeros(1), np.eye(1), NodeInfo(3, 1, 1, 10, 1.0, np.eye(1)))
     same = share(state.mass, 1)
-    after = filter_.absorb(state, MASS, [(0.0, same, 0.0)])
+    after = filter_.absorb(state, [Message(2, 0.0, same, 0.0)], EXCHANGE)
     assert not filter_.stopped(after)
     assert after.network.number == 1.0
