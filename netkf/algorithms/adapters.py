@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from netkf.algorithms.filter import (
+    CLOCKS,
     Exchange,
     Filter,
     Increments,
@@ -61,6 +62,7 @@ class FlowAdapter(_Adapter):
     """A flow filter: increments and messages over clocks; it knows no samples."""
 
     schedule = None
+    clocks = CLOCKS[:-1]  # all but after samples
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Its state at time 0."""

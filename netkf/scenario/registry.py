@@ -49,7 +49,7 @@ FAMILIES: dict[str, type[Part]] = {
 }
 """The contract that the classes of each family keep."""
 
-FORMER: dict[str, type[Part]] = {"filter": FlowFilter, "slot filter": SlotFilter}
+FORMER: dict[str, tuple[type[Part], ...]] = {"filter": (FlowFilter, SlotFilter)}
 """Contracts that classes of users may still keep (algorithms.adapters)."""
 
 KINDS: dict[str, dict[str, type[Part]]] = {
@@ -180,8 +180,8 @@ def _imported(family: str, kind: str, folder: Path) -> type[Part]:
     finally:
         sys.path[: len(places)] = []
     contract = FAMILIES[family]
-    former = FORMER.get(family, contract)
-    if not (isinstance(found, type) and issubclass(found, (contract, former))):
+    allowed = (contract, *FORMER.get(family, ()))
+    if not (isinstance(found, type) and issubclass(found, allowed)):
         raise ScenarioError(
             "kind",
             f"must be a subclass of netkf's {contract.__name__}",
