@@ -15,9 +15,7 @@ from netkf.testing import check_filter
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "writing_filters.md").read_text()
-FILES = {
-    name: text for name, text in re.findall(r"```(?:python|toml)\n# (\S+)\n(.*?)```", PAGE, re.S)
-}
+FILES = dict(re.findall(r"```(?:python|toml)\n# (\S+)\n(.*?)```", PAGE, re.S))
 ACTIVATIONS = [
     {"kind": "poisson", "rate": 3.0, "at": "nodes"},
     {"kind": "poisson", "rate": 3.0, "at": "directions"},

@@ -106,14 +106,14 @@ def test_a_former_filter_learns_its_place(tmp_path):
 
 
 def test_former_filters_are_refused_where_they_cannot_run(tmp_path):
-    with pytest.raises(ScenarioError, match="filter.kind: belongs to plants in slots"):
+    with pytest.raises(ScenarioError, match=r"filter\.kind: belongs to plants in slots"):
         simulated({**RING, "filter": {"kind": ""}}, tmp_path, "SoundSwap")
-    with pytest.raises(ScenarioError, match="filter.kind: belongs to plants in continuous time"):
+    with pytest.raises(ScenarioError, match=r"filter\.kind: belongs to plants in continuous time"):
         simulated({**GOSSIP, "filter": RING["filter"]}, tmp_path, "SoundReset")
     sampled = [{**RING["sensors"][0], "sampling": {"kind": "poisson", "rate": 1.0}}]
     with pytest.raises(ScenarioError, match=r"sensors\[0\].*a FlowFilter, which takes no samples"):
         simulated({**RING, "sensors": sampled}, tmp_path, "SoundReset")
-    with pytest.raises(ScenarioError, match="must be one that the .* filter runs under"):
+    with pytest.raises(ScenarioError, match=r"must be one that the .* filter runs under"):
         simulated(RING, tmp_path, "SoundReset", **{"network.activation": {"kind": "readings"}})
 
 
