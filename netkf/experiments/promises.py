@@ -50,7 +50,7 @@ def promises(scenario: Scenario) -> dict[str, Any]:
             for a, s, h, e in rows.itertuples(index=False)
         ],
     }
-    if isinstance(scenario.filter.algorithm, PushSum):
+    if isinstance(scenario.filter.algorithm, PushSum) and scenario.slotted:
         found["push_sum"] = push_sum_promises(scenario)
     elif scenario.slotted:
         found["slot_central_covariance"] = _value(lambda: _slot_central(scenario))

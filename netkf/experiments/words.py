@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.push_sum import PushSum
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import balanced
 
@@ -21,8 +22,16 @@ def without_delay(scenario: Scenario) -> str:
 
 
 def nees_words(scenario: Scenario) -> str:
-    """What NEES should be where P is conservative by design; empty where it should be near n."""
+    """What NEES should be where P is not the covariance of the error by design; empty where it
+    should be near n.
+    """
     algorithm = scenario.filter.algorithm
+    if isinstance(algorithm, PushSum) and not scenario.slotted and scenario.topology.links:
+        return (
+            "until others hear of its samples a node counts them as if all nodes had taken them: "
+            f"P is too small there, NEES above n = {scenario.plant.n} is right, and netkf "
+            "consistency says what it should be"
+        )
     cautious = isinstance(algorithm, (Hybrid, DiffusionFilter)) and scenario.topology.links
     if not cautious or not scenario.filters_know_the_truth:
         return ""
@@ -36,4 +45,6 @@ def mismatch_words(scenario: Scenario) -> str:
     """What P and its bound are worth where the filters believe another model; empty where not."""
     if scenario.filters_know_the_truth:
         return ""
+    if not scenario.drawn:
+        return "whether P fits the errors depends on the model: the state or readings are recorded"
     return "the filters' model differs from the truth: P and its bound need not bound the errors"

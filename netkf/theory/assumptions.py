@@ -54,7 +54,8 @@ def _graph(scenario: Scenario) -> list[Row]:
             "H II-B a",
             parts == 1 and not topology.directed,
             f"{len(topology.nodes)} nodes, {len(topology.links)} links, {parts} part"
-            + ("" if parts == 1 else "s"),
+            + ("" if parts == 1 else "s")
+            + (", directed" if topology.directed else ""),
         )
     ]
     if isinstance(algorithm, Hybrid):
@@ -123,8 +124,12 @@ def _sampling(scenario: Scenario) -> list[Row]:
 
 
 def _own_information(scenario: Scenario, node: int) -> np.ndarray:
-    H, R = scenario.observation(node)
-    return np.asarray(H.T @ np.linalg.solve(R, H))
+    """Of all sensors, of those that sample too: of one sample."""
+    information = np.zeros((scenario.plant.n, scenario.plant.n))
+    for place in scenario.placed.get(node, ()):
+        H, R = scenario.sensors[place.entry].H, scenario.noise(place.entry, believed=False)
+        information += H.T @ np.linalg.solve(R, H)
+    return information
 
 
 def _clocks(scenario: Scenario) -> list[Row]:

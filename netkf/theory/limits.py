@@ -8,6 +8,7 @@ import scipy.sparse
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
+from netkf.scenario.registry import spoken
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import Coupled, informations, left_weights, own_steps, promised
@@ -28,8 +29,7 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     A, Q = scenario.belief
     algorithm = scenario.filter.algorithm
     if algorithm.talks and (not isinstance(algorithm, Hybrid) or own_steps(algorithm, Hybrid)):
-        name = type(algorithm).__name__
-        raise TheoryError(f"H(13) is about the hybrid filter, and {name} is another one")
+        raise TheoryError(f"H(13) is about the hybrid filter, not about {spoken(algorithm)}")
     if by_readings(scenario) and algorithm.talks:
         raise TheoryError("S is the limit of fast links, and nodes transmit when they sample")
     w = left_weights(scenario)

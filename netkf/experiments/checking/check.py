@@ -23,7 +23,14 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
 from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
-from netkf.experiments.checking import diffusion, gossip, hybrid, intermittent, push_sum
+from netkf.experiments.checking import (
+    clocked,
+    diffusion,
+    gossip,
+    hybrid,
+    intermittent,
+    push_sum,
+)
 from netkf.experiments.checking.evidence import (
     BROKEN,
     NOT_PROMISED,
@@ -57,6 +64,8 @@ PAPERS: tuple[tuple[type, ModuleType], ...] = (
     (DiffusionFilter, diffusion),
     (PushSum, push_sum),
 )
+SLOTS_ONLY = (gossip, intermittent, push_sum)
+"""Modules with promises about slots; under clocks those of ``clocked`` are checked."""
 FEWEST, TWINS, SAME = 10, 10, 1e-6
 
 
@@ -92,7 +101,7 @@ def paper_of(scenario: Scenario) -> Any:
     promised = promised_filter(scenario.filter.algorithm)
     for kind, module in PAPERS:
         if isinstance(promised, kind):
-            return module
+            return clocked if module in SLOTS_ONLY and not scenario.slotted else module
     raise TheoryError(f"nothing is promised of the {spoken(promised)} filter that could be checked")
 
 
@@ -228,7 +237,10 @@ def check(
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     paper_of(scenario)
     if not scenario.drawn:
-        raise TheoryError("the truth or the readings are recorded: there is one run, and no law")
+        raise TheoryError(
+            "the state or the readings are recorded: there is one run, and no law to check; "
+            "netkf theory says what is assumed"
+        )
     if scenario.slotted and look_at(scenario)[-1] < FEWEST:
         words = f"must have at least {FEWEST} slots to check limits"
         raise ScenarioError("horizon", words, scenario.horizon, "lengthen it")

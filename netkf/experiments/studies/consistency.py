@@ -240,8 +240,8 @@ def consistency(
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "consistency takes a netkf.Scenario", scenario, LOAD)
     if not scenario.drawn:
-        words, remedy = "has recorded states or readings", "nobody knows their errors' law"
-        raise ScenarioError("plant", words, None, remedy)
+        words = "states or readings are recorded, so the law of the errors is unknown"
+        raise ScenarioError("plant", words, None, "simulate the plant and all readings")
     count = integer(low=FEWEST)("runs", runs)
     sure = number(above=0.0, below=1.0)("confidence", confidence)
     task = partial(one_run, engine=choose_engine(engine, scenario))
@@ -266,6 +266,8 @@ def weighed(scenario: Scenario, runs: Sequence[Seen], confidence: float) -> Cons
     clear = np.isfinite(means).sum(axis=0)
     inside = ((means >= low) & (means <= high)).sum(axis=0) / np.where(clear, clear, np.nan)
     quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))
+    right = scenario.filters_know_the_truth
+    reason = "the design of the filter" if right else "the filters' model"
     rows = []
     for i, node in enumerate(scenario.nodes):
         known = bool(np.isfinite(expected[:, i]).all())
@@ -286,7 +288,7 @@ def weighed(scenario: Scenario, runs: Sequence[Seen], confidence: float) -> Cons
                 if not given
                 else UNDECIDED
                 if lost
-                else _verdict(float(gaps.mean()), width, should, n, known),
+                else _verdict(float(gaps.mean()), width, should, n, known, reason),
             )
         )
     notes = () if given else (NO_COVARIANCE,)
@@ -296,7 +298,7 @@ def weighed(scenario: Scenario, runs: Sequence[Seen], confidence: float) -> Cons
     return Consistency(scenario.name, n, count, confidence, low, high, tuple(rows), notes)
 
 
-def _verdict(gap: float, width: float, should: float, n: int, known: bool) -> str:
+def _verdict(gap: float, width: float, should: float, n: int, known: bool, reason: str) -> str:
     if not math.isfinite(gap):
         return "no NEES: P is singular or not finite"
     if not known:
@@ -307,5 +309,5 @@ def _verdict(gap: float, width: float, should: float, n: int, known: bool) -> st
     if should < (1.0 - DESIGN) * n:
         return "as it should be: P is conservative by design"
     if should > (1.0 + DESIGN) * n:
-        return "as it should be: the filters' model makes P too small"
+        return f"as it should be: {reason} makes P too small"
     return "as it should be"
