@@ -14,18 +14,114 @@ from tests.conftest import ROOT
 OWN = '''
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import netkf
 from netkf.parts import (
-    Bernoulli, Channel, Cycle, Diffusion, FlowFilter, LinearSensor, LinkClock, Loss, Poisson,
+    Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, FlowFilter, Increments,
+    LinearSensor, LinkClock, Loss, Message, NodeInfo, Poisson, Reading, State,
     positive, probability, setting,
 )
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Listen(Filter):
+    """Takes the last estimate that arrives; the rest as in the base class."""
+
+    clocks = ("nodes", "links")
+    schedule = ("predict", "sense", "exchange")
+
+    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
+        for message in messages:
+            payload: Estimate = message.payload
+            state = state._replace(xhat=payload.xhat, root=payload.root)
+        return state
+
+
+class Own(NamedTuple):
+    xhat: Array
+    root: Array
+    model: Any
+    sent: int
+    mass: float
+
+
+@dataclass(frozen=True, eq=False)
+class Everything(Filter):
+    """Defines every method."""
+
+    gain: float = setting(positive, default=0.1)
+
+    schedule = None
+    first_slot = 1
+    one_way = True
+
+    def init(self, model: Any, mean: Array, cov: Array, node: NodeInfo) -> Own:
+        first: State = super().init(model, mean, cov, node)
+        return Own(first.xhat, first.root, model, 0, 1.0 / node.nodes)
+
+    def predict(self, state: Own, gap: float) -> Own:
+        xhat, root = state.model.predict(state.xhat, state.root, gap)
+        return state._replace(xhat=xhat, root=root)
+
+    def update(self, state: Own, reading: Reading | Increments) -> Own:
+        if isinstance(reading, Increments):
+            return state
+        return state._replace(xhat=state.xhat + self.gain * reading.H.T @ reading.y)
+
+    def emit(self, state: Own, exchange: Exchange) -> tuple[Own, tuple[float, Array] | None]:
+        if not exchange.receivers:
+            return state, None
+        share = state.mass / (1 + len(exchange.receivers))
+        return state._replace(mass=share, sent=state.sent + 1), (share, state.xhat)
+
+    def absorb(self, state: Own, messages: Sequence[Message], exchange: Exchange) -> Own:
+        heard = [m.weight * m.age * m.payload[0] for m in messages if m.sender != exchange.slot]
+        return state._replace(mass=state.mass + sum(heard))
+
+    def estimate(self, state: Own) -> tuple[Array, Array | None]:
+        return state.xhat, None
+
+    def shift(self, state: Own, offset: Array) -> Own:
+        return state._replace(xhat=state.xhat + offset)
+
+    def shift_payload(self, payload: tuple[float, Array], offset: Array) -> tuple[float, Array]:
+        return payload[0], payload[1] + offset
+
+    def accepts(self, payload: tuple[float, Array], age: float) -> bool:
+        return age < 1.0
+
+    def max_measurement_interval(self, state: Own) -> float:
+        return 0.1
+
+    def steps(self, phase: int) -> int:
+        return 1 + phase
+
+    def redraws_links(self, phase: int, step: int) -> bool:
+        return step == 0
+
+    def stopped(self, state: Own) -> bool:
+        return state.mass > 0.5
+
+    def conserved(self, state: Own) -> Mapping[str, float | Sequence[float]]:
+        return {"mass": state.mass, "sent": [float(state.sent)]}
+
+    def weight(self, degree: int, peer_degree: int) -> float:
+        return 1.0 / (1 + degree)
+
+    @property
+    def pair_weights(self) -> Array | None:
+        return None
+
+    def largest_degree(self) -> float:
+        return 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +167,18 @@ def scenario() -> netkf.Scenario:
     )
 
 
+algorithms: list[Filter] = [Listen(), Everything(gain=0.2)]
 kinds: dict[str, dict[str, type]] = netkf.parts.kinds()
 loss: Loss = Bernoulli(0.5)
 rate: float = Poisson(rate=2.0).mean_rate((0, 1))
 verdict = netkf.check(scenario(), runs=10)
 '''
 WRONG = """
+class Wrong(Filter):
+    def absorb(self, state: State, messages: Sequence[Message], exchange: int) -> State:
+        return state
+
+
 netkf.parts.Bernouli(0.5)
 netkf.check(5)
 """
@@ -105,7 +207,17 @@ def test_mypy_accepts_classes_of_ones_own_and_finds_mistakes(tmp_path):
     assert "own.py" not in found
     assert 'Module has no attribute "Bernouli"' in found
     assert 'Argument 1 to "check" has incompatible type "int"' in found
-    assert "Found 2 errors in 1 file (checked 2 source files)" in found
+    assert 'Argument 3 of "absorb" is incompatible with supertype' in found
+    assert "Found 3 errors in 1 file (checked 2 source files)" in found
+
+
+def test_a_class_with_every_method_has_every_method():
+    """Of the contract, so that none is forgotten above."""
+    own = OWN[OWN.index("class Everything") : OWN.index("class Regular")]
+    methods = [name for name in vars(netkf.parts.Filter) if not name.startswith("_")]
+    for name in methods:
+        if callable(getattr(netkf.parts.Filter, name)) or name == "pair_weights":
+            assert f"def {name}(" in own
 
 
 def test_every_kind_and_contract_is_imported_by_name():
