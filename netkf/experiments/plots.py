@@ -230,14 +230,13 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
     topology = scenario.topology
     places = topology.positions or _layout(scenario)
     delivered = finished.samples.delivered
-    counts = np.array(
-        [delivered.get((min(i, j), max(i, j)), 0) for i, j in topology.links], dtype=float
-    )
+    pairs = sorted({(min(i, j), max(i, j)) for i, j in topology.links})
+    counts = np.array([delivered.get(pair, 0) for pair in pairs], dtype=float)
     if len(counts):
         share = counts / max(float(counts.max()), 1.0)
         axes.add_collection(
             LineCollection(
-                [(places[i], places[j]) for i, j in topology.links],
+                [(places[i], places[j]) for i, j in pairs],
                 linewidths=0.3 + 2.2 * share,
                 colors=DARK,
                 alpha=0.45,
@@ -282,10 +281,11 @@ def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) 
     axes.axis("off")
     axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))
     total = finished.summary["messages"]
-    axes.set_title(
-        f"links as wide as they delivered; {total['sent']:,} messages, {total['lost']:,} lost",
-        fontsize=9,
-    )
+    words = f"{total['sent']:,} messages"
+    if total["transmissions"] < total["sent"]:
+        words += f" in {total['transmissions']:,} transmissions"
+    words = f"links as wide as they delivered; {words}, {total['lost']:,} lost"
+    axes.set_title(words, fontsize=9)
     label = "RMS error" if scenario.plant.shown else "mean trace P"
     figure.colorbar(dots, ax=axes, shrink=0.5, label=label, pad=0.01)
 

@@ -17,6 +17,7 @@ from netkf.core import compiling, small
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.streams import Streams
 from netkf.engines.compiled import lots
+from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.network.channels import Bernoulli, Fates
 from netkf.network.clocks import Poisson
@@ -27,12 +28,15 @@ from tests.conftest import SCENARIOS, scenario_files
 from tests.engines.agreement import assert_agree
 
 pytest.importorskip("numba")
-SHORT = {"intel_lab.toml": 1.5, "diffusion_regression.toml": 300.0}
+SHORT = {"intel_lab.toml": 1.5, "intel_lab_radio.toml": 3.0, "diffusion_regression.toml": 300.0}
 
 
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda file: file.stem)
 def test_every_scenario_agrees(file):
     scenario = netkf.load(file)
+    refusal = CompiledEngine().refusal(scenario)
+    if refusal is not None:
+        pytest.skip(refusal)
     horizon = min(scenario.horizon, SHORT.get(file.name, 40.0))
     assert_agree(scenario.replace({"horizon": horizon}))
 
