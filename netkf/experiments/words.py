@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.push_sum import PushSum
 from netkf.scenario.scenario import Scenario
-from netkf.theory.coupled import balanced
+from netkf.theory.coupled import balanced, own_steps
 
 
 def limit_words(scenario: Scenario) -> str:
@@ -26,14 +27,19 @@ def nees_words(scenario: Scenario) -> str:
     should be near n.
     """
     algorithm = scenario.filter.algorithm
+    designs = (CovarianceIntersection, Hybrid, DiffusionFilter, PushSum)
+    kind = next((kind for kind in designs if isinstance(algorithm, kind)), None)
+    if kind is None or own_steps(algorithm, kind):
+        return ""
     if isinstance(algorithm, PushSum) and not scenario.slotted and scenario.topology.links:
         return (
             "until others hear of its samples a node counts them as if all nodes had taken them: "
             f"P is too small there, NEES above n = {scenario.plant.n} is right, and netkf "
             "consistency says what it should be"
         )
-    cautious = isinstance(algorithm, (Hybrid, DiffusionFilter)) and scenario.topology.links
-    if not cautious or not scenario.filters_know_the_truth:
+    if isinstance(algorithm, PushSum) or not scenario.topology.links:
+        return ""
+    if not scenario.filters_know_the_truth:
         return ""
     return (
         f"this filter keeps P above the covariance of its error by design: NEES below n = "

@@ -8,7 +8,7 @@ import scipy.sparse
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.core.errors import TheoryError
-from netkf.scenario.registry import spoken
+from netkf.scenario.registry import name_of, spoken
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.coupled import Coupled, informations, left_weights, own_steps, promised
@@ -28,8 +28,13 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     """
     A, Q = scenario.belief
     algorithm = scenario.filter.algorithm
-    if algorithm.talks and (not isinstance(algorithm, Hybrid) or own_steps(algorithm, Hybrid)):
+    if algorithm.talks and not isinstance(algorithm, Hybrid):
         raise TheoryError(f"H(13) is about the hybrid filter, not about {spoken(algorithm)}")
+    if algorithm.talks and (own := own_steps(algorithm, Hybrid)):
+        name = spoken(algorithm)
+        if ":" in name_of("filter", algorithm):
+            name = f"{type(algorithm).__name__}, which defines {own[0]} itself"
+        raise TheoryError(f"H(13) is about the hybrid filter, not about {name}")
     if by_readings(scenario) and algorithm.talks:
         raise TheoryError("S is the limit of fast links, and nodes transmit when they sample")
     w = left_weights(scenario)

@@ -89,7 +89,8 @@ def test_errors_that_are_not_what_they_should_be_are_found(gossip, factor, words
     for _ in range(40):
         samples = factor * random.chisquare(n, size=(10, nodes))
         nothing = np.full(nodes, np.nan)
-        runs.append(Seen(samples, samples.mean(axis=0), np.full(nodes, 4.0), nothing, nothing))
+        told = samples.mean(axis=0), np.full(nodes, 4.0), nothing, nothing
+        runs.append(Seen(samples, *told, np.array([np.inf]), np.array([True])))
     found = weighed(gossip, runs, 0.999)
     assert bool(found) == (factor == 1.0)
     assert all(words in row.verdict for row in found.rows)
