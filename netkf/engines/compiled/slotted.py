@@ -106,13 +106,17 @@ class SlotRun:
         if len(self._mass) and count:
             now = {name: math.fsum(shown.mass[-1, :, j]) for j, name in SUMS}
             self._recorder.sums = {name: (self._sums[name], now[name]) for name in now}
+        x = np.array([states[slot].absolute for slot, _, _ in slots.samples]).reshape(-1, n)
+        local = x  # also where nobody knows the state
+        if self._truth.frame_slots is not None:
+            local = np.array([states[slot].shown for slot, _, _ in slots.samples]).reshape(-1, n)
         fine = recorded(
             self._scenario,
             self._recorder,
             self._progress,
             np.array([time for _, time, _ in slots.samples]),
-            np.array([states[slot].absolute for slot, _, _ in slots.samples]).reshape(-1, n),
-            np.array([states[slot].shown for slot, _, _ in slots.samples]).reshape(-1, n),
+            x,
+            local,
             shown.xhat,
             shown.root @ np.swapaxes(shown.root, -1, -2),
             lambda k: self._recorder.extend(rows[: slots.samples[k][2]]),
