@@ -17,13 +17,33 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.baselines import Central as SlotCentral
+from netkf.algorithms.baselines import Local as SlotLocal
 from netkf.algorithms.filter import Reading
+from netkf.algorithms.gossip import Gossip
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
 from netkf.core.arrays import FloatArray, square_root
 from netkf.core.compiling import compilable
 from netkf.core.fields import Part
 from netkf.core.small import applied, product, solution
+
+__all__ = [
+    "Gossip",
+    "Intermittent",
+    "Reading",
+    "Role",
+    "SlotCentral",
+    "SlotFilter",
+    "SlotLocal",
+    "SlotModel",
+    "SlotState",
+    "adapted",
+    "filtered",
+    "update_and_predict",
+]
+"""Filters and models have moved; classes of users may still ask for them here."""
 
 Messages = Sequence[tuple[float, Any, float]]
 

@@ -93,9 +93,9 @@ def test_frames_change_no_error(kind, mixed, monkeypatch):
     np.testing.assert_allclose(run.xhat, plain.xhat, rtol=1e-9, atol=1e-6)
 
 
-def test_errors_so_large_that_they_round_each_other_are_known(kind="hybrid"):
+def test_errors_so_large_that_they_round_each_other_are_known():
     """Blind nodes below the threshold: errors of 1e20 leave rounding where a sensor takes them."""
-    run = netkf.simulate(scenario(kind, SENSORS, horizon=300.0), engine="simpy")
+    run = netkf.simulate(scenario("hybrid", SENSORS, horizon=300.0), engine="simpy")
     assert 10.0 < run.rounding_from < 200.0
     early = run.times < run.rounding_from
     least = np.linalg.eigvalsh(run.P[early])[..., 0]

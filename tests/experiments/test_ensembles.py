@@ -206,7 +206,7 @@ from netkf.algorithms.hybrid import Hybrid
 
 
 class Bad(Hybrid):
-    def absorb(self, state, messages):
+    def absorb(self, state, messages, exchange):
         return 1 / 0
 
 

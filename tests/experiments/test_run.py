@@ -135,13 +135,13 @@ from netkf.algorithms.hybrid import Hybrid
 
 
 class Bad(Hybrid):
-    def absorb(self, state, messages):
+    def absorb(self, state, messages, exchange):
         return state._replace(xhat=1 / len(messages[1:]))
 
 
 class Nan(Hybrid):
-    def absorb(self, state, messages):
-        return state._replace(P=state.P * float("nan"))
+    def absorb(self, state, messages, exchange):
+        return state._replace(root=state.root * float("nan"))
 
 
 class Weightless(Hybrid):

@@ -371,7 +371,9 @@ def test_intervals_hold_as_often_as_they_say():
     random, misses, level = np.random.default_rng(5), 0, 0.1
     for _ in range(300):
         square = random.gamma(4.0, 0.25, size=(64, 3)) * [1.0, 1.0, 0.8]
-        figures = Figures(square, square, np.zeros((64, 4)), np.zeros((64, 1)))
+        figures = Figures(
+            square, square, np.zeros((64, 5)), np.zeros((64, 1)), np.full((64, 1), np.inf)
+        )
         interval = by_simulation(figures, Target("worst_rms", 1.0), level, None)
         misses += not interval.low <= 1.0 <= interval.high
     assert misses <= scipy.stats.binom.ppf(0.999, 300, level)
@@ -381,7 +383,7 @@ def test_intervals_hold_as_often_as_they_say():
 def test_a_run_that_diverges_has_errors_without_end():
     square = np.ones((20, 2))
     diverged = np.zeros((20, 1))
-    figures = Figures(square, square, np.zeros((20, 4)), diverged)
+    figures = Figures(square, square, np.zeros((20, 5)), diverged, np.full((20, 1), np.inf))
     assert by_simulation(figures, Target("worst_rms", 2.0), 0.05, None).high == 1.0
     diverged[3] = 1
     interval = by_simulation(figures, Target("worst_rms", 2.0), 0.05, None)
