@@ -18,7 +18,7 @@ from netkf.experiments.ensembles.directory import FinishedEnsemble
 from netkf.experiments.files import written_beside
 from netkf.experiments.run import Finished
 from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds
-from netkf.experiments.words import nees_words
+from netkf.experiments.words import by_design
 from netkf.scenario.scenario import Scenario
 
 SENSING, RELAY, PROMISE, DARK = "#c1440e", "#3b6ea5", "#222222", "#555555"
@@ -61,7 +61,7 @@ def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
             _bands(above, scenario, finished, ensemble.mean_error, ensemble.se_error)
             above.set(ylabel="root mean square error", xlabel="simulated seconds")
         else:
-            above.text(0.0, 0.5, "nobody knows the truth, so there are no errors", color=DARK)
+            above.text(0.0, 0.5, "no ground truth: errors are unavailable", color=DARK)
             above.axis("off")
         _bands(below, scenario, finished, ensemble.mean_P, ensemble.se_P)
         below.set(ylabel="square root of mean trace P", xlabel="simulated seconds")
@@ -150,7 +150,7 @@ def _scale(axes: Any, values: FloatArray) -> None:
 
 def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
     if not scenario.plant.shown:
-        axes.text(0.0, 0.5, "nobody knows the truth, so there are no errors", color=DARK)
+        axes.text(0.0, 0.5, "no ground truth: errors are unavailable", color=DARK)
         axes.axis("off")
         return
     times = np.array(finished.samples.times)
@@ -190,7 +190,8 @@ def _nees(axes: Any, times: FloatArray, nees: Any, scenario: Scenario, runs: int
     words = f"{CONFIDENCE:.0%} where P is exact"
     low, high = nees_bounds(scenario.plant.n, runs)
     axes.axhspan(low, high, color="#2e8b57", alpha=0.15, label=words)
-    label = f"n = {scenario.plant.n}" + (", P is larger by design" if nees_words(scenario) else "")
+    design = by_design(scenario)
+    label = f"n = {scenario.plant.n}" + (f", P is {design} by design" if design else "")
     axes.axhline(scenario.plant.n, color="#2e8b57", lw=1.1, label=label)
     _scale(axes, np.append(values, high))
     axes.set(ylabel="NEES" if runs == 1 else "mean NEES", xlabel="simulated seconds")

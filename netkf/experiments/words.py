@@ -22,29 +22,37 @@ def without_delay(scenario: Scenario) -> str:
     return ", if messages took no time" if delayed else ""
 
 
-def nees_words(scenario: Scenario) -> str:
-    """What NEES should be where P is not the covariance of the error by design; empty where it
-    should be near n.
+def by_design(scenario: Scenario) -> str:
+    """Whether the design of the filter makes P "larger" or "smaller" than the covariance of its
+    error; empty if neither is known.
     """
     algorithm = scenario.filter.algorithm
     designs = (CovarianceIntersection, Hybrid, DiffusionFilter, PushSum)
     kind = next((kind for kind in designs if isinstance(algorithm, kind)), None)
-    if kind is None or own_steps(algorithm, kind):
+    if kind is None or own_steps(algorithm, kind) or not scenario.topology.links:
         return ""
-    if isinstance(algorithm, PushSum) and not scenario.slotted and scenario.topology.links:
+    if kind is PushSum:
+        return "" if scenario.slotted else "smaller"
+    return "larger" if scenario.filters_know_the_truth else ""
+
+
+def nees_words(scenario: Scenario) -> str:
+    """What NEES should be where P is not the covariance of the error by design; empty where it
+    should be near n.
+    """
+    n, design = scenario.plant.n, by_design(scenario)
+    if design == "smaller":
         return (
             "until others hear of its samples a node counts them as if all nodes had taken them: "
-            f"P is too small there, NEES above n = {scenario.plant.n} is right, and netkf "
-            "consistency says what it should be"
+            f"P is too small there, NEES above n = {n} is right, and netkf consistency says what "
+            "it should be"
         )
-    if isinstance(algorithm, PushSum) or not scenario.topology.links:
-        return ""
-    if not scenario.filters_know_the_truth:
-        return ""
-    return (
-        f"this filter keeps P above the covariance of its error by design: NEES below n = "
-        f"{scenario.plant.n} is right, and netkf consistency says what it should be"
-    )
+    if design == "larger":
+        return (
+            "this filter keeps P above the covariance of its error by design: NEES below "
+            f"n = {n} is right, and netkf consistency says what it should be"
+        )
+    return ""
 
 
 def mismatch_words(scenario: Scenario) -> str:

@@ -4,7 +4,7 @@ import pytest
 
 import netkf
 from netkf.experiments.promises import promises, promises_text
-from netkf.experiments.words import nees_words
+from netkf.experiments.words import by_design, nees_words
 
 SENSOR = {"H": [[1.0]], "R": [[0.5]], "sampling": {"kind": "periodic", "period": 0.4}}
 LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.7}, "symmetric": False}
@@ -68,6 +68,7 @@ def test_theory_sees_what_sensors_that_sample_see(kind, clocked):
 
 def test_push_sum_says_where_its_covariance_is_too_small(clocked):
     scenario = clocked("push-sum")
+    assert by_design(scenario) == "smaller"
     assert "NEES above n = 1 is right" in nees_words(scenario)
     found = netkf.consistency(scenario, runs=20, workers=1)
     assert found

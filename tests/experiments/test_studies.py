@@ -398,7 +398,7 @@ def test_errors_of_a_truth_that_nobody_knows_are_no_target(tmp_path):
     table = {"format": 1, "name": "real", **SCALAR, "plant": plant, "sensors": [sensor]}
     table |= {"network": {"graph": {"kind": "path", "nodes": 2}}, "filter": {"kind": "local"}}
     scenario = from_table({**table, "horizon": 6.0}, tmp_path)
-    with pytest.raises(ScenarioError, match="nobody knows the truth"):
+    with pytest.raises(ScenarioError, match="there is no ground truth"):
         size(scenario, "horizon", 2.0, 6.0, "worst_rms<=5")
     table = sweep(scenario, {"horizon": [3.0, 6.0]}, workers=1)
     assert table["worst_rms"].isna().all()

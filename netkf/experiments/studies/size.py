@@ -60,7 +60,7 @@ def size(
     if wanted.of_errors and not scenario.plant.shown:
         remedy = "ask for mean_trace or worst_trace"
         raise ScenarioError(
-            "--target", "is about errors, and nobody knows the truth", target, remedy
+            "--target", "is about errors, and there is no ground truth", target, remedy
         )
     base = scenario if seed is None else scenario.replace({"seed": seed})
     whole = _checked_range(base, key, low, high)
