@@ -17,13 +17,14 @@ from netkf.core.arrays import FloatArray
 from netkf.experiments.ensembles.directory import FinishedEnsemble
 from netkf.experiments.files import written_beside
 from netkf.experiments.run import Finished
-from netkf.experiments.summary import CONFIDENCE, Promise, nees_bounds
+from netkf.experiments.summary import CONFIDENCE, NO_COVARIANCE, Promise, nees_bounds
 from netkf.experiments.words import by_design
 from netkf.scenario.scenario import Scenario
 
 SENSING, RELAY, PROMISE, DARK = "#c1440e", "#3b6ea5", "#222222", "#555555"
 MOST_LINES = 60
 LONGEST_LEGEND = 72
+NO_TRUTH = "no ground truth: errors are unavailable"
 
 
 def run_picture(scenario: Scenario, finished: Finished) -> None:
@@ -61,10 +62,12 @@ def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
             _bands(above, scenario, finished, ensemble.mean_error, ensemble.se_error)
             above.set(ylabel="root mean square error", xlabel="simulated seconds")
         else:
-            above.text(0.0, 0.5, "no ground truth: errors are unavailable", color=DARK)
-            above.axis("off")
-        _bands(below, scenario, finished, ensemble.mean_P, ensemble.se_P)
-        below.set(ylabel="square root of mean trace P", xlabel="simulated seconds")
+            _unavailable(above, NO_TRUTH)
+        if np.isfinite(ensemble.mean_P).any():
+            _bands(below, scenario, finished, ensemble.mean_P, ensemble.se_P)
+            below.set(ylabel="square root of mean trace P", xlabel="simulated seconds")
+        else:
+            _unavailable(below, f"{NO_COVARIANCE}: trace P is unavailable")
         runs = int(ensemble.runs.max())
         if lowest:
             _nees(lowest[0], ensemble.times, ensemble.mean_nees, scenario, runs)
@@ -150,8 +153,7 @@ def _scale(axes: Any, values: FloatArray) -> None:
 
 def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
     if not scenario.plant.shown:
-        axes.text(0.0, 0.5, "no ground truth: errors are unavailable", color=DARK)
-        axes.axis("off")
+        _unavailable(axes, NO_TRUTH)
         return
     times = np.array(finished.samples.times)
     error = np.sqrt(np.array(finished.samples.sq_error))
@@ -171,7 +173,16 @@ def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
     _legend(axes)
 
 
+def _unavailable(axes: Any, words: str) -> None:
+    """A panel without data."""
+    axes.text(0.0, 0.5, words, color=DARK)
+    axes.axis("off")
+
+
 def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
+    if not finished.samples.covariance_given:
+        _unavailable(axes, f"{NO_COVARIANCE}: trace P is unavailable")
+        return
     times, promised = np.array(finished.samples.times), finished.promised
     root = np.sqrt(np.maximum(np.array(finished.samples.trace), 0.0))
     _lines(axes, times, root, scenario)
@@ -185,6 +196,9 @@ def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
 def _nees(axes: Any, times: FloatArray, nees: Any, scenario: Scenario, runs: int = 1) -> None:
     """NEES of every node, (T, N), a mean over the runs, and where it lies when P is exact."""
     values = np.array(nees)
+    if not np.isfinite(values).any():
+        _unavailable(axes, "NEES is unavailable: it needs an error and a regular P")
+        return
     _lines(axes, times, values, scenario)
     axes.plot(times, values.mean(axis=1), color=PROMISE, lw=1.6, label="mean of all", zorder=3)
     words = f"{CONFIDENCE:.0%} where P is exact"
