@@ -20,6 +20,8 @@ from functools import cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
+from netkf.core.linking import linked_once
+
 ROOMS = ("core", "algorithms", "plants", "trace", "engines")
 """Whose code and numbers compiled functions may hold."""
 
@@ -133,7 +135,8 @@ def _moderately_optimised(made: Any, config: Any) -> None:
         before, began = config.OPT, time.perf_counter()
         config.OPT = type(before)(2)
         try:
-            return compile_for(*args, **kwargs)
+            with linked_once():
+                return compile_for(*args, **kwargs)
         finally:
             config.OPT = before
             _spent.append(time.perf_counter() - began)

@@ -1,0 +1,97 @@
+"""One piece of machine code for a compiled function and all that it calls.
+
+numba compiles each function to machine code of its own, with all that it calls linked in, although
+a function that is called by another compiled one alone is only ever linked into that. Of many small
+functions each is optimised over and over again so, which takes several times as long as the rest.
+Here, while the outermost function is compiled, those that it calls stay as they are until they are
+linked into it. This relies on names of numba that are not public (see pyproject.toml for its
+versions, and tests/core/test_linking.py).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+_DEPTH = {"compile": 0, "load": 0, "finalize": 0}
+
+
+@contextmanager
+def linked_once() -> Iterator[None]:
+    """Inside, only the outermost function that is compiled gets machine code."""
+    from numba.core.codegen import CPUCodeLibrary
+    from numba.core.cpu import CPUContext
+    from numba.core.dispatcher import Dispatcher
+
+    patches: list[tuple[Any, str, Callable[..., Any]]] = [
+        (Dispatcher, "compile", _counted("compile", Dispatcher.compile)),
+        (CPUCodeLibrary, "finalize", _counted("finalize", CPUCodeLibrary.finalize)),
+        (
+            CPUContext,
+            "get_executable",
+            _only_outermost("compile", _counted("load", CPUContext.get_executable), _stub),
+        ),
+        (
+            CPUCodeLibrary,
+            "_optimize_final_module",
+            _only_outermost("finalize", CPUCodeLibrary._optimize_final_module, _nothing),
+        ),
+        (
+            CPUCodeLibrary,
+            "_finalize_final_module",
+            _only_outermost("finalize", CPUCodeLibrary._finalize_final_module, _keep_as_it_is),
+        ),
+    ]
+    before = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
+    for owner, name, patch in patches:
+        setattr(owner, name, patch)
+    try:
+        yield
+    finally:
+        for owner, name, original in before:
+            setattr(owner, name, original)
+
+
+def _counted(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
+    def counted(*args: Any, **kwargs: Any) -> Any:
+        _DEPTH[what] += 1
+        try:
+            return original(*args, **kwargs)
+        finally:
+            _DEPTH[what] -= 1
+
+    return counted
+
+
+def _only_outermost(
+    what: str, original: Callable[..., Any], inner: Callable[..., Any]
+) -> Callable[..., Any]:
+    def choose(*args: Any, **kwargs: Any) -> Any:
+        # What is linked is finalized too, while its caller is lowered or finalized. What was kept
+        # on disk is loaded without being finalized again.
+        linked = _DEPTH[what] > 1 or (what == "finalize" and _DEPTH[what] > _DEPTH["load"])
+        return (inner if linked else original)(*args, **kwargs)
+
+    return choose
+
+
+def _stub(_: Any, library: Any, fndesc: Any, env: Any) -> Any:
+    """Stands for a function that is linked in, and never called from Python (it would raise)."""
+    from numba import _dynfunc  # type: ignore[attr-defined]
+
+    raising = ctypes.cast(ctypes.pythonapi.PyErr_NoMemory, ctypes.c_void_p).value
+    module, name = fndesc.lookup_module(), fndesc.qualname.split(".")[-1]
+    return _dynfunc.make_function(module, name, "linked in", raising, env, (library,))
+
+
+def _nothing(library: Any) -> None:
+    pass
+
+
+def _keep_as_it_is(library: Any) -> None:
+    """What numba does, without code for the machine."""
+    library._finalize_dynamic_globals()
+    library._verify_declare_only_symbols()
+    library._finalized = True
