@@ -7,13 +7,13 @@ import pytest
 
 import netkf
 from netkf.core import compiling
-from netkf.engines.compiled.replay import intersecting, replay
+from netkf.engines.compiled.event_loop import event_loop
 from netkf.engines.compiled.slotted import KERNELS
 from netkf.scenario.reading import from_table
 
 ROOT = Path(__file__).parent.parent
 SCENARIOS = ROOT / "scenarios"
-ONCE = {replay, intersecting, *KERNELS.values()}
+ONCE = {event_loop, *KERNELS.values()}
 
 
 def scenario_files():

@@ -78,7 +78,7 @@ class FlowModel:
         return flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
 
     @cached_property
-    def _forgetting(self) -> float:
+    def forgetting(self) -> float:
         """The fastest rate at which the plant forgets its state, 1/s; 0 if it never does."""
         return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
 
@@ -87,7 +87,7 @@ class FlowModel:
         if not self.A.any():
             return Backward(np.eye(len(self.A)), 1.0)
         inverse = np.asarray(scipy.linalg.expm(-gap * self.A))
-        return Backward(inverse, math.exp(-2.0 * self._forgetting * gap))
+        return Backward(inverse, math.exp(-2.0 * self.forgetting * gap))
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float

@@ -36,8 +36,9 @@ from netkf.core.streams import Streams
 from netkf.engines.base import silent
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.compiled.poisson import schedule
-from netkf.engines.compiled.schedule import LinkDraws, Window
-from netkf.engines.compiled.tables import host_tables, link_tables
+from netkf.engines.compiled.schedule import EntityDraws
+from netkf.engines.compiled.senders import senders_of
+from netkf.engines.compiled.state import entity_records, filters_at_start
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.theory import intermittent
 from netkf.trace.recorder import MemorySink, Recorder
@@ -81,7 +82,7 @@ def by_hand(table, window, ends, weights, xhat, P, now):
     E = np.empty(table.shape[1] - 1)
     X, Y = np.empty((n, n)), np.empty(n)
     for tick in range(len(window.t)):
-        t, link = window.t[tick], window.link[tick]
+        t, link = window.t[tick], window.entity[tick]
         for side in range(2):
             h = ends[link, side]
             gap, power, k = t - now[h], 1.0, 0
@@ -107,8 +108,8 @@ def by_hand(table, window, ends, weights, xhat, P, now):
                         P[h, i, j] += X[i, k] * E[j * n + k]
             now[h] = t
         i, j = ends[link]
-        w_i = weights[link, 1] if window.delay[tick, 1] == 0.0 else 0.0
-        w_j = weights[link, 0] if window.delay[tick, 0] == 0.0 else 0.0
+        w_i = weights[link, 1] if window.delay[window.at[tick] + 1] == 0.0 else 0.0
+        w_j = weights[link, 0] if window.delay[window.at[tick]] == 0.0 else 0.0
         for a in range(n):
             d = xhat[j, a] - xhat[i, a]
             xhat[i, a] += w_i * d
@@ -120,6 +121,15 @@ def by_hand(table, window, ends, weights, xhat, P, now):
     return len(window.t)
 
 
+def tables(case):
+    """Ends (L, 2) and weights (L, 2) of links, xhat, P and times of nodes, the series of a gap."""
+    start, (entities, ways) = filters_at_start(case), entity_records(case, senders_of(case))
+    ends = np.stack([entities["sender"], entities["other"]], axis=1)
+    P = start.root @ np.swapaxes(start.root, 1, 2)
+    nodes = start.xhat, np.ascontiguousarray(P), np.zeros(len(P))
+    return ends, ways["weight"].reshape(-1, 2).copy(), nodes, case.models[0].prediction.blind
+
+
 def hand_written(case):
     """Draw the schedule as the engine does and replay it."""
     import numba
@@ -127,12 +137,11 @@ def hand_written(case):
     fast = numba.njit(nogil=True, error_model="numpy")(by_hand)
 
     def run():
-        hosts, models = host_tables(case)
-        links, windows = link_tables(case), schedule(case, Streams(case.seed))
-        series, ticks = models.blind[-1], 0
+        ends, weights, nodes, series = tables(case)
+        windows, ticks = schedule(case, Streams(case.seed)), 0
         while True:
             window = windows.following()
-            ticks += fast(series, window, links.ends, links.weight, hosts.xhat, hosts.P, hosts.now)
+            ticks += fast(series, window, ends, weights, *nodes)
             if math.isinf(window.end):
                 return ticks
 
@@ -146,21 +155,19 @@ def bare_simpy(case):
     fast = numba.njit(nogil=True, error_model="numpy")(by_hand)
 
     def run():
-        hosts, models = host_tables(case)
-        tables, series = link_tables(case), models.blind[-1]
-        draws, env, made = LinkDraws(case, Streams(case.seed)), simpy.Environment(), 0
-        one = (series, tables.ends, tables.weight, hosts.xhat, hosts.P, hosts.now)
+        ends, weights, nodes, series = tables(case)
+        draws = EntityDraws(case, Streams(case.seed), senders_of(case))
+        env, made = simpy.Environment(), 0
 
         def ticking(k):
             nonlocal made
             link = np.array([k])
             while draws.last[k] < math.inf:
-                t, links, delays = draws.more(link)
-                for m in range(len(t)):
-                    yield env.timeout(t[m] - env.now)
-                    part = slice(m, m + 1)
-                    window = Window(0.0, t[part], links[part], delays[part])
-                    made += fast(one[0], window, *one[1:])
+                ticks = draws.more(link)
+                for m in range(len(ticks.t)):
+                    yield env.timeout(ticks.t[m] - env.now)
+                    part = ticks.chosen(np.array([m]), draws.sizes)
+                    made += fast(series, part.window(0.0, draws.sizes), ends, weights, *nodes)
 
         for k in range(draws.count):
             env.process(ticking(k))

@@ -7,17 +7,18 @@ from netkf.engines.simpy.engine import SimpyEngine
 
 
 def assert_agree(scenario, replica=0, engine="compiled"):
-    """Run an engine and SimPy with nothing compiled; returns the run of the former."""
+    """Run an engine and SimPy; returns the run of the former."""
     fast = netkf.simulate(scenario, replica=replica, engine=engine)
     slow = netkf.simulate(scenario, replica=replica, engine=SimpyEngine())
-    assert (fast.engine, slow.engine) == (engine, "processes")
+    assert (fast.engine, slow.engine) == (engine, "simpy")
     assert netkf.first_difference(fast, slow) is None
     assert fast.fingerprint == slow.fingerprint
     assert fast.status == slow.status
-    for name in ("times", "x", "xhat", "P"):
+    for name in ("times", "x", "xhat", "P", "error"):
         one, other = getattr(fast, name), getattr(slow, name)
         size = np.nanmax(np.abs(other), initial=0.0, where=np.isfinite(other))
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10 * size, err_msg=name)
+    assert fast.exact_errors == slow.exact_errors
     assert fast.sums.keys() == slow.sums.keys()
     for name, pair in slow.sums.items():
         np.testing.assert_allclose(fast.sums[name], pair, rtol=1e-10)

@@ -41,22 +41,9 @@ def test_every_scenario_agrees(file):
     assert_agree(scenario.replace({"horizon": horizon}))
 
 
-def test_clocks_of_processes_with_compiled_filters_agree(ring, monkeypatch):
-    """Also where a block ends among ticks of one instant, and where nothing ticks."""
-    monkeypatch.setattr("netkf.engines.simpy.ticking.TOGETHER", 4)
-    clock = {"kind": "periodic", "period": 0.25}
-    delay = {"kind": "exponential", "mean": 0.3}
-    for changes in (
-        {},
-        {"network.activation": clock, "network.channel.delay": delay},
-        {"network.activation.rate": 1e-9},
-    ):
-        assert_agree(ring.replace({"horizon": 4.0, **changes}), engine="processes")
-
-
 @pytest.mark.parametrize(
     "file",
-    [file for file in scenario_files() if '"hybrid"' in file.read_text()],
+    [file for file in scenario_files() if type(netkf.load(file).hosted) is Hybrid],
     ids=lambda file: file.stem,
 )
 def test_every_scenario_in_continuous_time_agrees_with_covariance_intersection(file):
@@ -357,7 +344,7 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     module = "netkf.engines.compiled"
     monkeypatch.setattr("netkf.trace.recorder.BLOCK", 7)
     monkeypatch.setattr(f"{module}.flow.FIRST_ROWS", 6)
-    monkeypatch.setattr(f"{module}.flow.FIRST_MAIL", 2)
+    monkeypatch.setattr(f"{module}.flow.FIRST_MESSAGES", 2)
     monkeypatch.setattr(f"{module}.flow.MOST_SAMPLES", 2)
     for room in ("plants.paths", "engines.compiled.draws", "engines.compiled.flow"):
         monkeypatch.setattr(f"netkf.{room}.BLOCK", 3)
@@ -372,6 +359,26 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     assert pieces.fingerprint == whole.fingerprint
     np.testing.assert_array_equal(pieces.P, whole.P)
     np.testing.assert_allclose(pieces.xhat, whole.xhat, rtol=0.0, atol=1e-12)  # of the path
+
+
+@pytest.mark.parametrize("kind", ["intermittent", "push-sum", "hybrid"])
+def test_messages_and_history_that_need_more_room(ring, monkeypatch, kind):
+    clock = {"kind": "poisson", "rate": 9.0, "at": "nodes"}
+    clock = {"kind": "readings"} if kind == "intermittent" else clock
+    sampling = {"kind": "periodic", "period": 0.05}
+    case = ring.replace(
+        {
+            "horizon": 4.0,
+            "sensors.0.sampling": sampling,
+            "network.activation": clock,
+            "network.channel": {"delay": {"kind": "exponential", "mean": 0.7}},
+            "filter": {"kind": kind, **({"epsilon": 0.3} if kind == "hybrid" else {})},
+        }
+    )
+    for name in ("FIRST_MESSAGES", "FIRST_PAST"):
+        monkeypatch.setattr(f"netkf.engines.compiled.flow.{name}", 1)
+    monkeypatch.setattr("netkf.engines.compiled.schedule.MOST_TICKS", 30)
+    assert assert_agree(case).count("absorb") > 50
 
 
 def test_growth_beyond_numbers_is_reported_alike(build):
@@ -421,10 +428,10 @@ class Halved(Bernoulli):
 def test_a_filter_of_ones_own_is_refused_by_name_and_auto_takes_the_other(ring):
     algorithm = Cautious(epsilon=0.3)
     own = dataclasses.replace(ring, filter=dataclasses.replace(ring.filter, algorithm=algorithm))
-    with pytest.raises(EngineError, match=r'filter .*Cautious.*; use engine="processes"'):
+    with pytest.raises(EngineError, match=r'filter .*Cautious.*; use engine="simpy"'):
         netkf.simulate(own, engine="compiled")
     run = netkf.simulate(own)
-    assert run.engine == "processes"
+    assert run.engine == "simpy"
     assert run.fingerprint == netkf.simulate(ring, engine="compiled").fingerprint
 
 
@@ -465,7 +472,7 @@ def test_parts_of_ones_own_that_break_the_rules_are_refused_by_name(ring, engine
 def test_auto_is_compiled_where_it_can_be(ring, monkeypatch):
     assert netkf.simulate(ring).engine == "compiled"
     monkeypatch.setattr(compiling, "available", lambda: False)
-    assert netkf.simulate(ring).engine == "processes"
+    assert netkf.simulate(ring).engine == "simpy"
     with pytest.raises(EngineError, match=r"needs numba.*pip install"):
         netkf.simulate(ring, engine="compiled")
 
@@ -485,9 +492,8 @@ def test_the_first_start_says_that_it_compiles(ring, monkeypatch, capsys, tmp_pa
         netkf.simulate(scenario, engine="compiled")
     assert capsys.readouterr().err.count("netkf: compiling, once") == 2
     monkeypatch.setattr(compiling, "_said", set())
-    netkf.simulate(ring, engine="processes")
-    netkf.simulate(ring, engine=SimpyEngine())
-    assert capsys.readouterr().err.count("netkf: compiling, once") == 1
+    netkf.simulate(ring, engine="simpy")
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

@@ -4,18 +4,20 @@ or for several together.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams, Together
-from netkf.engines.compiled.readings import Stretch
-from netkf.engines.compiled.tables import Sensing
+from netkf.engines.compiled.increments import PathBlock
+from netkf.engines.compiled.state import Sensing
+from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time
 from netkf.plants.paths import BLOCK
 from netkf.plants.sensors import step_noise
-from netkf.scenario.scenario import Scenario
+from netkf.scenario.scenario import Placed, Scenario
 
 LEAST_CUTS, MOST_CUTS = 64, 256  # normals that a sensor has ready
 MOST_BLOCKS = 16  # of steps that are drawn at once
@@ -32,31 +34,57 @@ def blocks_to_the_end(scenario: Scenario) -> int:
     return blocks
 
 
+def increments(scenario: Scenario) -> list[tuple[int, Placed]]:
+    """All increment sensors: node and place, in order."""
+    found = scenario.increment_sensors.items()
+    return [(node, place) for node, places in found for place in places]
+
+
 def sizes(scenario: Scenario) -> tuple[int, int]:
     """How many blocks of steps and how many cuts of each sensor are drawn at once in a run."""
-    rows = [len(scenario.sensors[place.entry].R) for p in scenario.placed.values() for place in p]
+    rows = [len(scenario.sensors[place.entry].R) for _, place in increments(scenario)]
     share = MOST_NORMALS // max(2 * sum(rows), 1)
     blocks = min(MOST_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
     return blocks, max(LEAST_CUTS, min(MOST_CUTS, share))
 
 
 class Paths:
-    """The paths of some runs, as stretches of so many ``blocks`` of BLOCK steps."""
+    """The paths of some runs, as so many ``blocks`` of BLOCK steps at once; they are cut where a
+    state is ``sampled``.
+    """
 
-    def __init__(self, scenario: Scenario, streams: Streams | Together, blocks: int) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        streams: Streams | Together,
+        blocks: int,
+        sampled: FloatArray = NO_TIMES,
+    ) -> None:
         self._blocks = blocks
+        sampling = streams.generators("samples", [()]) if len(sampled) else []
         self._paths = scenario.truth.paths(
-            streams.generators("plant", [()]), streams.generators("probe", [()]), scenario.times
+            streams.generators("plant", [()]),
+            streams.generators("probe", [()]),
+            scenario.times,
+            sampling,
+            sampled,
+            scenario.exact_errors,
         )
-        self._senses, self._horizon = bool(scenario.sensing), scenario.horizon
+        self._senses, self._horizon = bool(scenario.increment_sensors), scenario.horizon
+        steps, laws = self._paths.frame_steps, self._paths.laws
+        self.frame_times = np.empty(0)
+        if steps is not None:
+            count = int(scenario.horizon / (steps * laws.period)) + 2
+            times = np.array([grid_time(laws.period, steps * k) for k in range(1, count)])
+            self.frame_times = times[times < scenario.horizon]
 
-    def following(self) -> list[Stretch]:
-        """The next stretch of each run; the last one reaches beyond the horizon."""
+    def following(self) -> list[PathBlock]:
+        """The next steps of each run; the last ones reach beyond the horizon."""
         block, laws = self._paths.following(self._blocks), self._paths.laws
         ends = block.ends
         grid = ends[ends < self._horizon] if self._senses else np.empty(0)
         return [
-            Stretch(
+            PathBlock(
                 end=float(ends[-1]),
                 start=block.start,
                 stop=block.end,
@@ -72,6 +100,24 @@ class Paths:
             )
             for run in range(len(block.x_start))
         ]
+
+
+def no_path(n: int) -> PathBlock:
+    """Where nothing senses increments: one piece without an end."""
+    rows = {name: np.zeros((1, n)) for name in ("x_start", "x_stop")}
+    responses = {name: np.zeros((1, 1)) for name in ("to_end", "to_moments")}
+    return PathBlock(
+        end=math.inf,
+        start=np.zeros(1),
+        stop=np.array([math.inf]),
+        moments=np.zeros((1, 2, n)),
+        cubic=np.zeros((1, 4, n)),
+        step=np.zeros(1, dtype=np.int64),
+        last=np.array([math.inf]),
+        grid=np.empty(0),
+        **rows,
+        **responses,
+    )
 
 
 class Own(NamedTuple):
@@ -96,13 +142,12 @@ class Noise:
         steps: int,
         cuts: int,
     ) -> None:
-        placed = [(node, place) for node in scenario.sensing for place in scenario.placed[node]]
+        placed = increments(scenario)
         sensors = [scenario.sensors[place.entry] for _, place in placed]
         keys = [(node, place.ordinal) for node, place in placed]
         self._noise = streams.generators("noise", keys)
         self._cuts = streams.generators("cut", keys)
-        assert scenario.truth.sensing_period is not None
-        self._period, self._steps = scenario.truth.sensing_period, steps
+        self._period, self._steps = (scenario.truth.sensing_period or 1.0) if placed else 1.0, steps
         n, count, runs = scenario.plant.n, len(sensors), len(streams.each)
         self._rows = [len(sensor.R) for sensor in sensors]
         most = max(self._rows, default=0)
@@ -110,8 +155,8 @@ class Noise:
         for k, sensor in enumerate(sensors):
             p = self._rows[k]
             H[k, :p], root[k, :p, :p] = sensor.H, np.linalg.cholesky(sensor.R)
-        index, pooled = scenario.topology.index, scenario.filter.algorithm.pooled
-        hosts = [0 if pooled else index[node] for node in scenario.sensing]
+        index, pooled = scenario.topology.index, scenario.hosted.pooled
+        hosts = [0 if pooled else index[node] for node in scenario.increment_sensors]
         self._own = Own(
             rest=np.zeros((runs, count, 2, most)),
             step=np.full((runs, count), -1, dtype=np.int64),
@@ -120,7 +165,7 @@ class Noise:
             used=np.full((runs, count), cuts, dtype=np.int64),
         )
         rows, host = np.array(self._rows, dtype=np.int64), np.array(hosts, dtype=np.int64)
-        node = np.array(scenario.sensing, dtype=np.int64)
+        node = np.array(list(scenario.increment_sensors), dtype=np.int64)
         self.sensing = [
             Sensing(
                 rows=rows,

@@ -13,14 +13,19 @@ from netkf.core import compiling
 from netkf.core.fields import Part
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress
-from netkf.engines.compiled.flow import FlowRun, replay_for
-from netkf.engines.compiled.lots import at_a_desk
+from netkf.engines.compiled.event_loop import event_loop
+from netkf.engines.compiled.flow import FlowRun
+from netkf.engines.compiled.lots import at_a_workspace
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
-from netkf.network.channels import by_message
-from netkf.network.clocks import LinkClock
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
-from netkf.plants.recorded import RecordedPlant, RecordedSensor, UnknownPlant
+from netkf.plants.recorded import (
+    RecordedDiffusion,
+    RecordedPlant,
+    RecordedSensor,
+    UnknownDiffusion,
+    UnknownPlant,
+)
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
 from netkf.scenario.registry import name_of
@@ -28,7 +33,8 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 
 KNOWN = (
-    *(Diffusion, LinearPlant, RecordedPlant, UnknownPlant),
+    *(Diffusion, RecordedDiffusion, UnknownDiffusion),
+    *(LinearPlant, RecordedPlant, UnknownPlant),
     *(LinearSensor, RegressorSensor, RecordedSensor),
     *(Hybrid, CovarianceIntersection, Local, Central, *KERNELS),
 )
@@ -51,14 +57,6 @@ class CompiledEngine(Engine):
         parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
-        if not scenario.slotted:
-            activation = scenario.network.activation
-            beyond = scenario.sampled_sensors or scenario.exact_errors
-            beyond = beyond or by_message(scenario.network.channel.delay)
-            if beyond or (isinstance(activation, LinkClock) and activation.at != "links"):
-                return f'engine "compiled" cannot run these clocks yet; {remedy}'
-            if type(scenario.hosted) not in (Hybrid, CovarianceIntersection, Local, Central):
-                return f'engine "compiled" cannot run this filter under clocks yet; {remedy}'
         for family, part in parts:
             if type(part) not in KNOWN:
                 return (
@@ -71,7 +69,7 @@ class CompiledEngine(Engine):
         if scenario.slotted:
             compiling.announce(KERNELS[type(scenario.hosted)])
         else:
-            compiling.announce(replay_for(scenario))
+            compiling.announce(event_loop)
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
@@ -80,5 +78,5 @@ class CompiledEngine(Engine):
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             if scenario.slotted:
                 return SlotRun(scenario, streams, recorder, progress).to_the_end()
-            with at_a_desk(scenario, streams) as (desk, draws):
-                return FlowRun(scenario, desk, draws, recorder, progress).to_the_end()
+            with at_a_workspace(scenario, streams) as (workspace, draws):
+                return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()

@@ -1,61 +1,68 @@
-"""One run in continuous time: what the compiled replay works on and is given when it stops.
+"""One run in continuous time: what the compiled event loop works on and is given when it stops.
 
-Python draws - ticks, fates, the path, the noise - from the streams that the processes engine uses,
-and the replay does everything that happens an event at a time.
+Python draws - ticks, outcomes, the path, the noise - from the streams that the SimPy engine uses,
+and the loop does everything that happens an event at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+import math
+from typing import Any, Protocol
 
 import numpy as np
 
-from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.core.compiling import demanded
+from netkf.algorithms.intermittent import SLACK, Intermittent
+from netkf.algorithms.models import FlowModel
+from netkf.algorithms.push_sum import PushSum
+from netkf.core.arrays import FloatArray
 from netkf.core.interrupts import undisturbed
 from netkf.core.streams import Streams
 from netkf.engines.base import Progress
-from netkf.engines.compiled.draws import Noise, Paths, sizes
-from netkf.engines.compiled.poisson import schedule
-from netkf.engines.compiled.readings import Stretch
-from netkf.engines.compiled.replay import (
+from netkf.engines.compiled.draws import Noise, Paths, no_path, sizes
+from netkf.engines.compiled.event_loop import (
     DONE,
     WANT_CUTS,
-    WANT_MAIL,
+    WANT_MESSAGES,
+    WANT_PAST,
+    WANT_REBASE,
     WANT_ROWS,
     WANT_STEPS,
     WANT_TICKS,
-    Cursor,
-    Samples,
-    intersecting,
-    replay,
+    event_loop,
 )
+from netkf.engines.compiled.increments import PathBlock
+from netkf.engines.compiled.late_readings import History, empty_history, with_more_past
+from netkf.engines.compiled.origins import move_origin
+from netkf.engines.compiled.poisson import schedule
+from netkf.engines.compiled.running_totals import Totals, empty_totals
+from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.samples import recorded
-from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.tables import (
-    GRID_AT,
-    PLACES,
-    PROBE_AT,
-    ROW,
-    SHOWN,
-    STEP_AT,
-    TICK_AT,
+from netkf.engines.compiled.schedule import ReadingsSchedule, Window
+from netkf.engines.compiled.senders import senders_of
+from netkf.engines.compiled.state import (
+    CLOCKS,
+    KINDS,
+    RUN,
+    SUMS,
+    Instants,
     Sensing,
-    empty_mail,
-    host_tables,
-    larger,
-    link_tables,
-    room_for,
-    room_for_parts,
+    Shown,
+    Simulation,
+    empty_pool,
+    entity_records,
+    filters_at_start,
+    rooms,
+    with_more_messages,
 )
+from netkf.engines.compiled.truth import KnownStates, PathStates, States
 from netkf.plants.paths import BLOCK
+from netkf.scenario.sampling import all_sample_times, uses_grid
 from netkf.scenario.scenario import Scenario
 from netkf.trace import recorder as recording
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import EVENT
 
-FIRST_MAIL, FIRST_ROWS = 1024, 4096
+FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 1024, 4096, 256
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 
 
@@ -70,12 +77,16 @@ class Draws(Protocol):
     """What is drawn for one run, given out as the run goes on."""
 
     sensing: Sensing
+    instants: Instants
+    states: States
 
     def window(self) -> Window:
         """The next ticks."""
 
-    def stretch(self) -> Stretch:
-        """The next stretch of the path; the noise of its steps is in ``sensing``."""
+    def path(self) -> PathBlock:
+        """The next steps of the path; the noise of them is in ``sensing``, and what is sampled
+        meanwhile in ``instants``.
+        """
 
     def more_cuts(self) -> None:
         """New normals for cuts in ``sensing``."""
@@ -84,65 +95,128 @@ class Draws(Protocol):
 class Source:
     """Draws as they are wanted."""
 
-    def __init__(
-        self, scenario: Scenario, streams: Streams, windows: Windows | None = None
-    ) -> None:
-        self._windows = windows or schedule(scenario, streams)
-        blocks, cuts = sizes(scenario)
-        self._paths = Paths(scenario, streams, blocks)
+    states: States
+
+    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+        times = scenario.sample_times(streams)
+        self._samples = samples = SampleTables(scenario, streams, times)
+        self._sampled = sampled = all_sample_times(times)
+        self.instants = samples.instants
+        self._windows = _windows(scenario, streams, samples.instants)
+        self._grid = uses_grid(scenario)
+        blocks, cuts = sizes(scenario) if self._grid else (0, 0)
         self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
         self.sensing = self._noise.sensing[0]
+        self._read, self._n = -math.inf, scenario.plant.n
+        if self._grid:
+            self._paths = Paths(scenario, streams, blocks, sampled)
+            self.states = PathStates(scenario, self._paths.frame_times)
+        else:
+            self.states = known = KnownStates(scenario, streams)
+            samples.read(known.truth.states(sampled)[0], sampled, -math.inf, math.inf)
 
     def window(self) -> Window:
-        """Some ticks for each link."""
+        """Some ticks of each entity."""
         return self._windows.following()
 
-    def stretch(self) -> Stretch:
+    def path(self) -> PathBlock:
         """A block of steps."""
+        if not self._grid:
+            return no_path(self._n)
         self._noise.following()
-        return self._paths.following()[0]
+        path = self._paths.following()[0]
+        first, last = np.searchsorted(self._sampled, [self._read, path.end], side="right")
+        if first < last:
+            times = self._sampled[first:last]
+            pieces = np.searchsorted(path.stop, times)
+            assert isinstance(self.states, PathStates)
+            x = self.states.local(times, path, pieces)
+            self._samples.read(x, times, self._read, path.end)
+        self._read = path.end
+        return path
 
     def more_cuts(self) -> None:
         """A block for each sensor that has none left."""
         self._noise.more_cuts(0)
 
 
-def replay_for(scenario: Scenario) -> Callable[..., int]:
-    """What is compiled for the filters of a scenario."""
-    intersects = isinstance(scenario.filter.algorithm, CovarianceIntersection)
-    return intersecting if intersects else replay
+def _windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
+    senders = senders_of(scenario)
+    if senders.at == "readings":
+        return ReadingsSchedule(scenario, streams, senders, instants.t, instants.host)
+    return schedule(scenario, streams, senders)
 
 
-class Desk:
-    """The tables of a scenario, and where the states of a run are; serves one run after another."""
+class Workspace:
+    """The tables of a scenario, and where the state of a run is; serves one run after another."""
 
     def __init__(self, scenario: Scenario) -> None:
-        function = replay_for(scenario)
-        self.replay = demanded(function)
-        self.hosts, self.models = host_tables(scenario)
-        self._xhat, self._P = self.hosts.xhat.copy(), self.hosts.P.copy()
-        self.links, self.mail = link_tables(scenario), empty_mail(self.hosts, FIRST_MAIL)
-        self.room = room_for(self.models)
-        self.parts = room_for_parts(self.links, self.hosts) if function is intersecting else None
-        self.cursor = Cursor(np.zeros(PLACES, dtype=np.int64), np.zeros(1))
-        self.rows = np.empty(FIRST_ROWS, dtype=EVENT)
-        self.probes = np.array(scenario.times, dtype=np.float64)
-        size, n = self.hosts.xhat.shape
+        self._scenario, self._senders = scenario, senders_of(scenario)
+        self._start = filters_at_start(scenario)
+        self._records = entity_records(scenario, self._senders)
+        self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
+        size, n = self._start.xhat.shape
+        self._pool = empty_pool(FIRST_MESSAGES, n)
+        self._rows = np.empty(FIRST_ROWS, dtype=EVENT)
+        self._probes = np.array(scenario.times, dtype=np.float64)
+        kind = KINDS[type(scenario.hosted).__name__]
+        terms = 2 * size + len(self._senders.ways) if kind == SUMS else 0
         room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
-        self.samples = Samples(
+        self._shown = Shown(
             xhat=np.zeros((room, size, n)),
             P=np.zeros((room, size, n, n)),
             rows=np.zeros(room, dtype=np.int64),
             piece=np.zeros(room, dtype=np.int64),
+            terms=np.zeros((room, terms)),
         )
 
-    def clear(self) -> None:
-        """Put everything where it is at time 0."""
-        hosts, mail = self.hosts, self.mail
-        hosts.xhat[:], hosts.P[:] = self._xhat, self._P
-        hosts.now[:], hosts.inbox[:], hosts.least[:] = 0.0, -1, 0.0
-        self.links.messages[:], mail.next[:] = 0, np.arange(1, len(mail.next) + 1)
-        self.cursor.place[:], self.cursor.mailed[:] = 0, 0.0
+    def begin(self, draws: Draws) -> Simulation:
+        """The state of a run at time 0."""
+        start, instants = self._start, draws.instants
+        entities, ways = self._records
+        ways["messages"] = 0
+        pool = self._pool[0]
+        pool["next"] = np.arange(1, len(pool) + 1)
+        room, flow, update = rooms(start.table, start.gains, instants)
+        return Simulation(
+            run=self._run(instants),
+            nodes=start.nodes.copy(),
+            xhat=start.xhat.copy(),
+            root=start.root.copy(),
+            table=start.table,
+            gains=start.gains,
+            entities=entities,
+            hearing=self._senders.hearing,
+            ways=ways,
+            pool=pool,
+            pool_x=self._pool[1],
+            pool_root=self._pool[2],
+            heap=self._pool[3],
+            waiting=self._waiting,
+            instants=instants,
+            sensing=draws.sensing,
+            frames=draws.states.frame_times,
+            probes=self._probes,
+            shown=self._shown,
+            rows=self._rows,
+            room=room,
+            flow_room=flow,
+            update_room=update,
+        )
+
+    def _run(self, instants: Instants) -> np.ndarray:
+        algorithm, run = self._scenario.hosted, np.zeros(1, dtype=RUN)
+        now, most = run[0], int(np.diff(self._senders.first).max(initial=0))
+        now["kind"] = KINDS[type(algorithm).__name__]
+        now["at"] = CLOCKS.index(self._senders.at)
+        now["keep_own"] = getattr(algorithm, "on_loss", "") == "keep-own"
+        now["most_messages"], now["free_count"] = most, len(self._pool[0])
+        now["most_rows"] = 2 + 2 * most + int(np.diff(instants.first).max(initial=0))
+        now["horizon"], now["age_limit"] = self._scenario.horizon, math.inf
+        if isinstance(algorithm, Intermittent):
+            window = math.inf if algorithm.window is None else algorithm.window
+            now["age_limit"] = 0.0 if algorithm.late == "drop" else window
+        return run
 
 
 class FlowRun:
@@ -151,92 +225,136 @@ class FlowRun:
     def __init__(
         self,
         scenario: Scenario,
-        desk: Desk,
+        workspace: Workspace,
         draws: Draws,
         recorder: Recorder,
         progress: Progress,
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
-        self._desk, self._draws = desk, draws
-        self._window, self._stretch = draws.window(), draws.stretch()
+        recorder.exact_errors = scenario.exact_errors
+        self._draws, self._state = draws, workspace.begin(draws)
+        self._run: Any = self._state.run[0]
+        self._totals, self._history = (
+            _totals(scenario, self._state),
+            _history(scenario, self._state),
+        )
+        self._window, self._path = draws.window(), draws.path()
 
     def to_the_end(self) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
         try:
             wanted = WANT_ROWS
             while wanted != DONE:
-                wanted = self._go_on()
-                if not self._take_samples():
+                some = self._state, self._window, self._path, self._totals, self._history
+                wanted = int(event_loop(*some))
+                if not self._hand_samples_on():
                     return "diverged"
                 self._give(wanted)
         finally:
             with undisturbed():
                 try:
-                    self._pass_rows_on(int(self._desk.cursor.place[ROW]))
+                    self._pass_rows_on(int(self._run["row"]))
                 finally:
                     self._recorder.flush()
         return "complete"
 
-    def _go_on(self) -> int:
-        desk = self._desk
-        return int(
-            desk.replay(
-                desk.hosts,
-                desk.models,
-                self._draws.sensing,
-                desk.links,
-                desk.mail,
-                desk.cursor,
-                self._window,
-                self._stretch,
-                desk.probes,
-                desk.samples,
-                float(self._scenario.horizon),
-                desk.rows,
-                desk.room,
-                desk.parts,
-            )
-        )
-
     def _give(self, wanted: int) -> None:
-        place = self._desk.cursor.place
+        run = self._run
         if wanted == WANT_TICKS:
-            self._window, place[TICK_AT] = self._draws.window(), 0
+            self._window, run["tick_at"] = self._draws.window(), 0
         elif wanted == WANT_STEPS:
-            self._stretch = self._draws.stretch()
-            place[STEP_AT] = place[GRID_AT] = 0
+            self._path = self._draws.path()
+            run["piece"] = run["grid_at"] = 0
         elif wanted == WANT_CUTS:
             self._draws.more_cuts()
-        elif wanted == WANT_MAIL:
-            self._desk.mail = larger(self._desk.mail)
+        elif wanted == WANT_MESSAGES:
+            self._more_messages()
         elif wanted == WANT_ROWS:
-            self._pass_rows_on(int(place[ROW]))
-            if len(self._desk.rows) < recording.BLOCK:
-                self._desk.rows = np.empty(recording.BLOCK, dtype=EVENT)
+            self._pass_rows_on(int(run["row"]))
+            self._make_rows()
+        elif wanted == WANT_PAST and self._history is not None:
+            self._history = with_more_past(self._history, len(self._state.nodes))
+        elif wanted == WANT_REBASE:
+            self._rebase()
+
+    def _rebase(self) -> None:
+        k = int(self._run["frame_at"])
+        offset = -self._draws.states.offset(k, self._path, int(self._run["piece"]))
+        if self._history is not None and self._history.free[1] < len(self._state.nodes):
+            self._history = with_more_past(self._history, len(self._state.nodes))
+        move_origin(self._scenario, self._state, self._totals, self._history, k, offset)
+        self._run["frame_at"] = k + 1
+
+    def _more_messages(self) -> None:
+        self._state = with_more_messages(self._state, int(self._run["most_messages"]))
+        if self._totals is not None:
+            grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
+            grown[: len(self._totals.offered)] = self._totals.offered
+            self._totals = self._totals._replace(offered=grown)
+
+    def _make_rows(self) -> None:
+        least = max(recording.BLOCK, 2 * int(self._run["most_rows"]))
+        if len(self._state.rows) < least:
+            self._state = self._state._replace(rows=np.empty(least, dtype=EVENT))
 
     def _pass_rows_on(self, used: int) -> None:
-        desk, recorder = self._desk, self._recorder
-        desk.cursor.place[ROW] = 0
-        recorder.extend(desk.rows[:used])
+        rows, recorder = self._state.rows, self._recorder
+        self._run["row"] = 0
+        recorder.extend(rows[:used])
         if not recorder.counted:  # they are the recorder's now
-            desk.rows = np.empty(len(desk.rows), dtype=EVENT)
+            self._state = self._state._replace(rows=np.empty(len(rows), dtype=EVENT))
 
-    def _take_samples(self) -> bool:
+    def _hand_samples_on(self) -> bool:
         """Record the samples that are there; False where one of them is no longer finite."""
-        place, path, taken = self._desk.cursor.place, self._stretch, self._desk.samples
-        count, place[SHOWN] = int(place[SHOWN]), 0
-        times = self._desk.probes[place[PROBE_AT] - count : place[PROBE_AT]]
-        piece = taken.piece[:count]
-        ends = (times == path.stop[piece])[:, None]
-        x = np.where(ends, path.x_stop[piece], path.x_start[piece])
-        return recorded(
+        run, shown = self._run, self._state.shown
+        count, run["shown"] = int(run["shown"]), 0
+        if not count:
+            return True
+        times = self._state.probes[run["probe_at"] - count : run["probe_at"]].copy()
+        local, x = self._draws.states.shown(times, self._path, shown.piece[:count])
+        lost = [count - 1]
+
+        def pass_rows_on(k: int) -> None:
+            lost[0] = k
+            self._pass_rows_on(int(shown.rows[k]))
+
+        fine = recorded(
             self._scenario,
             self._recorder,
             self._progress,
-            times.copy(),
+            times,
             x,
-            x,
-            taken.xhat[:count].copy(),
-            taken.P[:count].copy(),
-            lambda k: self._pass_rows_on(int(taken.rows[k])),
+            local,
+            shown.xhat[:count].copy(),
+            shown.P[:count].copy(),
+            pass_rows_on,
         )
+        if self._totals is not None:
+            self._recorder.sums = _sums(shown.terms[lost[0]], self._totals.receivers)
+        return fine
+
+
+def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, float]]:
+    """The weights that nodes hold, with what each sent and less what was heard."""
+    count = len(receivers)
+    sent = np.repeat(terms[count : 2 * count], receivers)
+    now = math.fsum([*terms[:count].tolist(), *sent.tolist(), *(-terms[2 * count :]).tolist()])
+    return {"weight": (float(count), now)}
+
+
+def _totals(scenario: Scenario, state: Simulation) -> Totals | None:
+    if not isinstance(scenario.hosted, PushSum):
+        return None
+    receivers = np.array([info.receivers for info in scenario.node_infos], dtype=np.int64)
+    model: FlowModel = scenario.models[0]
+    return empty_totals(state, receivers, model.A, model.forgetting)
+
+
+def _history(scenario: Scenario, state: Simulation) -> History | None:
+    algorithm = scenario.hosted
+    if not isinstance(algorithm, Intermittent):
+        return None
+    lag = max((info.max_delay for info in scenario.node_infos), default=0.0)
+    if algorithm.window is not None:
+        lag = min(algorithm.window, lag)
+    return empty_history(state, 0.0 if algorithm.late == "drop" else SLACK * lag, FIRST_PAST)

@@ -2,7 +2,7 @@
 
 What a short run costs beside its events is Python, call after call. Where it is known that the
 replicas of a block come one after the other (``together``), the calls are made once for all of
-them, and their compiled replays follow at one desk. Every number is what it is for a run alone.
+them, and they share one workspace. Every number is what it is for a run alone.
 """
 
 from __future__ import annotations
@@ -15,12 +15,16 @@ from functools import cached_property
 
 from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
-from netkf.engines.compiled.flow import Desk, Draws, Source
+from netkf.engines.compiled.flow import Draws, Source, Workspace
+from netkf.engines.compiled.increments import PathBlock
 from netkf.engines.compiled.poisson import schedules
-from netkf.engines.compiled.readings import Stretch
+from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
+from netkf.engines.compiled.state import Instants
+from netkf.engines.compiled.truth import PathStates, States
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
+from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
 
 LARGEST_LOT = 64
@@ -32,19 +36,27 @@ A_RUN, A_STEP, A_TICK = 5e-4, 1e-6, 1e-6
 
 
 class OfLot:
-    """The draws of one run of a lot: all at once."""
+    """The draws of one run of a batch: all at once."""
 
-    def __init__(self, window: Window, stretch: Stretch, noise: Noise, run: int) -> None:
-        self._window, self._stretch, self._noise, self._run = window, stretch, noise, run
-        self.sensing = noise.sensing[run]
+    def __init__(
+        self,
+        window: Window,
+        path: PathBlock,
+        noise: Noise,
+        run: int,
+        instants: Instants,
+        states: States,
+    ) -> None:
+        self._window, self._path, self._noise, self._run = window, path, noise, run
+        self.sensing, self.instants, self.states = noise.sensing[run], instants, states
 
     def window(self) -> Window:
         """All ticks."""
         return self._window
 
-    def stretch(self) -> Stretch:
+    def path(self) -> PathBlock:
         """All steps."""
-        return self._stretch
+        return self._path
 
     def more_cuts(self) -> None:
         """As many more."""
@@ -67,57 +79,70 @@ class Lots:
         return lot_size(self._scenario)
 
     @cached_property
-    def _desk(self) -> Desk:
-        return Desk(self._scenario)
+    def _drawn_together(self) -> bool:
+        """Whether all that is random comes from link clocks and increments."""
+        return uses_grid(self._scenario) and not self._scenario.sampled_sensors
+
+    @cached_property
+    def _workspace(self) -> Workspace:
+        return Workspace(self._scenario)
 
     def take(self, scenario: Scenario, streams: Streams) -> bool:
-        """Whether such runs are expected and the desk was free; it is taken then, and a run within
+        """Whether such runs are expected and the workspace was free; it is taken then, and a run in
         this one or in another thread has its own.
         """
         expected = scenario is self._scenario and streams.seed == self._seed
         return expected and type(streams) is Streams and self._taken.acquire(blocking=False)
 
     def leave(self) -> None:
-        """The desk is free again."""
+        """The workspace is free again."""
         self._taken.release()
 
-    def prepared(self, replica: int) -> tuple[Desk, OfLot] | None:
+    def prepared(self, replica: int) -> tuple[Workspace, OfLot] | None:
         """For the run of a replica, once; None where it had better draw for itself."""
         drawn = replica in self._draws
-        if self._size < 2 or not (drawn or self._next <= replica < self._stop):
+        if (
+            not self._drawn_together
+            or self._size < 2
+            or not (drawn or self._next <= replica < self._stop)
+        ):
             return None
         if not drawn:
             self._draw(replica)
-        self._desk.clear()
-        return self._desk, self._draws.pop(replica)
+        return self._workspace, self._draws.pop(replica)
 
     def _draw(self, replica: int) -> None:
         count = min(self._size, self._stop - replica)
         streams = Together(self._seed, replica, count)
-        windows = schedules(self._scenario, streams)
-        blocks = blocks_to_the_end(self._scenario)
-        stretches = Paths(self._scenario, streams, blocks).following()
+        scenario = self._scenario
+        windows = schedules(scenario, streams)
+        blocks = blocks_to_the_end(scenario)
+        paths = Paths(scenario, streams, blocks)
         ticks = max(len(window.t) for window in windows)
-        cuts = 16 + len(self._scenario.times) + 3 * ticks // len(self._scenario.nodes)
-        noise = Noise(self._scenario, streams, blocks * BLOCK, cuts)
+        cuts = 16 + len(scenario.times) + 3 * ticks // len(scenario.nodes)
+        noise = Noise(scenario, streams, blocks * BLOCK, cuts)
         noise.following()
         for run in range(count):
             noise.more_cuts(run)
+        nothing = SampleTables(scenario, Streams(self._seed, replica), {}).instants
         self._draws = {
-            replica + run: OfLot(window, stretch, noise, run)
-            for run, (window, stretch) in enumerate(zip(windows, stretches, strict=True))
+            replica + run: OfLot(
+                window, path, noise, run, nothing, PathStates(scenario, paths.frame_times)
+            )
+            for run, (window, path) in enumerate(zip(windows, paths.following(), strict=True))
         }
         self._next = replica + count
 
 
 def work_of(scenario: Scenario) -> tuple[float, int, float]:
     """Of one run: steps of the path, sensors, and ticks, nan where they are not known."""
-    period, clock = scenario.truth.sensing_period, scenario.network.activation
-    assert period is not None
-    steps = scenario.horizon / period + 64.0 + len(scenario.times)
+    clock = scenario.network.activation
+    period = scenario.truth.sensing_period if uses_grid(scenario) else None
+    steps = 64.0 + len(scenario.times) + (0.0 if period is None else scenario.horizon / period)
     sensors, ticks = sum(len(placed) for placed in scenario.placed.values()), 0.0
-    if scenario.filter.algorithm.talks and isinstance(clock, LinkClock):
-        ticks = sum(clock.mean_rate(link) for link in scenario.topology.links) * scenario.horizon
+    if scenario.hosted.talks and isinstance(clock, LinkClock):
+        entities = clock.entities(scenario.topology)
+        ticks = sum(clock.mean_rate(entity) for entity in entities) * scenario.horizon
     return steps, sensors, ticks
 
 
@@ -152,13 +177,13 @@ def together(scenario: Scenario, seed: int, first: int, stop: int) -> Iterator[N
 
 
 @contextmanager
-def at_a_desk(scenario: Scenario, streams: Streams) -> Iterator[tuple[Desk, Draws]]:
+def at_a_workspace(scenario: Scenario, streams: Streams) -> Iterator[tuple[Workspace, Draws]]:
     """What a run works with: drawn with others where it was expected, else its own."""
     lots = _expected.get()
     if lots is None or not lots.take(scenario, streams):
-        yield Desk(scenario), Source(scenario, streams)
+        yield Workspace(scenario), Source(scenario, streams)
         return
     try:
-        yield lots.prepared(streams.replica) or (Desk(scenario), Source(scenario, streams))
+        yield lots.prepared(streams.replica) or (Workspace(scenario), Source(scenario, streams))
     finally:
         lots.leave()

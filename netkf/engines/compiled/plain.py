@@ -5,12 +5,14 @@ What ``Exchanges`` does a message at a time, with the same numbers from the same
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
+from netkf.core.draws import Draws
+from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.exchanges import (
     ABSORB,
     DELIVER,
@@ -28,12 +30,31 @@ from netkf.engines.compiled.exchanges import (
     silent,
 )
 from netkf.engines.compiled.masses import stopping
-from netkf.engines.compiled.schedule import way_chances, way_luck
 from netkf.network.channels import alike
+from netkf.network.graphs import Link
 from netkf.network.matchings import Broadcast, Matching
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
 from netkf.trace.schema import EVENT
+
+
+def way_chances(scenario: Scenario, ways: Sequence[Sequence[Link]]) -> FloatArray:
+    """(ways, L): the one chance that all messages of a direction have, where losses are alike."""
+    loss = scenario.network.channel.loss
+    return np.array(
+        [[loss.chance(way, 0, False, scenario.measured(way)) for way in some] for some in ways]
+    )
+
+
+def way_luck(
+    scenario: Scenario, streams: Streams | Together, ways: Sequence[Sequence[Link]]
+) -> list[Draws]:
+    """What decides about them: of both ways together where they share their fate, and nothing where
+    nothing is left to decide.
+    """
+    channel = scenario.network.channel
+    drawn = ways[:1] if channel.symmetric else ways
+    return [] if channel.loss.certain else [Draws(streams, "loss", some) for some in drawn]
 
 
 def is_plain(scenario: Scenario) -> bool:

@@ -13,19 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import demanded, in_place
+from netkf.core.compiling import kernel
 from netkf.core.draws import Draws, Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.schedule import (
     LOST,
     Schedule,
-    Ticks,
     Window,
-    way_chances,
-    way_luck,
+    delivery_chances,
+    plain,
     whole_schedules,
 )
-from netkf.network.channels import alike
+from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.scenario.scenario import Scenario
 
@@ -36,55 +35,72 @@ one costs is to be spread over some ticks.
 
 
 class Drawing(NamedTuple):
-    """L links of several runs: the tick that is ``coming`` (L,), ``rate`` (L,), the states of the
-    streams of ``ticks`` (L, 4) and of what decides about messages forth and back ``fates`` (W L, 4)
-    with W = 0 (nothing is drawn), 1 (both share it) or 2, and ``chance`` (2, L) to arrive.
+    """E entities of several runs: the tick that is ``coming`` (E,), ``rate`` (E,), the states of
+    the streams of ``ticks`` (E, 4) and of what decides about messages, ``luck`` (S, 4), of which
+    each run has ``streams`` (S = 0: nothing is drawn). Of one run: entity e sends on the ways
+    ``hearing`` from ``first[e]`` up to ``first[e + 1]``, way w has the stream ``source[w]`` and the
+    ``chance[w]`` to arrive.
     """
 
     coming: FloatArray
     rate: FloatArray
     ticks: np.ndarray
-    fates: np.ndarray
+    luck: np.ndarray
+    streams: int
+    first: np.ndarray
+    hearing: np.ndarray
+    source: np.ndarray
     chance: FloatArray
 
 
-@in_place
+class Found(NamedTuple):
+    """Ticks as they are found: ``t, entity`` (K,), and where in ``delay`` their outcomes begin."""
+
+    t: FloatArray
+    entity: np.ndarray
+    at: np.ndarray
+    delay: FloatArray
+
+
+@kernel
 def draw_ticks(
-    links: Drawing,
-    first: int,
-    after: int,
+    drawing: Drawing,
+    run: int,
     end: float,
     delay: float,
     exponential: Ziggurat,
-    found: Ticks,
-    place: int,
-) -> int:
-    """Write the ticks before ``end`` of the links from ``first`` up to ``after``, as links of one
-    run, from ``place`` on; returns the place after the last one: where the room ends there may be
-    more.
+    found: Found,
+    used: np.ndarray,
+) -> bool:
+    """Write the ticks before ``end`` of a run behind those that are there; ``used`` (2,) counts
+    them and their outcomes. False where the room ended first.
     """
-    coming, count = links.coming, len(links.coming)
-    for k in range(first, after):
+    coming, first, count = drawing.coming, drawing.first, len(drawing.first) - 1
+    for e in range(count):
+        k = run * count + e
         while coming[k] < end:
-            if place == len(found.t):
-                return place
-            found.t[place], found.link[place] = coming[k], k - first
-            luck = 0.0
-            for way in range(2):
-                if way * count < len(links.fates):
-                    luck = next_unit(links.fates, way * count + k)
-                found.delay[place, way] = delay if luck < links.chance[way, k] else LOST
-            place += 1
-            gap: float = next_exponential(links.ticks, k, exponential)
-            coming[k] += gap / links.rate[k]
-    return place
+            if used[0] == len(found.t) or used[1] + first[e + 1] - first[e] > len(found.delay):
+                return False
+            found.t[used[0]], found.entity[used[0]], found.at[used[0]] = coming[k], e, used[1]
+            luck, drawn = 0.0, -1
+            for m in range(first[e], first[e + 1]):
+                w = drawing.hearing[m]
+                if drawing.streams > 0 and drawing.source[w] != drawn:
+                    drawn = drawing.source[w]
+                    luck = next_unit(drawing.luck, run * drawing.streams + drawn)
+                found.delay[used[1]] = delay if luck < drawing.chance[w] else LOST
+                used[1] += 1
+            used[0] += 1
+            gap: float = next_exponential(drawing.ticks, k, exponential)
+            coming[k] += gap / drawing.rate[k]
+    return True
 
 
-@in_place
+@kernel
 def put_in_time_order(
-    begin: float, end: float, count: int, found: Ticks, ordered: Ticks, place: np.ndarray
+    begin: float, end: float, count: int, found: Found, ordered: Found, place: np.ndarray
 ) -> None:
-    """Write the first ``count`` ticks, which lie in [begin, end), in the order of (time, link);
+    """Write the first ``count`` ticks, which lie in [begin, end), in the order of (time, entity);
     ``place`` (count + 1,) is room to work in.
     """
     scale = count / (end - begin)
@@ -94,59 +110,63 @@ def put_in_time_order(
         place[min(int((found.t[m] - begin) * scale), count - 1) + 1] += 1
     for m in range(count):
         place[m + 1] += place[m]
-    t, link, delay = ordered.t, ordered.link, ordered.delay
+    t, entity, at = ordered.t, ordered.entity, ordered.at
     for m in range(count):
         k = min(int((found.t[m] - begin) * scale), count - 1)
         to = place[k]
         place[k] += 1
-        t[to], link[to] = found.t[m], found.link[m]
-        delay[to, 0], delay[to, 1] = found.delay[m, 0], found.delay[m, 1]
+        t[to], entity[to], at[to] = found.t[m], found.entity[m], found.at[m]
     for m in range(1, count):
-        now, which, forth, back = t[m], link[m], delay[m, 0], delay[m, 1]
+        now, which, where = t[m], entity[m], at[m]
         to = m
-        while to > 0 and (t[to - 1] > now or (t[to - 1] == now and link[to - 1] > which)):
-            t[to], link[to] = t[to - 1], link[to - 1]
-            delay[to, 0], delay[to, 1] = delay[to - 1, 0], delay[to - 1, 1]
+        while to > 0 and (t[to - 1] > now or (t[to - 1] == now and entity[to - 1] > which)):
+            t[to], entity[to], at[to] = t[to - 1], entity[to - 1], at[to - 1]
             to -= 1
-        t[to], link[to], delay[to, 0], delay[to, 1] = now, which, forth, back
+        t[to], entity[to], at[to] = now, which, where
 
 
 def is_poisson(scenario: Scenario) -> bool:
     """Whether the schedules of a scenario can be made so."""
     network = scenario.network
-    return (
-        scenario.filter.algorithm.talks
-        and bool(scenario.topology.links)
-        and type(network.activation) is Poisson
-        and alike(network.channel.loss)
-        and network.channel.delay.fixed is not None
-    )
+    talks = scenario.hosted.talks and bool(scenario.topology.links)
+    return talks and type(network.activation) is Poisson and plain(network.channel)
 
 
 class PoissonSchedules:
     """The ticks of some runs of such a scenario, a window at a time."""
 
-    def __init__(self, scenario: Scenario, streams: Streams | Together) -> None:
-        clock, links, runs = scenario.network.activation, scenario.topology.links, len(streams.each)
+    def __init__(
+        self, scenario: Scenario, streams: Streams | Together, senders: Senders | None = None
+    ) -> None:
+        clock, runs = scenario.network.activation, len(streams.each)
+        senders = senders_of(scenario) if senders is None else senders
         assert isinstance(clock, LinkClock)
-        both = links, tuple((j, i) for i, j in links)
-        ticks, count = Draws(streams, "clock", links), len(links) * runs
-        luck = [draws.states for draws in way_luck(scenario, streams, both)]
-        rates = np.array([clock.mean_rate(link) for link in links])
+        ticks, count = Draws(streams, "clock", senders.entities), len(senders.entities) * runs
+        luck: np.ndarray = np.empty((0, 4), dtype=np.uint64)
+        if not scenario.network.channel.loss.certain:
+            luck = Draws(streams, "loss", senders.sources).states
+        rates = np.array([clock.mean_rate(entity) for entity in senders.entities])
         self._drawing = Drawing(
             coming=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),
             rate=np.tile(rates, runs),
             ticks=ticks.states,
-            fates=np.concatenate([*luck, np.empty((0, 4), dtype=np.uint64)]),
-            chance=np.tile(way_chances(scenario, both), runs),
+            luck=luck,
+            streams=len(luck) // runs,
+            first=senders.first,
+            hearing=senders.hearing,
+            source=senders.source,
+            chance=delivery_chances(scenario, senders.ways),
         )
         self._drawing.coming[:] /= self._drawing.rate
-        self._links, self._rate = len(links), float(rates.sum())
+        self._runs, self._rate = runs, float(rates.sum())
+        self._sends = float(rates @ np.diff(senders.first)) / self._rate
+        self._most = int(np.diff(senders.first).max())
         self._delay = float(scenario.network.channel.delay.fixed or 0.0)
         self._horizon, self._length = scenario.horizon, math.inf
         if self._rate > 0.0:
-            self._length = max(TICKS, min(TICKS_A_LINK * len(links), MOST_TICKS)) / self._rate
-        self._end, self._found = 0.0, _room(0)
+            entities = len(senders.entities)
+            self._length = max(TICKS, min(TICKS_A_LINK * entities, MOST_TICKS)) / self._rate
+        self._end, self._found = 0.0, _room(0, 0)
 
     def following(self) -> Window:
         """The next window of one run; its end is infinite where nothing comes after it."""
@@ -158,33 +178,37 @@ class PoissonSchedules:
 
     def whole(self) -> list[Window]:
         """All ticks of each run, as one window."""
-        runs = len(self._drawing.coming) // self._links
-        return [self._window(run, 0.0, math.inf) for run in range(runs)]
+        return [self._window(run, 0.0, math.inf) for run in range(self._runs)]
 
     def _window(self, run: int, begin: float, end: float) -> Window:
-        draw, put = demanded(draw_ticks), demanded(put_in_time_order)
-        last = min(end, self._horizon)
+        last, used = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         expected = self._rate * (last - begin)
-        count, room = 0, int(expected + 8.0 * math.sqrt(expected)) + 8
-        first = run * self._links
-        some = first, first + self._links, last, self._delay, ziggurat()
+        ticks = int(expected + 8.0 * math.sqrt(expected)) + 8
+        sends = int(self._sends * ticks) + self._most
         while True:
-            if len(self._found.t) < room:
-                larger = _room(room)
-                for target, source in zip(larger, self._found, strict=True):
-                    target[:count] = source[:count]
-                self._found = larger
-            count = draw(self._drawing, *some, self._found, count)
-            if count < len(self._found.t):
+            self._make_room(ticks, sends, used)
+            if draw_ticks(self._drawing, run, last, self._delay, ziggurat(), self._found, used):
                 break
-            room = 2 * count
-        ordered = _room(count)
-        put(begin, last, count, self._found, ordered, np.empty(count + 1, dtype=np.int64))
+            ticks, sends = 2 * ticks, 2 * sends
+        count = int(used[0])
+        ordered = _room(count, 0)._replace(delay=self._found.delay[: used[1]].copy())
+        places = np.empty(count + 1, dtype=np.int64)
+        put_in_time_order(begin, last, count, self._found, ordered, places)
         return Window(end, *ordered)
 
+    def _make_room(self, ticks: int, sends: int, used: np.ndarray) -> None:
+        if len(self._found.t) >= ticks and len(self._found.delay) >= sends:
+            return
+        larger = _room(ticks, sends)
+        for target, source in zip(larger, self._found, strict=True):
+            kept = min(len(source), len(target))
+            target[:kept] = source[:kept]
+        self._found = larger
 
-def _room(count: int) -> Ticks:
-    return Ticks(np.empty(count), np.empty(count, dtype=np.int64), np.empty((count, 2)))
+
+def _room(ticks: int, sends: int) -> Found:
+    entity, at = (np.empty(ticks, dtype=np.int64) for _ in range(2))
+    return Found(np.empty(ticks), entity, at, np.empty(sends))
 
 
 def schedules(scenario: Scenario, streams: Together) -> list[Window]:
@@ -194,6 +218,9 @@ def schedules(scenario: Scenario, streams: Together) -> list[Window]:
     return whole_schedules(scenario, streams)
 
 
-def schedule(scenario: Scenario, streams: Streams) -> PoissonSchedules | Schedule:
+def schedule(
+    scenario: Scenario, streams: Streams, senders: Senders | None = None
+) -> PoissonSchedules | Schedule:
     """The windows of one run, one after the other."""
-    return (PoissonSchedules if is_poisson(scenario) else Schedule)(scenario, streams)
+    made = PoissonSchedules if is_poisson(scenario) else Schedule
+    return made(scenario, streams, senders)

@@ -1,15 +1,14 @@
-"""Schedules made beforehand: ticks of all links and fates of their messages, window by window.
+"""Schedules made beforehand: ticks of all clocks and outcomes of their messages, window by window.
 
-Nothing here depends on an estimate. Every link draws its ticks and fates in blocks from its own
-streams, as one message after the other would; a window takes what lies in a stretch of time and
-merges the links. What links have in common is done for all of them at once, since there may be
-hundreds of thousands of them with a few ticks each.
+Nothing here depends on an estimate. Every clock draws its ticks, and every directed link its
+outcomes, in blocks from its own streams, as one message after the other would; a window takes what
+lies in a stretch of time and merges the clocks. What they have in common is done for all of them at
+once, since there may be hundreds of thousands with a few ticks each.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -19,268 +18,367 @@ from netkf.core.arrays import FloatArray
 from netkf.core.clock import next_ticks
 from netkf.core.draws import Draws
 from netkf.core.streams import Streams, Together
-from netkf.network.channels import Fates, alike, chances, needed
+from netkf.engines.compiled.senders import Senders, senders_of
+from netkf.network.channels import (
+    Channel,
+    Fates,
+    alike,
+    by_message,
+    chances,
+    checked_delay,
+    needed,
+)
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 
 FIRST_BLOCK, LONGEST_BLOCK = 8, 1024
-TICKS_A_LINK = 256  # in a window, so that what a link costs is spread over them
+TICKS_A_LINK = 256  # in a window, so that what a clock costs is spread over them
 MOST_TICKS, LEAST_TICKS = 1 << 20, 1 << 12
 LOST = -1.0
 
 
 class Window(NamedTuple):
-    """Ticks before ``end`` in the order of (time, link): ``t`` (K,), ``link`` (K,) places in
-    ``topology.links``, ``delay`` (K, 2) seconds forth and back, LOST where the message is lost.
+    """Ticks before ``end`` in the order of (time, entity): ``t`` (K,), ``entity`` (K,) places among
+    the senders' entities; the outcomes of what tick k sends are ``delay`` from ``at[k]`` on, in the
+    order of its directed links: seconds, or LOST.
     """
 
     end: float
     t: FloatArray
-    link: np.ndarray
+    entity: np.ndarray
+    at: np.ndarray
     delay: FloatArray
 
 
 class Ticks(NamedTuple):
-    """Some ticks of L links, those of each link together and in order of time: ``t, link`` (K,),
-    ``delay`` (K, 2) as in a window.
+    """Some ticks, those of each entity together and in order of time: ``t, entity`` (K,), and the
+    outcomes ``delay`` of all that they send, tick after tick.
     """
 
     t: FloatArray
-    link: np.ndarray
+    entity: np.ndarray
     delay: FloatArray
+
+    def chosen(self, which: np.ndarray, sizes: np.ndarray) -> Ticks:
+        """Those in some places, where a tick of entity e has ``sizes[e]`` outcomes."""
+        sent = sizes[self.entity]
+        first, count = (np.cumsum(sent) - sent)[which], sent[which]
+        begin = np.cumsum(count) - count
+        places = np.repeat(first - begin, count) + np.arange(int(count.sum()))
+        return Ticks(self.t[which], self.entity[which], self.delay[places])
+
+    def window(self, end: float, sizes: np.ndarray) -> Window:
+        """Ticks that are in order, as a window."""
+        sent = sizes[self.entity]
+        return Window(end, self.t, self.entity, np.cumsum(sent) - sent, self.delay)
 
 
 class Clocks:
-    """The ticks of all links, run by run and block by block: ``last`` (L,) are the last ones known,
-    infinite after the horizon, and ``drawn`` (L,) how many were drawn.
+    """The ticks of E entities in all runs, run by run and block by block: ``last`` (E,) are the
+    last ones known, infinite after the horizon, and ``drawn`` (E,) how many were drawn.
     """
 
-    def __init__(
-        self, scenario: Scenario, streams: Streams | Together, links: tuple[Link, ...]
-    ) -> None:
-        clock, runs = scenario.network.activation, len(streams.each)
-        assert isinstance(clock, LinkClock) or not links
-        self._clock, self._links, self._horizon = clock, links * runs, scenario.horizon
-        count = len(self._links)
+    def __init__(self, scenario: Scenario, streams: Streams | Together, senders: Senders) -> None:
+        clock, runs, entities = scenario.network.activation, len(streams.each), senders.entities
+        assert isinstance(clock, LinkClock) or not entities
+        self._clock, self._entities, self._horizon = clock, entities * runs, scenario.horizon
+        count = len(self._entities)
         self.last, self.drawn = np.zeros(count), np.zeros(count, dtype=np.int64)
         self._alike = type(clock) is Poisson
         self._rates = self._origins = np.empty(0)
         if isinstance(clock, LinkClock) and self._alike:
-            self._draws = Draws(streams, "clock", links)
-            self._rates = np.tile([clock.mean_rate(link) for link in links], runs)
+            self._draws = Draws(streams, "clock", entities)
+            self._rates = np.tile([clock.mean_rate(entity) for entity in entities], runs)
         elif isinstance(clock, LinkClock):
-            self._random = streams.generators("clock", links)
+            self._random = streams.generators("clock", entities)
             self._origins = np.array(
                 [
-                    clock.origin(link, partial(one.generator, "phase", *link))
+                    clock.origin(entity, partial(one.generator, "phase", *entity))
                     for one in streams.each
-                    for link in links
+                    for entity in entities
                 ]
             )
 
-    def more(self, links: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-        """So many more ticks of each of these links: the times before the horizon, one link after
-        the other, and how many each has. The horizon is half open; later ticks, and there may be
-        many, are not kept.
+    def more(self, places: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
+        """So many more ticks of each of these entities: the times before the horizon, one entity
+        after the other, and how many each has. The horizon is half open; later ticks, and there may
+        be many, are not kept.
         """
         if self._alike:
-            times, asked = self._exponential(links, counts), counts
+            times, asked = self._exponential(places, counts), counts
         else:
-            drawn = [self._ticks(k, count) for k, count in zip(links, counts, strict=True)]
+            drawn = [self._ticks(k, count) for k, count in zip(places, counts, strict=True)]
             asked = np.array([len(t) for t in drawn])
-            times = np.full((len(links), max(asked.max(), 1)), np.inf)
+            times = np.full((len(places), max(asked.max(), 1)), np.inf)
             for row, t in zip(times, drawn, strict=True):
                 row[: len(t)] = t
         kept = times < self._horizon
         got = kept.sum(axis=1)
-        self.drawn[links] += asked
+        self.drawn[places] += asked
         ended = (asked == 0) | (got < asked)
-        self.last[links] = np.where(ended, np.inf, times[np.arange(len(links)), asked - 1])
+        self.last[places] = np.where(ended, np.inf, times[np.arange(len(places)), asked - 1])
         return times[kept], got
 
-    def _exponential(self, links: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """As ``Poisson.ticks`` for all links at once; infinite where a link has fewer."""
-        times = np.full((len(links), counts.max() + 1), np.inf)
-        times[:, 0] = self.last[links]
-        gaps = self._draws.exponentials(links, counts) / np.repeat(self._rates[links], counts)
+    def _exponential(self, places: np.ndarray, counts: np.ndarray) -> FloatArray:
+        """As ``Poisson.ticks`` for all at once; infinite where an entity has fewer."""
+        times = np.full((len(places), counts.max() + 1), np.inf)
+        times[:, 0] = self.last[places]
+        gaps = self._draws.exponentials(places, counts) / np.repeat(self._rates[places], counts)
         times[:, 1:][np.arange(times.shape[1] - 1) < counts[:, None]] = gaps
         return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
 
     def _ticks(self, k: int, count: int) -> FloatArray:
         assert isinstance(self._clock, LinkClock)
         origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
-        link, random = self._links[k], self._random[k]
-        return next_ticks(self._clock, link, origin, index, now, random, int(count))
+        entity, random = self._entities[k], self._random[k]
+        return next_ticks(self._clock, entity, origin, index, now, random, int(count))
 
 
-def way_chances(scenario: Scenario, ways: Sequence[Sequence[Link]]) -> FloatArray:
-    """(ways, L): the one chance that all messages of a direction have, where losses are alike."""
+def plain(channel: Channel) -> bool:
+    """Whether each directed link has one chance and all messages one delay."""
+    delay = channel.delay
+    fixed = delay.fixed is not None and not delay.drawn and not by_message(delay)
+    return fixed and alike(channel.loss)
+
+
+def delivery_chances(scenario: Scenario, ways: tuple[Link, ...]) -> FloatArray:
+    """(W,) the one chance that all messages of a directed link have, where losses are alike."""
     loss = scenario.network.channel.loss
-    return np.array(
-        [[loss.chance(way, 0, False, scenario.measured(way)) for way in some] for some in ways]
-    )
+    return np.array([loss.chance(way, 0, False, scenario.measured(way)) for way in ways])
 
 
-def way_luck(
-    scenario: Scenario, streams: Streams | Together, ways: Sequence[Sequence[Link]]
-) -> list[Draws]:
-    """What decides about them: of both ways together where they share their fate, and nothing where
-    nothing is left to decide.
-    """
-    channel = scenario.network.channel
-    drawn = ways[:1] if channel.symmetric else ways
-    return [] if channel.loss.certain else [Draws(streams, "loss", some) for some in drawn]
+class Outcomes:
+    """What becomes of all messages, run by run, activation after activation of each entity."""
 
-
-class Fortunes:
-    """The fates of all messages, run by run, activation after activation of each link."""
-
-    def __init__(
-        self, scenario: Scenario, streams: Streams | Together, links: tuple[Link, ...]
-    ) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams | Together, senders: Senders) -> None:
         self._channel = channel = scenario.network.channel
-        runs, both = len(streams.each), (links, tuple((j, i) for i, j in links))
-        self._ways = tuple(ways * runs for ways in both)
-        measured = [[scenario.measured(way) for way in ways] for ways in both]
-        self._measured = np.tile(measured, runs)
-        self._alike = alike(channel.loss)
-        self._plain = self._alike and channel.delay.fixed is not None
+        runs = len(streams.each)
+        self._senders, self._ways = senders, len(senders.ways)
+        self._first, self._hearing = senders.first, senders.hearing
+        self._count, self._sources = len(senders.entities), len(senders.sources)
+        self._measured = np.array([scenario.measured(way) for way in senders.ways])
+        self._alike, self._plain = alike(channel.loss), plain(channel)
         if self._alike:
-            self._chances = np.tile(way_chances(scenario, both), runs)
-        if self._plain:
-            self._luck = way_luck(scenario, streams, both)
-        else:
+            self._chances = delivery_chances(scenario, senders.ways)
+        if not self._plain:
             self._fates = [
-                [
-                    Fates(channel, partial(_stream, made, way))
-                    for made in (one.seeded(needed(channel), ways) for one in streams.each)
-                    for way in ways
-                ]
-                for ways in (both[:1] if channel.symmetric else both)
+                Fates(channel, partial(_stream, made, source))
+                for made in (one.seeded(needed(channel), senders.sources) for one in streams.each)
+                for source in senders.sources
             ]
+        elif not channel.loss.certain:
+            self._luck = Draws(streams, "loss", senders.sources)
+        self.sizes = np.tile(np.diff(senders.first), runs)
 
-    def of(self, links: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
-        """(K, 2) delays, LOST where lost, of the next ``counts`` messages of each link, which are
-        numbers ``first`` and so on.
+    def of(self, places: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
+        """The outcomes of the next ``counts`` activations of each entity, tick after tick; they are
+        the activations ``first`` and so on.
         """
-        which = np.repeat(links, counts)
-        drawn = self._plainly(links, counts) if self._plain else self._one_by_one(links, counts)
-        out = np.empty((len(which), 2))
-        for way in range(2):
-            luck, bad, delay = drawn[way % len(drawn)]
-            if self._alike:
-                chance = self._chances[way][which]
-            else:
-                chance = self._chance(way, links, counts, first, bad)
-            out[:, way] = np.where(luck >= chance, LOST, delay)
+        runs, entity = np.divmod(places, max(self._count, 1))
+        sizes = self.sizes[places]
+        out = np.empty(int((counts * sizes).sum()))
+        begin = np.cumsum(counts * sizes) - counts * sizes
+        drawn: tuple[np.ndarray, ...] = ()
+        for k in range(int(sizes.max(initial=0))):
+            some = sizes > k
+            ways = self._hearing[self._first[entity[some]] + k]
+            count = counts[some]
+            if not drawn or not self._senders.shared:
+                sources = runs[some] * self._sources + self._senders.source[ways]
+                drawn = self._draw(sources, count)
+            step = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+            to = np.repeat(begin[some] + k, count) + step * np.repeat(sizes[some], count)
+            out[to] = self._delays(ways, count, first[some], *drawn)
         return out
 
-    def _plainly(self, links: np.ndarray, counts: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+    def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
+        """(K,) uniform draws, whether the link is in its bad state, and delays as drawn."""
         total = int(counts.sum())
-        delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
-        fine, never = np.zeros(total, dtype=bool), np.zeros(total)
-        drawn: list[tuple[np.ndarray, ...]]
-        drawn = [(draws.units(links, counts), fine, delay) for draws in self._luck]
-        return drawn or [(never, fine, delay)]
-
-    def _one_by_one(self, links: np.ndarray, counts: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-        drawn = []
-        for fates in self._fates:
-            parts = [fates[k].draws(n) for k, n in zip(links, counts.tolist(), strict=True)]
+        if not self._plain:
+            parts = [self._fates[k].draws(n) for k, n in zip(sources, counts.tolist(), strict=True)]
             columns = zip(*parts, strict=True)
-            drawn.append(tuple(np.concatenate([np.empty(0), *column]) for column in columns))
-        return drawn
+            return tuple(np.concatenate([np.empty(0), *column]) for column in columns)
+        delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
+        certain = self._channel.loss.certain
+        luck = np.zeros(total) if certain else self._luck.units(sources, counts)
+        return luck, np.zeros(total, dtype=bool), delay
+
+    def _delays(
+        self,
+        ways: np.ndarray,
+        counts: np.ndarray,
+        first: np.ndarray,
+        luck: np.ndarray,
+        bad: np.ndarray,
+        delay: np.ndarray,
+    ) -> FloatArray:
+        """(K,) seconds or LOST."""
+        if self._alike:
+            chance = np.repeat(self._chances[ways], counts)
+        else:
+            chance = self._chance(ways, counts, first, bad)
+        lost = luck >= chance
+        if by_message(self._channel.delay):
+            delay = self._by_message(ways, counts, first, lost, delay)
+        return np.where(lost, LOST, delay)
 
     def _chance(
-        self, way: int, links: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
+        self, ways: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0
-        for k, count, number in zip(links, counts.tolist(), first.tolist(), strict=True):
+        for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
             part = slice(done, done + count)
-            measured = float(self._measured[way, k])
-            out[part] = chances(loss, self._ways[way][k], number, bad[part].astype(bool), measured)
+            way, measured = self._senders.ways[w], float(self._measured[w])
+            out[part] = chances(loss, way, number, bad[part].astype(bool), measured)
             done += count
         return out
 
+    def _by_message(
+        self,
+        ways: np.ndarray,
+        counts: np.ndarray,
+        first: np.ndarray,
+        lost: np.ndarray,
+        delay: np.ndarray,
+    ) -> FloatArray:
+        model, out, k = self._channel.delay, np.array(delay), 0
+        for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
+            for message in range(number, number + count):
+                if not lost[k]:
+                    way = self._senders.ways[w]
+                    out[k] = checked_delay(model, way, message, float(delay[k]))
+                k += 1
+        return out
 
-class LinkDraws:
-    """Ticks and fates of all links, drawn as they are asked for; nothing where the filter does not
-    talk. Links of several runs follow one another, run by run.
+
+class EntityDraws:
+    """Ticks and outcomes of all entities, drawn as they are asked for; nothing where the filter
+    does not talk. Entities of several runs follow one another, run by run.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams | Together) -> None:
-        links = scenario.topology.links if scenario.filter.algorithm.talks else ()
-        self.count = len(links) * len(streams.each)
-        self._clocks = Clocks(scenario, streams, links)
-        self._fortunes = Fortunes(scenario, streams, links)
+    def __init__(self, scenario: Scenario, streams: Streams | Together, senders: Senders) -> None:
+        self.count = len(senders.entities) * len(streams.each)
+        self._clocks = Clocks(scenario, streams, senders)
+        self._outcomes = Outcomes(scenario, streams, senders)
+        self.sizes = self._outcomes.sizes
         self._longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(self.count, 1)))
         self._block = np.full(self.count, FIRST_BLOCK)
 
     @property
     def last(self) -> FloatArray:
-        """(L,) the last tick known of each link; infinite where all are."""
+        """(E,) the last tick known of each entity; infinite where all are."""
         return self._clocks.last
 
     @property
     def rate(self) -> float:
-        """Ticks a second of all links together, as far as they are known."""
+        """Ticks a second of all together, as far as they are known."""
         return float((self._clocks.drawn / self.last).sum())
 
-    def more(self, links: np.ndarray) -> Ticks:
-        """A block of ticks of each of these links (places, in order)."""
-        first = self._clocks.drawn[links]
-        t, counts = self._clocks.more(links, self._block[links])
-        self._block[links] = np.minimum(2 * self._block[links], self._longest)
-        return Ticks(t, np.repeat(links, counts), self._fortunes.of(links, counts, first))
+    def more(self, places: np.ndarray) -> Ticks:
+        """A block of ticks of each of these entities (places, in order)."""
+        first = self._clocks.drawn[places]
+        t, counts = self._clocks.more(places, self._block[places])
+        self._block[places] = np.minimum(2 * self._block[places], self._longest)
+        return Ticks(t, np.repeat(places, counts), self._outcomes.of(places, counts, first))
+
+
+def _joined(parts: list[Ticks]) -> Ticks:
+    return Ticks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 class Schedule:
     """The windows of one run, one after the other."""
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        self._links = links = LinkDraws(scenario, streams)
-        wanted = min(max(TICKS_A_LINK * links.count, LEAST_TICKS), MOST_TICKS)
+    def __init__(
+        self, scenario: Scenario, streams: Streams, senders: Senders | None = None
+    ) -> None:
+        senders = senders_of(scenario) if senders is None else senders
+        self._draws = draws = EntityDraws(scenario, streams, senders)
+        wanted = min(max(TICKS_A_LINK * draws.count, LEAST_TICKS), MOST_TICKS)
         self._horizon, self._end = scenario.horizon, 0.0
-        self._known = links.more(np.arange(links.count)) if links.count else _NOTHING
-        self._length = wanted / links.rate if links.rate > 0.0 else math.inf
+        self._known = draws.more(np.arange(draws.count)) if draws.count else NO_TICKS
+        self._length = wanted / draws.rate if draws.rate > 0.0 else math.inf
 
     def following(self) -> Window:
         """The next window; its end is infinite where nothing comes after it."""
-        end = self._end + self._length
+        end, draws = self._end + self._length, self._draws
         if not self._end < end < self._horizon:
             end = math.inf
         self._end = end
         parts = [self._known]
-        while len(late := np.flatnonzero(self._links.last < end)):
-            parts.append(self._links.more(late))
-        known = Ticks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        while len(late := np.flatnonzero(draws.last < end)):
+            parts.append(draws.more(late))
+        known = _joined(parts)
         now = known.t < end
-        self._known = Ticks(*(column[~now] for column in known))
-        t, link, delay = (column[now] for column in known)
-        order = np.argsort(t)
-        if (np.diff(t[order]) == 0.0).any():
-            order = np.lexsort((link, t))
-        return Window(end, t[order], link[order], delay[order])
+        self._known = known.chosen(np.flatnonzero(~now), draws.sizes)
+        order = np.flatnonzero(now)
+        order = order[np.argsort(known.t[order])]
+        if (np.diff(known.t[order]) == 0.0).any():
+            order = order[np.lexsort((known.entity[order], known.t[order]))]
+        return known.chosen(order, draws.sizes).window(end, draws.sizes)
+
+
+class ReadingsSchedule:
+    """The windows of one run in which nodes transmit after their samples, at the times ``t`` (K,)
+    and places ``host`` (K,), in order.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        streams: Streams,
+        senders: Senders,
+        t: FloatArray,
+        host: np.ndarray,
+    ) -> None:
+        self._outcomes = Outcomes(scenario, streams, senders)
+        self._t, self._host, self._begin = t, host, 0
+        self._sent = np.zeros(len(senders.entities), dtype=np.int64)
+
+    def following(self) -> Window:
+        """The next window; its end is infinite where nothing comes after it."""
+        begin, sizes = self._begin, self._outcomes.sizes
+        sent = np.cumsum(np.maximum(sizes[self._host[begin:]], 1))
+        stop = begin + int(np.searchsorted(sent, MOST_TICKS))
+        while 0 < stop < len(self._t) and self._t[stop] == self._t[stop - 1]:
+            stop += 1  # an instant is in one window
+        self._begin = stop
+        t, host = self._t[begin:stop], self._host[begin:stop]
+        places, counts = np.unique(host, return_counts=True)
+        delay = self._outcomes.of(places, counts, self._sent[places])
+        self._sent[places] += counts
+        by_entity = np.argsort(host, kind="stable")
+        ticks = Ticks(t[by_entity], host[by_entity], delay)
+        back = np.empty(len(host), dtype=np.int64)
+        back[by_entity] = np.arange(len(host))
+        end = float(self._t[stop]) if stop < len(self._t) else math.inf
+        return ticks.chosen(back, sizes).window(end, sizes)
 
 
 def whole_schedules(scenario: Scenario, streams: Together) -> list[Window]:
     """All ticks of each of several runs, as one window."""
-    links, runs = LinkDraws(scenario, streams), len(streams.each)
-    if not links.count:
-        return [Window(math.inf, *_NOTHING)] * runs
-    parts = []
-    while len(late := np.flatnonzero(links.last < math.inf)):
-        parts.append(links.more(late))
-    t, link, delay = (np.concatenate(column) for column in zip(*parts, strict=True))
-    run, link = np.divmod(link, links.count // runs)
-    order = np.lexsort((link, t, run))
-    cuts = np.cumsum(np.bincount(run, minlength=runs))[:-1]
-    columns = (np.split(column[order], cuts) for column in (t, link, delay))
-    return [Window(math.inf, *mine) for mine in zip(*columns, strict=True)]
+    senders, runs = senders_of(scenario), len(streams.each)
+    draws = EntityDraws(scenario, streams, senders)
+    if not draws.count:
+        return [NO_TICKS.window(math.inf, draws.sizes)] * runs
+    parts = [NO_TICKS]
+    while len(late := np.flatnonzero(draws.last < math.inf)):
+        parts.append(draws.more(late))
+    known, count = _joined(parts), draws.count // runs
+    run, entity = np.divmod(known.entity, count)
+    order = np.lexsort((entity, known.t, run))
+    known = known.chosen(order, draws.sizes)
+    cuts = np.concatenate([[0], np.cumsum(np.bincount(run, minlength=runs))])
+    windows = []
+    for k in range(runs):
+        mine = known.chosen(np.arange(cuts[k], cuts[k + 1]), draws.sizes)
+        mine = mine._replace(entity=mine.entity - k * count)
+        windows.append(mine.window(math.inf, draws.sizes))
+    return windows
 
 
-_NOTHING = Ticks(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2)))
+NO_TICKS = Ticks(np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
 
 
 def _stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:

@@ -1,0 +1,188 @@
+"""Readings that come late, used as if they had come in time (algorithms/intermittent, in loops)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.intermittent import SAME
+from netkf.algorithms.root_flow import move_root
+from netkf.algorithms.root_update import sample_root
+from netkf.core.arrays import FloatArray
+from netkf.core.compiling import kernel
+from netkf.engines.compiled.state import Simulation
+
+PAST = np.dtype(
+    [("instant", np.int64), ("frame", np.int64), ("before", np.int64), ("time", np.float64)]
+)
+
+
+class History(NamedTuple):
+    """What nodes keep so that late readings can be used: a pool ``past`` (P,) of things that
+    happened, each with the instant of the reading that was used or the number of the frame that
+    began (else -1), and the state right after it, ``x`` (P, n), ``root`` (P, n, n). ``newest`` (N,)
+    of each node; ``free`` (2,) the first free one and how many are; ``offsets`` (F, n) of frames;
+    ``lag`` (1,) seconds for which they are kept.
+    """
+
+    past: np.ndarray
+    x: FloatArray
+    root: FloatArray
+    newest: np.ndarray
+    free: np.ndarray
+    offsets: FloatArray
+    lag: FloatArray
+
+
+def empty_history(state: Simulation, lag: float, capacity: int) -> History:
+    """What is known at the start."""
+    count, n = state.xhat.shape
+    capacity = count + capacity
+    past = np.zeros(capacity, dtype=PAST)
+    past["instant"] = past["frame"] = -1
+    past["before"] = np.arange(1, capacity + 1)
+    past["before"][:count] = -1
+    x, root = np.zeros((capacity, n)), np.zeros((capacity, n, n))
+    x[:count], root[:count] = state.xhat, state.root
+    free = np.array([count, capacity - count], dtype=np.int64)
+    offsets = np.zeros((len(state.frames), n))
+    return History(past, x, root, np.arange(count), free, offsets, np.array([lag]))
+
+
+def with_more_past(history: History, least: int) -> History:
+    """Room for as much again, or ``least`` more."""
+    old = len(history.past)
+    more = max(old, least)
+    past = np.zeros(more, dtype=PAST)
+    past["before"] = np.arange(old + 1, old + more + 1)
+    past["before"][-1], history.free[0] = history.free[0], old
+    history.free[1] += more
+    return history._replace(
+        past=np.concatenate([history.past, past]),
+        x=np.concatenate([history.x, np.zeros((more, *history.x.shape[1:]))]),
+        root=np.concatenate([history.root, np.zeros((more, *history.root.shape[1:]))]),
+    )
+
+
+@kernel
+def use_instant(
+    state: Simulation, instant: int, root: FloatArray, x: FloatArray, k: int, scale: float
+) -> None:
+    """Update place ``k`` with all samples of an instant together, in the order of sensors; R counts
+    ``scale``^2 times.
+    """
+    given, room, n, row = state.instants, state.room, x.shape[1], 0
+    for s in range(given.first[instant], given.first[instant + 1]):
+        sensor, matrix = given.sensor[s], given.matrix[s]
+        p = given.rows[sensor]
+        for i in range(p):
+            room.y[row + i] = given.y[s, i]
+            for j in range(n):
+                room.H[row + i, j] = given.H[matrix, i, j]
+            for j in range(row):
+                room.root_R[row + i, j] = 0.0
+            for j in range(i + 1):
+                room.root_R[row + i, row + j] = scale * given.root[sensor, i, j]
+        row += p
+    if row > 0:
+        sample_root(root, x, k, room.y[:row], room.H, room.root_R, state.update_room)
+
+
+@kernel
+def copy_state(
+    x: FloatArray, root: FloatArray, k: int, from_x: FloatArray, from_root: FloatArray, m: int
+) -> None:
+    """Copy place ``m`` to place ``k``."""
+    n = x.shape[1]
+    for i in range(n):
+        x[k, i] = from_x[m, i]
+        for j in range(n):
+            root[k, i, j] = from_root[m, i, j]
+
+
+@kernel
+def take_past(history: History, time: float, instant: int, frame: int) -> int:
+    """A free entry, for what happens at ``time``."""
+    k = history.free[0]
+    entry = history.past[k]
+    history.free[0] = entry.before
+    history.free[1] -= 1
+    entry.time, entry.instant, entry.frame = time, instant, frame
+    return int(k)
+
+
+@kernel
+def remember(
+    state: Simulation, history: History, h: int, time: float, instant: int, frame: int
+) -> None:
+    """Keep the state of node ``h`` after it used a reading, or a frame began."""
+    k = take_past(history, time, instant, frame)
+    history.past[k].before = history.newest[h]
+    history.newest[h] = k
+    copy_state(history.x, history.root, k, state.xhat, state.root, h)
+
+
+@kernel
+def forget(history: History, h: int, since: float) -> None:
+    """Free all that no late reading can reach: what is before the last thing before ``since``."""
+    past = history.past
+    k = history.newest[h]
+    while k != -1 and not past[k].time < since:
+        k = past[k].before
+    if k == -1:
+        return
+    gone = past[k].before
+    past[k].before = -1
+    while gone != -1:
+        following = past[gone].before
+        past[gone].before = history.free[0]
+        history.free[0] = gone
+        history.free[1] += 1
+        gone = following
+
+
+@kernel
+def use_reading(state: Simulation, history: History, h: int, instant: int) -> None:
+    """Use a reading of now."""
+    use_instant(state, instant, state.root, state.xhat, h, 1.0)
+    lag, time = history.lag[0], state.instants.t[instant]
+    if lag <= 0.0:
+        return
+    if time // lag > history.past[history.newest[h]].time // lag:  # now and then
+        forget(history, h, time - lag)
+    remember(state, history, h, time, instant, -1)
+
+
+@kernel
+def use_late_reading(state: Simulation, history: History, h: int, instant: int, now: float) -> None:
+    """Go back to before the time of a reading, use it, and do again what came after it."""
+    past, x, root, model = history.past, history.x, history.root, state.nodes[h].model
+    time = state.instants.t[instant]
+    again, k = -1, history.newest[h]
+    while past[k].time > time + SAME * now and past[k].before != -1:
+        before = past[k].before
+        past[k].before = again
+        again, k = k, before
+    before, k = k, take_past(history, time, instant, -1)
+    past[k].before = before
+    while True:
+        copy_state(x, root, k, x, root, before)
+        if past[k].time > past[before].time:
+            gap = past[k].time - past[before].time
+            move_root(state.table, model, root, x, k, gap, state.flow_room)
+        if past[k].instant >= 0:
+            use_instant(state, past[k].instant, root, x, k, 1.0)
+        if past[k].frame >= 0:
+            for i in range(x.shape[1]):
+                x[k, i] += history.offsets[past[k].frame, i]
+        if again == -1:
+            break
+        before, k, again = k, again, past[again].before
+        past[k].before = before
+    history.newest[h] = k
+    copy_state(state.xhat, state.root, h, x, root, k)
+    if now > past[k].time:
+        gap = now - past[k].time
+        move_root(state.table, model, state.root, state.xhat, h, gap, state.flow_room)
+    forget(history, h, now - history.lag[0])

@@ -1,0 +1,112 @@
+"""Messages in the event loop: the heap of those on their way, inboxes, the list of free ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.compiling import kernel
+
+
+@kernel
+def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
+    """Whether message ``a`` arrives before ``b``: by time, directed link, order of sending."""
+    one, other = pool[a], pool[b]
+    if one.arrival != other.arrival:
+        return bool(one.arrival < other.arrival)
+    if one.way != other.way:
+        return bool(one.way < other.way)
+    return bool(one.order < other.order)
+
+
+@kernel
+def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
+    """Put a message on the heap of ``size``."""
+    k = size
+    while k > 0 and arrives_first(pool, message, heap[(k - 1) // 2]):
+        heap[k] = heap[(k - 1) // 2]
+        k = (k - 1) // 2
+    heap[k] = message
+
+
+@kernel
+def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
+    """Take the next message off the heap of ``size``."""
+    top, moved, k = heap[0], heap[size - 1], 0
+    while 2 * k + 1 < size - 1:
+        child = 2 * k + 1
+        if child + 1 < size - 1 and arrives_first(pool, heap[child + 1], heap[child]):
+            child += 1
+        if not arrives_first(pool, heap[child], moved):
+            break
+        heap[k] = heap[child]
+        k = child
+    heap[k] = moved
+    return int(top)
+
+
+@kernel
+def take(run: np.ndarray, pool: np.ndarray) -> int:
+    """A free message."""
+    message = run[0].free
+    run[0].free = pool[message].next
+    run[0].free_count -= 1
+    return int(message)
+
+
+@kernel
+def release(run: np.ndarray, pool: np.ndarray, message: int) -> None:
+    """It is free again."""
+    pool[message].next = run[0].free
+    run[0].free = message
+    run[0].free_count += 1
+
+
+@kernel
+def put(
+    run: np.ndarray,
+    nodes: np.ndarray,
+    ways: np.ndarray,
+    pool: np.ndarray,
+    h: int,
+    message: int,
+    newest_only: bool,
+) -> None:
+    """Put a message into the inbox of node ``h``, in the order of senders; of several of one sender
+    the newest counts, or all in the order of arrival.
+    """
+    node, peer = nodes[h], ways[pool[message].way].sender
+    before, here = -1, node.inbox
+    if here != -1 and ways[pool[node.last].way].sender < peer:  # mostly they come in order
+        before, here = node.last, -1
+    while here != -1:
+        other = ways[pool[here].way].sender
+        if other > peer or (other == peer and newest_only):
+            break
+        before, here = here, pool[here].next
+    if here != -1 and ways[pool[here].way].sender == peer:
+        if pool[message].sent < pool[here].sent:
+            release(run, pool, message)
+            return
+        gone, here = here, pool[here].next
+        release(run, pool, gone)
+    pool[message].next = here
+    if before == -1:
+        node.inbox = message
+    else:
+        pool[before].next = message
+    if here == -1:
+        node.last = message
+
+
+@kernel
+def sort_places(places: np.ndarray, count: int) -> None:
+    """Sort the first ``count`` places (Shell's sort: a few lines to compile)."""
+    gap = count // 2
+    while gap > 0:
+        for k in range(gap, count):
+            moved, to = places[k], k
+            while to >= gap and places[to - gap] > moved:
+                places[to] = places[to - gap]
+                to -= gap
+            places[to] = moved
+        gap //= 2

@@ -1,0 +1,50 @@
+"""Everything in the coordinates of a new origin, see plants/truth."""
+
+from __future__ import annotations
+
+from netkf.core.arrays import FloatArray
+from netkf.engines.compiled.late_readings import History, remember
+from netkf.engines.compiled.running_totals import Totals
+from netkf.engines.compiled.state import READINGS, Simulation
+from netkf.scenario.scenario import Scenario
+
+
+def move_origin(
+    scenario: Scenario,
+    state: Simulation,
+    totals: Totals | None,
+    history: History | None,
+    k: int,
+    offset: FloatArray,
+) -> None:
+    """Add ``offset`` (n,) to all estimates at the time of frame ``k``, and to what is under way
+    what the plant makes of it since that was sent.
+    """
+    now = float(state.frames[k])
+    state.xhat[:] += offset
+    if totals is not None:
+        _move_totals(scenario, state, totals, now, offset)
+    if history is not None and history.lag[0] > 0.0:
+        history.offsets[k] = offset
+        for h in range(len(state.nodes)):
+            remember(state, history, h, now, -1, k)
+    if totals is not None or state.run[0]["kind"] == READINGS:
+        return
+    for m in state.heap[: state.run[0]["flying"]]:
+        state.pool_x[m] += scenario.moved_back(offset, now - state.pool["sent"][m])
+
+
+def _move_totals(
+    scenario: Scenario, state: Simulation, totals: Totals, now: float, offset: FloatArray
+) -> None:
+    """``u`` by ``U offset`` wherever there is one, in coordinates of the time that it refers to."""
+    for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
+        for k, time in enumerate(times.tolist()):
+            _shift(values[k], scenario.moved_back(offset, now - time))
+    for m in state.heap[: state.run[0]["flying"]]:
+        _shift(totals.offered[m], scenario.moved_back(offset, now - state.pool["sent"][m]))
+
+
+def _shift(total: FloatArray, offset: FloatArray) -> None:
+    n = len(offset)
+    total[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset

@@ -1,0 +1,319 @@
+"""Push-sum by running sums in the event loop (algorithms/running_sums, in loops).
+
+Totals move with the plant. Here each keeps the time it refers to, and is moved once it is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.root_flow import transform
+from netkf.core.arrays import FloatArray
+from netkf.core.compiling import kernel
+from netkf.engines.compiled.late_readings import use_instant
+from netkf.engines.compiled.state import Simulation
+
+TERMS = 18  # of the exponential, for a norm of at most 1/2
+SWEEPS, SMALL = 30, 1e-32  # of Jacobi's method; squares of what is left, relative
+
+
+class Totals(NamedTuple):
+    """Of N nodes: ``weight`` (N,), the total ``sent`` (N, m), m = 1 + n n + n, to each receiver,
+    the time ``sent_at`` (N,) that it refers to, ``rounds`` and ``receivers`` (N,). Of W directed
+    links: the total ``heard`` last (W, m), its ``number`` (W,) (-1: none) and ``heard_at`` (W,).
+    Of messages: the totals ``offered`` (C, m). ``A`` (n, n) and ``forgetting`` (1,) of the plant;
+    room for what is ``gained`` (m,), and for matrices (4, n, n).
+    """
+
+    weight: FloatArray
+    sent: FloatArray
+    sent_at: FloatArray
+    rounds: np.ndarray
+    receivers: np.ndarray
+    heard: FloatArray
+    number: np.ndarray
+    heard_at: FloatArray
+    offered: FloatArray
+    A: FloatArray
+    forgetting: FloatArray
+    gained: FloatArray
+    room: FloatArray
+
+
+def empty_totals(
+    state: Simulation, receivers: np.ndarray, A: FloatArray, forgetting: float
+) -> Totals:
+    """Weight 1 at every node, and nothing sent yet."""
+    count, n = state.xhat.shape
+    m, ways = 1 + n * n + n, len(state.ways)
+    return Totals(
+        weight=np.ones(count),
+        sent=np.zeros((count, m)),
+        sent_at=np.zeros(count),
+        rounds=np.zeros(count, dtype=np.int64),
+        receivers=receivers,
+        heard=np.zeros((ways, m)),
+        number=np.full(ways, -1),
+        heard_at=np.zeros(ways),
+        offered=np.zeros((len(state.pool), m)),
+        A=np.array(A, dtype=np.float64),
+        forgetting=np.array([forgetting]),
+        gained=np.zeros(m),
+        room=np.zeros((4, n, n)),
+    )
+
+
+@kernel
+def multiply(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """``out = a b`` of (n, n)."""
+    n = len(a)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(n):
+                total += a[i, r] * b[r, j]
+            out[i, j] = total
+
+
+@kernel
+def fill_inverse(totals: Totals, gap: float) -> None:
+    """Write ``e^{-A gap}`` into ``room[0]``: the power series of a part of the gap, squared."""
+    A, out, term, moved = totals.A, totals.room[0], totals.room[1], totals.room[2]
+    n, norm = len(A), 0.0
+    for i in range(n):
+        row = 0.0
+        for j in range(n):
+            row += abs(A[i, j]) * gap
+            out[i, j] = term[i, j] = 1.0 if i == j else 0.0
+        norm = max(norm, row)
+    halvings, step = 0, -gap
+    while norm > 0.5:
+        norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
+    for k in range(1, TERMS if norm > 0.0 else 1):
+        multiply(moved, term, A)
+        for i in range(n):
+            for j in range(n):
+                term[i, j] = moved[i, j] * step / k
+                out[i, j] += term[i, j]
+    for _ in range(halvings):
+        multiply(moved, out, out)
+        for i in range(n):
+            for j in range(n):
+                out[i, j] = moved[i, j]
+
+
+@kernel
+def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
+    """``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` of row ``k``, ``gap`` seconds later."""
+    if not gap > 0.0:
+        return
+    fill_inverse(totals, gap)
+    inverse, half, moved = totals.room[0], totals.room[1], totals.room[2]
+    n, fading = len(inverse), math.exp(-2.0 * totals.forgetting[0] * gap)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(n):
+                total += values[k, 1 + i * n + r] * inverse[r, j]
+            half[i, j] = total
+    for i in range(n):
+        total = 0.0
+        for r in range(n):
+            total += inverse[r, i] * values[k, 1 + n * n + r]
+        moved[0, i] = fading * total
+    for i in range(n):
+        values[k, 1 + n * n + i] = moved[0, i]
+        for j in range(n):
+            total = 0.0
+            for r in range(n):
+                total += inverse[r, i] * half[r, j]
+            values[k, 1 + i * n + j] = fading * total
+
+
+@kernel
+def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
+    """One round of node ``h``, whose masses all shrink by one factor; False if nobody hears it."""
+    receivers, n, weight = totals.receivers[h], state.xhat.shape[1], totals.weight[h]
+    if receivers == 0:
+        return False
+    move_total(totals, totals.sent, h, now - totals.sent_at[h])
+    totals.sent_at[h] = now
+    inverse, U, sent = totals.room[0], totals.room[1], totals.sent
+    fill_inverse_root(inverse, state.root, h)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(max(i, j), n):
+                total += inverse[r, i] * inverse[r, j]
+            U[i, j] = weight / len(state.nodes) * total
+            sent[h, 1 + i * n + j] += U[i, j] / (receivers + 1)
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += U[i, j] * state.xhat[h, j]
+        sent[h, 1 + n * n + i] += total / (receivers + 1)
+    # The node gives up exactly what its total grew by, for each receiver.
+    before = sent[h, 0]
+    sent[h, 0] += weight / (receivers + 1)
+    totals.weight[h] -= receivers * (sent[h, 0] - before)
+    totals.rounds[h] += 1
+    return True
+
+
+@kernel
+def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
+    """Inverse of a lower triangular root, which must be regular."""
+    n = root.shape[1]
+    for i in range(n):
+        for j in range(i + 1):
+            value = 1.0 if j == i else 0.0
+            for r in range(j, i):
+                value -= root[h, i, r] * out[r, j]
+            out[i, j] = value / root[h, i, i]
+
+
+@kernel
+def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
+    """Gain what each total grew by since it was heard last; an older one brings nothing."""
+    gained, pool, heard, offered = totals.gained, state.pool, totals.heard, totals.offered
+    for j in range(len(gained)):
+        gained[j] = 0.0
+    m = state.nodes[h].inbox
+    while m != -1:
+        message = pool[m]
+        w = message.way
+        if message.tag > totals.number[w]:
+            move_total(totals, offered, m, now - message.sent)
+            move_total(totals, heard, w, now - totals.heard_at[w])
+            totals.heard_at[w] = now
+            for j in range(len(gained)):
+                gained[j] += offered[m, j] - heard[w, j]
+        m = message.next
+    if not gained[0] > 0.0:
+        return
+    m = state.nodes[h].inbox
+    while m != -1:
+        message = pool[m]
+        if message.tag > totals.number[message.way]:
+            totals.number[message.way] = message.tag
+            for j in range(len(gained)):
+                heard[message.way, j] = offered[m, j]
+        m = message.next
+    weight = totals.weight[h] + gained[0]
+    size = math.sqrt(weight / totals.weight[h])
+    totals.weight[h] = weight
+    gain_mass(state, totals, h, size, len(state.nodes) / weight)
+
+
+@kernel
+def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: float) -> None:
+    """``P^-1 <- (w P^-1 + N U) / w+`` and the estimate likewise; the root counts ``size`` times,
+    what was gained ``share`` times, and it cannot be less than nothing.
+    """
+    root, gained, n = state.root, totals.gained, state.xhat.shape[1]
+    inner, half, vectors = totals.room[0], totals.room[1], totals.room[2]
+    for i in range(n):
+        for j in range(i + 1):
+            root[h, i, j] *= size
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(j, n):
+                total += (gained[1 + i * n + r] + gained[1 + r * n + i]) * root[h, r, j]
+            half[i, j] = total
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(i, n):
+                total += root[h, r, i] * half[r, j]
+            inner[i, j] = 0.5 * share * total + (1.0 if i == j else 0.0)
+    diagonalise(inner, vectors)
+    shrink_root(state, h, inner, vectors)
+    move_by_gain(state, h, gained, share, totals.room[3, 0])
+
+
+@kernel
+def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
+    """The triangular root of ``S V D^-1 V' S'``: D is the diagonal of ``values``, at least 1."""
+    root, F, n = state.root, state.flow_room.values, state.xhat.shape[1]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(i + 1):
+                total += root[h, i, r] * vectors[r, j]
+            F[i * n + j] = total / math.sqrt(max(values[j, j], 1.0))
+    for i in range(n):
+        for j in range(i + 1):
+            root[h, i, j] = 1.0 if i == j else 0.0
+    transform(root, h, F, 0, state.flow_room.wide, state.flow_room.T, False)
+
+
+@kernel
+def move_by_gain(
+    state: Simulation, h: int, gained: FloatArray, share: float, news: FloatArray
+) -> None:
+    """``xhat += P share (u - U xhat)``; ``news`` (n,) is room to work in."""
+    root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
+    for i in range(n):
+        total = gained[1 + n * n + i]
+        for j in range(n):
+            total -= gained[1 + i * n + j] * xhat[h, j]
+        news[i] = share * total
+    for j in range(n):  # S' news: place j is not read again
+        total = 0.0
+        for i in range(j, n):
+            total += root[h, i, j] * news[i]
+        news[j] = total
+    for i in range(n):
+        for j in range(i + 1):
+            xhat[h, i] += root[h, i, j] * news[j]
+
+
+@kernel
+def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
+    """Jacobi's method: the eigenvalues of a symmetric (n, n) come on its diagonal, the eigenvectors
+    are the columns of ``vectors``.
+    """
+    n = len(a)
+    for i in range(n):
+        for j in range(n):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(SWEEPS):
+        turned = False
+        for p in range(n):
+            for q in range(p + 1, n):
+                if a[p, q] * a[p, q] > SMALL * abs(a[p, p] * a[q, q]):
+                    turned = True
+                    rotate(a, vectors, p, q)
+        if not turned:
+            return
+
+
+@kernel
+def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
+    """Turn rows and columns p and q so that ``a[p, q]`` becomes 0."""
+    n, tilt = len(a), 0.5 * (a[q, q] - a[p, p]) / a[p, q]
+    t = 1.0 / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))
+    if tilt < 0.0:
+        t = -t
+    c = 1.0 / math.sqrt(1.0 + t * t)
+    s = t * c
+    for k in range(n):
+        one, other = a[k, p], a[k, q]
+        a[k, p], a[k, q] = c * one - s * other, s * one + c * other
+    for k in range(n):
+        one, other = a[p, k], a[q, k]
+        a[p, k], a[q, k] = c * one - s * other, s * one + c * other
+        one, other = vectors[k, p], vectors[k, q]
+        vectors[k, p], vectors[k, q] = c * one - s * other, s * one + c * other
+    a[p, q] = a[q, p] = 0.0
+
+
+@kernel
+def add_reading(state: Simulation, totals: Totals, h: int, instant: int) -> None:
+    """``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms of P^-1."""
+    scale = math.sqrt(totals.weight[h] / len(state.nodes))
+    use_instant(state, instant, state.root, state.xhat, h, scale)

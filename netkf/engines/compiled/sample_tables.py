@@ -1,0 +1,102 @@
+"""All samples of a run as tables: at which instants, by which sensors, and what they read."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams
+from netkf.engines.compiled.state import Instants
+from netkf.plants.sampling import Samples
+from netkf.scenario.scenario import Placed, Scenario
+
+
+class SampledSensor(NamedTuple):
+    """One sensor: the ``times`` (K,) of its samples, what reads them, the places (K,) of its
+    samples among all, and its own place among sensors.
+    """
+
+    times: FloatArray
+    samples: Samples
+    places: np.ndarray
+    place: int
+
+
+class SampleTables:
+    """The samples of one run. What is read is filled in once the state is known: a state does not
+    depend on estimates, nor do readings.
+    """
+
+    def __init__(
+        self, scenario: Scenario, streams: Streams, times: dict[tuple[int, int], FloatArray]
+    ) -> None:
+        placed = [(n, place) for n, some in scenario.sampled_sensors.items() for place in some]
+        counts = [len(times[node, place.ordinal]) for node, place in placed]
+        t = np.concatenate([np.empty(0), *(times[n, place.ordinal] for n, place in placed)])
+        sensor = np.repeat(np.arange(len(placed)), counts)
+        order = np.lexsort((sensor, t))
+        back = np.empty(len(t), dtype=np.int64)
+        back[order] = np.arange(len(t))
+        cuts = np.cumsum(counts)[:-1]
+        parts = np.split(back, cuts) if placed else []
+        self._sensors = [
+            SampledSensor(
+                times[node, place.ordinal], scenario.sample_path(streams, node, place), some, k
+            )
+            for k, ((node, place), some) in enumerate(zip(placed, parts, strict=True))
+        ]
+        self.instants = _instants(scenario, placed, t[order], sensor[order])
+        self._matrices: list[FloatArray] = []
+
+    def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
+        """Fill in what is read in (``after``, ``until``], where the states (T, n) are those at
+        ``times`` (T,).
+        """
+        given = self.instants
+        for sensor in self._sensors:
+            first, last = np.searchsorted(sensor.times, [after, until], side="right")
+            if first == last:
+                continue
+            here = sensor.times[first:last]
+            x = states[np.searchsorted(times, here)]
+            y, H = sensor.samples.several(range(first, last), x)
+            places, p = sensor.places[first:last], y.shape[1]
+            given.y[places, :p] = y
+            if given.matrix[places[0]] >= len(given.rows):  # a sensor with an H for each sample
+                given.H[given.matrix[places], :p] = H
+
+
+def _instants(
+    scenario: Scenario, placed: list[tuple[int, Placed]], t: FloatArray, sensor: np.ndarray
+) -> Instants:
+    index, pooled, n = scenario.topology.index, scenario.hosted.pooled, scenario.plant.n
+    node = np.array([node for node, _ in placed], dtype=np.int64)
+    host = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
+    parts = [(scenario.sensors[p.entry], scenario.noise(p.entry, True)) for _, p in placed]
+    rows = np.array([len(R) for _, R in parts], dtype=np.int64)
+    most = int(rows.max(initial=1))
+    root, H = np.zeros((len(parts), most, most)), np.zeros((len(parts), most, n))
+    for k, (part, R) in enumerate(parts):
+        root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.H
+    own = np.array([part.varying for part, _ in parts], dtype=bool)
+    matrix, varying = sensor.copy(), own[sensor] if parts else np.zeros(0, dtype=bool)
+    matrix[varying] = len(parts) + np.arange(int(varying.sum()))
+    H = np.concatenate([H, np.zeros((int(varying.sum()), most, n))])
+    whose = host[sensor] if parts else sensor
+    begins = np.ones(len(t), dtype=bool)
+    begins[1:] = (np.diff(t) != 0.0) | (np.diff(whose) != 0)
+    first = np.flatnonzero(begins)
+    return Instants(
+        t=t[first],
+        host=whose[first],
+        first=np.append(first, len(t)),
+        node=node[sensor] if parts else sensor,
+        y=np.zeros((len(t), most)),
+        sensor=sensor,
+        matrix=matrix,
+        rows=rows,
+        root=root,
+        H=H,
+    )

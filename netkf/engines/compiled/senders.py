@@ -1,0 +1,66 @@
+"""Who transmits when something ticks, and over which directed links."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.clock import Entity
+from netkf.network.clocks import LinkClock
+from netkf.network.graphs import Link
+from netkf.scenario.scenario import Scenario
+
+
+class Senders(NamedTuple):
+    """E ``entities`` with a clock (``at`` "readings": nodes) and all directed links, ``ways`` (W,),
+    in the order in which simultaneous messages arrive. Entity e sends on the ways ``hearing`` from
+    ``first[e]`` up to ``first[e + 1]``. The outcomes of way w are those of stream ``source[w]``,
+    named by ``sources``; where ways share one, a tick draws it once.
+    """
+
+    at: str
+    entities: tuple[Entity, ...]
+    ways: tuple[Link, ...]
+    first: np.ndarray
+    hearing: np.ndarray
+    sources: tuple[Link, ...]
+    source: np.ndarray
+
+    @property
+    def shared(self) -> bool:
+        """Whether both ways of a link share outcomes."""
+        return len(self.sources) < len(self.ways)
+
+
+def senders_of(scenario: Scenario) -> Senders:
+    """Nobody where the filter does not talk."""
+    topology, clock = scenario.topology, scenario.network.activation
+    if not scenario.hosted.talks or not isinstance(clock, LinkClock):
+        none = np.zeros(0, dtype=np.int64)
+        return Senders("links", (), (), np.zeros(1, dtype=np.int64), none, (), none)
+    if clock.at == "links":
+        return _links(topology.links, topology.directed, scenario.network.channel.symmetric)
+    ways = topology.directions
+    each = np.arange(len(ways))
+    if clock.at == "directions":
+        first = np.arange(len(ways) + 1)
+        return Senders(clock.at, ways, ways, first, each, ways, each)
+    senders = np.array([topology.index[i] for i, _ in ways], dtype=np.int64)
+    counts = np.bincount(senders, minlength=len(topology.nodes))
+    first = np.concatenate([[0], np.cumsum(counts)])
+    entities = tuple((node,) for node in topology.nodes)
+    hearing = np.argsort(senders, kind="stable")
+    return Senders(clock.at, entities, ways, first, hearing, ways, each)
+
+
+def _links(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
+    if directed:
+        each = np.arange(len(links))
+        return Senders("links", links, links, np.arange(len(links) + 1), each, links, each)
+    ways = tuple(way for i, j in links for way in ((i, j), (j, i)))
+    each = np.arange(len(ways))
+    first = np.arange(0, len(ways) + 1, 2)
+    if symmetric:
+        return Senders("links", links, ways, first, each, links, each // 2)
+    return Senders("links", links, ways, first, each, ways, each)

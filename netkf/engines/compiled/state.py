@@ -1,0 +1,290 @@
+"""What the event loop works on: everything of a run as plain arrays in a few named groups.
+
+Numbers that belong to one node, message or directed link are fields of a record, so that they have
+names in compiled code too. No type depends on the size of a scenario: one compiled loop fits all.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.gains import GainTable
+from netkf.algorithms.models import FlowModel, first_root
+from netkf.algorithms.root_flow import FlowRoom, FlowTable, flow_room, stack_tables
+from netkf.algorithms.root_update import UpdateRoom, update_room
+from netkf.core.arrays import FloatArray
+from netkf.engines.compiled.senders import Senders
+from netkf.scenario.scenario import Scenario
+
+
+def _record(integers: str, floats: str = "") -> np.dtype:
+    fields = [(name, np.int64) for name in integers.split()]
+    return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
+
+
+RUN = _record(
+    "kind at keep_own frame_at piece grid_at wake_at instant_at tick_at probe_at "
+    "row most_rows most_messages free free_count flying order waiting absorbing shown",
+    "horizon age_limit mail_time",
+)
+"""Where a run stands. ``kind`` and ``at``: see KINDS and CLOCKS; ``..._at``: the next one of
+frames, points of the sensing grid, nodes that wake there, instants of samples, ticks and probes;
+the ``piece`` of the path; the next ``row``, and how many one event may need (``most_rows``); the
+first ``free`` message and how many are (``free_count``, ``most_messages``); messages on the heap
+(``flying``) and how many were put there (``order``); nodes with mail (``waiting``), of which so
+many are done (``absorbing``) at ``mail_time``; samples not handed on yet (``shown``); messages
+older than ``age_limit`` seconds are late.
+"""
+
+NODE = _record("model id sensor sensors inbox last sent reading", "now least own")
+"""One filter: its model, the id in the trace (-1: pooled), its increment sensors from ``sensor`` up
+to ``sensors``, first and last message of its inbox (-1: none), how many transmissions it ``sent``,
+the instant of its newest sample (``reading``), the time it has reached (``now``), the shortest
+stretch of increments it uses on its way (``least``; 0: it stands), and its ``own`` weight.
+"""
+
+WAY = _record("sender receiver messages", "weight")
+"""A directed link: nodes by place, how many messages went, the weight of each."""
+
+ENTITY = _record("sender other first after")
+"""Whatever has a clock: the node that sends, the other end of a link (else -1), and the directed
+links that it sends on, ``Simulation.hearing`` from ``first`` up to ``after``.
+"""
+
+MESSAGE = _record("way number next order tag", "sent arrival")
+"""On its way or in an inbox; ``next`` in the same inbox or among the free ones. ``tag`` is the
+instant of a reading that is sent, or the number of a running sum.
+"""
+
+CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT = range(7)
+"""Kinds of filters by what they do with messages."""
+
+KINDS = {
+    "Hybrid": CONVEX,
+    "CovarianceIntersection": INTERSECTION,
+    "Gossip": SWAP,
+    "DiffusionFilter": SHARES,
+    "Intermittent": READINGS,
+    "PushSum": SUMS,
+    "Local": SILENT,
+    "Central": SILENT,
+}
+LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
+CLOCKS = ("links", "directions", "nodes", "readings")
+
+
+class Gains(NamedTuple):
+    """The gain tables of M models, flat: of model m from ``first[m]`` on; ``shape`` (M, 3) = rows
+    2 p of moments, terms and width.
+    """
+
+    series: FloatArray
+    first: np.ndarray
+    shape: np.ndarray
+
+
+class Room(NamedTuple):
+    """Room to work in: moments (2 p,) and noise ``early`` (2, p) for the most increments p of any
+    node, moments ``seen`` and their ``total`` (2, n) of x, ``values`` of the longest series,
+    ``of_x`` (n,), ``from_noise`` (2, 4); a sample of most rows q: ``y`` (q,), ``H`` (q, n),
+    ``root_R`` (q, q).
+    """
+
+    moments: FloatArray
+    early: FloatArray
+    seen: FloatArray
+    total: FloatArray
+    values: FloatArray
+    of_x: FloatArray
+    from_noise: FloatArray
+    y: FloatArray
+    H: FloatArray
+    root_R: FloatArray
+
+
+class Sensing(NamedTuple):
+    """S increment sensors: rows p (S,), H (S, p, n), root of R (S, p, p), the rest of the present
+    step's noise (S, 2, p) and which step that is (S,); noise of the steps (S, steps, 2, p) and
+    normals for cuts (S, count, 2, p), of which ``used`` (S,) are gone. ``host`` and ``node`` (K,)
+    say who wakes at a grid point, in their order.
+    """
+
+    rows: np.ndarray
+    H: FloatArray
+    root: FloatArray
+    rest: FloatArray
+    step: np.ndarray
+    noise: FloatArray
+    normals: FloatArray
+    used: np.ndarray
+    host: np.ndarray
+    node: np.ndarray
+
+
+class Instants(NamedTuple):
+    """K instants at which a node has samples, in order: ``t`` (K,), ``host`` (K,), its samples from
+    ``first[k]`` up to ``first[k + 1]``. Of each of S samples: the ``node`` that took it, ``y``
+    (S, p), the places ``sensor`` and ``matrix`` (S,) of its noise and its H. Those are ``rows``
+    (L,), ``root`` (L, p, p) of R and ``H`` (M, p, n).
+    """
+
+    t: FloatArray
+    host: np.ndarray
+    first: np.ndarray
+    node: np.ndarray
+    y: FloatArray
+    sensor: np.ndarray
+    matrix: np.ndarray
+    rows: np.ndarray
+    root: FloatArray
+    H: FloatArray
+
+
+class Shown(NamedTuple):
+    """Room for B samples of all N nodes: xhat (B, N, n), P (B, N, n, n), how many ``rows`` (B,)
+    came before, in which ``piece`` (B,) of the path each is, and ``terms`` (B, T) of sums that are
+    conserved. They are handed on many at a time, since a call of the loop costs more than a sample.
+    """
+
+    xhat: FloatArray
+    P: FloatArray
+    rows: np.ndarray
+    piece: np.ndarray
+    terms: FloatArray
+
+
+class Simulation(NamedTuple):
+    """A run, but for what comes in windows. Filters: ``nodes`` (N,), xhat (N, n), root (N, n, n),
+    the ``table`` of their models and, last, of prediction alone. Messages: ``pool`` (C,), what
+    they carry (C, n), (C, n, n), the ``heap`` of arrivals (C,), ``waiting`` (N,) nodes with mail.
+    """
+
+    run: np.ndarray
+    nodes: np.ndarray
+    xhat: FloatArray
+    root: FloatArray
+    table: FlowTable
+    gains: Gains
+    entities: np.ndarray
+    hearing: np.ndarray
+    ways: np.ndarray
+    pool: np.ndarray
+    pool_x: FloatArray
+    pool_root: FloatArray
+    heap: np.ndarray
+    waiting: np.ndarray
+    instants: Instants
+    sensing: Sensing
+    frames: FloatArray
+    probes: FloatArray
+    shown: Shown
+    rows: np.ndarray
+    room: Room
+    flow_room: FlowRoom
+    update_room: UpdateRoom
+
+
+class Filters(NamedTuple):
+    """The filters at time 0: see Simulation."""
+
+    nodes: np.ndarray
+    xhat: FloatArray
+    root: FloatArray
+    table: FlowTable
+    gains: Gains
+
+
+def filters_at_start(scenario: Scenario) -> Filters:
+    """Where they are pooled, one stands for all."""
+    ids, pooled = scenario.nodes, scenario.hosted.pooled
+    models = (scenario.pooled_model,) if pooled else scenario.models
+    distinct = list({id(model): model for model in models}.values())
+    place = {id(model): k for k, model in enumerate(distinct)}
+    starts = [scenario.start(node) for node in (ids[:1] if pooled else ids)]
+    roots = {id(cov): first_root(cov) for _, cov in starts}
+    counts = [len(scenario.increment_sensors.get(node, ())) for node in ids]
+    after = np.array([sum(counts)] if pooled else np.cumsum(counts), dtype=np.int64)
+    nodes = np.zeros(len(starts), dtype=NODE)
+    nodes["model"] = [place[id(model)] for model in models]
+    nodes["id"] = [-1] if pooled else ids
+    nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
+    nodes["inbox"] = nodes["reading"] = -1
+    nodes["own"] = [scenario.own_weights[node] for node in (ids[:1] if pooled else ids)]
+    table, gains = _tables(distinct)
+    xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
+    return Filters(nodes, xhat, np.stack([roots[id(cov)] for _, cov in starts]), table, gains)
+
+
+def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
+    n = len(models[0].A)
+    nothing = GainTable(n, 0, np.zeros((0, 0)))
+    gains = [model.gains if len(model.H) else nothing for model in models]
+    sizes = [gain.series.size for gain in gains]
+    return stack_tables([*(model.flow for model in models), models[0].blind_flow]), Gains(
+        series=np.concatenate([gain.series.ravel() for gain in gains]),
+        first=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
+        shape=np.array([(gain.moments, *gain.series.shape) for gain in gains], dtype=np.int64),
+    )
+
+
+def entity_records(scenario: Scenario, senders: Senders) -> tuple[np.ndarray, np.ndarray]:
+    """ENTITY and WAY records of a run that has not begun."""
+    index = scenario.topology.index
+    entities = np.zeros(len(senders.entities), dtype=ENTITY)
+    ends = np.array([(*e, -1)[:2] for e in senders.entities], dtype=np.int64).reshape(-1, 2)
+    place = np.vectorize(lambda node: index.get(node, -1), otypes=[np.int64])
+    if len(ends):
+        entities["sender"], entities["other"] = place(ends[:, 0]), place(ends[:, 1])
+    if senders.at != "links":
+        entities["other"][:] = [index[e[1]] if len(e) > 1 else -1 for e in senders.entities]
+    entities["first"], entities["after"] = senders.first[:-1], senders.first[1:]
+    ways = np.zeros(len(senders.ways), dtype=WAY)
+    ways["sender"] = [index[i] for i, _ in senders.ways]
+    ways["receiver"] = [index[j] for _, j in senders.ways]
+    ways["weight"] = [scenario.weight(j, i) for i, j in senders.ways]
+    return entities, ways
+
+
+def rooms(table: FlowTable, gains: Gains, instants: Instants) -> tuple[Room, FlowRoom, UpdateRoom]:
+    """Room for all that is computed."""
+    n, (most, _, width) = table.levels.shape[3], gains.shape.max(axis=0)
+    rows = np.concatenate([instants.rows, [0]])[instants.sensor]
+    totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
+    q = max(1, int(np.diff(totals).max(initial=0)))
+    room = Room(
+        moments=np.zeros(most),
+        early=np.zeros((2, most // 2)),
+        seen=np.zeros((2, n)),
+        total=np.zeros((2, n)),
+        values=np.zeros(max(width, 2 * n * n)),
+        of_x=np.zeros(n),
+        from_noise=np.zeros((2, 4)),
+        y=np.zeros(q),
+        H=np.zeros((q, n)),
+        root_R=np.zeros((q, q)),
+    )
+    return room, flow_room(table), update_room(n, q)
+
+
+def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
+    """Pool, xhat, root and heap of messages that are all free."""
+    pool = np.zeros(capacity, dtype=MESSAGE)
+    pool["next"] = np.arange(1, capacity + 1)
+    return pool, np.zeros((capacity, n)), np.zeros((capacity, n, n)), np.zeros(capacity, np.int64)
+
+
+def with_more_messages(state: Simulation, least: int) -> Simulation:
+    """The pool at least doubled, by ``least`` messages or more."""
+    old, n = len(state.pool), state.xhat.shape[1]
+    more = max(old, least)
+    fresh = empty_pool(more, n)
+    fresh[0]["next"] = np.arange(old + 1, old + more + 1)
+    run = state.run[0]
+    fresh[0]["next"][-1], run["free"] = run["free"], old
+    run["free_count"] += more
+    before = (state.pool, state.pool_x, state.pool_root, state.heap)
+    grown = [np.concatenate(pair) for pair in zip(before, fresh, strict=True)]
+    pool, pool_x, pool_root, heap = grown
+    return state._replace(pool=pool, pool_x=pool_x, pool_root=pool_root, heap=heap)

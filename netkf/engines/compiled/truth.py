@@ -1,0 +1,87 @@
+"""The state of one run where it is sampled, shown and counted from a new origin."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from netkf.core.arrays import FloatArray
+from netkf.core.streams import Streams
+from netkf.engines.compiled.increments import PathBlock
+from netkf.plants.transitions import Transitions
+from netkf.scenario.scenario import Scenario
+
+
+class States(Protocol):
+    """What a run asks for."""
+
+    frame_times: FloatArray
+
+    def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
+        """(n,) the local state just before ``frame_times[k]``, which ends a piece of the path."""
+
+    def shown(
+        self, times: FloatArray, path: PathBlock, pieces: np.ndarray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(T, n) local and absolute states at times in these pieces of the path."""
+
+
+class KnownStates:
+    """Those of a truth that was drawn up to the horizon, or recorded."""
+
+    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+        self.truth = scenario.continuous_truth(streams)
+        self.frame_times = np.array(self.truth.frame_times, dtype=np.float64)
+
+    def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
+        """(n,) the local state just before ``frame_times[k]``."""
+        return np.asarray(self.truth.rebase(k))
+
+    def shown(
+        self, times: FloatArray, path: PathBlock, pieces: np.ndarray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(T, n) local and absolute states."""
+        local, absolute = self.truth.states(times)
+        return local, absolute
+
+
+class PathStates:
+    """Those of a path that is drawn block by block."""
+
+    def __init__(self, scenario: Scenario, frame_times: FloatArray) -> None:
+        self.frame_times = frame_times
+        self._moves = Transitions(scenario.truth.A, scenario.truth.B) if len(frame_times) else None
+        self._frame, self._begun, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
+
+    def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:
+        """(T, n) states in the present frame, which are 0 where one begins."""
+        ends = (times == path.stop[pieces])[:, None]
+        x = np.where(ends, path.x_stop[pieces], path.x_start[pieces])
+        if len(self.frame_times):
+            x[np.isin(times, self.frame_times)] = 0.0
+        return np.asarray(x)
+
+    def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
+        """(n,) the local state just before ``frame_times[k]``; from now on its frame counts."""
+        x, time = path.x_stop[piece], float(self.frame_times[k])
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._origin = self._moved(np.array([time]))[0] + x
+        self._frame, self._begun = k + 1, time
+        return np.asarray(x)
+
+    def shown(
+        self, times: FloatArray, path: PathBlock, pieces: np.ndarray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(T, n) local and absolute states at times in the present frame."""
+        local = self.local(times, path, pieces)
+        if not self._frame:
+            return local, local
+        with np.errstate(over="ignore", invalid="ignore"):
+            return local, local + self._moved(times)
+
+    def _moved(self, times: FloatArray) -> FloatArray:
+        if self._moves is None or not self._origin.any():
+            return np.broadcast_to(self._origin, (len(times), len(self._origin)))
+        moves = self._moves.transitions(times - self._begun)
+        return np.asarray((moves @ self._origin[:, None])[:, :, 0])

@@ -1,0 +1,44 @@
+"""Everything that runs in continuous time: both engines, one event after the other."""
+
+import collections
+
+import pytest
+
+from tests.engines.agreement import assert_agree
+from tests.engines.drawn import FILTERS, drawn_scenario
+
+FEW, MANY, TOGETHER = 64, 360, 8
+
+
+def agree(seeds, folder):
+    """Runs of the scenarios of these seeds."""
+    runs = {}
+    for seed in seeds:
+        place = folder / str(seed)
+        place.mkdir()
+        scenario = drawn_scenario(seed, place)
+        runs[seed] = scenario, assert_agree(scenario)
+    return runs
+
+
+@pytest.mark.parametrize("first", range(0, FEW, TOGETHER))
+def test_drawn_scenarios_agree(first, tmp_path):
+    agree(range(first, first + TOGETHER), tmp_path)
+
+
+@pytest.mark.slow
+def test_many_drawn_scenarios_agree_and_leave_nothing_out(tmp_path):
+    runs = agree(range(FEW, FEW + MANY), tmp_path)
+    filters = collections.Counter(type(scenario.hosted).__name__ for scenario, _ in runs.values())
+    assert len(filters) == len(FILTERS)
+    assert min(filters.values()) >= 30
+    counts = collections.Counter()
+    for scenario, run in runs.values():
+        kinds = ("tick", "transmit", "send", "lost", "late", "deliver", "absorb", "sense")
+        counts.update(kind for kind in kinds if run.count(kind))
+        mixed = scenario.increment_sensors and scenario.sampled_sensors
+        counts["frames"] += scenario.exact_errors
+        counts["directed"] += scenario.topology.directed
+        counts["mixed"] += bool(mixed)
+        counts["on one node"] += bool(mixed and set(mixed) & set(scenario.increment_sensors))
+    assert min(counts.values()) >= 5, counts
