@@ -84,7 +84,8 @@ def main():
         worse = [f"{rate:g}" for rate, gain, spread in rows if gain < -2.0 * spread]
         print(f"mean square error below that of {name} by two standard errors of the difference,")
         print(
-            f"run by run, at {', '.join(sure) or 'no'} rounds/s; above at {', '.join(worse) or 'none'}"
+            f"run by run, at {', '.join(sure) or 'no'} rounds/s; above at "
+            f"{', '.join(worse) or 'none'}"
         )
 
 

@@ -151,20 +151,13 @@ def seconds_spent() -> float:
 
 def announce(function: Callable[..., Any]) -> None:
     """Say that a function will be compiled first, where its code is not kept on disk."""
-    if function in _said or not available():
+    if function in _said:
         return
     _said.add(function)
     folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
     if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
         words = "netkf: compiling, once after an installation (10 to 20 s) ..."
         print(words, file=sys.stderr, flush=True)
-
-
-def available() -> bool:
-    """Whether numba is installed."""
-    from importlib.util import find_spec
-
-    return find_spec("numba") is not None
 
 
 def _introduce() -> None:

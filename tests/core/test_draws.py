@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from netkf.core.streams import Streams, Together
-
-pytest.importorskip("numba")
 from netkf.core.draws import Draws
+from netkf.core.streams import Streams, Together
 
 LINKS = [(k, k + 1) for k in range(200)] + [(2**40, 3)]
 

@@ -27,7 +27,6 @@ from netkf.trace.schema import EVENT
 from tests.conftest import SCENARIOS, scenario_files
 from tests.engines.agreement import assert_agree
 
-pytest.importorskip("numba")
 SHORT = {"intel_lab.toml": 1.5, "intel_lab_radio.toml": 3.0, "diffusion_regression.toml": 300.0}
 
 

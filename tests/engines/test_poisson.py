@@ -10,8 +10,6 @@ from netkf.engines.compiled import poisson
 from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson, schedule
 from netkf.engines.compiled.schedule import Schedule, whole_schedules
 
-pytest.importorskip("numba")
-
 CHANNELS = {
     "shared": {"symmetric": True, "loss": {"kind": "bernoulli", "delivery": 0.7}},
     "each way": {"symmetric": False, "loss": {"kind": "bernoulli", "delivery": 0.7}},

@@ -345,7 +345,6 @@ class NoProcesses:
 
 
 def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
-    pytest.importorskip("numba")
     monkeypatch.setattr(pools, "Processes", NoProcesses)
     monkeypatch.setattr(pools, "cores", lambda: 2)
     short = ring.replace({"horizon": 2.0})

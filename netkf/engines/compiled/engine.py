@@ -51,9 +51,6 @@ class CompiledEngine(Engine):
     def refusal(self, scenario: Scenario) -> str | None:
         """Why this engine cannot run the scenario, with the remedy; None where it can."""
         remedy = 'use engine="simpy", or "auto", which chooses'
-        if not compiling.available():
-            remedy = 'install it (pip install "netkf[fast]") or use engine="simpy"'
-            return f'engine "compiled" needs numba, which is not installed; {remedy}'
         parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
