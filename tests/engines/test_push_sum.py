@@ -70,7 +70,6 @@ def written(case, folder):
 @pytest.mark.parametrize("engine", ["processes", "compiled"])
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c["name"])
 def test_reference_cases(case, engine, tmp_path):
-    if engine == "compiled":
     run = netkf.simulate(netkf.load(written(case, tmp_path)), engine=engine)
     expected = np.array(case["out"]["xhat"])
     assert run.xhat.shape == expected.shape
