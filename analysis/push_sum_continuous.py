@@ -82,10 +82,9 @@ def main():
     for name, rows in better.items():
         sure = [f"{rate:g}" for rate, gain, spread in rows if gain > 2.0 * spread]
         worse = [f"{rate:g}" for rate, gain, spread in rows if gain < -2.0 * spread]
-        print(f"mean square error below that of {name} by two standard errors of the difference,")
+        print(f"push-sum against {name}, run by run, beyond two standard errors of the difference:")
         print(
-            f"run by run, at {', '.join(sure) or 'no'} rounds/s; above at "
-            f"{', '.join(worse) or 'none'}"
+            f"better at {', '.join(sure) or 'no'} rounds/s, worse at {', '.join(worse) or 'none'}"
         )
 
 

@@ -32,6 +32,9 @@ from netkf.algorithms.models import Backward, first_root, sample_update
 from netkf.algorithms.root_update import lower_root
 from netkf.core.arrays import FloatArray
 
+SHOWN = 1e-4
+"""How exactly a total must grow by what is offered, in parts of it; or else nothing is offered."""
+
 
 class Offer(NamedTuple):
     """What a broadcast carries: which one it is of its sender, and the running ``total``."""
@@ -110,8 +113,12 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
     U = (state.weight / state.nodes) * (inverse.T @ inverse)
     mass = np.concatenate([[state.weight], U.reshape(-1), U @ state.xhat])
     sent = state.sent + mass / (state.receivers + 1)
-    # The node gives up exactly what its total grew by, for each receiver.
-    weight = state.weight - state.receivers * float(sent[0] - state.sent[0])
+    # The node gives up exactly what its total grew by, for each receiver. A node that hears nobody
+    # has less and less; what its total cannot show for rounding, it keeps, and says what it said.
+    grown, share = float(sent[0] - state.sent[0]), float(mass[0]) / (state.receivers + 1)
+    if abs(grown - share) > SHOWN * share:
+        return state._replace(rounds=state.rounds + 1), Offer(state.rounds, state.sent)
+    weight = state.weight - state.receivers * grown
     return state._replace(weight=weight, sent=sent, rounds=state.rounds + 1), Offer(
         state.rounds, sent
     )

@@ -153,7 +153,7 @@ def _scale(axes: Any, values: FloatArray) -> None:
 
 def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
     if not scenario.plant.shown:
-        _unavailable(axes, NO_TRUTH)
+        _estimates(axes, scenario, finished)
         return
     times = np.array(finished.samples.times)
     error = np.sqrt(np.array(finished.samples.sq_error))
@@ -177,6 +177,16 @@ def _unavailable(axes: Any, words: str) -> None:
     """A panel without data."""
     axes.text(0.0, 0.5, words, color=DARK)
     axes.axis("off")
+
+
+def _estimates(axes: Any, scenario: Scenario, finished: Finished) -> None:
+    """Without a truth there are no errors, but nodes that agree or do not."""
+    times, first = np.array(finished.samples.times), np.array(finished.samples.first)
+    _lines(axes, times, first, scenario)
+    axes.plot([], [], color=SENSING, label="nodes with a sensor")
+    axes.plot([], [], color=RELAY, label="nodes without; nobody knows the truth")
+    axes.set(ylabel="estimate, first component", xlabel="simulated seconds")
+    _legend(axes)
 
 
 def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:

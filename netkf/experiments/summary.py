@@ -24,11 +24,11 @@ CONFIDENCE = 0.95
 
 
 class SummarySink(Sink):
-    """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES; and
-    how many messages each node sent and each link delivered. ``rounding_from`` is the first sample
-    at which the state is so large that rounding blurs the errors (unstable plants over long
-    horizons, where errors are subtracted), ``diverged`` are the nodes whose estimate or covariance
-    was broken at the last one.
+    """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES, the
+    ``first`` component of the estimate; and how many messages each node sent and each link
+    delivered. ``rounding_from`` is the first sample at which the state is so large that rounding
+    blurs the errors (unstable plants over long horizons, where errors are subtracted), ``diverged``
+    are the nodes whose estimate or covariance was broken at the last one.
     """
 
     anywhere: ClassVar[bool] = True
@@ -38,6 +38,7 @@ class SummarySink(Sink):
         self.sq_error: list[FloatArray] = []
         self.trace: list[FloatArray] = []
         self.nees: list[FloatArray] = []
+        self.first: list[FloatArray] = []
         self.delivered: dict[tuple[int, int], int] = {}
         self.rounding_from: float | None = None
         self.diverged: list[int] = []
@@ -63,6 +64,7 @@ class SummarySink(Sink):
         self.times += t.tolist()
         self.sq_error += list(sq_error)
         self.nees += list(nees)
+        self.first += list(np.array(xhat[:, :, 0]))
         self.trace += list(np.trace(P, axis1=2, axis2=3))
         if self.rounding_from is None:
             first = rounding_from(t, carried(x, error, self.exact_errors), P, error)

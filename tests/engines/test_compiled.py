@@ -27,7 +27,12 @@ from netkf.trace.schema import EVENT
 from tests.conftest import SCENARIOS, scenario_files
 from tests.engines.agreement import assert_agree
 
-SHORT = {"intel_lab.toml": 1.5, "intel_lab_radio.toml": 3.0, "diffusion_regression.toml": 300.0}
+SHORT = {
+    "intel_lab.toml": 1.5,
+    "intel_lab_radio.toml": 3.0,
+    "diffusion_regression.toml": 300.0,
+    "ulb_library.toml": 600.0,
+}
 
 
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda file: file.stem)
