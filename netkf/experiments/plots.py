@@ -184,7 +184,7 @@ def _estimates(axes: Any, scenario: Scenario, finished: Finished) -> None:
     times, first = np.array(finished.samples.times), np.array(finished.samples.first)
     _lines(axes, times, first, scenario)
     axes.plot([], [], color=SENSING, label="nodes with a sensor")
-    axes.plot([], [], color=RELAY, label="nodes without; nobody knows the truth")
+    axes.plot([], [], color=RELAY, label="nodes without; no ground truth")
     axes.set(ylabel="estimate, first component", xlabel="simulated seconds")
     _legend(axes)
 
