@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.root_flow import transform
+from netkf.algorithms.running_sums import SHOWN
 from netkf.core.arrays import FloatArray
 from netkf.core.compiling import kernel
 from netkf.engines.compiled.late_readings import use_instant
@@ -141,7 +142,13 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
         return False
     move_total(totals, totals.sent, h, now - totals.sent_at[h])
     totals.sent_at[h] = now
+    totals.rounds[h] += 1
     inverse, U, sent = totals.room[0], totals.room[1], totals.sent
+    # The node gives up exactly what its total grows by, for each receiver, or nothing.
+    before, share = sent[h, 0], weight / (receivers + 1)
+    grown = (before + share) - before
+    if abs(grown - share) > SHOWN * share:
+        return True
     fill_inverse_root(inverse, state.root, h)
     for i in range(n):
         for j in range(n):
@@ -155,11 +162,8 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
         for j in range(n):
             total += U[i, j] * state.xhat[h, j]
         sent[h, 1 + n * n + i] += total / (receivers + 1)
-    # The node gives up exactly what its total grew by, for each receiver.
-    before = sent[h, 0]
-    sent[h, 0] += weight / (receivers + 1)
-    totals.weight[h] -= receivers * (sent[h, 0] - before)
-    totals.rounds[h] += 1
+    sent[h, 0] = before + share
+    totals.weight[h] -= receivers * grown
     return True
 
 
