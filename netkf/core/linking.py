@@ -20,31 +20,14 @@ _DEPTH = {"compile": 0, "load": 0, "finalize": 0}
 
 @contextmanager
 def linked_once() -> Iterator[None]:
-    """Inside, only the outermost function that is compiled gets machine code."""
-    from numba.core.codegen import CPUCodeLibrary
-    from numba.core.cpu import CPUContext
-    from numba.core.dispatcher import Dispatcher
-
-    patches: list[tuple[Any, str, Callable[..., Any]]] = [
-        (Dispatcher, "compile", _counted("compile", Dispatcher.compile)),
-        (CPUCodeLibrary, "finalize", _counted("finalize", CPUCodeLibrary.finalize)),
-        (
-            CPUContext,
-            "get_executable",
-            _only_outermost("compile", _counted("load", CPUContext.get_executable), _stub),
-        ),
-        (
-            CPUCodeLibrary,
-            "_optimize_final_module",
-            _only_outermost("finalize", CPUCodeLibrary._optimize_final_module, _nothing),
-        ),
-        (
-            CPUCodeLibrary,
-            "_finalize_final_module",
-            _only_outermost("finalize", CPUCodeLibrary._finalize_final_module, _keep_as_it_is),
-        ),
-    ]
-    before = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
+    """Inside, only the outermost function that is compiled gets machine code. With a numba that has
+    other names everything is compiled as numba does it.
+    """
+    try:
+        patches = _patches()
+        before = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
+    except (AttributeError, ImportError, KeyError):
+        patches, before = [], []
     for owner, name, patch in patches:
         setattr(owner, name, patch)
     try:
@@ -52,6 +35,38 @@ def linked_once() -> Iterator[None]:
     finally:
         for owner, name, original in before:
             setattr(owner, name, original)
+
+
+def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
+    """What stands in for methods of numba meanwhile: class, name, method."""
+    from numba.core.codegen import CPUCodeLibrary
+    from numba.core.cpu import CPUContext
+    from numba.core.dispatcher import Dispatcher
+
+    library: Any = CPUCodeLibrary
+    return [
+        (Dispatcher, "compile", _counted("compile", Dispatcher.compile)),
+        (library, "finalize", _counted("finalize", library.finalize)),
+        (
+            CPUContext,
+            "get_executable",
+            _only_outermost("compile", _counted("load", CPUContext.get_executable), _stub),
+        ),
+        *(
+            (CPUContext, name, _only_outermost("compile", getattr(CPUContext, name), _nothing))
+            for name in ("create_cpython_wrapper", "create_cfunc_wrapper")
+        ),
+        (
+            library,
+            "_optimize_final_module",
+            _only_outermost("finalize", library._optimize_final_module, _nothing),
+        ),
+        (
+            library,
+            "_finalize_final_module",
+            _only_outermost("finalize", library._finalize_final_module, _keep_as_it_is),
+        ),
+    ]
 
 
 def _counted(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -86,8 +101,8 @@ def _stub(_: Any, library: Any, fndesc: Any, env: Any) -> Any:
     return _dynfunc.make_function(module, name, "linked in", raising, env, (library,))
 
 
-def _nothing(library: Any) -> None:
-    pass
+def _nothing(*_: Any, **__: Any) -> None:
+    """What Python needs to call a function, and what makes it fast alone, is left out."""
 
 
 def _keep_as_it_is(library: Any) -> None:

@@ -122,13 +122,20 @@ def next_of(times: FloatArray, k: int) -> float:
 
 @kernel
 def note(
-    state: Simulation, t: float, kind: int, node: int, peer: int, message: int, age: float
+    run: np.ndarray,
+    rows: np.ndarray,
+    t: float,
+    kind: int,
+    node: int,
+    peer: int,
+    message: int,
+    age: float,
 ) -> None:
     """Write one row of the trace."""
-    row = state.rows[state.run[0].row]
+    row = rows[run[0].row]
     row.t, row.kind, row.node, row.peer = t, kind, node, peer
     row.message, row.phase, row.age = message, -1, age
-    state.run[0].row += 1
+    run[0].row += 1
 
 
 @kernel
@@ -166,7 +173,7 @@ def on_sense(state: Simulation, path: PathBlock, now: float) -> int:
     run, sensing = state.run[0], state.sensing
     if not predict(state, path, sensing.host[run.wake_at], now):
         return WANT_CUTS
-    note(state, now, SENSE, sensing.node[run.wake_at], -1, -1, np.nan)
+    note(state.run, state.rows, now, SENSE, sensing.node[run.wake_at], -1, -1, np.nan)
     run.wake_at += 1
     if run.wake_at == len(sensing.host):
         run.wake_at = 0
@@ -194,7 +201,7 @@ def on_sample(
     for s in range(given.first[instant], given.first[instant + 1]):
         if given.node[s] != sensed:  # of a pooled filter several nodes, in order
             sensed = given.node[s]
-            note(state, now, SENSE, sensed, -1, -1, np.nan)
+            note(state.run, state.rows, now, SENSE, sensed, -1, -1, np.nan)
     if totals is not None:
         add_reading(state, totals, h, instant)
     elif history is not None:
@@ -220,12 +227,14 @@ def on_tick(
     if run.at == LINKS and not predict(state, path, j, now):
         return WANT_CUTS
     if run.at != AFTER_READINGS:
-        note(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1, np.nan)
+        note(
+            state.run, state.rows, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1, np.nan
+        )
     sends = True
     if totals is not None:
         sends = offer_round(state, totals, i, now)
     if run.at >= NODES and sends:
-        note(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent, np.nan)
+        note(state.run, state.rows, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent, np.nan)
         nodes[i].sent += 1
     first = window.at[run.tick_at] - entity.first
     if sends:
@@ -242,9 +251,9 @@ def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: fl
     number, h = way.messages, way.sender
     way.messages += 1
     one, other = state.nodes[h].id, state.nodes[way.receiver].id
-    note(state, now, SEND, one, other, number, np.nan)
+    note(state.run, state.rows, now, SEND, one, other, number, np.nan)
     if not delay >= 0.0:
-        note(state, now, LOST, one, other, number, np.nan)
+        note(state.run, state.rows, now, LOST, one, other, number, np.nan)
         return
     if delay > 0.0 and not now + delay < run.horizon:
         return
@@ -286,10 +295,10 @@ def arrive(state: Simulation, m: int, now: float) -> None:
     one, other = state.nodes[way.sender].id, state.nodes[way.receiver].id
     age = now - message.sent
     if not age <= run.age_limit:
-        note(state, now, LATE, other, one, message.number, age)
+        note(state.run, state.rows, now, LATE, other, one, message.number, age)
         release(state.run, state.pool, m)
         return
-    note(state, now, DELIVER, other, one, message.number, age)
+    note(state.run, state.rows, now, DELIVER, other, one, message.number, age)
     if state.nodes[way.receiver].inbox == -1:
         state.waiting[run.waiting] = way.receiver
         run.waiting += 1
@@ -331,7 +340,7 @@ def on_absorb(
         release(state.run, pool, m)
         m = following
     node.inbox = -1
-    note(state, now, ABSORB, node.id, -1, -1, oldest)
+    note(state.run, state.rows, now, ABSORB, node.id, -1, -1, oldest)
     run.absorbing += 1
     if run.absorbing == run.waiting:
         run.absorbing = run.waiting = 0
