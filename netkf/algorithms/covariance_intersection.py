@@ -6,18 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
 from netkf.algorithms.filter import Exchange, Message, State
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.intersection import intersected
 from netkf.algorithms.root_update import intersect_roots
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
-from netkf.core.small import fill_square, product
-
-SINGULAR = 1e-15  # least eigenvalue that counts, relative to the largest
-TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,34 +32,3 @@ class CovarianceIntersection(Hybrid):
     def shift(self, state: State, offset: FloatArray) -> State:
         """Affine: the weights sum to one."""
         return state._replace(xhat=state.xhat + offset)
-
-
-@compilable
-def intersected_pairs(
-    weights: FloatArray, means: FloatArray, P: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """D (8) and (9) of weights (k,), estimates (k, n) and their covariances (k, n, n): ``xhat``
-    (n,) and P (n, n).
-    """
-    roots = np.empty(P.shape)
-    for m in range(len(P)):
-        fill_square(roots[m], invertible_root(P[m]))
-    xhat, root = intersected(weights, means, roots)
-    return xhat, product(root, root.T)
-
-
-@compilable
-def invertible_root(P: FloatArray) -> FloatArray:
-    """A root that can be inverted: soon after a start from 0 the noise has reached some
-    combinations of states only to rounding. Nan where P is not finite.
-    """
-    if not np.isfinite(P).all():
-        return np.full(P.shape, np.nan)
-    n = len(P)
-    scale = np.sqrt(np.maximum(np.diag(P), TINY))
-    scaled = P / np.outer(scale, scale)
-    if not np.isfinite(scaled).all():
-        return np.full(P.shape, np.nan)
-    values, vectors = np.linalg.eigh(scaled)
-    floor = SINGULAR * max(values[n - 1], TINY)
-    return np.asarray(scale.reshape(n, 1) * vectors * np.sqrt(np.maximum(values, floor)))

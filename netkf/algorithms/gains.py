@@ -18,9 +18,8 @@ import numpy as np
 
 from netkf.algorithms.riccati import exponential_series, hamiltonian
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import in_place
 from netkf.core.legendre import MOMENTS, backward_coefficients
-from netkf.core.series import fill_polynomial, polynomial, with_reach
+from netkf.core.series import polynomial, with_reach
 from netkf.core.small import added, applied
 
 LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
@@ -76,34 +75,6 @@ def _terms(size: float) -> int:
         last *= size / terms
         terms += 1
     return terms
-
-
-@in_place
-def gain_move(
-    moments: FloatArray,
-    series: FloatArray,
-    P: FloatArray,
-    x: FloatArray,
-    k: int,
-    gap: float,
-    values: FloatArray,
-) -> None:
-    """``gain_update`` in loops and in place, for place ``k`` of P (K, n, n) and x (K, n); over the
-    ``moments`` (2p,) it writes innovations. ``values`` is room for a row of ``series``.
-    """
-    n, q = x.shape[1], len(moments)
-    fill_polynomial(values, series, gap)
-    for m in range(q):
-        for j in range(n):
-            moments[m] -= values[(2 * q + m) * n + j] * x[k, j]
-    for i in range(n):
-        total = 0.0
-        for m in range(q):
-            gain = values[i * q + m]
-            for j in range(n):
-                gain += P[k, i, j] * values[(n + j) * q + m]
-            total += gain * moments[m]
-        x[k, i] += total
 
 
 def gain_update(

@@ -11,7 +11,6 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.root_update import combine_roots
 from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable_as, in_place
 from netkf.core.fields import number, setting
 
 
@@ -54,36 +53,3 @@ class Hybrid(Filter):
     def shift(self, state: State, offset: FloatArray) -> State:
         """Affine: the weights sum to one."""
         return state._replace(xhat=state.xhat + offset)
-
-
-@in_place
-def _add_loops(
-    xhat: FloatArray,
-    P: FloatArray,
-    k: int,
-    weight: float,
-    other: FloatArray,
-    other_P: FloatArray,
-    m: int,
-) -> None:
-    for i in range(xhat.shape[1]):
-        xhat[k, i] += weight * other[m, i]
-        for j in range(xhat.shape[1]):
-            P[k, i, j] += weight * other_P[m, i, j]
-
-
-@compilable_as(_add_loops)
-def add_neighbour(
-    xhat: FloatArray,
-    P: FloatArray,
-    k: int,
-    weight: float,
-    other: FloatArray,
-    other_P: FloatArray,
-    m: int,
-) -> None:
-    """Put one more neighbour, place ``m`` of (M, n) and (M, n, n), into the partial sums of H (7)
-    and (9) at place ``k`` of (K, n) and (K, n, n).
-    """
-    xhat[k] += weight * other[m]
-    P[k] += weight * other_P[m]

@@ -19,12 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.arrays import FloatArray, symmetric
-from netkf.core.compiling import in_place
-from netkf.core.series import fill_polynomial, polynomial, with_reach
+from netkf.core.series import polynomial, with_reach
 from netkf.core.small import (
     added,
     applied,
-    eliminate,
     even,
     product,
     solution,
@@ -159,114 +157,6 @@ def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, F
     n = table.n
     values = polynomial(table.series, gap)
     return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
-
-
-@in_place
-def move_part(
-    series: FloatArray,
-    P: FloatArray,
-    x: FloatArray,
-    k: int,
-    gap: float,
-    E: FloatArray,
-    X: FloatArray,
-    Y: FloatArray,
-) -> None:
-    """``part_of_unit`` in loops and in place, for place ``k`` of P (K, n, n) and x (K, n).
-
-    ``E`` (5 n n,), ``X`` (n + 1, n) and ``Y`` (n, n) are room to work in.
-    """
-    n = x.shape[1]
-    fill_polynomial(E, series, gap)
-    for i in range(n):  # X' and Y' are made as such
-        total = 0.0
-        for j in range(n):
-            total += E[(4 * n + i) * n + j] * x[k, j]
-        X[n, i] = total
-        above, below = 2 * n * i, 2 * n * (n + i)
-        for j in range(n):
-            up, down = E[above + j], E[below + j]
-            for m in range(n):
-                up += E[above + n + m] * P[k, m, j]
-                down += E[below + n + m] * P[k, m, j]
-            X[j, i], Y[j, i] = up, down
-    eliminate(X, Y, n)
-    for i in range(n):
-        x[k, i] = X[n, i]
-        P[k, i, i] = Y[i, i]
-        for j in range(i):
-            P[k, i, j] = P[k, j, i] = 0.5 * (Y[i, j] + Y[j, i])
-
-
-@in_place
-def move_blind(
-    blind: FloatArray,
-    P: FloatArray,
-    x: FloatArray,
-    k: int,
-    gap: float,
-    E: FloatArray,
-    X: FloatArray,
-) -> None:
-    """``move_part`` where there are no readings."""
-    n = x.shape[1]
-    fill_polynomial(E[: 2 * n * n], blind, gap)
-    for i in range(n):
-        X[n, i] = 0.0
-        for j in range(n):
-            X[n, i] += E[i * n + j] * x[k, j]
-            X[i, j] = 0.0
-            for m in range(n):
-                X[i, j] += E[i * n + m] * P[k, m, j]
-    for i in range(n):
-        x[k, i] = X[n, i]
-        for j in range(i + 1):
-            total = E[(n + i) * n + j]
-            for m in range(n):
-                total += X[i, m] * E[j * n + m]
-            P[k, i, j] = P[k, j, i] = total
-
-
-@in_place
-def move_units(
-    whole: int,
-    jump: FloatArray,
-    F: FloatArray,
-    G: FloatArray,
-    Q: FloatArray,
-    P: FloatArray,
-    x: FloatArray,
-    k: int,
-    X: FloatArray,
-    Y: FloatArray,
-) -> None:
-    """The ``whole`` units of ``riccati_step`` in loops and in place, see ``move_part``."""
-    n, level = x.shape[1], 0
-    while whole >> level:
-        if whole >> level & 1:
-            for i in range(n):
-                X[n, i] = 0.0
-                for j in range(n):
-                    X[n, i] += jump[level, i, j] * x[k, j]
-                    total = 1.0 if i == j else 0.0
-                    for m in range(n):
-                        total += P[k, i, m] * G[level, m, j]
-                    X[i, j], Y[i, j] = total, P[k, i, j]
-            eliminate(X, Y, n)
-            for i in range(n):
-                x[k, i] = X[n, i]
-                for j in range(n):
-                    X[i, j] = 0.0
-                    for m in range(n):
-                        X[i, j] += F[level, i, m] * Y[m, j]
-            for i in range(n):
-                for j in range(i + 1):
-                    up, down = Q[level, i, j], Q[level, j, i]
-                    for m in range(n):
-                        up += X[i, m] * F[level, j, m]
-                        down += X[j, m] * F[level, i, m]
-                    P[k, i, j] = P[k, j, i] = 0.5 * (up + down)
-        level += 1
 
 
 def part_of_unit(
