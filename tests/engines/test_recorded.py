@@ -184,7 +184,7 @@ def test_tables_with_mistakes_are_refused(name, text, words, tmp_path):
         ({"plant.kind": "recorded"}, "plant.path: is missing"),
         ({"plant": {"kind": "unknown", "A": [[1.0]]}}, "plant.B: is missing"),
         ({"plant": {"kind": "unknown", "F": F, "Q": Q}}, "plant.period: is missing"),
-        ({"plant.kind": "unknown", "filter.kind": "hybrid"}, "belongs to plants in continuous"),
+        ({"filter": {"kind": "hybrid", "epsilon": 0.3}}, "belongs to plants in continuous"),
     ],
 )
 def test_parts_that_do_not_go_together_are_refused(changes, words, tmp_path):
