@@ -8,6 +8,7 @@ keep the mass; the stop rule of step 2.3 fires when all links of a node are down
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -112,7 +113,7 @@ class PushSum(Filter):
 
     def steps(self, phase: int) -> int:
         """One for the mass, ``gamma`` for the estimates."""
-        return self.gamma if phase == AVERAGE else 1
+        return self.gamma or 1 if phase == AVERAGE else 1
 
     def redraws_links(self, phase: int, step: int) -> bool:
         """Links that are held keep the outcome of the first averaging step."""
@@ -133,7 +134,7 @@ class PushSum(Filter):
             return running_sums.hear(state, messages)
         received = [message.payload for message in messages]
         if exchange.phase == AVERAGE:
-            return state._replace(xhat=averaged(state.xhat, received, self.delta))
+            return state._replace(xhat=averaged(state.xhat, received, self.delta or math.inf))
         if self.asymptotic or (self.stop == "paper" and state.stopped):
             return state
         mass = mixed(state.mass, received, state.degree)

@@ -11,11 +11,22 @@ versions, and tests/core/test_linking.py).
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-_DEPTH = {"compile": 0, "load": 0, "finalize": 0}
+
+class _Depth(threading.local):
+    """How deep a thread is in compiling, loading and finalizing."""
+
+    def __init__(self) -> None:
+        self.compile = self.load = self.finalize = 0
+
+
+_DEPTH = _Depth()
+_ONE_AT_A_TIME = threading.RLock()
+"""numba's methods are replaced for the whole process, so threads compile one after the other."""
 
 
 @contextmanager
@@ -23,6 +34,12 @@ def linked_once() -> Iterator[None]:
     """Inside, only the outermost function that is compiled gets machine code. With a numba that has
     other names everything is compiled as numba does it.
     """
+    with _ONE_AT_A_TIME, _replaced():
+        yield
+
+
+@contextmanager
+def _replaced() -> Iterator[None]:
     try:
         patches = _patches()
         before = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
@@ -71,11 +88,11 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
 
 def _counted(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
     def counted(*args: Any, **kwargs: Any) -> Any:
-        _DEPTH[what] += 1
+        setattr(_DEPTH, what, getattr(_DEPTH, what) + 1)
         try:
             return original(*args, **kwargs)
         finally:
-            _DEPTH[what] -= 1
+            setattr(_DEPTH, what, getattr(_DEPTH, what) - 1)
 
     return counted
 
@@ -86,7 +103,8 @@ def _only_outermost(
     def choose(*args: Any, **kwargs: Any) -> Any:
         # What is linked is finalized too, while its caller is lowered or finalized. What was kept
         # on disk is loaded without being finalized again.
-        linked = _DEPTH[what] > 1 or (what == "finalize" and _DEPTH[what] > _DEPTH["load"])
+        depth = getattr(_DEPTH, what)
+        linked = depth > 1 or (what == "finalize" and depth > _DEPTH.load)
         return (inner if linked else original)(*args, **kwargs)
 
     return choose

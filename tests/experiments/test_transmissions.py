@@ -21,12 +21,17 @@ def counted(rows, size):
 
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
 def test_blocks_do_not_matter(file):
-    """By hand: in slots the distinct (node, t, phase) of sends, under clocks every send."""
+    """By hand: in slots the distinct (node, t, phase) of sends, under clocks every send, or where
+    nodes broadcast every transmission.
+    """
     log = netkf.simulate(netkf.load(file, {"seed": 3})).log[:5000]
     sends = log[log["kind"] == CODES["send"]]
     keys = [(row["node"], row["t"], row["phase"]) for row in sends]
     slotted = len(sends) and sends["phase"].min() >= 0
     expected = Counter(int(key[0]) for key in (set(keys) if slotted else keys))
+    transmitted = log[log["kind"] == CODES["transmit"]]
+    if len(transmitted):
+        expected = Counter(transmitted["node"].tolist())
     for size in (1, 7, 5000):
         found = counted(log, size)
         assert found.sent == Counter(sends["node"].tolist())

@@ -53,14 +53,14 @@ def test_defaults_come_from_the_plant(build):
     )
     run = netkf.simulate(scenario)
     assert run.xhat[0].tolist() == [[3.0], [3.0]]
-    assert run.P[0].tolist() == [[[2.0]], [[2.0]]]
+    np.testing.assert_allclose(run.P[0], [[[2.0]], [[2.0]]], rtol=1e-15)
 
 
 def test_one_start_per_node(build):
     filters = {"kind": "hybrid", "epsilon": 0.5, "mean": [[1.0], [2.0]], "cov": [[[3.0]], [[4.0]]]}
     run = netkf.simulate(build(filter=filters))
     assert run.xhat[0].tolist() == [[1.0], [2.0]]
-    assert run.P[0].tolist() == [[[3.0]], [[4.0]]]
+    np.testing.assert_allclose(run.P[0], [[[3.0]], [[4.0]]], rtol=1e-15)
 
 
 def test_replace_takes_paths_as_in_a_file(ring):
