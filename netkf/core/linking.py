@@ -22,6 +22,7 @@ class _Depth(threading.local):
 
     def __init__(self) -> None:
         self.compile = self.load = self.finalize = 0
+        self.inner: set[str] = set()
 
 
 _DEPTH = _Depth()
@@ -76,7 +77,7 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
         (
             library,
             "_optimize_final_module",
-            _only_outermost("finalize", library._optimize_final_module, _nothing),
+            _only_outermost("finalize", _private(library._optimize_final_module), _nothing),
         ),
         (
             library,
@@ -123,8 +124,22 @@ def _nothing(*_: Any, **__: Any) -> None:
     """What Python needs to call a function, and what makes it fast alone, is left out."""
 
 
+def _private(optimize: Callable[..., Any]) -> Callable[..., Any]:
+    """Nobody else calls what was linked in, so its unused arguments and copies may go."""
+
+    def optimize_all(library: Any) -> Any:
+        for function in library._final_module.functions:
+            if function.name in _DEPTH.inner and not function.is_declaration:
+                function.linkage = "internal"
+        return optimize(library)
+
+    return optimize_all
+
+
 def _keep_as_it_is(library: Any) -> None:
     """What numba does, without code for the machine."""
+    defined = library._final_module.functions
+    _DEPTH.inner.update(f.name for f in defined if not f.is_declaration)
     library._finalize_dynamic_globals()
     library._verify_declare_only_symbols()
     library._finalized = True
