@@ -966,6 +966,7 @@ def test_a_seed_that_breaks_the_scenario_is_refused_with_the_file(write, refusal
 def test_a_seed_of_the_command_line_mends_the_scenario(write, tmp_path, capsys):
     good, bad = seeds(write)
     path = write(DRAWN | {"seed": str(bad)})
+    signal.alarm(120)  # where nothing is kept from before, a first run compiles
     out = tmp_path / "out"
     assert main(["run", str(path), "--seed", str(good), "--out", str(out), "--no-plot"]) == 0
     assert capsys.readouterr().err == ""
