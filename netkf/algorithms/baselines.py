@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message
-from netkf.core.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +23,7 @@ class Local(Filter):
         """Nothing arrives; the state stays."""
         return state
 
-    def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Affine."""
-        return super().shift(state, offset)
+    shift = Filter.shift  # affine
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from netkf.algorithms.filter import Exchange, Message, State
+from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.root_update import intersect_roots
-from netkf.core.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +28,4 @@ class CovarianceIntersection(Hybrid):
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
 
-    def shift(self, state: State, offset: FloatArray) -> State:
-        """Affine: the weights sum to one."""
-        return state._replace(xhat=state.xhat + offset)
+    shift = Filter.shift  # affine: the weights sum to one

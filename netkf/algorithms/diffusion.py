@@ -108,9 +108,7 @@ class DiffusionFilter(Filter):
         xhat, root = intersect_roots(np.array([own, *heard]), means, roots)
         return state._replace(xhat=xhat, root=root)
 
-    def shift(self, state: DiffusionState, offset: FloatArray) -> DiffusionState:
-        """Affine: the weights sum to one."""
-        return state._replace(xhat=state.xhat + offset)
+    shift = Filter.shift  # affine: the weights sum to one
 
     def share(self, own: float, arrived: list[float]) -> tuple[float, list[float]]:
         """The own weight and those of the messages that arrived, which sum to 1, from the nominal

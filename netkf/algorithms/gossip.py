@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
-from netkf.core.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +33,4 @@ class Gossip(Filter):
         xhat, root = state.model.extrapolate(pair.xhat, pair.root, age)
         return state._replace(xhat=xhat, root=root)
 
-    def shift(self, state: State, offset: FloatArray) -> State:
-        """Affine."""
-        return state._replace(xhat=state.xhat + offset)
+    shift = Filter.shift  # affine

@@ -50,6 +50,4 @@ class Hybrid(Filter):
         """``1 / epsilon``: beyond it a node's own weight would be negative."""
         return (1.0 + 1e-12) / self.epsilon
 
-    def shift(self, state: State, offset: FloatArray) -> State:
-        """Affine: the weights sum to one."""
-        return state._replace(xhat=state.xhat + offset)
+    shift = Filter.shift  # affine: the weights sum to one

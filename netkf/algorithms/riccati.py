@@ -145,13 +145,6 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return inverse
 
 
-def hamiltonians(table: RiccatiTable, gaps: FloatArray) -> FloatArray:
-    """(g, 2n, 2n) ``exp(M gap)`` for gaps (g,) of at most one unit."""
-    n = table.n
-    powers = np.vander(gaps, TAYLOR_TERMS, increasing=True)
-    return np.asarray((powers @ table.series[:, : 4 * n * n]).reshape(len(gaps), 2 * n, 2 * n))
-
-
 def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, FloatArray]:
     """``exp(M gap)`` (2n, 2n) and ``exp(A gap)`` (n, n) for a gap of at most one unit."""
     n = table.n

@@ -24,7 +24,6 @@ from :func:`update_room`; wrappers for Python take one node and return new array
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -365,8 +364,3 @@ def intersect_roots(
         add_to_intersection(float(weights[m]), roots, means, m, means, 0, room)
     end_intersection(root, x, 0, means, 0, room)
     return x[0], root[0]
-
-
-def stack_roots(roots: Sequence[FloatArray]) -> FloatArray:
-    """(K, n, n), triangular, of roots (n, c) of any kind."""
-    return np.stack([lower_root(root) for root in roots])

@@ -6,13 +6,10 @@ import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.filter import Estimate
-from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import AVERAGE, PushSum, averaged
-from netkf.algorithms.slot import SlotFilter, update_and_predict
-from netkf.core.fields import positive, setting
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
 
@@ -290,39 +287,3 @@ class SwapsTooMuch(Gossip):
             xhat, root = message.payload
             state = state._replace(xhat=xhat, root=1.4 * root)
         return state
-
-
-@dataclass(frozen=True, eq=False)
-class OwnReset(FlowFilter):
-    """A reset filter from scratch, of the former contract, that forgets its own share."""
-
-    epsilon: float = setting(positive)
-
-    def absorb(self, state, messages):
-        P = state.P
-        for weight, payload, _ in messages:
-            P = P + weight * payload.P
-        return state._replace(P=P)
-
-    def weight(self, degree, peer_degree):
-        return self.epsilon
-
-
-@dataclass(frozen=True, eq=False)
-class OwnSwap(SlotFilter):
-    """The same, a gossip filter that takes twice the partner's covariance."""
-
-    first_slot = 1
-    pairwise = True
-
-    def emit(self, state, phase):
-        return state.xhat, state.root
-
-    def absorb(self, state, phase, messages):
-        for _, (xhat, root), _ in messages:
-            state = state._replace(xhat=xhat, root=1.4 * root)
-        return state
-
-    def sense(self, state, reading):
-        xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
-        return state._replace(xhat=xhat, root=root)

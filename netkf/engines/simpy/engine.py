@@ -14,7 +14,7 @@ from netkf.algorithms.filter import Filter
 from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
-from netkf.engines.simpy.nodes import ClockedNode, Node
+from netkf.engines.simpy.nodes import ClockedNode, Node, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import (
     FIRST_RANK,
@@ -95,7 +95,7 @@ class _Simulation:
             return ClockedNode(*common, *_identity(scenario, node, entity))
 
         nodes = _nodes(scenario, make)
-        sums = _Sums(_distinct(nodes))
+        sums = _Sums(distinct(nodes))
         shared = (scenario, streams, timeline, self._recorder)
         return [
             self._sampling(truth, nodes, sums),
@@ -108,7 +108,7 @@ class _Simulation:
         """Show the states at the probe times."""
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
-            for node in _distinct(nodes):
+            for node in distinct(nodes):
                 node.predict_to(time)
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
 
@@ -118,10 +118,10 @@ class _Simulation:
         """
         for k, time in enumerate(truth.frame_times.tolist()):
             yield self.timeline.at(time, Rank.REBASE, 0)
-            for node in _distinct(nodes):
+            for node in distinct(nodes):
                 node.predict_to(time)
             offset = -truth.rebase(k)
-            for node in _distinct(nodes):
+            for node in distinct(nodes):
                 node.shift(offset)
             self._transmitter.shift(self._scenario.hosted, offset)
 
@@ -135,7 +135,7 @@ class _Simulation:
             return SlotNode(recorder, schedule, period, *_identity(scenario, node, entity))
 
         nodes = _nodes(scenario, make)
-        processes = [node.running(self.timeline) for node in _distinct(nodes)]
+        processes = [node.running(self.timeline) for node in distinct(nodes)]
         for node, placed in scenario.placed.items():
             sensors = [scenario.slot_path(streams, node, place) for place in placed]
             entity = scenario.topology.index[node]
@@ -144,7 +144,7 @@ class _Simulation:
         if scenario.hosted.talks:
             shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)
             processes.append(SlotClock(*shared).ticking(self.timeline))
-        sums = _Sums(_distinct(nodes))
+        sums = _Sums(distinct(nodes))
         return [self._sampling_slots(truth, schedule, nodes, sums), *processes]
 
     def _sampling_slots(
@@ -159,7 +159,7 @@ class _Simulation:
                 self._record(time, truth.absolute(slot), truth.local(slot), nodes, sums)
             if truth.frame_slots and slot and slot % truth.frame_slots == 0:
                 offset = -truth.rebase(slot)
-                for node in _distinct(nodes):
+                for node in distinct(nodes):
                     node.shift(offset)
 
         while True:
@@ -183,7 +183,7 @@ class _Simulation:
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
         """Hand one sample on; ``local`` is the state in the coordinates of the estimates."""
         scenario, recorder = self._scenario, self._recorder
-        shown = {id(n): n.algorithm.estimate(n.state) for n in _distinct(nodes)}
+        shown = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [shown[id(nodes[node])] for node in scenario.nodes]
         near = np.array([xhat for xhat, _ in estimates])
         nothing = np.full((len(x), len(x)), math.nan)
@@ -223,10 +223,6 @@ def _identity(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         scenario.start(first),
         scenario.node_infos[entity],
     )
-
-
-def _distinct(nodes: dict[int, Any]) -> list[Any]:
-    return list({id(node): node for node in nodes.values()}.values())
 
 
 class _Sums:

@@ -8,6 +8,7 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
+from netkf.algorithms.flow import stretch_end
 from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.engines.base import LONGER, SHORTEST_SHARE, Rank
 from netkf.engines.simpy.timeline import Timeline
@@ -109,8 +110,7 @@ class ClockedNode(Node):
             end = time
             interval = self.algorithm.max_measurement_interval(self.state)
             if interval < time - self._now:
-                end = self._now + max(interval, least)
-                end = end if self._now < end < time else time
+                end = stretch_end(self._now, time, max(interval, least))
                 least *= LONGER
             gap = end - self._now
             self.state = self.algorithm.predict(self.state, gap)
@@ -168,3 +168,8 @@ class ClockedNode(Node):
         self.state = self.algorithm.absorb(self.state, messages, Exchange(time=time))
         oldest = max(message.age for message in messages)
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))
+
+
+def distinct(nodes: dict[int, Any]) -> list[Any]:
+    """The carriers of these nodes, each once: a filter that is pooled has one for all."""
+    return list({id(node): node for node in nodes.values()}.values())

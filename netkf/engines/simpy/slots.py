@@ -17,7 +17,7 @@ from netkf.algorithms.filter import Exchange, Reading
 from netkf.core.arrays import FloatArray
 from netkf.core.streams import Streams
 from netkf.engines.base import Rank
-from netkf.engines.simpy.nodes import Envelope, Node
+from netkf.engines.simpy.nodes import Envelope, Node, distinct
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.network.matchings import Matching, RecordedSlots
@@ -238,6 +238,7 @@ class SlotClock:
     ) -> None:
         self._scenario, self._recorder, self._schedule = scenario, recorder, schedule
         self._nodes, self._algorithm = nodes, scenario.hosted
+        self._distinct = distinct(nodes)
         self._matching_random = streams.generator("matching")
         links = scenario.topology.links if scenario.hosted.talks else ()
         self._talking = sorted({node for link in links for node in link})
@@ -258,7 +259,7 @@ class SlotClock:
 
     def _exchange(self, stage: Stage, slot: int) -> None:
         now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
-        for node in {id(n): n for n in self._nodes.values()}.values():
+        for node in self._distinct:
             node.open(stage.number)
         pairs, up = self._pairs(stage, slot, broadcast)
         senders = self._talking
