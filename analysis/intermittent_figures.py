@@ -19,7 +19,7 @@ CELLS = ((2.41, 3.0), (5.82, 7.0), (2.41, 15.0))
 
 def scalar_cells(axes, delivery, samples):
     """Fig. 1: the law on the cells S_0, S_1 and S_0 to S_2: exact curve and samples."""
-    law = netkf.theory.scalar_law(*SCALAR, delivery)
+    law = netkf.theory.intermittent.scalar_law(*SCALAR, delivery)
     P = np.sort(netkf.theory.invariant_samples(*SCALAR, delivery, samples, seed=1)[:, 0, 0])
     share = np.arange(1, len(P) + 1) / len(P)
     for ax, (low, high) in zip(axes, CELLS, strict=True):

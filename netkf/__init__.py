@@ -6,41 +6,40 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
+from netkf.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from netkf import parts, testing, theory
-    from netkf.experiments.checking.check import check
-    from netkf.experiments.ensembles.monte_carlo import Ensemble, monte_carlo
-    from netkf.experiments.run import save
-    from netkf.experiments.simulate import simulate
-    from netkf.experiments.studies.compare import compare
-    from netkf.experiments.studies.consistency import consistency
-    from netkf.experiments.studies.size import size
-    from netkf.experiments.studies.sweep import sweep
+    from netkf.checks.check import check
+    from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
+    from netkf.runs.run import save
+    from netkf.runs.simulate import simulate
     from netkf.scenario.reading import load
     from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
+    from netkf.studies.compare import compare
+    from netkf.studies.consistency import consistency
+    from netkf.studies.size import size
+    from netkf.studies.sweep import sweep
     from netkf.trace.run import Run, first_difference
-
-__version__ = "0.1.0"
 
 _WHERE = {
     "Belief": "netkf.scenario.scenario",
-    "Ensemble": "netkf.experiments.ensembles.monte_carlo",
+    "Ensemble": "netkf.ensembles.monte_carlo",
     "Filtering": "netkf.scenario.scenario",
     "Network": "netkf.scenario.scenario",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
-    "compare": "netkf.experiments.studies.compare",
-    "consistency": "netkf.experiments.studies.consistency",
+    "compare": "netkf.studies.compare",
+    "consistency": "netkf.studies.consistency",
     "first_difference": "netkf.trace.run",
     "load": "netkf.scenario.reading",
-    "check": "netkf.experiments.checking.check",
-    "monte_carlo": "netkf.experiments.ensembles.monte_carlo",
+    "check": "netkf.checks.check",
+    "monte_carlo": "netkf.ensembles.monte_carlo",
     "parts": "netkf.parts",
-    "save": "netkf.experiments.run",
-    "simulate": "netkf.experiments.simulate",
-    "size": "netkf.experiments.studies.size",
-    "sweep": "netkf.experiments.studies.sweep",
+    "save": "netkf.runs.run",
+    "simulate": "netkf.runs.simulate",
+    "size": "netkf.studies.size",
+    "sweep": "netkf.studies.sweep",
     "testing": "netkf.testing",
     "theory": "netkf.theory",
 }

@@ -2,6 +2,6 @@
 
 import sys
 
-from netkf.cli import main
+from netkf.cli.main import main
 
 sys.exit(main())

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 import netkf
-from netkf.core import compiling
 from netkf.engines.compiled.event_loop import event_loop
 from netkf.engines.compiled.slotted import KERNELS
+from netkf.linalg import compiling
 from netkf.scenario.reading import from_table
 
 ROOT = Path(__file__).parent.parent

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import netkf
-from netkf.cli import main, parse_changes
+from netkf.cli.main import main, parse_changes
 from tests.conftest import SCENARIOS
 
 RING = str(SCENARIOS / "poisson_ring.toml")
@@ -34,7 +34,7 @@ def test_run_ends_with_a_table_and_a_picture(tmp_path, capsys):
 
 
 def test_a_missing_matplotlib_is_told_and_costs_the_picture_only(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "netkf.experiments.plots", None)
+    monkeypatch.setitem(sys.modules, "netkf.runs.plots", None)
     out = tmp_path / "out"
     assert main(["run", RING, "--out", str(out), "--set", "horizon=2.0"]) == 0
     assert "pip install matplotlib" in capsys.readouterr().err
@@ -100,7 +100,7 @@ def test_public_names_exist():
 def test_an_interrupted_run_leaves_what_was_finished(tmp_path, name):
     out = tmp_path / "out"
     arguments = ["run", RING, "--set", "horizon=100000.0", "--set", "probe=1.0", "--out", str(out)]
-    code = f"import sys; from netkf.cli import main; sys.exit(main({arguments!r}))"
+    code = f"import sys; from netkf.cli.main import main; sys.exit(main({arguments!r}))"
     run = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     for _ in range(600):
         time.sleep(0.1)
@@ -122,7 +122,7 @@ def test_nothing_is_claimed_to_be_kept_where_nothing_was_written(capsys, monkeyp
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("netkf.experiments.promises.promises", stop)
+    monkeypatch.setattr("netkf.runs.promises.promises", stop)
     assert main(["theory", RING]) == 130
     assert capsys.readouterr().err == "netkf: interrupted\n"
 
@@ -130,7 +130,7 @@ def test_nothing_is_claimed_to_be_kept_where_nothing_was_written(capsys, monkeyp
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_a_full_disk_is_told_in_one_line(tmp_path):
     arguments = ["run", RING, "--set", "horizon=2.0", "--no-plot", "--out", str(tmp_path / "out")]
-    code = f"import sys; from netkf.cli import main; sys.exit(main({arguments!r}))"
+    code = f"import sys; from netkf.cli.main import main; sys.exit(main({arguments!r}))"
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-c", code],

@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 import netkf
-from netkf.cli import _parser
+from netkf.cli.main import _parser
 from netkf.scenario.reading import from_table
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Belief, Scenario

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 import netkf
-from netkf.experiments.run import run_to_directory
+from netkf.runs.run import run_to_directory
 
 
 def test_all_parts_can_be_taken_at_once():

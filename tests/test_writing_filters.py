@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 import netkf
-from netkf.cli import main
+from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.testing import check_filter
 from tests.conftest import ROOT

@@ -20,7 +20,7 @@ from netkf.algorithms.filter import (
 )
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.slot import Role, SlotFilter
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 
 AnyFilter = Filter | FlowFilter | SlotFilter
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.root_update import intersect_roots
+from netkf.algorithms.kernels.root_update import intersect_roots
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo
+from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.models import first_root
-from netkf.algorithms.root_update import intersect_roots
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, either, nested, setting, square
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import compilable
 
 METROPOLIS = "metropolis"
 

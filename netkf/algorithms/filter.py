@@ -19,8 +19,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.fields import Part
+from netkf.linalg.arrays import FloatArray
 
 CLOCKS = ("links", "directions", "nodes", "readings")
 """What may make a node transmit in continuous time, see network.clocks."""

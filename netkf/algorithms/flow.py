@@ -16,12 +16,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Increments
-from netkf.algorithms.gains import gain_update
+from netkf.algorithms.kernels.gains import gain_update
+from netkf.algorithms.kernels.riccati import riccati_step
 from netkf.algorithms.models import FlowModel, usable
-from netkf.algorithms.riccati import riccati_step
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import in_place
 from netkf.core.fields import Part
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import in_place
 
 Reading = Increments
 """What the sensors of a node saw over the last ``gap`` seconds."""

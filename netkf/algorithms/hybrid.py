@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
-from netkf.algorithms.root_update import combine_roots
-from netkf.core.arrays import FloatArray
+from netkf.algorithms.kernels.root_update import combine_roots
 from netkf.core.fields import number, setting
+from netkf.linalg.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

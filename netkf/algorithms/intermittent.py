@@ -8,8 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.models import first_root, sample_update
-from netkf.core.arrays import FloatArray
 from netkf.core.fields import choice, positive, setting
+from netkf.linalg.arrays import FloatArray
 
 SLACK = 1.0 + 1e-6
 """Ages are rounded."""

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.gains import GainTable, gain_table
-from netkf.algorithms.riccati import RiccatiTable, riccati_table
-from netkf.algorithms.root_flow import FlowTable, flow_root, flow_table, gain_update_root
-from netkf.algorithms.root_update import lower_root, update_with_sample
-from netkf.algorithms.square_root import predict_root
-from netkf.core.arrays import FloatArray, square_root, symmetric
-from netkf.core.compiling import in_place
+from netkf.algorithms.kernels.gains import GainTable, gain_table
+from netkf.algorithms.kernels.riccati import RiccatiTable, riccati_table
+from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
+from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
+from netkf.algorithms.kernels.square_root import predict_root
+from netkf.linalg.arrays import FloatArray, square_root, symmetric
+from netkf.linalg.compiling import in_place
 
 STRETCH = 1.0
 
@@ -108,7 +108,7 @@ class FlowModel:
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
-        """The estimate once the increments of the gap are used, see algorithms/gains."""
+        """The estimate once the increments of the gap are used, see algorithms/kernels/gains."""
         return gain_update_root(self.gains, root, xhat, moments, gap)
 
     def max_interval(self, root: FloatArray) -> float:

@@ -17,14 +17,14 @@ import numpy as np
 
 from netkf.algorithms import running_sums
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.square_root import lower_triangular
+from netkf.algorithms.kernels.stopping import RULES, stops
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.running_sums import Offer, RunningSums
-from netkf.algorithms.square_root import lower_triangular
-from netkf.algorithms.stopping import RULES, stops
-from netkf.core.arrays import FloatArray, square_root, symmetric
-from netkf.core.compiling import compilable
 from netkf.core.fields import boolean, choice, integer, number, positive, setting
-from netkf.core.small import applied, even, product, solution
+from netkf.linalg.arrays import FloatArray, square_root, symmetric
+from netkf.linalg.compiling import compilable
+from netkf.linalg.small import applied, even, product, solution
 
 MASS, AVERAGE = 0, 1
 """The two exchanges of a slot."""

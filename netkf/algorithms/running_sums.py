@@ -28,9 +28,9 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.filter import Message, NodeInfo, Reading
+from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.models import Backward, first_root, sample_update
-from netkf.algorithms.root_update import lower_root
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 
 SHOWN = 1e-4
 """How exactly a total must grow by what is offered, in parts of it; or else nothing is offered."""

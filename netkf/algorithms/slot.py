@@ -22,12 +22,12 @@ from netkf.algorithms.baselines import Local as SlotLocal
 from netkf.algorithms.filter import Reading
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.kernels.square_root import lower_triangular, predict_root, update_root
 from netkf.algorithms.models import SlotModel
-from netkf.algorithms.square_root import lower_triangular, predict_root, update_root
-from netkf.core.arrays import FloatArray, square_root
-from netkf.core.compiling import compilable
 from netkf.core.fields import Part
-from netkf.core.small import applied, product, solution
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.compiling import compilable
+from netkf.linalg.small import applied, product, solution
 
 __all__ = [
     "Gossip",

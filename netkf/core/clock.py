@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Part
+from netkf.linalg.arrays import FloatArray
 
 Entity = Any
 """A tuple of ids: those of a link's ends, (node,), or (node, ordinal of its sensor).

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, frozen, is_semidefinite
 from netkf.core.errors import ScenarioError
+from netkf.linalg.arrays import FloatArray, frozen, is_semidefinite
 
 
 @dataclass(frozen=True)

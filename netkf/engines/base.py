@@ -1,7 +1,7 @@
 """What every engine promises, and the order of things that happen at one instant.
 
 1. Simultaneous events run by (time, rank, entity), never by accident of insertion.
-2. All randomness comes from core.streams, one generator for each purpose and entity.
+2. All randomness comes from rng.streams, one generator for each purpose and entity.
 3. A message is known by its directed link and its number on that link.
 4. The horizon is half open, [0, T); a sample at T is taken after everything before T.
 5. Nothing is sent at time 0.
@@ -15,9 +15,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
 from netkf.engines.soundness import sound
+from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 

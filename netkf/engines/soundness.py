@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Part,
@@ -20,6 +19,7 @@ from netkf.core.fields import (
     probability,
     setting,
 )
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
 
 

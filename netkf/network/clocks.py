@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.clock import Clock, Entity
+from netkf.core.csv_files import read_columns, read_header, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Rule,
@@ -26,7 +26,7 @@ from netkf.core.fields import (
     several,
     source_file,
 )
-from netkf.core.tables import read_columns, read_header, whole
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology, demand_links, demand_nodes
 
 AT = ("links", "directions", "nodes")

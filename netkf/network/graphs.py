@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from netkf.core.csv_files import read_columns, read_header, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Part,
@@ -25,7 +26,6 @@ from netkf.core.fields import (
     several,
     source_file,
 )
-from netkf.core.tables import read_columns, read_header, whole
 
 if TYPE_CHECKING:
     import networkx

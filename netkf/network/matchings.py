@@ -13,7 +13,7 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
+from netkf.core.csv_files import read_columns, read_header, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Part,
@@ -24,7 +24,7 @@ from netkf.core.fields import (
     setting,
     source_file,
 )
-from netkf.core.tables import read_columns, read_header, whole
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology, demand_links
 
 MOST_EDGES = 20  # beyond it the recursions over sets of edges take too long

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.core.csv_files import read_columns, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, choice, setting, source_file
-from netkf.core.tables import read_columns, whole
 from netkf.network.channels import Delay, Loss
 from netkf.network.graphs import Link, Topology, demand_links
 

@@ -9,8 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import matrix, positive, setting, square
+from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.laws import Laws
 from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
@@ -128,7 +128,7 @@ def default_sensing_period(
     """The sensing period for which the errors' covariance is within 1e-3 of the exact one.
 
     ``informations`` are the matrices H' R^-1 H of the nodes that sense, ``longest`` what their
-    filters can use at once (algorithms/gains). The period is a fraction
+    filters can use at once (algorithms/kernels/gains). The period is a fraction
     of the fastest time constant of the plant and of a node's own filter (a large
     covariance asks for nothing shorter, see FlowFilter.stretch), rounded down to 1, 2 or 5 times a
     power of ten. It depends on nothing else, so that filters and networks meet the same truth.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, symmetric, symmetric_root
-from netkf.core.legendre import forward_coefficients
-from netkf.core.series import polynomial, with_reach
+from netkf.linalg.arrays import FloatArray, symmetric, symmetric_root
+from netkf.linalg.legendre import forward_coefficients
+from netkf.linalg.series import polynomial, with_reach
 from netkf.plants.recursion import Recursion
 
 MOST_SPLITS = 256  # kept laws of a state shown inside a step
@@ -103,7 +103,7 @@ class Laws:
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
     """Power series in the gap of ``exp(A g)`` (terms, n n + 1) and of its two moments
-    (terms, 2 n n + 1), with their reach, see core/series.
+    (terms, 2 n n + 1), with their reach, see linalg/series.
     """
     n, size = len(A), float(np.abs(A).sum(axis=0).max()) * longest
     terms, last = 1, 1.0

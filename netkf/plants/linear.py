@@ -13,8 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, square_root
 from netkf.core.fields import covariance, positive, setting, square
+from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.plant import Plant
 from netkf.plants.recursion import Recursion
 from netkf.plants.transitions import frame_slots

@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import in_place
-from netkf.core.series import fill_polynomial, polynomial
-from netkf.core.small import added, applied
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import in_place
+from netkf.linalg.series import fill_polynomial, polynomial
+from netkf.linalg.small import added, applied
 from netkf.plants.laws import Laws, grid_time
 from netkf.plants.transitions import Transitions
 

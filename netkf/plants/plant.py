@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.fields import Part, covariance, setting, vector
+from netkf.linalg.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, frozen
+from netkf.core.csv_files import finite_numbers, read_columns, read_header, read_rows, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -25,7 +25,7 @@ from netkf.core.fields import (
     several,
     source_file,
 )
-from netkf.core.tables import finite_numbers, read_columns, read_header, read_rows, whole
+from netkf.linalg.arrays import FloatArray, frozen
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.sampling import RecordedSamples

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 
 
 class Recursion:

@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray, frozen, square_root
 from netkf.core.fields import covariance, definite_covariance, matrix, setting, square, vector
+from netkf.linalg.arrays import FloatArray, frozen, square_root
 from netkf.plants.linear import LinearPath, SlotReadings
 from netkf.plants.recursion import Recursion
 from netkf.plants.sensors import Sensor

@@ -9,11 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.clock import Clock, Entity
+from netkf.core.csv_files import read_columns, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Rule, SourceFile, setting, source_file
-from netkf.core.tables import read_columns, whole
+from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import SlotReadings
 
 

@@ -17,9 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.clock import Clock, all_ticks
-from netkf.core.compiling import in_place
 from netkf.core.fields import (
     Part,
     definite_covariance,
@@ -28,7 +26,9 @@ from netkf.core.fields import (
     setting,
     several,
 )
-from netkf.core.small import added, product
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import in_place
+from netkf.linalg.small import added, product
 from netkf.plants.linear import Readings, SlotReadings
 from netkf.plants.paths import BLOCK, DiffusionPath
 from netkf.plants.sampling import DrawnSamples, Samples, sampling

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 
 UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
 DEPENDENT = 1e-9  # share of a row's norm below which what is left of it counts as rounding

@@ -13,9 +13,9 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
+from netkf.linalg.arrays import FloatArray
 from netkf.plants.transitions import Transitions
 
 TOLERANCE = 1e-9  # seconds by which a recorded time may be off

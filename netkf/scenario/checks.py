@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netkf.algorithms.gains import longest_interval
+from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Part

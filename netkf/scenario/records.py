@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.core.streams import Streams
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
 from netkf.plants.truth import TOLERANCE
+from netkf.rng.streams import Streams
 from netkf.scenario.sampling import all_sample_times, sample_times
 
 if TYPE_CHECKING:

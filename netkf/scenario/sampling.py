@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from netkf.algorithms.filter import commutes
-from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
-from netkf.core.streams import Streams
+from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import RecordedDiffusion, RecordedSensor, UnknownDiffusion
 from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.plants.transitions import frame_period, frame_slots
 from netkf.plants.truth import ContinuousTruth
+from netkf.rng.streams import Streams
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Placed, Scenario

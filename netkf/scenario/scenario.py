@@ -14,10 +14,9 @@ import scipy.linalg
 from netkf.algorithms.adapters import AnyFilter, adapted
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.gains import longest_interval
+from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel, SlotModel
 from netkf.algorithms.slot import SlotFilter
-from netkf.core.arrays import FloatArray, block_diagonal, symmetric
 from netkf.core.errors import TheoryError
 from netkf.core.fields import (
     Part,
@@ -37,7 +36,7 @@ from netkf.core.fields import (
     text,
     vector,
 )
-from netkf.core.streams import Streams
+from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Graph, Link, Topology
@@ -49,6 +48,7 @@ from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sampling import Samples
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.rng.streams import Streams
 from netkf.scenario import sampling
 
 

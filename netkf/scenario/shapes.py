@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from netkf.core.arrays import FloatArray
 from netkf.core.errors import ScenarioError
+from netkf.linalg.arrays import FloatArray
 
 
 def demand_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:

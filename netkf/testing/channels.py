@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
+from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Channel, Delay, Fates, Loss
 from netkf.network.graphs import Link
+from netkf.rng.streams import Streams
 from netkf.testing.generators import Told, spoken
 from netkf.testing.watching import Watched, demand, fail, global_randomness, made
 

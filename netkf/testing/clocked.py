@@ -10,9 +10,9 @@ import scipy.linalg
 
 from netkf.algorithms.adapters import FlowAdapter
 from netkf.algorithms.filter import Exchange, Increments, Message
-from netkf.algorithms.gains import longest_interval
+from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 from netkf.testing.filters import System, check_estimate
 from netkf.testing.trials import Trial
 from netkf.testing.watching import Watched, demand

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.testing.generators import Told

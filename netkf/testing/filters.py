@@ -11,8 +11,8 @@ from netkf.algorithms.adapters import FlowAdapter, SlotAdapter, adapted
 from netkf.algorithms.filter import CLOCKS, Filter, commutes
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.slot import SlotFilter
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
+from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
 from netkf.testing.watching import Watched, demand, difference, leaves, made
 
 SYMMETRY, SEMIDEFINITE = 1e-9, 1e-9

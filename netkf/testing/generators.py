@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.streams import Streams
+from netkf.rng.streams import Streams
 
 Calls = list[tuple[str, int]]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.arrays import ArrayLike, symmetric
+from netkf.linalg.arrays import ArrayLike, symmetric
 from netkf.testing.watching import demand, fail
 
 

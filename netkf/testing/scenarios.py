@@ -34,8 +34,8 @@ def assert_promises(
     Raises AssertionError whose text has a line for each broken promise, TheoryError where nothing
     is promised of the filter, ScenarioError for a bad file or bad arguments.
     """
-    from netkf.experiments.checking.check import check
-    from netkf.experiments.checking.evidence import BROKEN
+    from netkf.checks.check import check
+    from netkf.checks.evidence import BROKEN
 
     chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
     verdict = check(chosen, runs, seed, confidence, workers)

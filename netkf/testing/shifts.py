@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray
 from netkf.testing.trials import Shown, Trial, trials
 from netkf.testing.watching import Watched, demand
 

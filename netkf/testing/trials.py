@@ -11,8 +11,8 @@ import numpy as np
 
 from netkf.algorithms.adapters import SlotAdapter
 from netkf.algorithms.filter import Exchange, Message, NodeInfo, Reading
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
+from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
 from netkf.testing.filters import System, check_estimate, check_state_pickles, systems
 from netkf.testing.watching import Watched, demand
 

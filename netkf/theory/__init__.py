@@ -1,14 +1,14 @@
 """What the papers promise, computed: functions on scenarios and on plain matrices."""
 
 from netkf.theory.assumptions import assumptions
-from netkf.theory.bounds import covariance_bound
-from netkf.theory.certified_gamma import exact_minimum_gamma, gamma_constants, minimum_gamma
-from netkf.theory.demands import demanding
-from netkf.theory.disconnection import Probability, disconnection_probability
-from netkf.theory.errors import error_covariance
-from netkf.theory.gossip import detecting_walk, mean_matching
-from netkf.theory.information import information_level
-from netkf.theory.intermittent import (
+from netkf.theory.common.errors import error_covariance
+from netkf.theory.common.requirements import demanding
+from netkf.theory.diffusion.information import information_level
+from netkf.theory.gossip.matchings import detecting_walk, mean_matching
+from netkf.theory.hybrid.bounds import covariance_bound
+from netkf.theory.hybrid.limits import central_covariance, limit_covariance, true_limit_covariance
+from netkf.theory.hybrid.steady import steady_covariance_bound
+from netkf.theory.intermittent.riccati import (
     critical_certificate,
     critical_probability,
     invariant_samples,
@@ -17,13 +17,17 @@ from netkf.theory.intermittent import (
     steady_covariance,
     support,
 )
-from netkf.theory.limits import central_covariance, limit_covariance, true_limit_covariance
-from netkf.theory.matrices import riccati_flow
-from netkf.theory.mean_square import push_sum_radius, push_sum_stability
-from netkf.theory.push_sum import consensus_gain_bound, push_sum_limits
-from netkf.theory.push_sum_covariance import push_sum_error_covariance
-from netkf.theory.scalar_law import scalar_law
-from netkf.theory.steady import steady_covariance_bound
+from netkf.theory.intermittent.scalar_law import scalar_law
+from netkf.theory.numerics.matrices import riccati_flow
+from netkf.theory.push_sum.certified_gamma import (
+    exact_minimum_gamma,
+    gamma_constants,
+    minimum_gamma,
+)
+from netkf.theory.push_sum.covariance import push_sum_error_covariance
+from netkf.theory.push_sum.disconnection import Probability, disconnection_probability
+from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
+from netkf.theory.push_sum.mean_square import push_sum_radius, push_sum_stability
 
 __all__ = [
     "Probability",

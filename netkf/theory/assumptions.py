@@ -14,12 +14,12 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
-from netkf.theory.coupled import balanced
-from netkf.theory.evidence import Row, knowledge, of_the_truth
-from netkf.theory.matrices import unobservable
-from netkf.theory.push_sum_assumptions import push_sum_rows
-from netkf.theory.samples import at_random, by_readings, clock_of
-from netkf.theory.slot_assumptions import slot_rows
+from netkf.theory.common.evidence import Row, knowledge, of_the_truth
+from netkf.theory.common.slot_assumptions import slot_rows
+from netkf.theory.hybrid.coupled import balanced
+from netkf.theory.hybrid.samples import at_random, by_readings, clock_of
+from netkf.theory.numerics.matrices import unobservable
+from netkf.theory.push_sum.assumptions import push_sum_rows
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,8 +18,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.interrupts import undisturbed
+from netkf.linalg.arrays import FloatArray
 from netkf.trace.schema import CODES, EVENT, KINDS
 
 BLOCK = 1 << 17  # rows; large enough that the system gives memory for them in large pages

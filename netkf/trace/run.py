@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.errors import quote
+from netkf.linalg.arrays import FloatArray
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from netkf import theory
-from netkf.algorithms import chains
+from netkf.algorithms.kernels import chains
 
 RANDOM = np.random.default_rng(5)
 READINGS = [  # of no, one and two rows

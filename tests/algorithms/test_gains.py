@@ -5,10 +5,10 @@ import pytest
 import scipy.linalg
 
 from netkf.algorithms.filter import Estimate, Exchange, Increments, Message, State
-from netkf.algorithms.gains import gain_table, longest_interval
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.kernels.gains import gain_table, longest_interval
+from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
 from netkf.algorithms.models import FlowModel
-from netkf.algorithms.riccati import riccati_step, riccati_table
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
 

@@ -5,7 +5,7 @@ import pytest
 
 import netkf
 from netkf import theory
-from netkf.algorithms.intersection import intersection
+from netkf.algorithms.kernels.intersection import intersection
 from tests.engines.linearity import engine_covariance
 
 PLANAR = {

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netkf.algorithms.filter import Exchange, Message, NodeInfo
+from netkf.algorithms.kernels.stopping import settled, within
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.push_sum import (
     MASS,
@@ -19,7 +20,6 @@ from netkf.algorithms.push_sum import (
     mixed,
     share,
 )
-from netkf.algorithms.stopping import settled, within
 
 EXCHANGE = Exchange(phase=MASS, step=0, slot=1)
 EDGES = ((0, 1), (1, 2), (0, 2), (2, 3), (3, 4))

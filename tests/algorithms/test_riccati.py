@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import netkf
-from netkf.algorithms.riccati import riccati_step, riccati_table
+from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
 
 WALK = np.array([[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
 PUSH = np.diag([0.0, 0.25, 0.0, 0.25])

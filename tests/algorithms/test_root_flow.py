@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from netkf.algorithms.gains import gain_table, gain_update
-from netkf.algorithms.riccati import riccati_step, riccati_table
-from netkf.algorithms.root_flow import (
+from netkf.algorithms.kernels.gains import gain_table, gain_update
+from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.algorithms.kernels.root_flow import (
     flow_room,
     flow_root,
     flow_table,
@@ -16,7 +16,7 @@ from netkf.algorithms.root_flow import (
     move_root,
     stack_tables,
 )
-from netkf.algorithms.root_update import lower_root, update_with_sample
+from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
 from tests import reference
 from tests.algorithms.test_root_update import distance, wide_root
 

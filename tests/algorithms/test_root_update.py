@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from netkf.algorithms.root_update import (
+from netkf.algorithms.kernels.root_update import (
     combine_roots,
     intersect_roots,
     lower_root,

@@ -32,7 +32,6 @@ import numpy as np
 import simpy
 
 import netkf
-from netkf.core.streams import Streams
 from netkf.engines.base import silent
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.compiled.poisson import schedule
@@ -40,7 +39,8 @@ from netkf.engines.compiled.schedule import EntityDraws
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import entity_records, filters_at_start
 from netkf.engines.simpy.engine import SimpyEngine
-from netkf.theory import intermittent
+from netkf.rng.streams import Streams
+from netkf.theory.intermittent import riccati as intermittent
 from netkf.trace.recorder import MemorySink, Recorder
 from tests.benchmarks import peers
 from tests.benchmarks.engine import scenario as thousand

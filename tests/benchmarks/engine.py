@@ -17,9 +17,9 @@ import simpy
 
 import netkf
 from netkf.algorithms.hybrid import Hybrid
-from netkf.core.streams import Streams
 from netkf.engines.base import silent
 from netkf.engines.simpy.engine import SimpyEngine
+from netkf.rng.streams import Streams
 from netkf.trace.recorder import MemorySink, Recorder
 
 RING = Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml"

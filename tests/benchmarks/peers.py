@@ -16,8 +16,8 @@ import scipy.linalg
 import scipy.sparse.linalg
 
 import netkf
-from netkf.theory.coupled import coupled
-from netkf.theory.packed import Packed
+from netkf.theory.hybrid.coupled import coupled
+from netkf.theory.hybrid.packed import Packed
 from tests.benchmarks.engine import RING
 
 EPOCH = datetime.datetime(2000, 1, 1)

@@ -14,9 +14,9 @@ import time
 from pathlib import Path
 
 import netkf
-from netkf.core.streams import Streams
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.experiments.files import ParquetSink
+from netkf.rng.streams import Streams
+from netkf.runs.files import ParquetSink
 from netkf.trace.recorder import Recorder
 from tests.benchmarks.engine import RING
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.algorithms.chains import advance, alphabet
+from netkf.algorithms.kernels.chains import advance, alphabet
 from tests.benchmarks import compiled, peers
 
 

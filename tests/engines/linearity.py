@@ -7,8 +7,8 @@ draw, with that draw 1 and all others 0, gives the columns of the linear map, he
 import numpy as np
 
 from netkf import simulate
-from netkf.core.streams import Streams
 from netkf.engines.simpy.engine import SimpyEngine
+from netkf.rng.streams import Streams
 from netkf.trace.recorder import MemorySink, Recorder
 
 GAUSSIAN = {"plant", "noise", "cut", "probe"}

@@ -219,7 +219,7 @@ def test_one_node_with_irregular_samples_is_filterpy(tmp_path):
     sensors = [{"nodes": [0], "H": [[1.0, 0.4]], "R": [[0.3]], "sampling": sampling}]
     made = scenario(tmp_path, flow("diffusion"), {}, {"kind": "local"}, sensors=sensors)
     run = netkf.simulate(made, engine="simpy")
-    from netkf.core.streams import Streams
+    from netkf.rng.streams import Streams
 
     streams = Streams(made.seed)
     times = made.sample_times(streams)[0, 0]

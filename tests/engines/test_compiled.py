@@ -10,16 +10,16 @@ from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 
 import netkf
-from netkf.algorithms import square_root
 from netkf.algorithms.hybrid import Hybrid
-from netkf.core import compiling, small
+from netkf.algorithms.kernels import square_root
 from netkf.core.errors import EngineError, ScenarioError
-from netkf.core.streams import Streams
 from netkf.engines.compiled import lots
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
+from netkf.linalg import compiling, small
 from netkf.network.channels import Bernoulli, Fates
 from netkf.network.clocks import Poisson
+from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
 from netkf.trace.recorder import MemorySink, Recorder
 from netkf.trace.schema import EVENT

@@ -7,9 +7,9 @@ import json
 import pytest
 
 import netkf
-from netkf.cli import main
-from netkf.core.streams import Streams
+from netkf.cli.main import main
 from netkf.engines.simpy.timeline import Timeline
+from netkf.rng.streams import Streams
 from tests.conftest import SCENARIOS
 
 STEADY = {"kind": "diffusion", "A": [[-0.5]], "B": [[1.0]], "cov": [[1.0]]}

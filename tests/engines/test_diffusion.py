@@ -8,10 +8,10 @@ import scipy.integrate
 
 import netkf
 from netkf import theory
-from netkf.core.streams import Streams
+from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
 from netkf.scenario.writing import as_table
-from netkf.theory.information import normalised_outer
+from netkf.theory.diffusion.information import normalised_outer
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
 from tests.engines.linearity import engine_covariance

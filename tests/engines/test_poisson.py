@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from netkf.core.streams import Streams, Together
 from netkf.engines.compiled import poisson
 from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson, schedule
 from netkf.engines.compiled.schedule import Schedule, whole_schedules
+from netkf.rng.streams import Streams, Together
 
 CHANNELS = {
     "shared": {"symmetric": True, "loss": {"kind": "bernoulli", "delivery": 0.7}},

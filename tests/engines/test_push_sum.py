@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.cli import main
-from netkf.experiments.run import run_to_directory
+from netkf.cli.main import main
+from netkf.runs.run import run_to_directory
 from netkf.scenario.writing import to_toml
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS

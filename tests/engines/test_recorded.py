@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.core.streams import Streams
-from netkf.experiments.run import run_to_directory
 from netkf.plants.linear import SlotReadings
+from netkf.rng.streams import Streams
+from netkf.runs.run import run_to_directory
 from netkf.scenario.reading import from_table
 
 F, Q = [[1.0, 0.2], [-0.2, 1.0]], [[0.3, 0.0], [0.0, 0.3]]

@@ -128,8 +128,8 @@ def test_local_and_central_are_the_textbook_filter(tmp_path):
 
 def readings_of(x, sensors):
     """The readings that the engine made, from the same streams."""
-    from netkf.core.streams import Streams
     from netkf.plants.linear import SlotReadings
+    from netkf.rng.streams import Streams
 
     paths = [
         SlotReadings(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from netkf.core.streams import Streams
 from netkf.network import channels
+from netkf.rng.streams import Streams
 from netkf.trace.schema import CODES
 
 import netkf  # isort: skip

@@ -6,9 +6,9 @@ import scipy.stats
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
-from netkf.core.streams import Streams
 from netkf.network.clocks import LinkClock, OnReadings, Periodic, Poisson, RecordedClock, Renewal
 from netkf.network.graphs import Edges, PathGraph
+from netkf.rng.streams import Streams
 
 LINK = (0, 1)
 

@@ -10,7 +10,7 @@ import netkf
 from netkf import theory
 from netkf.network.graphs import Cycle, Edges
 from netkf.network.matchings import Matching, maximal_matchings
-from netkf.theory.gossip import primitive
+from netkf.theory.gossip.matchings import primitive
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
 

@@ -7,7 +7,7 @@ import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table, load
 from netkf.scenario.writing import resolved, to_toml
-from netkf.theory.diffusion_assumptions import weight_matrix
+from netkf.theory.diffusion.assumptions import weight_matrix
 from tests.conftest import SCENARIOS
 
 I3 = np.eye(3).tolist()

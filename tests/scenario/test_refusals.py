@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 import netkf
-from netkf.cli import main
+from netkf.cli.main import main
 from tests.conftest import SCENARIOS
 
 LIMIT = 5  # seconds; a refusal that takes longer is a mistake too

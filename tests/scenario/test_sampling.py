@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.core.streams import Streams
 from netkf.plants.paths import DiffusionPath
 from netkf.plants.truth import RecordedTruth, SampledTruth
+from netkf.rng.streams import Streams
 from netkf.scenario import sampling
 from netkf.scenario.reading import from_table
 from netkf.scenario.writing import as_table, resolved

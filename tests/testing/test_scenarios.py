@@ -8,10 +8,10 @@ import pytest
 
 import netkf
 from netkf import testing
+from netkf.checks.check import paper_of
 from netkf.core.errors import ScenarioError, TheoryError
-from netkf.experiments.checking.check import paper_of
+from tests.checks.broken import Overconfident
 from tests.conftest import ROOT, SCENARIOS
-from tests.experiments.broken import Overconfident
 
 SHORT = {
     "blind_unstable": 8.0,

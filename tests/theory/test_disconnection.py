@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import netkf
 from netkf import theory
-from netkf.theory import disconnection
+from netkf.theory.push_sum import disconnection
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import T1, planar
 

@@ -75,7 +75,7 @@ def test_readings_over_several_links_count_by_the_sets_that_arrive(tmp_path):
     """Two scalar sensors at 0.3 each: nothing comes with probability 0.49, and 0.49 F^2 < 1, though
     neither link alone reaches the critical 0.5. Two modes seen by one sensor each: the worse one.
     """
-    from netkf.theory.intermittent import contraction_radius
+    from netkf.theory.intermittent.riccati import contraction_radius
 
     F, one, none = np.array([[2.0**0.5]]), np.ones((1, 1)), np.zeros((0, 1))
     sets = [(0.49, none), (0.21, one), (0.21, one), (0.09, np.ones((2, 1)))]

@@ -8,7 +8,7 @@ import scipy.linalg
 
 import netkf
 from netkf import theory
-from netkf.theory import certified_gamma
+from netkf.theory.push_sum import certified_gamma
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import RHO_T1, of_case, planar, scenario
 

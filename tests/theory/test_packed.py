@@ -8,10 +8,10 @@ import scipy.linalg
 import scipy.sparse
 
 from netkf import theory
-from netkf.theory import linearised
-from netkf.theory.coupled import Coupled
-from netkf.theory.packed import Packed
-from netkf.theory.taylor import StiffError, followed
+from netkf.theory.hybrid import linearised
+from netkf.theory.hybrid.coupled import Coupled
+from netkf.theory.hybrid.packed import Packed
+from netkf.theory.hybrid.taylor import StiffError, followed
 
 N, n = 5, 3
 

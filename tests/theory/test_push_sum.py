@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
-from netkf.theory import averaging, mean_square, push_sum_covariance
+from netkf.theory.push_sum import averaging, mean_square
+from netkf.theory.push_sum import covariance as push_sum_covariance
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import RHO_T1, T1, of_case, planar, scenario
 

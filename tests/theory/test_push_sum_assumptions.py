@@ -7,8 +7,8 @@ import pytest
 import scipy.linalg
 
 from netkf import theory
-from netkf.cli import main
-from netkf.experiments.promises import promises
+from netkf.cli.main import main
+from netkf.runs.promises import promises
 from netkf.scenario.writing import resolved, to_toml
 from tests.theory.push_sum_systems import RHO_T1, planar, scenario
 

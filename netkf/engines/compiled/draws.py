@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.increments import PathBlock
 from netkf.engines.compiled.state import Sensing
+from netkf.linalg.arrays import FloatArray
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time
 from netkf.plants.paths import BLOCK
 from netkf.plants.sensors import step_noise
+from netkf.rng.streams import Streams, Together
 from netkf.scenario.scenario import Placed, Scenario
 
 LEAST_CUTS, MOST_CUTS = 64, 256  # normals that a sensor has ready

@@ -9,14 +9,13 @@ import numpy as np
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
-from netkf.core import compiling
 from netkf.core.fields import Part
-from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.event_loop import event_loop
 from netkf.engines.compiled.flow import FlowRun
 from netkf.engines.compiled.lots import at_a_workspace
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
+from netkf.linalg import compiling
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import (
@@ -28,6 +27,7 @@ from netkf.plants.recorded import (
 )
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
+from netkf.rng.streams import Streams
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder

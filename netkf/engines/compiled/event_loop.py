@@ -14,16 +14,14 @@ import math
 
 import numpy as np
 
-from netkf.algorithms.root_flow import move_root
-from netkf.algorithms.root_update import (
+from netkf.algorithms.kernels.root_flow import move_root
+from netkf.algorithms.kernels.root_update import (
     add_root,
     add_to_intersection,
     begin_intersection,
     end_intersection,
     scale_root,
 )
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import kernel
 from netkf.engines.compiled.increments import PathBlock, predict_with_increments
 from netkf.engines.compiled.late_readings import (
     History,
@@ -51,6 +49,8 @@ from netkf.engines.compiled.state import (
     SWAP,
     Simulation,
 )
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
 from netkf.trace.schema import CODES
 
 SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT = (

@@ -18,13 +18,13 @@ import numpy as np
 
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
 from netkf.engines.compiled.masses import stopping
+from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Fates, checked_chance, checked_delay
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.transitions import frame_slots
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
 from netkf.trace.schema import CODES, EVENT

@@ -14,9 +14,7 @@ import numpy as np
 from netkf.algorithms.intermittent import SLACK, Intermittent
 from netkf.algorithms.models import FlowModel
 from netkf.algorithms.push_sum import PushSum
-from netkf.core.arrays import FloatArray
 from netkf.core.interrupts import undisturbed
-from netkf.core.streams import Streams
 from netkf.engines.base import Progress
 from netkf.engines.compiled.draws import Noise, Paths, no_path, sizes
 from netkf.engines.compiled.event_loop import (
@@ -55,7 +53,9 @@ from netkf.engines.compiled.state import (
     with_more_messages,
 )
 from netkf.engines.compiled.truth import KnownStates, PathStates, States
+from netkf.linalg.arrays import FloatArray
 from netkf.plants.paths import BLOCK
+from netkf.rng.streams import Streams
 from netkf.scenario.sampling import all_sample_times, uses_grid
 from netkf.scenario.scenario import Scenario
 from netkf.trace import recorder as recording

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.flow import stretch_end
+from netkf.algorithms.kernels.root_flow import gain_root, information_rate, move_root
 from netkf.algorithms.models import usable
-from netkf.algorithms.root_flow import gain_root, information_rate, move_root
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import kernel
-from netkf.core.small import fill_square
 from netkf.engines.base import LONGER, SHORTEST_SHARE
 from netkf.engines.compiled.state import Sensing, Simulation
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.small import fill_square
 from netkf.plants.paths import fill_seen
 from netkf.plants.sensors import divide, fill_reading
 

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.intermittent import SAME
-from netkf.algorithms.root_flow import move_root
-from netkf.algorithms.root_update import sample_root
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import kernel
+from netkf.algorithms.kernels.root_flow import move_root
+from netkf.algorithms.kernels.root_update import sample_root
 from netkf.engines.compiled.state import Simulation
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
 
 PAST = np.dtype(
     [("instant", np.int64), ("frame", np.int64), ("before", np.int64), ("time", np.float64)]

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cached_property
 
-from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
 from netkf.engines.compiled.flow import Draws, Source, Workspace
 from netkf.engines.compiled.increments import PathBlock
@@ -24,6 +23,7 @@ from netkf.engines.compiled.state import Instants
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
+from netkf.rng.streams import Streams, Together
 from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
 

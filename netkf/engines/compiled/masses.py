@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.kernels.stopping import PAPER, RULES, stops
 from netkf.algorithms.push_sum import PushSum, kept, share, understood
-from netkf.algorithms.stopping import PAPER, RULES, stops
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable, demanded
-from netkf.core.small import fill, fill_square
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import compilable, demanded
+from netkf.linalg.small import fill, fill_square
 from netkf.scenario.scenario import Scenario
 
 

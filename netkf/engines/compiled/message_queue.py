@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.compiling import kernel
+from netkf.linalg.compiling import kernel
 
 
 @kernel

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from netkf.core.arrays import FloatArray
 from netkf.engines.compiled.late_readings import History, remember
 from netkf.engines.compiled.running_totals import Totals
 from netkf.engines.compiled.state import READINGS, Simulation
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
 

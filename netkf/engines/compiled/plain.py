@@ -10,9 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.draws import Draws
-from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.exchanges import (
     ABSORB,
     DELIVER,
@@ -30,9 +27,12 @@ from netkf.engines.compiled.exchanges import (
     silent,
 )
 from netkf.engines.compiled.masses import stopping
+from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import alike
 from netkf.network.graphs import Link
 from netkf.network.matchings import Broadcast, Matching
+from netkf.rng.draws import Draws
+from netkf.rng.streams import Streams, Together
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
 from netkf.trace.schema import EVENT

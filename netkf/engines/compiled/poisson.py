@@ -12,10 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import kernel
-from netkf.core.draws import Draws, Ziggurat, next_exponential, next_unit, ziggurat
-from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.schedule import (
     LOST,
     Schedule,
@@ -25,7 +21,11 @@ from netkf.engines.compiled.schedule import (
     whole_schedules,
 )
 from netkf.engines.compiled.senders import Senders, senders_of
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Poisson
+from netkf.rng.draws import Draws, Ziggurat, next_exponential, next_unit, ziggurat
+from netkf.rng.streams import Streams, Together
 from netkf.scenario.scenario import Scenario
 
 TICKS, TICKS_A_LINK, MOST_TICKS = 1 << 15, 4, 1 << 20

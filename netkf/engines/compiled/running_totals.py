@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.root_flow import transform
+from netkf.algorithms.kernels.root_flow import transform
 from netkf.algorithms.running_sums import SHOWN
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import kernel
 from netkf.engines.compiled.late_readings import use_instant
 from netkf.engines.compiled.state import Simulation
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
 
 TERMS = 18  # of the exponential, for a norm of at most 1/2
 SWEEPS, SMALL = 30, 1e-32  # of Jacobi's method; squares of what is left, relative

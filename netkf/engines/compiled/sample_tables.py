@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
 from netkf.engines.compiled.state import Instants
+from netkf.linalg.arrays import FloatArray
 from netkf.plants.sampling import Samples
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Placed, Scenario
 
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.engines.base import Progress
 from netkf.engines.soundness import sound
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES

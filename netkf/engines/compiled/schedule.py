@@ -14,11 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
 from netkf.core.clock import next_ticks
-from netkf.core.draws import Draws
-from netkf.core.streams import Streams, Together
 from netkf.engines.compiled.senders import Senders, senders_of
+from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import (
     Channel,
     Fates,
@@ -30,6 +28,8 @@ from netkf.network.channels import (
 )
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.network.graphs import Link
+from netkf.rng.draws import Draws
+from netkf.rng.streams import Streams, Together
 from netkf.scenario.scenario import Scenario
 
 FIRST_BLOCK, LONGEST_BLOCK = 8, 1024

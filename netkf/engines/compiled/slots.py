@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.diffusion import shares
-from netkf.algorithms.intersection import intersected
+from netkf.algorithms.kernels.intersection import intersected
+from netkf.algorithms.kernels.square_root import predict_root
 from netkf.algorithms.push_sum import MASS, corrected, corrected_root
 from netkf.algorithms.slot import adapted, filtered
-from netkf.algorithms.square_root import predict_root
-from netkf.core.arrays import FloatArray
-from netkf.core.compiling import compilable
-from netkf.core.small import applied
 from netkf.engines.compiled.exchanges import REBASING, SAMPLING, SENSING
 from netkf.engines.compiled.masses import Masses, exchange_masses
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import compilable
+from netkf.linalg.small import applied
 
 
 class Nodes(NamedTuple):

@@ -13,11 +13,8 @@ from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.kernels.stopping import RULES
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.stopping import RULES
-from netkf.core.arrays import FloatArray, square_root
-from netkf.core.compiling import demanded
-from netkf.core.streams import Streams
 from netkf.engines.base import Progress
 from netkf.engines.compiled.exchanges import SENSING, Slots
 from netkf.engines.compiled.masses import first_masses
@@ -34,7 +31,10 @@ from netkf.engines.compiled.slots import (
     local,
     push_sum,
 )
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.compiling import demanded
 from netkf.plants.linear import Truth
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Recorder
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.gains import GainTable
+from netkf.algorithms.kernels.gains import GainTable
+from netkf.algorithms.kernels.root_flow import FlowRoom, FlowTable, flow_room, stack_tables
+from netkf.algorithms.kernels.root_update import UpdateRoom, update_room
 from netkf.algorithms.models import FlowModel, first_root
-from netkf.algorithms.root_flow import FlowRoom, FlowTable, flow_room, stack_tables
-from netkf.algorithms.root_update import UpdateRoom, update_room
-from netkf.core.arrays import FloatArray
 from netkf.engines.compiled.senders import Senders
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
 

@@ -6,10 +6,10 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
 from netkf.engines.compiled.increments import PathBlock
+from netkf.linalg.arrays import FloatArray
 from netkf.plants.transitions import Transitions
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import simpy
 
 from netkf.core.clock import next_ticks
-from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter, stream
 from netkf.network.clocks import LinkClock
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES

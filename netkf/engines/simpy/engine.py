@@ -11,7 +11,6 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Filter
-from netkf.core.streams import Streams
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.nodes import ClockedNode, Node, distinct
@@ -25,6 +24,7 @@ from netkf.engines.simpy.slots import (
 )
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import Transmitter
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES

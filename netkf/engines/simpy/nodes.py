@@ -9,9 +9,9 @@ import simpy
 
 from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
 from netkf.algorithms.flow import stretch_end
-from netkf.core.arrays import FloatArray, block_diagonal
 from netkf.engines.base import LONGER, SHORTEST_SHARE, Rank
 from netkf.engines.simpy.timeline import Timeline
+from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import simpy
 
-from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
 from netkf.plants.sensors import LinearSensor, SensorPath
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Placed, Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES

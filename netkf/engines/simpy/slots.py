@@ -14,14 +14,14 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Exchange, Reading
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope, Node, distinct
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
+from netkf.linalg.arrays import FloatArray
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.linear import Readings
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES

@@ -10,13 +10,13 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Filter
-from netkf.core.arrays import FloatArray
-from netkf.core.streams import Streams
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope
 from netkf.engines.simpy.timeline import Timeline
+from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Fates, checked_chance, checked_delay
 from netkf.network.graphs import Link
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES

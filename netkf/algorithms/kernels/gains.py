@@ -1,0 +1,89 @@
+"""How a Kalman-Bucy filter uses the two moments of a reading (the gains that end an interval).
+
+Exactly, ``xhat(b) = exp(A g) xhat(a) + int k(s) (dy - H xhat_open(s) ds)`` with the weight
+``k(s) = Phi(b, s) P(s) H' R^-1`` and the open-loop prediction ``xhat_open``. Since the Hamiltonian
+flow is symplectic, ``k(s) = Y(s)' H' R^-1`` with ``[X; Y](s) = exp(-M (b - s)) [I; P(b)]``: the
+weight is *affine in the covariance at the end*. Projecting it on the Legendre polynomials
+``P_0, P_1`` of the interval gives gains ``K_j = U_j(g) + P(b) W_j(g)`` for the two moments of dy,
+with U and W power series in g; what is left out has fourth order in g. The estimate enters
+through the innovation only, so the error never depends on the state itself.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.legendre import MOMENTS, backward_coefficients
+from netkf.linalg.series import polynomial, with_reach
+from netkf.linalg.small import added, applied
+
+LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
+
+
+class GainTable(NamedTuple):
+    """Power series in the interval g of U (n, 2p), W (n, 2p) and the predictor C (2p, n), with
+    their reach, see linalg/series.
+    """
+
+    n: int
+    moments: int
+    series: FloatArray
+
+
+def gain_table(
+    A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
+) -> GainTable:
+    """Tabulate the gains for intervals up to ``longest`` seconds; raises ValueError above
+    :func:`longest_interval`.
+    """
+    n, p = len(A), len(H)
+    HR = np.linalg.solve(R, H).T
+    M, scale = hamiltonian(A, Q, HR @ H)
+    size = float(np.abs(M).sum(axis=0).max()) * longest
+    if size > LONGEST_INTERVAL * (1.0 + 1e-9):
+        raise ValueError(f"an interval of {longest:g} s is too long for the gains of this sensor")
+    terms = _terms(size)
+    E = exponential_series(-M, terms)
+    c = backward_coefficients(terms)
+    weight = np.array([1.0, 3.0])  # 2 j + 1
+    from_Y = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, :n] * scale, HR)
+    from_P = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, n:], HR)
+    seen = np.einsum("jk,pa,kab->kjpb", c, H, exponential_series(-A, terms))
+    series = np.zeros((terms + 1, 3 * n * MOMENTS * p))
+    size_U = n * MOMENTS * p
+    series[:-1, :size_U] = from_Y.reshape(terms, -1)
+    series[:-1, size_U : 2 * size_U] = from_P.reshape(terms, -1)
+    series[1:, 2 * size_U :] = seen.reshape(terms, -1)
+    return GainTable(n, MOMENTS * p, with_reach(series, longest))
+
+
+def longest_interval(A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> float:
+    """Seconds; the longest interval whose reading the gains can use."""
+    M, _ = hamiltonian(A, Q, H.T @ np.linalg.solve(R, H))
+    norm = float(np.abs(M).sum(axis=0).max())
+    return LONGEST_INTERVAL / norm if norm > 0.0 else math.inf
+
+
+def _terms(size: float) -> int:
+    terms, last = 1, 1.0
+    while last > 1e-18 or terms < 8:
+        last *= size / terms
+        terms += 1
+    return terms
+
+
+def gain_update(
+    table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
+) -> FloatArray:
+    """``xhat(b)`` (n,) from the open-loop prediction ``x``, ``P = P(b)`` and the moments (2p,)."""
+    n, q = table.n, table.moments
+    values = polynomial(table.series, gap)
+    U = values[: n * q].reshape(n, q)
+    W = values[n * q : 2 * n * q].reshape(n, q)
+    C = values[2 * n * q :].reshape(q, n)
+    return np.asarray(x + applied(added(U, P, W), moments - applied(C, x)))

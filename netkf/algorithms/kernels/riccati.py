@@ -1,0 +1,186 @@
+"""The flow of the Riccati equation dP = A P + P A' + Q - P G P over gaps of any length.
+
+The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian
+``M = [[-A', G], [Q, A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``.
+One exponential over a long gap loses every digit, so a gap is cut into whole units, in which
+``|M| unit <= 1``, and a rest. The rest uses a Taylor series whose coefficients are tabulated;
+the whole units use their binary digits: the flow over ``unit * 2^k`` is tabulated as the triple
+``(F, G, Q)`` with ``P -> Q + F P (I + G P)^-1 F'``, and a triple follows from the one before it by
+the doubling formulas (Davison and Maki 1973; Anderson 1978), which only add positive terms.
+
+Where there are no readings, ``G = 0``, the rest needs no inverse: ``P(gap) = e P e' + W`` with
+``e = exp(A gap)`` and the covariance W of what the noise added.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.series import polynomial, with_reach
+from netkf.linalg.small import (
+    added,
+    applied,
+    even,
+    product,
+    solution,
+)
+
+TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
+
+
+class RiccatiTable(NamedTuple):
+    """Everything that depends on ``A, Q, G`` and not on ``P`` or the gap.
+
+    series : (terms, 5 n n + 1) Taylor coefficients of the blocks of ``exp(M g)`` and of
+             ``exp(A g)``, with their reach, see linalg/series
+    blind  : (terms, 2 n n + 1) those of ``exp(A g)`` and of W where G = 0, else no row
+    unit   : gap that the series covers, seconds
+    jump, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
+    """
+
+    n: int
+    unit: float
+    series: FloatArray
+    blind: FloatArray
+    jump: FloatArray
+    F: FloatArray
+    G: FloatArray
+    Q: FloatArray
+
+
+def exponential_series(M: FloatArray, terms: int) -> FloatArray:
+    """(terms, n, n) with ``exp(M g) = sum_k g^k series[k]``."""
+    series = np.empty((terms, *M.shape), dtype=M.dtype)
+    series[0] = np.eye(len(M))
+    for k in range(1, terms):
+        series[k] = series[k - 1] @ M / k
+    return series
+
+
+def growth_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
+    """(terms, n, n): those of ``W`` with ``dW = A W + W A' + Q`` from W = 0 on."""
+    series = np.zeros((terms, *A.shape))
+    series[1] = Q
+    for k in range(2, terms):
+        moved = A @ series[k - 1]
+        series[k] = (moved + moved.T) / k
+    return series
+
+
+def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray, float]:
+    """The Hamiltonian of ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``."""
+    size_A, size_Q, size_G = (float(np.abs(matrix).max()) for matrix in (A, Q, G))
+    size_A = max(size_A, 1e-6)
+    if size_Q > 0.0 and size_G > 0.0:
+        scale = (size_Q / size_G) ** 0.5
+    elif size_Q > 0.0 or size_G > 0.0:  # one of them may be made as small as A
+        scale = size_Q / size_A if size_Q > 0.0 else size_A / size_G
+    else:
+        scale = 1.0
+    return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
+
+
+def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -> RiccatiTable:
+    """Tabulate the flow for gaps up to ``longest`` seconds; ``A, Q, G`` are (n, n)."""
+    n = len(A)
+    M, scale = hamiltonian(A, Q, G)
+    norm, size, blind = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
+    if blind:  # W grows by A from both sides
+        norm = max(norm, float(size.sum(axis=0).max() + size.sum(axis=1).max()))
+    # A power of two, so that a whole number of units is exact.
+    unit = 2.0 ** np.floor(np.log2(min(1.0 / max(norm, 1e-300), longest)))
+    blocks = exponential_series(M, TAYLOR_TERMS)
+    blocks[:, :n, n:] /= scale
+    blocks[:, n:, :n] *= scale
+    moves = exponential_series(A, TAYLOR_TERMS)
+    series, lean = _side_by_side(unit, blocks, moves), np.zeros((0, 2 * n * n + 1))
+    if blind:
+        lean = _side_by_side(unit, moves, growth_series(A, Q, TAYLOR_TERMS))
+    levels = max(1, int(longest / unit).bit_length())
+    return RiccatiTable(n, unit, series, lean, *_triples(M, scale, A, unit, levels))
+
+
+def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
+    """(terms, ...) coefficients of matrices as rows (terms, size + 1)."""
+    rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    return with_reach(rows, unit)
+
+
+def _triples(
+    M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    # Doubling also doubles the relative error, so it works in extended precision (where the
+    # machine has it): after 2^14 units a table in double would have lost 1e-12.
+    n, wide = len(A), np.longdouble
+    E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
+    inverse = _inverse(E[:n, :n])
+    F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
+    jump = np.tensordot(wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1)
+    tables = tuple(np.empty((levels, n, n)) for _ in range(4))
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable blind plant overflows late
+        for level in range(levels):
+            G, Q = symmetric(G), symmetric(Q)
+            for table, value in zip(tables, (jump, F, G / scale, Q * scale), strict=True):
+                table[level] = value
+            W = _inverse(np.eye(n) + G @ Q)
+            jump, F, G, Q = jump @ jump, F @ W.T @ F, G + F.T @ W @ G @ F, Q + F @ Q @ W @ F.T
+    return tables  # type: ignore[return-value]
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """The inverse in the precision of ``matrix``, by Newton's iteration from double; nan where
+    there is none, as after so many units of an unstable plant that nothing is left of them.
+    """
+    if not np.isfinite(matrix).all():
+        return np.full_like(matrix, np.nan)
+    try:
+        inverse = np.linalg.inv(matrix.astype(np.float64)).astype(matrix.dtype)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
+    for _ in range(2):
+        inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
+    return inverse
+
+
+def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, FloatArray]:
+    """``exp(M gap)`` (2n, 2n) and ``exp(A gap)`` (n, n) for a gap of at most one unit."""
+    n = table.n
+    values = polynomial(table.series, gap)
+    return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
+
+
+def part_of_unit(
+    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
+) -> tuple[FloatArray, FloatArray]:
+    """``riccati_step`` for a gap of at most one unit."""
+    n = table.n
+    if len(table.blind):
+        values = polynomial(table.blind, gap)
+        transition, grown = values.reshape(2, n, n)
+        return even(added(grown, product(transition, P), transition.T)), applied(transition, x)
+    E, transition = evaluate_hamiltonian(table, gap)
+    X = added(E[:n, :n], E[:n, n:], P)
+    Y = added(E[n:, :n], E[n:, n:], P)
+    return even(solution(X.T, Y.T)), applied(transition, x)
+
+
+def riccati_step(
+    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
+) -> tuple[FloatArray, FloatArray]:
+    """``P`` (n, n) moved by the flow over ``gap`` seconds, and ``x`` (n,) by ``exp(A gap)``."""
+    n, whole = table.n, int(gap / table.unit)
+    level = 0
+    while whole >> level:
+        if whole >> level & 1:
+            F = table.F[level]
+            middle = solution(added(np.eye(n), P, table.G[level]), P)
+            P = even(added(table.Q[level], product(F, middle), F.T))
+            x = applied(table.jump[level], x)
+        level += 1
+    rest = gap - whole * table.unit
+    if rest <= 0.0:
+        return P, x
+    return part_of_unit(table, P, x, rest)

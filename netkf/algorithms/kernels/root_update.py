@@ -1,0 +1,366 @@
+"""Updates and combinations of estimates whose covariances are carried as roots.
+
+A root is lower triangular, ``P = S S'``, and only its lower triangle is read or written. Nothing
+here inverts a covariance or subtracts one from another: samples are used by Givens rotations of
+columns, which keep columns of very different sizes apart (a first covariance of 1e12 beside a
+sensor of 1e-9), and combinations are one orthogonal elimination.
+
+Kernels work in place on place ``k`` of stacks, root (K, n, n) and x (K, n), and take their room
+from :func:`update_room`; wrappers for Python take one node and return new arrays:
+
+=================================  ============================================================
+``sample_root``                    kernel: use one sample ``y = H x + v`` (p rows)
+``update_with_sample``             the same for Python
+``scale_root``, ``add_root``       kernels: ``sum w_j P_j`` and ``sum w_j x_j``, term by term
+``combine_roots``                  the same for Python
+``begin_intersection``,            kernels: covariance intersection, term by term, read off at
+``add_to_intersection``,           the end
+``end_intersection``
+``intersect_roots``                the same for Python
+``lower_root``                     for Python: the triangular root of any root (n, c), c >= n
+=================================  ============================================================
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.kernels.square_root import lower_triangular
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+
+SINGULAR = 2.0**-25
+"""Least pivot of a root that counts in an intersection, relative to the length of its row: the
+square root of what a covariance would be known to.
+"""
+NEGLIGIBLE = 1e-40  # of the square of a pivot: what cannot move it, nor the rows below it
+TINY = 1e-200
+
+
+class UpdateRoom(NamedTuple):
+    """Room to work in: C (p, p), HS (p, n) and gains (p, n) of a sample, with p >= 1 its largest
+    number of rows; ``wide`` (n, n), ``whitened`` (n, n + 1) and ``total`` (n, n + 1) of
+    combinations.
+    """
+
+    C: FloatArray
+    HS: FloatArray
+    gains: FloatArray
+    wide: FloatArray
+    whitened: FloatArray
+    total: FloatArray
+
+
+def update_room(n: int, p: int) -> UpdateRoom:
+    """Room for states of n entries and samples of at most p rows."""
+    p = max(p, 1)
+    shapes = ((p, p), (p, n), (p, n), (n, n), (n, n + 1), (n, n + 1))
+    return UpdateRoom(*(np.zeros(shape) for shape in shapes))
+
+
+def lower_root(root: FloatArray) -> FloatArray:
+    """The lower triangular S (n, n) with nonnegative diagonal and ``S S' = root root'`` (n, c)."""
+    n, columns = root.shape
+    wide = np.concatenate([root, np.zeros((n, max(n - columns, 0)))], axis=1)
+    L = np.tril(lower_triangular(wide))
+    return np.asarray(L * np.where(np.diag(L) < 0.0, -1.0, 1.0))
+
+
+# Samples.
+
+
+@kernel
+def rotate_out(
+    root: FloatArray, k: int, row: FloatArray, m: int, gains: FloatArray, pivot: float
+) -> float:
+    """Use the scalar observation with ``h S = row[m]`` and noise variance ``pivot``^2; the gain is
+    ``gains[m]`` (n,) over the value that is returned, the standard deviation of the innovation.
+    """
+    # [pivot, h S; 0, S] times rotations that empty h S from its end, so that S stays triangular.
+    n = root.shape[1]
+    for i in range(n):
+        gains[m, i] = 0.0
+    for j in range(n - 1, -1, -1):
+        size = row[m, j]
+        if size != 0.0:
+            whole = math.sqrt(pivot * pivot + size * size)
+            c, s = pivot / whole, size / whole
+            pivot = whole
+            for i in range(j, n):
+                old, gain = root[k, i, j], gains[m, i]
+                root[k, i, j] = c * old - s * gain
+                gains[m, i] = s * old + c * gain
+    return pivot
+
+
+@kernel
+def sample_root(
+    root: FloatArray,
+    x: FloatArray,
+    k: int,
+    y: FloatArray,
+    H: FloatArray,
+    root_R: FloatArray,
+    room: UpdateRoom,
+) -> None:
+    """Use the sample ``y = H x + v``: y (p,), H (p, n), ``root_R`` (p, p) lower triangular
+    and regular.
+
+    ``y`` is overwritten with the normalised innovation: its squares sum to the NIS, and its entries
+    are independent standard normals where the filter is consistent.
+    """
+    # [root_R, H S; 0, S] is made lower triangular, [C, 0; gains', S+], row by row of H.
+    p, n = len(y), x.shape[1]
+    C, HS, gains = room.C, room.HS, room.gains
+    for r in range(p):
+        for m in range(r + 1):
+            C[r, m] = root_R[r, m]
+        seen = 0.0
+        for j in range(n):
+            total = 0.0
+            for i in range(j, n):
+                total += H[r, i] * root[k, i, j]
+            HS[r, j] = total
+            seen += H[r, j] * x[k, j]
+        y[r] -= seen
+    for r in range(p):
+        if r == p - 1:
+            C[r, r] = rotate_out(root, k, HS, r, gains, C[r, r])
+        else:
+            rotate_rows(root, k, C, HS, gains, r, p)
+        total = y[r]
+        for m in range(r):
+            total -= C[r, m] * y[m]
+        y[r] = total / C[r, r] if C[r, r] != 0.0 else 0.0
+        for i in range(n):
+            x[k, i] += gains[r, i] * y[r]
+
+
+@kernel
+def rotate_rows(
+    root: FloatArray, k: int, C: FloatArray, HS: FloatArray, gains: FloatArray, r: int, p: int
+) -> None:
+    """``rotate_out`` for row ``r`` of p, which turns the rows of the observation below it too."""
+    n = root.shape[1]
+    for i in range(n):
+        gains[r, i] = 0.0
+    for j in range(n - 1, -1, -1):
+        size = HS[r, j]
+        if size != 0.0:
+            whole = math.sqrt(C[r, r] * C[r, r] + size * size)
+            c, s = C[r, r] / whole, size / whole
+            C[r, r] = whole
+            for i in range(r + 1, p):
+                old, gain = HS[i, j], C[i, r]
+                HS[i, j] = c * old - s * gain
+                C[i, r] = s * old + c * gain
+            for i in range(j, n):
+                old, gain = root[k, i, j], gains[r, i]
+                root[k, i, j] = c * old - s * gain
+                gains[r, i] = s * old + c * gain
+
+
+def update_with_sample(
+    root: FloatArray, x: FloatArray, y: FloatArray, H: FloatArray, root_R: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Root (n, n), x (n,) and normalised innovation (p,) once the sample y (p,) is used."""
+    n = len(x)
+    roots, means, innovation = root.reshape(1, n, n).copy(), x.reshape(1, n).copy(), y.copy()
+    sample_root(roots, means, 0, innovation, H, root_R, update_room(n, len(y)))
+    return roots[0], means[0], innovation
+
+
+# Convex combinations.
+
+
+@kernel
+def scale_root(root: FloatArray, x: FloatArray, k: int, weight: float) -> None:
+    """Weigh place ``k`` alone: ``weight`` >= 0 times P and x."""
+    n, size = x.shape[1], math.sqrt(weight)
+    for i in range(n):
+        x[k, i] *= weight
+        for j in range(i + 1):
+            root[k, i, j] *= size
+
+
+@kernel
+def add_root(
+    root: FloatArray,
+    x: FloatArray,
+    k: int,
+    weight: float,
+    other: FloatArray,
+    other_x: FloatArray,
+    m: int,
+    room: UpdateRoom,
+) -> None:
+    """Add ``weight`` >= 0 times P and x of place ``m`` of ``other`` (M, n, n), ``other_x``."""
+    n, size, wide = x.shape[1], math.sqrt(weight), room.wide
+    for i in range(n):
+        x[k, i] += weight * other_x[m, i]
+        for j in range(i + 1):
+            wide[i, j] = size * other[m, i, j]
+    absorb_columns(root, k, wide)
+
+
+@kernel
+def absorb_columns(root: FloatArray, k: int, wide: FloatArray) -> None:
+    """Make place ``k`` the root of ``S S' + wide wide'``; ``wide`` (n, n) is lower triangular and
+    is used up.
+    """
+    # Householder's reflections of a column of S with the columns of ``wide`` that reach its row.
+    n = root.shape[1]
+    for i in range(n):
+        below = 0.0
+        for j in range(i + 1):
+            below += wide[i, j] * wide[i, j]
+        pivot = root[k, i, i]
+        if below <= NEGLIGIBLE * pivot * pivot + TINY:
+            continue
+        length = math.sqrt(pivot * pivot + below)
+        first = -below / (pivot + length) if pivot >= 0.0 else pivot - length
+        root[k, i, i] = length
+        scale = 2.0 / (first * first + below)
+        for r in range(i + 1, n):
+            total = first * root[k, r, i]
+            for j in range(i + 1):
+                total += wide[i, j] * wide[r, j]
+            total *= scale
+            root[k, r, i] -= total * first
+            for j in range(i + 1):
+                wide[r, j] -= total * wide[i, j]
+
+
+def combine_roots(
+    weights: FloatArray, means: FloatArray, roots: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``sum w_j x_j`` (n,) and the root of ``sum w_j P_j`` (n, n), for weights (k,), means
+    (k, n) and roots (k, n, n).
+    """
+    x, root = means[:1].copy(), roots[:1].copy()
+    room = update_room(means.shape[1], 1)
+    scale_root(root, x, 0, float(weights[0]))
+    for m in range(1, len(weights)):
+        add_root(root, x, 0, float(weights[m]), roots, means, m, room)
+    return x[0], root[0]
+
+
+# Covariance intersection, D (8) and (9): information is a root too, P^-1 = Z' Z.
+
+
+@kernel
+def begin_intersection(room: UpdateRoom) -> None:
+    """Forget what was intersected before."""
+    total = room.total
+    for i in range(total.shape[0]):
+        for j in range(total.shape[1]):
+            total[i, j] = 0.0
+
+
+@kernel
+def add_to_intersection(
+    weight: float,
+    root: FloatArray,
+    x: FloatArray,
+    k: int,
+    centre: FloatArray,
+    m: int,
+    room: UpdateRoom,
+) -> None:
+    """Add ``weight`` times the information of place ``k``; means count from ``centre[m]``, which
+    must be the same for all terms of one intersection.
+    """
+    whitened, total, n = room.whitened, room.total, x.shape[1]
+    if weight <= 0.0:
+        return
+    invert_root(whitened, root, k, math.sqrt(weight))
+    for i in range(n):
+        mean = 0.0
+        for j in range(i + 1):
+            mean += whitened[i, j] * (x[k, j] - centre[m, j])
+        whitened[i, n] = mean
+    # Both are lower triangular, and stay so when columns are emptied from the last one on.
+    for j in range(n - 1, -1, -1):
+        below = 0.0
+        for r in range(j, n):
+            below += whitened[r, j] * whitened[r, j]
+        pivot = total[j, j]
+        if below <= NEGLIGIBLE * pivot * pivot + TINY:
+            continue
+        length = math.sqrt(pivot * pivot + below)
+        first = -below / (pivot + length)
+        total[j, j] = length
+        scale = 2.0 / (first * first + below)
+        for column in range(j + 1):
+            c = n if column == j else column
+            inner = first * total[j, c]
+            for r in range(j, n):
+                inner += whitened[r, j] * whitened[r, c]
+            inner *= scale
+            total[j, c] -= inner * first
+            for r in range(j, n):
+                whitened[r, c] -= inner * whitened[r, j]
+
+
+@kernel
+def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> None:
+    """Write ``factor`` times the inverse of place ``k`` into ``out`` (n, >= n), lower triangular.
+
+    Soon after a start from 0 the noise has reached some combinations of states only to rounding:
+    pivots are at least SINGULAR of their row, which makes P no smaller.
+    """
+    n, least = root.shape[1], TINY
+    for i in range(n):
+        for j in range(i + 1):
+            least += NEGLIGIBLE * root[k, i, j] * root[k, i, j]
+    for i in range(n):
+        row = least
+        for j in range(i + 1):
+            row += root[k, i, j] * root[k, i, j]
+        pivot = max(abs(root[k, i, i]), SINGULAR * math.sqrt(row))
+        if root[k, i, i] < 0.0:
+            pivot = -pivot
+        for j in range(i + 1):
+            value = factor if j == i else 0.0
+            for m in range(j, i):
+                value -= root[k, i, m] * out[m, j]
+            out[i, j] = value / pivot
+
+
+@kernel
+def end_intersection(
+    root: FloatArray, x: FloatArray, k: int, centre: FloatArray, m: int, room: UpdateRoom
+) -> None:
+    """Write the intersection into place ``k``; nan where nothing was added."""
+    total, whitened, n = room.total, room.whitened, x.shape[1]
+    for i in range(n):
+        for j in range(i + 1):
+            value = 1.0 if j == i else 0.0
+            for r in range(j, i):
+                value -= total[i, r] * whitened[r, j]
+            whitened[i, j] = value / total[i, i]
+    for i in range(n):
+        mean = centre[m, i]
+        for j in range(i + 1):
+            root[k, i, j] = whitened[i, j]
+            mean += whitened[i, j] * total[j, n]
+        whitened[i, n] = mean
+    for i in range(n):  # ``centre`` may be x itself
+        x[k, i] = whitened[i, n]
+
+
+def intersect_roots(
+    weights: FloatArray, means: FloatArray, roots: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Estimate (n,) and root (n, n) of D (8), (9), for weights (k,), means (k, n) and roots
+    (k, n, n).
+    """
+    x, root = means[:1].copy(), np.zeros_like(roots[:1])
+    room = update_room(means.shape[1], 1)
+    for m in range(len(weights)):
+        add_to_intersection(float(weights[m]), roots, means, m, means, 0, room)
+    end_intersection(root, x, 0, means, 0, room)
+    return x[0], root[0]

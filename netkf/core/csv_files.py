@@ -1,0 +1,102 @@
+"""Small CSV tables that scenarios name: read whole, checked column by column."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import SourceFile
+from netkf.linalg.arrays import FloatArray
+
+LARGEST_ID = 2**53
+
+
+def read_columns(
+    source: SourceFile, required: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> dict[str, FloatArray]:
+    """The named columns as float arrays of equal length.
+
+    Raises ScenarioError, with the file and the line, for a missing column, a row of another
+    length, or an entry that is not a finite number.
+    """
+    header, rows = read_rows(source, required)
+    names = [name for name in (*required, *optional) if name in header]
+    places = [header.index(name) for name in names]
+    numbers = [finite_numbers(source, line, header, row, places) for line, row in rows]
+    columns = np.array(numbers, dtype=np.float64).reshape(len(rows), len(names)).T
+    return dict(zip(names, columns, strict=True))
+
+
+def read_header(source: SourceFile) -> list[str]:
+    """The names of the columns; raises ScenarioError where the file is no table."""
+    return read_rows(source, ())[0]
+
+
+def read_rows(
+    source: SourceFile, required: tuple[str, ...]
+) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names of the columns, and (line, entries) of every row that is not empty.
+
+    Raises ScenarioError where the file is no table or lacks a required column.
+    """
+    header, rows = _read(source)
+    missing = [name for name in required if name not in header]
+    if missing:
+        words = f"{source.name} must have the columns {', '.join(required)}"
+        raise ScenarioError("path", words, header, f"add the column {missing[0]}")
+    return header, rows
+
+
+def _read(source: SourceFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    try:
+        with source.full.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            header = [name.strip() for name in next(reader, [])]
+            return header, [(reader.line_num, row) for row in reader if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        words = f"{source.name} cannot be read as a UTF-8 table of comma-separated values"
+        raise ScenarioError("path", words, str(error), "mend the file") from None
+
+
+def finite_numbers(
+    source: SourceFile, line: int, header: list[str], entries: list[str], places: list[int]
+) -> list[float]:
+    """The numbers at some places of a row; raises ScenarioError where one is not finite or the row
+    is not as long as the header.
+    """
+    where = f"{source.name} line {line}"
+    if len(entries) != len(header):
+        raise ScenarioError(
+            "path", f"{where} must have {len(header)} entries", entries, "mend the row"
+        )
+    numbers = []
+    for place in places:
+        try:
+            value = float(entries[place])
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ScenarioError(
+                "path",
+                f"{where}: {header[place]} must be a finite number",
+                entries[place],
+                "mend the row",
+            )
+        numbers.append(value)
+    return numbers
+
+
+def whole(source: SourceFile, name: str, column: FloatArray) -> list[int]:
+    """A column of node ids or counts as Python integers; raises ScenarioError for others."""
+    wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > LARGEST_ID))
+    if wrong.size:
+        raise ScenarioError(
+            "path",
+            f"{source.name}: {name} must hold integers from 0 to 2^53",
+            float(column[wrong[0]]),
+            "mend the row",
+        )
+    return [int(value) for value in column]

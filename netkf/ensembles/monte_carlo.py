@@ -1,0 +1,186 @@
+"""``netkf.monte_carlo``: an ensemble of runs, reduced as they come."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import integer
+from netkf.ensembles.pools import workers_for
+from netkf.ensembles.replicas import Progress, replicate
+from netkf.ensembles.statistics import MESSAGES, Tally, merge, reduced_run
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.simulate import choose_engine
+from netkf.scenario.scenario import Scenario
+from netkf.trace.schema import ensemble_columns
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+LOAD = "load it first: netkf.monte_carlo(netkf.load(path), runs)"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Ensemble:
+    """What many runs of one scenario came to.
+
+    times (T,), nodes (N,), ``runs`` (T,): how many have that sample (runs that diverge end early);
+    mean_P and mean_error (T, N, n, n): means of P and of e e', e = x - xhat; mean_nees (T, N);
+    se_P, se_error, se_nees: their standard errors entry by entry, nan for a single run. ``average``
+    and ``se_average`` (N + 1, 3): mean square error, mean trace of P and mean NEES, each averaged
+    over the samples after time 0, of the nodes in their order and, last, of all of them together.
+    ``messages``: how many were sent, delivered, lost and still in flight in all runs; ``diverged``:
+    how many runs did. ``fingerprint`` is that of replica 0. From ``rounding_from`` on, inf in most
+    cases, rounding of the state blurs the errors: they and NEES are nan there and left out of
+    averages. P and NEES are nan where the filter gives no covariance.
+    """
+
+    times: FloatArray
+    nodes: tuple[int, ...]
+    runs: np.ndarray
+    mean_P: FloatArray
+    se_P: FloatArray
+    mean_error: FloatArray
+    se_error: FloatArray
+    mean_nees: FloatArray
+    se_nees: FloatArray
+    average: FloatArray
+    se_average: FloatArray
+    messages: dict[str, int]
+    diverged: int
+    events: int
+    seed: int
+    engine: str
+    fingerprint: str
+    shown: bool = True
+    rounding_from: float = np.inf
+
+    def __repr__(self) -> str:
+        return (
+            f"<netkf.Ensemble: {self.runs.max():,} runs, {self.diverged:,} diverged, "
+            f"{len(self.times)} samples, {len(self.nodes)} nodes, {self.mean_P.shape[-1]} states, "
+            f"seed {self.seed}>"
+        )
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """A row a time and node; columns as trace.schema.ensemble_columns."""
+        import pandas as pd
+
+        return pd.DataFrame(ensemble_table(self))
+
+
+def monte_carlo(
+    scenario: Scenario,
+    runs: int,
+    seed: int | None = None,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    engine: str = "auto",
+    progress: Progress | None = None,
+) -> Ensemble:
+    """Simulate replicas 0 .. runs - 1 and keep their means and standard errors.
+
+    Replica 0 is the run of ``netkf.simulate(scenario, seed)``. The result is the same to the last
+    bit for any number of ``workers`` (processes; by default as many as there are cores, or this one
+    where the runs are done before others have started), for any ``executor`` of concurrent.futures
+    and for any Dask ``scheduler`` ("tcp://HOST:PORT"). ``progress(done, wanted)`` is called as runs
+    are done.
+
+    Raises ScenarioError for arguments that are wrong and EngineError where the engine cannot run
+    the scenario, a plugged-in class fails, or workers die again and again.
+    """
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)
+    chosen = choose_engine(engine, scenario)
+    seed, count = scenario.seed if seed is None else seed, integer(low=1)("runs", runs)
+    whole = replicate(
+        partial(reduced_run, engine=chosen),
+        scenario,
+        count,
+        seed,
+        merge=merge,
+        workers=workers_for(scenario, count, chosen, workers, executor, scheduler),
+        executor=executor,
+        scheduler=scheduler,
+        progress=progress,
+    )
+    return ensemble_of(scenario, whole, seed, chosen.name)
+
+
+def ensemble_of(scenario: Scenario, tally: Tally, seed: int, engine: str) -> Ensemble:
+    """What a tally of all runs says."""
+    n, samples = scenario.plant.n, tally.samples
+    with np.errstate(invalid="ignore"):
+        means = np.where(samples.size > 0.0, samples.mean, np.nan)
+    mean_P, mean_error, mean_nees = _unpacked(means, n)
+    se_P, se_error, se_nees = _unpacked(samples.standard_error(), n)
+    for errors in (mean_error, mean_nees, se_error, se_nees):
+        errors[scenario.times >= tally.rounding_from] = np.nan
+    totals = tally.messages.mean * tally.messages.size
+    return Ensemble(
+        scenario.times,
+        scenario.nodes,
+        samples.size[:, 0, 0].astype(np.int64),
+        mean_P,
+        se_P,
+        mean_error,
+        se_error,
+        mean_nees,
+        se_nees,
+        tally.averages.mean,
+        tally.averages.standard_error(),
+        {
+            name: round(total)
+            for name, total in zip(MESSAGES, totals.tolist(), strict=True)
+            if np.isfinite(total)
+        },
+        int(tally.totals[1]),
+        int(tally.totals[0]),
+        seed,
+        engine,
+        tally.fingerprint,
+        scenario.plant.shown,
+        tally.rounding_from,
+    )
+
+
+def _unpacked(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(T, N, 2 u + 1) as two stacks of symmetric matrices (T, N, n, n) and (T, N)."""
+    i, j = np.triu_indices(n)
+    matrices = np.empty((2, *values.shape[:2], n, n))
+    for matrix, upper in zip(matrices, np.split(values[..., :-1], 2, axis=-1), strict=True):
+        matrix[..., i, j] = upper
+        matrix[..., j, i] = upper
+    return matrices[0], matrices[1], values[..., -1]
+
+
+def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
+    """Named columns, a row a time and node; errors only where the truth is shown."""
+    n, rows = ensemble.mean_P.shape[-1], len(ensemble.times) * len(ensemble.nodes)
+    i, j = np.triu_indices(n)
+
+    def upper(values: FloatArray) -> list[FloatArray]:
+        return list(values[:, :, i, j].reshape(rows, -1).T)
+
+    columns = [
+        np.repeat(ensemble.times, len(ensemble.nodes)),
+        np.tile(np.array(ensemble.nodes, dtype=np.int64), len(ensemble.times)),
+        np.repeat(ensemble.runs, len(ensemble.nodes)),
+        *upper(ensemble.mean_P),
+        *upper(ensemble.se_P),
+        *upper(ensemble.mean_error),
+        *upper(ensemble.se_error),
+        ensemble.mean_nees.reshape(rows),
+        ensemble.se_nees.reshape(rows),
+    ]
+    names = ensemble_columns(n)
+    kept = len(names) if ensemble.shown else 3 + 2 * len(i)
+    return dict(zip(names[:kept], columns[:kept], strict=True))

@@ -1,0 +1,71 @@
+"""How worker processes start: without this one's threads, memory and script, and early.
+
+Knows no numerics, so that a command can start them before it loads its own.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+ONE_THREAD = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+PRELOADED = ["netkf.ensembles.statistics"]
+
+
+def context() -> Any:
+    """Processes that begin without this one's threads and memory; quickly where they can."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    made = multiprocessing.get_context("forkserver")
+    made.set_forkserver_preload(PRELOADED)
+    return made
+
+
+def start_early() -> None:
+    """Let the process that workers are forked from load what they need, while this one goes on."""
+    if context().get_start_method() == "forkserver":
+        from multiprocessing.forkserver import ensure_running
+
+        with one_blas_thread():
+            ensure_running()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Numerical libraries read these when a process loads them."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def main_hidden(hide: bool) -> Iterator[None]:
+    """Keep new processes from running the user's script once more."""
+    main = sys.modules["__main__"]
+    kept = {name: main.__dict__[name] for name in ("__file__", "__spec__") if name in main.__dict__}
+    if not hide:
+        kept = {}
+    for name in kept:
+        setattr(main, name, None)
+    try:
+        yield
+    finally:
+        for name, value in kept.items():
+            setattr(main, name, value)

@@ -1,0 +1,88 @@
+"""What an ensemble comes to: the summary of one run, averaged over runs, with standard errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.ensembles.statistics import MESSAGES, Tally
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.summary import CONFIDENCE, Promise, nees_bounds, notes_of
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.usage import record_usage
+
+
+def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> dict[str, Any]:
+    """The keys of one run's summary. ``rms_error`` is the root of the mean square error of all
+    runs; a key that ends in ``_se`` is a standard error.
+    """
+    mean, error = tally.averages.mean, tally.averages.standard_error()
+    bound = _bounds(scenario, promised)
+    blurred = tally.rounding_from if np.isfinite(tally.rounding_from) else None
+    rows = [_row(*values) for values in zip(mean, error, bound, strict=True)]
+    messages = tally.messages.mean.tolist()
+    messages_se = tally.messages.standard_error().tolist()
+    nodes = [{"node": node, **row} for node, row in zip(scenario.nodes, rows[:-1], strict=True)]
+    summary: dict[str, Any] = {
+        "runs": tally.runs,
+        "diverged": int(tally.totals[1]),
+        "nodes": nodes,
+        "overall": rows[-1],
+        "limit": promised.limit,
+        "central": promised.central,
+        "bound": promised.words or "H(12), promised by H Theorem 2",
+        "rounding_from": blurred,
+        "notes": notes_of(scenario, blurred, bool(np.isfinite(mean[:, 1]).any())),
+        "messages": dict(zip(MESSAGES, messages, strict=True)),
+        "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
+    }
+    if scenario.plant.shown:
+        summary["nees"] = _chi_square(scenario, tally)
+    if tally.conserved:
+        summary["conserved"] = {
+            name: {"exact": sums.mean[0], "total": sums.mean[1], "drift": drift}
+            for name, (sums, drift) in tally.conserved.items()
+        }
+    records = {} if tally.totals[1] else record_usage(scenario, None)
+    if records:
+        summary["records"] = records
+    return summary
+
+
+def _chi_square(scenario: Scenario, tally: Tally) -> dict[str, float]:
+    """Bounds on the mean NEES of one sample over the runs that hold with ``confidence`` where P is
+    exact, since the sum is chi-square; over n they bound the ANEES. ``inside``: the share of all
+    samples after time 0 that every run has and that rounding does not blur.
+    """
+    n, runs = scenario.plant.n, tally.runs
+    low, high = nees_bounds(n, runs)
+    clear = (scenario.times > 0.0) & (scenario.times < tally.rounding_from)
+    kept = clear & (tally.samples.size[:, 0, 0] == runs)
+    means = tally.samples.mean[kept, :, -1]
+    inside = float(((means >= low) & (means <= high)).mean()) if means.size else np.nan
+    return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": inside}
+
+
+def _bounds(scenario: Scenario, promised: Promise) -> list[float | None]:
+    """Averages of the bound over the samples after time 0, of the nodes and of all."""
+    if promised.bound is None:
+        return [None] * (len(scenario.nodes) + 1)
+    after: FloatArray = promised.bound[scenario.times > 0.0]
+    nodes = (after if len(after) else promised.bound).mean(axis=0)
+    return [*nodes.tolist(), float(nodes.mean())]
+
+
+def _row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
+    rms = float(np.sqrt(mean[0]))
+    return {
+        "rms_error": rms,
+        "rms_error_se": float(error[0]) / (2.0 * rms) if rms > 0.0 else 0.0,
+        "mean_trace": float(mean[1]),
+        "mean_trace_se": float(error[1]),
+        "bound": bound,
+        "ratio": None if bound is None else float(mean[1]) / bound,
+        "ratio_se": None if bound is None else float(error[1]) / bound,
+        "mean_nees": float(mean[2]),
+        "mean_nees_se": float(error[2]),
+    }

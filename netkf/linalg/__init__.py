@@ -1,0 +1,1 @@
+"""Matrices: small kernels, series, and the decorator that compiles them."""

@@ -1,0 +1,69 @@
+"""Array types and small helpers for symmetric matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from netkf.linalg.compiling import compilable
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+__all__ = [
+    "ArrayLike",
+    "FloatArray",
+    "IntArray",
+    "block_diagonal",
+    "frozen",
+    "is_semidefinite",
+    "square_root",
+    "symmetric",
+]
+
+
+def frozen(value: ArrayLike) -> FloatArray:
+    """A read-only float64 copy."""
+    array = np.array(value, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+def symmetric(matrices: FloatArray) -> FloatArray:
+    """The symmetric part of one matrix or of a stack of them."""
+    return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
+
+
+def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
+    """Whether a symmetric matrix has no eigenvalue below ``-tolerance`` times its largest one."""
+    values = np.linalg.eigvalsh(matrix)
+    return bool(values[0] >= -tolerance * max(abs(values[-1]), np.finfo(float).tiny))
+
+
+@compilable
+def square_root(matrix: FloatArray) -> FloatArray:
+    """A factor ``S`` with ``S S' = matrix``; the matrix may be singular."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def symmetric_root(matrix: FloatArray) -> FloatArray:
+    """The factor that is symmetric itself: it moves little where the matrix does, while the
+    vectors that ``square_root`` is made of may turn round.
+    """
+    values, vectors = np.linalg.eigh(matrix)
+    return symmetric((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
+    """The blocks, possibly rectangular or empty, along the diagonal of one matrix."""
+    rows = sum(b.shape[0] for b in blocks)
+    columns = sum(b.shape[1] for b in blocks)
+    whole = np.zeros((rows, columns))
+    row = column = 0
+    for block in blocks:
+        whole[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    return whole

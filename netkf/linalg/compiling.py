@@ -1,0 +1,219 @@
+"""Loops compiled by numba, which is imported when the first of them is called.
+
+:func:`kernel` marks a numerical function that is written once, as loops: other kernels may call
+it, and Python may call it too. Its code is kept on disk, so that the next process starts at once.
+
+Older functions are marked with :func:`compilable`: compiled ones may call them, and they stay what
+they are for Python. Where numpy is the way to say it in Python and loops are what a compiler wants
+(products of small matrices), the loops stand beside it: ``compilable_as(loops)``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from functools import cache, wraps
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+from netkf.linalg.linking import linked_once
+
+ROOMS = ("core", "algorithms", "plants", "trace", "engines")
+"""Whose code and numbers compiled functions may hold."""
+
+MOST_STATES = 4
+"""Of the sources, whose compiled code is kept."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "_nrt": True}
+_UNCOUNTED: Any = {**_OPTIONS, "_nrt": False}
+_marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
+_known: set[Callable[..., Any]] = set()
+_in_place: set[Callable[..., Any]] = set()
+_loops: dict[Callable[..., Any], Callable[..., Any]] = {}
+_said: set[Callable[..., Any]] = set()
+_spent: list[float] = []
+
+
+@overload
+def kernel(function: Function) -> Function: ...
+
+
+@overload
+def kernel(*, allocates: bool) -> Callable[[Function], Function]: ...
+
+
+def kernel(function: Callable[..., Any] | None = None, *, allocates: bool = False) -> Any:
+    """Mark a numerical function, written as loops over arrays, that is always run compiled.
+
+    Python and other kernels call it alike; it may call kernels and compilable functions. It works
+    in place and makes no arrays, or is marked ``@kernel(allocates=True)``.
+    """
+    if function is None:
+        return lambda loops: _marked_kernel(loops, allocates)
+    return _marked_kernel(function, allocates)
+
+
+def _marked_kernel(loops: Callable[..., Any], allocates: bool) -> Callable[..., Any]:
+    @wraps(loops)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return demanded(loops)(*args, **kwargs)
+
+    if not allocates:
+        _in_place.add(loops)
+    _loops[call] = loops
+    return compilable_as(loops)(call)
+
+
+def compilable(function: Function) -> Function:
+    """Mark a function that compiled ones may call; what it calls must be marked too."""
+    return compilable_as(function)(function)
+
+
+def compilable_as(loops: Callable[..., Any]) -> Callable[[Function], Function]:
+    """The same for a function that is ``loops``, of the same parameters, where it is compiled."""
+
+    def mark(function: Function) -> Function:
+        _marked.append((function, loops))
+        return function
+
+    return mark
+
+
+def in_place(function: Function) -> Function:
+    """``compilable``, for a function that neither makes nor returns arrays. It may call one that
+    makes some for itself.
+    """
+    _in_place.add(function)
+    return compilable(function)
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
+    """The compiled form of a function that is made of loops and of compilable functions, or None
+    where numba is missing.
+
+    Kept on disk, so that the next process starts at once. It runs without the interpreter's lock.
+    """
+    return _compiled(_loops.get(function, function))
+
+
+@cache
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
+    try:
+        import numba
+    except ImportError:
+        return None
+    _introduce()
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    # numba looks at the file of the function alone, and what it calls may have changed.
+    config.CACHE_DIR = str(_folder(before))
+    try:
+        made: Callable[..., Any] = numba.njit(cache=True, **_options(function))(function)
+    finally:
+        config.CACHE_DIR = before
+    _moderately_optimised(made, config)
+    return made
+
+
+def demanded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``compiled``, where numba is known to be there."""
+    made = compiled(function)
+    assert made is not None, "numba is needed"
+    return made
+
+
+def _moderately_optimised(made: Any, config: Any) -> None:
+    """Let LLVM work at its level 2: level 3 takes a quarter longer and gains nothing here."""
+    compile_for = made._compile_for_args
+
+    def moderately(*args: Any, **kwargs: Any) -> Any:
+        before, began = config.OPT, time.perf_counter()
+        config.OPT = type(before)(2)
+        try:
+            with linked_once():
+                return compile_for(*args, **kwargs)
+        finally:
+            config.OPT = before
+            _spent.append(time.perf_counter() - began)
+
+    made._compile_for_args = moderately
+
+
+def seconds_spent() -> float:
+    """On compiling, or loading what is kept, in this process so far."""
+    return sum(_spent)
+
+
+def announce(function: Callable[..., Any]) -> None:
+    """Say that a function will be compiled first, where its code is not kept on disk."""
+    if function in _said:
+        return
+    _said.add(function)
+    folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
+    if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
+        words = "netkf: compiling, once after an installation (10 to 20 s) ..."
+        print(words, file=sys.stderr, flush=True)
+
+
+def _introduce() -> None:
+    from numba import extending
+
+    for function, loops in _marked:
+        if function not in _known:
+            _known.add(function)
+            extending.overload(function, jit_options=_options(loops))(_always(loops))
+
+
+def _options(function: Callable[..., Any]) -> Any:
+    return _UNCOUNTED if function in _in_place else _OPTIONS
+
+
+def _always(loops: Callable[..., Any]) -> Callable[..., Any]:
+    """What numba asks for an implementation; it must have the same signature."""
+
+    @wraps(loops)
+    def choose(*_types: Any) -> Callable[..., Any]:
+        return loops
+
+    return choose
+
+
+@cache
+def _folder(chosen: str) -> Path:
+    """Where compiled code is kept: a folder for each state of the sources."""
+    root = Path(__file__).parents[1]
+    sources = hashlib.sha256()
+    files = [file for room in ROOMS for file in (root / room).rglob("*.py")]
+    for file in sorted(files):
+        sources.update(file.read_bytes())
+    name = f"netkf-{sources.hexdigest()[:16]}"
+    kept = _kept_in(chosen, root)
+    if not (kept / name).exists():
+        _make_room(kept)
+    return kept / name
+
+
+def _kept_in(chosen: str, root: Path) -> Path:
+    """Where numba was told to keep code, else beside the sources, else in the user's cache."""
+    if chosen:
+        return Path(chosen)
+    beside = root / "__pycache__"
+    try:
+        beside.mkdir(exist_ok=True)
+        writable = os.access(beside, os.W_OK)
+    except OSError:
+        writable = False
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return beside if writable else home / "netkf"
+
+
+def _make_room(folder: Path) -> None:
+    """Remove what was compiled from sources that are long gone."""
+    found = [path for path in folder.glob("netkf-*") if path.is_dir()]
+    for old in sorted(found, key=lambda path: path.stat().st_mtime)[: -MOST_STATES + 1]:
+        shutil.rmtree(old, ignore_errors=True)

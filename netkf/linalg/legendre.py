@@ -1,0 +1,25 @@
+"""The two moments that a continuous reading is reduced to over one interval.
+
+Over ``[a, b]`` of length g a signal z is known by ``(int P_0 dz, int P_1 dz)`` with the Legendre
+polynomials ``P_0 = 1`` and ``P_1(s) = 2 (s - a) / g - 1``. One moment would make a filter that
+reads the record second-order accurate in g, two make it fourth-order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+
+MOMENTS = 2
+
+
+def forward_coefficients(terms: int) -> FloatArray:
+    """(2, terms): ``int_0^1 u^k P_j(2 u - 1) du``, for ``exp(M (s - a))`` integrated from a."""
+    k = np.arange(terms)
+    return np.stack([1.0 / (k + 1), k / ((k + 1.0) * (k + 2.0))])
+
+
+def backward_coefficients(terms: int) -> FloatArray:
+    """(2, terms): ``int_0^1 u^k P_j(1 - 2 u) du``, for ``exp(-M (b - s))`` integrated from b."""
+    return np.asarray(forward_coefficients(terms) * np.array([[1.0], [-1.0]]))

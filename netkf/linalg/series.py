@@ -1,0 +1,59 @@
+"""Power series of matrices in a gap, summed as far as the gap needs.
+
+The last column of a table (terms, size + 1) says up to which gap its rows so far are enough.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import in_place
+
+ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
+NOTHING = 1e-30  # of the largest entry
+OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in steps of an octave
+
+
+def with_reach(series: FloatArray, longest: float) -> FloatArray:
+    """(terms, size + 1): ``sum_k gap^k series[k]`` of (terms, size), for gaps up to ``longest``
+    seconds, whose last column says for each k up to which gap what follows is below rounding. The
+    number of terms is made odd.
+    """
+    if len(series) % 2 == 0:
+        series = np.concatenate([series, np.zeros((1, series.shape[1]))])
+    terms = len(series)
+    gaps = longest * 2.0 ** (-np.arange(OCTAVES * STEPS + 1)[::-1] / STEPS)
+    sizes = np.abs(series) * (gaps[:, None] ** np.arange(terms))[:, :, None]
+    left = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1] - sizes
+    largest = sizes.max(axis=1)
+    most = ROUNDING * largest + NOTHING * largest.max(axis=1, initial=0.0)[:, None]
+    needed = (left > most[:, None]).any(axis=2).sum(axis=1)
+    counts = np.searchsorted(np.maximum.accumulate(needed), np.arange(terms), side="right")
+    reach = np.concatenate([[0.0], gaps])[counts]
+    reach[-1:] = np.inf
+    return np.column_stack([series, reach])
+
+
+@in_place
+def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
+    """Write the first entries of the sum into a vector."""
+    size, reach = len(out), series.shape[1] - 1
+    for j in range(size):
+        out[j] = series[0, j]
+    k, even = 0, 1.0
+    while gap > series[k, reach]:  # two rows at a time: ``out`` is gone through half as often
+        odd = even * gap
+        even = odd * gap
+        for j in range(size):
+            out[j] += odd * series[k + 1, j] + even * series[k + 2, j]
+        k += 2
+
+
+def polynomial(series: FloatArray, gap: float) -> FloatArray:
+    """The sum (size,) of a table (terms, size + 1)."""
+    terms = int(np.searchsorted(series[:-1, -1], gap)) + 1
+    powers = np.empty(terms)
+    powers[0] = 1.0
+    powers[1:] = gap
+    return np.asarray(np.multiply.accumulate(powers) @ series[:terms, :-1])

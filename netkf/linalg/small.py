@@ -1,0 +1,140 @@
+"""Products of small matrices: numpy in Python, loops without a call where they are compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dgesv
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import compilable_as, in_place
+
+
+def _product_loops(a: FloatArray, b: FloatArray) -> FloatArray:
+    rows, inner, columns = a.shape[0], a.shape[1], b.shape[1]
+    out = np.empty((rows, columns))
+    for i in range(rows):
+        for j in range(columns):
+            total = 0.0
+            for k in range(inner):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+    return out
+
+
+@compilable_as(_product_loops)
+def product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a b`` (r, c) of (r, m) and (m, c)."""
+    return np.asarray(a @ b)
+
+
+def added(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """``c + a b`` (r, s) of (r, s), (r, m) and (m, s)."""
+    return np.asarray(c + a @ b)
+
+
+def _even_loops(P: FloatArray) -> FloatArray:
+    out = np.empty(P.shape)
+    for i in range(P.shape[0]):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
+    return out
+
+
+@compilable_as(_even_loops)
+def even(P: FloatArray) -> FloatArray:
+    """The symmetric part of one matrix (n, n)."""
+    return np.asarray(0.5 * (P + P.T))
+
+
+def _applied_loops(a: FloatArray, x: FloatArray) -> FloatArray:
+    out = np.empty(a.shape[0])
+    for i in range(a.shape[0]):
+        total = 0.0
+        for k in range(a.shape[1]):
+            total += a[i, k] * x[k]
+        out[i] = total
+    return out
+
+
+@compilable_as(_applied_loops)
+def applied(a: FloatArray, x: FloatArray) -> FloatArray:
+    """``a x`` (r,) of (r, m) and (m,)."""
+    return np.asarray(a @ x)
+
+
+@in_place
+def eliminate(  # noqa: PLR0912 - loops are what the compiler wants
+    L: FloatArray, out: FloatArray, n: int
+) -> None:
+    """Write ``L^-1 out`` over ``out`` (n, c), and over the first ``n`` rows of L (., n) too; nan
+    where they are singular.
+    """
+    # Gauss with the largest pivot of each column, as LAPACK does it.
+    columns = out.shape[1]
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(L[i, k]) > abs(L[best, k]):
+                best = i
+        if L[best, k] == 0.0:
+            for i in range(n):
+                for j in range(columns):
+                    out[i, j] = np.nan
+            return
+        if best != k:
+            for j in range(k, n):
+                L[k, j], L[best, j] = L[best, j], L[k, j]
+            for j in range(columns):
+                out[k, j], out[best, j] = out[best, j], out[k, j]
+        for i in range(k + 1, n):
+            factor = L[i, k] / L[k, k]
+            for j in range(k + 1, n):
+                L[i, j] -= factor * L[k, j]
+            for j in range(columns):
+                out[i, j] -= factor * out[k, j]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            for j in range(columns):
+                out[i, j] -= L[i, k] * out[k, j]
+        for j in range(columns):
+            out[i, j] /= L[i, i]
+
+
+def _solution_loops(left: FloatArray, right: FloatArray) -> FloatArray:
+    out = right.copy()
+    eliminate(left.copy(), out, len(left))
+    return out
+
+
+@compilable_as(_solution_loops)
+def solution(left: FloatArray, right: FloatArray) -> FloatArray:
+    """``left^-1 right`` (n, c) of (n, n) and (n, c); nan where it overflows or is singular."""
+    # LAPACK itself: numpy's wrapper takes longer than the arithmetic.
+    _, _, solved, info = dgesv(left, right)
+    return np.full_like(right, np.nan) if info else np.asarray(solved)
+
+
+@in_place
+def _fill_loops(target: FloatArray, source: FloatArray) -> None:
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@compilable_as(_fill_loops)
+def fill(target: FloatArray, source: FloatArray) -> None:
+    """Write a vector into another of its size."""
+    # An assignment of arrays, compiled, brings words about shapes with it: seconds of compiling.
+    target[:] = source
+
+
+@in_place
+def _fill_square_loops(target: FloatArray, source: FloatArray) -> None:
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@compilable_as(_fill_square_loops)
+def fill_square(target: FloatArray, source: FloatArray) -> None:
+    """Write a matrix into another of its size."""
+    target[:] = source

@@ -1,0 +1,160 @@
+"""Numbers of many streams at once: those that numpy's ``Generator(PCG64DXSM)`` draws, compiled.
+
+A network of 1e5 links has as many streams, and a generator of numpy for each costs more than what
+is drawn from it. So the state of all of them is one array here. The words follow PCG64DXSM (M. E.
+O'Neill's permuted congruential generator with the output of numpy's issue 13635), which numpy's
+policy keeps as it is; exponentials come from the ziggurat of Marsaglia and Tsang (2000) with
+numpy's tables (``ziggurat_constants.h``, BSD-3-Clause), kept in ``ziggurat.npz``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import demanded, in_place
+from netkf.rng.streams import Streams, Together
+
+_U = np.uint64
+CHEAP = _U(0xDA942042E4DD58B5)
+FULL_HIGH, FULL_LOW = _U(0x2360ED051FC65DA4), _U(0x4385DF649FCCF645)
+ZERO, ONE, HALF, LAYER = _U(0), _U(1), _U(0xFFFFFFFF), _U(0xFF)
+S3, S8, S11, S32, S48, S63 = _U(3), _U(8), _U(11), _U(32), _U(48), _U(63)
+TO_UNIT = 2.0**-53
+EXPONENTIAL_TAIL = 7.69711747013104972
+
+
+class Ziggurat(NamedTuple):
+    """256 layers under exp(-x): heights, widths / 2^53, and the integers that are surely inside."""
+
+    height: FloatArray
+    width: FloatArray
+    inside: np.ndarray
+
+
+@cache
+def ziggurat() -> Ziggurat:
+    """As numpy has it."""
+    with np.load(Path(__file__).with_name("ziggurat.npz")) as kept:
+        return Ziggurat(kept["fe"], kept["we"], kept["ke"])
+
+
+@in_place
+def high_word(a: Any, b: Any) -> Any:
+    """The upper 64 bits of the product of two words."""
+    a1, a0, b1, b0 = a >> S32, a & HALF, b >> S32, b & HALF
+    low, cross = a0 * b0, a1 * b0
+    middle = (low >> S32) + (cross & HALF) + a0 * b1
+    return a1 * b1 + (cross >> S32) + (middle >> S32)
+
+
+@in_place
+def next_word(states: np.ndarray, k: int) -> Any:
+    """The next word of stream ``k`` of states (K, 4): state and increment, high words first."""
+    high, low = states[k, 0], states[k, 1]
+    made = high ^ (high >> S32)
+    made *= CHEAP
+    made ^= made >> S48
+    made *= low | ONE
+    step = low * CHEAP + states[k, 3]
+    carry = ONE if step < states[k, 3] else ZERO
+    states[k, 0] = high * CHEAP + high_word(low, CHEAP) + states[k, 2] + carry
+    states[k, 1] = step
+    return made
+
+
+@in_place
+def next_unit(states: np.ndarray, k: int) -> float:
+    """The next number of stream ``k``, uniform on [0, 1)."""
+    return float(next_word(states, k) >> S11) * TO_UNIT
+
+
+@in_place
+def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
+    """The next number of stream ``k`` from the exponential law of mean 1."""
+    while True:
+        word = next_word(states, k) >> S3
+        layer = int(word & LAYER)
+        word >>= S8
+        x: float = float(word) * ziggurat.width[layer]
+        if word < ziggurat.inside[layer]:
+            return x
+        if layer == 0:
+            return EXPONENTIAL_TAIL - math.log1p(-next_unit(states, k))
+        above, height = ziggurat.height[layer - 1], ziggurat.height[layer]
+        if (above - height) * next_unit(states, k) + height < math.exp(-x):
+            return x
+
+
+@in_place
+def seed_states(words: np.ndarray, states: np.ndarray) -> None:
+    """Write the states (K, 4) that follow from four words of seed (K, 4) each."""
+    for k in range(len(words)):
+        high = (words[k, 2] << ONE) | (words[k, 3] >> S63)
+        low = (words[k, 3] << ONE) | ONE
+        states[k, 2], states[k, 3] = high, low
+        start = low + words[k, 1]
+        carry = ONE if start < low else ZERO
+        upper = high + words[k, 0] + carry
+        made = start * FULL_LOW
+        product = high_word(start, FULL_LOW) + upper * FULL_LOW + start * FULL_HIGH
+        states[k, 1] = made + low
+        carry = ONE if states[k, 1] < low else ZERO
+        states[k, 0] = product + high + carry
+
+
+@in_place
+def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: FloatArray) -> None:
+    """Write the next ``counts`` uniform numbers of each of the streams ``which``, one stream after
+    the other.
+    """
+    place = 0
+    for m in range(len(which)):
+        for _ in range(counts[m]):
+            out[place] = next_unit(states, which[m])
+            place += 1
+
+
+@in_place
+def fill_exponentials(
+    states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
+) -> None:
+    """The same for exponential numbers."""
+    place = 0
+    for m in range(len(which)):
+        for _ in range(counts[m]):
+            out[place] = next_exponential(states, which[m], ziggurat)
+            place += 1
+
+
+class Draws:
+    """The streams of one purpose of many entities, in order, run by run: their ``states`` (K, 4),
+    which drawing changes; needs numba.
+    """
+
+    def __init__(
+        self, streams: Streams | Together, purpose: str, entities: Sequence[tuple[int, ...]]
+    ) -> None:
+        words = streams.words(purpose, entities)
+        self.states = np.empty(words.shape, dtype=np.uint64)
+        demanded(seed_states)(words, self.states)
+
+    def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
+        """``Generator.random(count)`` of each of the entities in these places, one after the
+        other.
+        """
+        out = np.empty(int(counts.sum()))
+        demanded(fill_units)(self.states, which, counts, out)
+        return out
+
+    def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
+        """The same for ``Generator.standard_exponential``."""
+        out = np.empty(int(counts.sum()))
+        demanded(fill_exponentials)(self.states, which, counts, ziggurat(), out)
+        return out

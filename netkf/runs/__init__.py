@@ -1,0 +1,1 @@
+"""One run: simulate, summarise, write and read its directory."""

@@ -1,0 +1,97 @@
+"""What ``netkf theory`` says of the push-sum filter: P section 4, and the exact mean squares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from netkf.core.errors import TheoryError
+from netkf.runs.tables import number
+from netkf.scenario.scenario import Scenario
+from netkf.theory import (
+    central_covariance,
+    consensus_gain_bound,
+    disconnection_probability,
+    exact_minimum_gamma,
+    minimum_gamma,
+    push_sum_error_covariance,
+    push_sum_limits,
+    push_sum_radius,
+)
+
+MOST_STATES = 120  # of all nodes together; beyond it a search over gamma takes minutes
+MOST_STEPS = 20
+
+
+def push_sum_promises(scenario: Scenario) -> dict[str, Any]:
+    """Values by name, each ``{"value", "reason"}``; plain JSON values."""
+
+    def p_inf() -> float:
+        return float(np.trace(push_sum_limits(scenario).P))
+
+    def central() -> float:
+        return float(np.trace(central_covariance(scenario)))
+
+    def by_node() -> list[float]:
+        covariance = push_sum_error_covariance(scenario)
+        return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
+
+    def exact_gamma() -> int:
+        if len(scenario.nodes) * scenario.plant.n > MOST_STATES:
+            raise TheoryError("not looked for in a network of this size")
+        return exact_minimum_gamma(scenario, most=MOST_STEPS)
+
+    def cut() -> list[float]:
+        found = disconnection_probability(scenario)
+        return [found.low, found.high]
+
+    functions: dict[str, Callable[[], Any]] = {
+        "limit_trace": p_inf,
+        "central_trace": central,
+        "error_traces": by_node,
+        "radius": lambda: push_sum_radius(scenario),
+        "laplacian_radius": lambda: consensus_gain_bound(scenario).radius,
+        "exact_minimum_gamma": exact_gamma,
+        "minimum_gamma_mean": lambda: minimum_gamma(scenario, "mean"),
+        "minimum_gamma_mean_square": lambda: minimum_gamma(scenario, "mean-square"),
+        "disconnection_probability": cut,
+    }
+    return {name: _value(function) for name, function in functions.items()}
+
+
+def _value(function: Callable[[], Any]) -> dict[str, Any]:
+    try:
+        return {"value": function(), "reason": None}
+    except TheoryError as error:
+        return {"value": None, "reason": str(error)}
+
+
+def push_sum_lines(found: dict[str, Any]) -> list[str]:
+    """The same for a terminal."""
+
+    def shown(name: str, make: Callable[[Any], str] = number) -> str:
+        value = found[name]
+        return value["reason"] or make(value["value"])
+
+    def errors(traces: list[float]) -> str:
+        mean, central = float(np.mean(traces)), found["central_trace"]["value"]
+        ratio = f", {mean / central:.4g} times the central one" if central else ""
+        return f"mean {number(mean)}, from {number(min(traces))} to {number(max(traces))}{ratio}"
+
+    def interval(ends: list[float]) -> str:
+        low, high = ends
+        return number(low) if low == high else f"{number(low)} .. {number(high)} (simulated)"
+
+    return [
+        f"trace of P_inf, what every node takes its covariance to be: {shown('limit_trace')}",
+        f"trace of the central filter's covariance: {shown('central_trace')}",
+        f"trace of the steady error covariance, exact: {shown('error_traces', errors)}",
+        f"mean-square radius, exact: {shown('radius')}",
+        f"smallest gamma with a radius below 1: {shown('exact_minimum_gamma', str)}",
+        f"smallest gamma by P Theorem 5 (mean): {shown('minimum_gamma_mean', str)}",
+        f"smallest gamma by P Theorem 6 (mean square): {shown('minimum_gamma_mean_square', str)}",
+        f"rho(L): {shown('laplacian_radius')}",
+        f"disconnection probability: {shown('disconnection_probability', interval)}",
+    ]

@@ -1,0 +1,101 @@
+"""How often each node sent and transmitted: a broadcast is sent to many and transmitted once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import ClassVar
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.network.graphs import Link
+from netkf.trace.recorder import Sink
+from netkf.trace.schema import CODES, KINDS
+
+SEND = CODES["send"]
+TRANSMIT = KINDS.index("transmit")
+
+
+class Transmissions:
+    """Counts of each node, from blocks of EVENT rows as they come.
+
+    Under clocks a broadcast has a ``transmit`` row, and without such rows every message is a
+    transmission of its own. In slots what a node sends in one step of an exchange is one.
+    """
+
+    def __init__(self) -> None:
+        self.sent: Counter[int] = Counter()
+        self._broadcasts: Counter[int] = Counter()
+        self._in_slots: Counter[int] = Counter()
+        self._under_clocks: Counter[int] = Counter()
+        self._step: tuple[float, int] = (np.nan, -1)
+        self._senders: set[int] = set()
+
+    def add(self, rows: np.ndarray) -> None:
+        """Count a block that follows the one before."""
+        sends = rows[rows["kind"] == SEND]
+        _count(self.sent, sends["node"])
+        _count(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
+        in_slots = sends["phase"] >= 0
+        _count(self._under_clocks, sends["node"][~in_slots])
+        self._add_slots(sends[in_slots])
+
+    def _add_slots(self, sends: np.ndarray) -> None:
+        """Steps follow each other: a step that goes on from the last block is counted once."""
+        if not len(sends):
+            return
+        t, phase = sends["t"], sends["phase"]
+        begins = np.flatnonzero((t[1:] != t[:-1]) | (phase[1:] != phase[:-1])) + 1
+        ends = [0, *begins.tolist(), len(sends)]
+        first, last = sends["node"][: ends[1]], sends["node"][ends[-2] :]
+        if (float(t[0]), int(phase[0])) != self._step:
+            self._senders = set()
+        distinct = set(first.tolist())
+        self._in_slots.update(distinct - self._senders)
+        step = np.zeros(len(sends), dtype=np.int64)
+        step[begins] = 1
+        nodes, place = np.unique(sends["node"], return_inverse=True)
+        pairs = np.unique(np.cumsum(step) * len(nodes) + place)
+        _count(self._in_slots, nodes[pairs[pairs >= len(nodes)] % len(nodes)])
+        single = len(ends) == 2
+        self._senders = self._senders | distinct if single else set(last.tolist())
+        self._step = float(t[-1]), int(phase[-1])
+
+    def of(self, node: int) -> int:
+        """How often a node transmitted."""
+        clocks = self._broadcasts if self._broadcasts else self._under_clocks
+        return self._in_slots[node] + clocks[node]
+
+    @property
+    def total(self) -> int:
+        """How often all nodes transmitted."""
+        clocks = self._broadcasts if self._broadcasts else self._under_clocks
+        return self._in_slots.total() + clocks.total()
+
+
+class SentPerLink(Sink):
+    """Counts the messages of each directed link, lost ones included."""
+
+    anywhere: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        self.sent: Counter[Link] = Counter()
+
+    def events(self, rows: np.ndarray) -> None:
+        """Sends."""
+        sends = rows[rows["kind"] == SEND]
+        ends = np.column_stack([sends["node"], sends["peer"]])
+        pairs, counts = np.unique(ends, axis=0, return_counts=True)
+        for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+            self.sent[i, j] += count
+
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
+        """Not counted."""
+
+
+def _count(counter: Counter[int], nodes: np.ndarray) -> None:
+    found, counts = np.unique(nodes, return_counts=True)
+    for node, count in zip(found.tolist(), counts.tolist(), strict=True):
+        counter[node] += count

@@ -1,0 +1,262 @@
+"""``netkf compare``: finished runs and ensembles side by side, real differences marked."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import scipy.special
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import number
+from netkf.studies.metrics import over_runs
+
+AVERAGES = ("rms_error", "mean_trace", "mean_nees")
+MESSAGES = ("sent", "delivered", "lost")
+TRACES = ("bound", "limit", "central")
+ENDED = ("complete", "diverged")
+
+
+class Entry(NamedTuple):
+    """A quantity in one directory: its value, standard error and, where there is something to tell,
+    the difference from the first directory with its interval, whether it is real, and by what.
+    """
+
+    value: float | None
+    se: float | None
+    difference: float | None = None
+    low: float | None = None
+    high: float | None = None
+    real: bool | None = None
+    method: str = ""
+
+
+class Row(NamedTuple):
+    """A quantity, of one ``node`` or of all (-1), in every directory."""
+
+    quantity: str
+    node: int
+    entries: tuple[Entry, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A run directory that was read: its manifest and its summary."""
+
+    directory: Path
+    manifest: dict[str, Any]
+    summary: dict[str, Any]
+
+    @property
+    def runs(self) -> int:
+        """How many runs are in it."""
+        return int(self.manifest["runs"]["done"] or 1)
+
+    def value(self, quantity: str, node: int) -> tuple[float | None, float | None]:
+        """Value and standard error of a quantity, None where there is none."""
+        if quantity in MESSAGES:
+            table, errors = self.summary["messages"], self.summary.get("messages_se", {})
+            return table.get(quantity), errors.get(quantity)
+        table = self.summary["overall"]
+        if node >= 0:
+            table = next(row for row in self.summary["nodes"] if row["node"] == node)
+        value = self.summary[quantity] if quantity in ("limit", "central") else table[quantity]
+        return value, table.get(f"{quantity}_se")
+
+    @property
+    def nodes(self) -> tuple[int, ...]:
+        """Node ids."""
+        return tuple(row["node"] for row in self.summary["nodes"])
+
+    @cached_property
+    def samples(self) -> pd.DataFrame | None:
+        """Samples after time 0 of all runs, where the directory has them."""
+        file = self.directory / "states.parquet"
+        if not file.exists() or self.runs < 2:
+            return None
+        states = pd.read_parquet(file)
+        complete = states["run"].nunique() == self.runs and "sq_error" in states
+        states["mean_trace"] = states.filter(regex=r"^P(\d)\1$").sum(axis=1)
+        return states[states["t"] > 0.0] if complete else None
+
+    @property
+    def rounding_from(self) -> float:
+        """From when on rounding blurs the errors, inf where it does not."""
+        found = self.summary.get("rounding_from")
+        return math.inf if found is None else float(found)
+
+    def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
+        """Averages over time, run by run; of the squared error where it is about errors, over the
+        samples before ``end``.
+        """
+        columns = {"rms_error": "sq_error", "mean_trace": "mean_trace", "mean_nees": "nees"}
+        if self.samples is None or quantity not in columns:
+            return None
+        chosen = self.samples if node < 0 else self.samples[self.samples["node"] == node]
+        if quantity != "mean_trace":
+            chosen = chosen[chosen["t"] < end]
+        return chosen.groupby("run")[columns[quantity]].mean()
+
+
+def read(directory: Path) -> Finished:
+    """A finished run directory; raises ScenarioError where it is not one."""
+    where = str(directory)
+    if not directory.is_dir():
+        raise ScenarioError(where, "is not a directory", None, "name run directories")
+    found = []
+    for name in ("manifest.json", "summary.json"):
+        try:
+            found.append(json.loads((directory / name).read_text(encoding="utf-8")))
+        except (OSError, ValueError):
+            words = f"is not the directory of a run: {name} is missing or cannot be read"
+            raise ScenarioError(where, words, None, "name what netkf run left") from None
+        if name == "manifest.json" and found[0].get("status") not in ENDED:
+            words = f"holds a run that did not finish ({found[0].get('status')})"
+            raise ScenarioError(where, words, None, "finish it with netkf run --resume")
+    try:
+        finished = Finished(directory, found[0], found[1])
+        _ = finished.runs, [finished.value(q, -1) for q in (*AVERAGES, *MESSAGES, *TRACES)]
+        _ = [finished.value("rms_error", node) for node in finished.nodes]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        words = "is not the directory of a run: summary.json or manifest.json lacks what runs have"
+        raise ScenarioError(where, words, None, "name what netkf run left") from None
+    return finished
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Rows side by side; all marks together are right with probability ``confidence``. ``notes``
+    say of each directory what its averages leave out.
+    """
+
+    directories: tuple[str, ...]
+    names: tuple[str, ...]
+    runs: tuple[int, ...]
+    confidence: float
+    rows: tuple[Row, ...]
+    notes: tuple[tuple[str, ...], ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        rows = [
+            {"quantity": q, "node": node, "entries": [entry._asdict() for entry in entries]}
+            for q, node, entries in self.rows
+        ]
+        return {
+            "directories": list(self.directories),
+            "names": list(self.names),
+            "runs": list(self.runs),
+            "confidence": self.confidence,
+            "rows": rows,
+            "notes": [list(notes) for notes in self.notes],
+        }
+
+
+def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comparison:
+    """The summaries of finished runs and ensembles, and which differ from the first for certain.
+
+    Where two ensembles have the same seed and met the same truth, and both kept the states of all
+    runs (``--trace full``), differences are taken run by run; else by the standard errors of both
+    (Welch). The intervals of all rows and directories hold together with probability
+    ``confidence`` (Bonferroni). A single run says nothing about certainty. Raises ScenarioError for
+    a directory that is not that of a finished run.
+    """
+    sure = number(above=0.0, below=1.0)("--confidence", confidence)
+    found = [read(Path(directory)) for directory in directories]
+    if not found:
+        raise ScenarioError("compare", "needs run directories", None, "name at least one")
+    first = found[0]
+    wanted = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
+    if all(other.nodes == first.nodes for other in found):
+        wanted += [("rms_error", node) for node in first.nodes]
+    level = (1.0 - sure) / (len(wanted) * max(1, len(found) - 1))
+    rows = [
+        Row(q, node, tuple(_entry(first, other, q, node, level) for other in found))
+        for q, node in wanted
+    ]
+    rows += [Row(q, -1, tuple(Entry(*other.value(q, -1)) for other in found)) for q in TRACES]
+    return Comparison(
+        tuple(str(other.directory) for other in found),
+        tuple(str(other.manifest.get("name", "")) for other in found),
+        tuple(other.runs for other in found),
+        sure,
+        tuple(rows),
+        tuple(tuple(other.summary.get("notes", ())) for other in found),
+    )
+
+
+def _entry(first: Finished, other: Finished, quantity: str, node: int, level: float) -> Entry:
+    value, se = other.value(quantity, node)
+    entry = Entry(value, se)
+    if other is first or value is None:
+        return entry
+    return _paired(first, other, quantity, node, level, entry) or _welch(
+        first.value(quantity, node), entry, (first.runs, other.runs), level
+    )
+
+
+def _paired(
+    first: Finished, other: Finished, quantity: str, node: int, level: float, entry: Entry
+) -> Entry | None:
+    """Run by run, where both met the same truth."""
+    end = min(first.rounding_from, other.rounding_from)
+    one, two = (finished.by_run(quantity, node, end) for finished in (first, other))
+    if one is None or two is None or not _same_truth(first, other):
+        return None
+    gaps = np.asarray((two - one).dropna(), dtype=np.float64)
+    if len(gaps) < 2:
+        return None
+    mean, error = over_runs(gaps)
+    ends = _around(mean, error, len(gaps) - 1, level)
+    words = "paired" if quantity != "rms_error" else "paired, mean squares"
+    return entry._replace(
+        difference=mean, low=ends[0], high=ends[1], real=_off_zero(*ends), method=words
+    )
+
+
+def _same_truth(first: Finished, other: Finished) -> bool:
+    one, two = first.samples, other.samples
+    if one is None or two is None or first.manifest.get("seed") != other.manifest.get("seed"):
+        return False
+    columns = ["run", "t", *(c for c in one.columns if c.startswith("x") and c[1:].isdecimal())]
+    if not set(columns) <= set(two.columns):
+        return False
+    states = [s[columns].drop_duplicates().set_index(["run", "t"]) for s in (one, two)]
+    shared = states[0].index.intersection(states[1].index)
+    return bool(len(shared)) and bool(states[0].loc[shared].equals(states[1].loc[shared]))
+
+
+def _welch(
+    base: tuple[float | None, float | None], entry: Entry, runs: tuple[int, int], level: float
+) -> Entry:
+    """By standard errors of independent runs."""
+    errors = [base[1], entry.se]
+    if base[0] is None or entry.value is None:
+        return entry
+    difference = entry.value - base[0]
+    if any(e is None or not math.isfinite(e) for e in errors) or min(runs) < 2:
+        return entry._replace(difference=difference, method="one run")
+    squares = [float(e or 0.0) ** 2 for e in errors]
+    total = sum(squares)
+    parts = sum(s * s / (n - 1) for s, n in zip(squares, runs, strict=True))
+    freedom = total * total / parts if parts > 0.0 else float(min(runs) - 1)
+    low, high = _around(difference, math.sqrt(total), freedom, level)
+    return entry._replace(
+        difference=difference, low=low, high=high, real=_off_zero(low, high), method="Welch"
+    )
+
+
+def _around(mean: float, error: float, freedom: float, level: float) -> tuple[float, float]:
+    width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
+    return mean - width, mean + width
+
+
+def _off_zero(low: float, high: float) -> bool:
+    return bool(np.isfinite([low, high]).all() and (low > 0.0 or high < 0.0))

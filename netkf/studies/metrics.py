@@ -1,0 +1,167 @@
+"""What runs of one scenario come to: errors, covariances and messages, run by run."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.baselines import Central
+from netkf.algorithms.models import SlotModel
+from netkf.core.errors import TheoryError
+from netkf.engines.base import Engine
+from netkf.ensembles.statistics import count_messages, reduced_run
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.simulate import simulate
+from netkf.scenario.scenario import Filtering, Scenario
+from netkf.theory import covariance_bound, error_covariance, riccati_step
+
+MOST_ERRORS = 24
+
+
+class Figures(NamedTuple):
+    """Of R runs: ``mean_square`` error and ``trace`` of P (R, N), averaged over the samples after
+    time 0; ``messages`` (R, 5) as MESSAGES; ``diverged`` (R,); ``rounding_from`` (R,): when it
+    begins to blur errors, which are averaged over the samples before, nan without one.
+    """
+
+    mean_square: FloatArray
+    trace: FloatArray
+    messages: FloatArray
+    diverged: FloatArray
+    rounding_from: FloatArray
+
+
+def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Figures:
+    """The figures of one replica, for ``replicate``."""
+    tally = reduced_run(scenario, seed, replica, engine)
+    averages = tally.averages.mean[:-1]
+    blurred = np.array([tally.rounding_from])
+    return Figures(averages[:, 0], averages[:, 1], tally.messages.mean, tally.totals[1:2], blurred)
+
+
+def together(runs: Sequence[Figures]) -> Figures:
+    """The figures of several runs, stacked."""
+    return Figures(*(np.stack(values) for values in zip(*runs, strict=True)))
+
+
+def one_expected_run(
+    scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
+) -> Figures:
+    """As ``one_run``, with the expected square of the error given the events of the run: what luck
+    with noise adds is left out, and far fewer runs are enough.
+    """
+    run = simulate(scenario, seed, replica, engine)
+    if run.status != "complete":
+        return one_run(scenario, seed, replica, engine)
+    square, trace = (
+        averaged(scenario, np.trace(matrices, axis1=2, axis2=3))
+        for matrices in (error_covariance(scenario, run), run.P)
+    )
+    messages = count_messages(run.count, scenario.slotted)
+    return Figures(square, trace, messages, np.zeros(1, dtype=np.int64), np.full(1, np.inf))
+
+
+def expected_errors_known(scenario: Scenario) -> bool:
+    """Whether ``one_expected_run`` can be done, and in about the time of a few runs."""
+    small = len(scenario.nodes) * scenario.plant.n <= MOST_ERRORS
+    if not (scenario.slotted and small and scenario.drawn):
+        return False
+    try:
+        error_covariance(scenario, simulate(scenario))
+    except TheoryError:
+        return False
+    return True
+
+
+class Estimate(NamedTuple):
+    """A mean over runs with its standard error, nan for a single run."""
+
+    value: float
+    error: float
+
+
+def over_runs(values: FloatArray) -> Estimate:
+    """Of one value a run (R,)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+    return Estimate(float(values.mean()), spread / math.sqrt(len(values)))
+
+
+def worst(values: FloatArray) -> Estimate:
+    """Of the node with the largest mean, from (R, N)."""
+    return over_runs(values[:, int(np.argmax(values.mean(axis=0)))])
+
+
+def overall(values: FloatArray) -> Estimate:
+    """Of the mean over all nodes, from (R, N)."""
+    return over_runs(values.mean(axis=1))
+
+
+def root(estimate: Estimate) -> Estimate:
+    """Of the square root of what was estimated, by the delta method."""
+    value = math.sqrt(estimate.value)
+    return Estimate(value, estimate.error / (2.0 * value) if value > 0.0 else math.nan)
+
+
+def averaged(scenario: Scenario, values: FloatArray) -> FloatArray:
+    """(N,) means over the samples after time 0 of (T, N) values, as in the table of a run."""
+    after = scenario.times > 0.0
+    return np.asarray(values[after if after.any() else slice(None)].mean(axis=0))
+
+
+def bound_traces(scenario: Scenario) -> FloatArray:
+    """(N,) traces of the covariance bound, averaged over the samples after time 0: of H(12), or
+    where nodes do not talk of their own covariance. Raises TheoryError where there is none.
+    """
+    if not scenario.slotted:
+        bound = covariance_bound(scenario, scenario.times)
+        return averaged(scenario, np.trace(bound, axis1=2, axis2=3))
+    if scenario.filter.algorithm.talks:
+        raise TheoryError("H(12) is about filters in continuous time")
+    _fixed_rows(scenario)
+    pooled = scenario.filter.algorithm.pooled
+    models = [scenario.pooled_slot_model] * len(scenario.nodes) if pooled else scenario.slot_models
+    starts = [scenario.start(node)[1] for node in scenario.nodes]
+    columns = [_slot_traces(scenario, m, P) for m, P in zip(models, starts, strict=True)]
+    return averaged(scenario, np.stack(columns, axis=1))
+
+
+def central_trace(scenario: Scenario) -> float:
+    """The trace of the covariance of a filter that has all readings and the true model, averaged
+    over the same samples; of its prediction where the scenario's filter predicts.
+    """
+    algorithm = Central()
+    central = dataclasses.replace(scenario, filter=Filtering(algorithm=algorithm))
+    if not scenario.slotted:
+        return float(bound_traces(central)[0])
+    _fixed_rows(scenario)
+    traces = _slot_traces(scenario, central.pooled_slot_model, scenario.plant.start_cov)
+    return float(averaged(scenario, traces[:, None])[0])
+
+
+def _fixed_rows(scenario: Scenario) -> None:
+    if not scenario.drawn:
+        raise TheoryError("the readings are recorded: nobody knows their law")
+    for node in scenario.sensing:
+        scenario.observation(node)  # raises where H is random
+
+
+def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
+    """(T,) traces of the covariance of a Kalman filter with a model, as samples show it."""
+    predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
+    F, Q, H, R = model.F, model.Q, model.H, model.R
+    P, found = start, np.empty(max(scenario.slots) + 1)
+    found[0] = np.trace(start)
+    for slot in range(1, len(found)):
+        if predicts:
+            P = riccati_step(P, F, Q, H, R) if len(H) else F @ P @ F.T + Q
+        else:
+            P = F @ P @ F.T + Q
+            S = H @ P @ H.T + R
+            P = P - P @ H.T @ np.linalg.solve(S, H @ P) if len(H) else P
+        found[slot] = np.trace(P)
+    return np.asarray(found[np.array(scenario.slots)])

@@ -1,0 +1,157 @@
+"""Sweeps, searches and comparisons for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from netkf.runs.tables import number, table
+from netkf.studies.compare import Comparison, Entry
+from netkf.studies.consistency import Consistency
+from netkf.studies.search import Sizing
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = ("worst_rms", "mean_rms", "mean_trace", "bound", "central")
+MOST_ROWS = 40
+LONGEST = 30
+
+
+def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
+    """A row a cell; the ends of long tables."""
+    header = [*keys, *(name.replace("_", " ") for name in COLUMNS), "messages", "status"]
+    rows = [
+        [
+            *(_short(row[key]) for key in keys),
+            *(_with_error(row[name], row.get(f"{name}_se")) for name in COLUMNS),
+            f"{row['sent']:,.6g}",
+            row["status"],
+        ]
+        for row in found.to_dict("records")
+    ]
+    if len(rows) > MOST_ROWS:
+        middle = [f"({len(rows) - MOST_ROWS} more)", *[""] * (len(header) - 1)]
+        rows = [*rows[: MOST_ROWS // 2], middle, *rows[-MOST_ROWS // 2 :]]
+    return table(header, rows)
+
+
+def _short(value: Any) -> str:
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _with_error(value: float | None, error: float | None) -> str:
+    known = error is not None and math.isfinite(error)
+    return number(value) + (f" +- {error:.1g}" if known else "")
+
+
+def sizing_text(found: Sizing) -> str:
+    """What was tried, the answer, and how sure it is."""
+    header = [found.key, found.target.quantity, "at least", "at most", "runs", "target"]
+    rows = [
+        [f"{p.value:g}", number(p.quantity), number(p.low), number(p.high), str(p.runs), p.target]
+        for p in sorted(found.probes)
+    ]
+    if found.by == "theory":
+        header = [*header[:2], header[-1]]
+        rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(found.probes)]
+    lines = [table(header, rows), ""]
+    lines += [answer(found), f"{found.target.quantity}: {found.quantity}", f"sure: {found.sure}"]
+    return "\n".join(lines)
+
+
+def answer(found: Sizing) -> str:
+    """One line."""
+    values = [probe.value for probe in found.probes]
+    span = f"{min(values):g} .. {max(values):g}"
+    if found.value is None:
+        undecided = any(probe.target == "undecided" for probe in found.probes)
+        words = "was shown to reach" if undecided else "reaches"
+        return f"no value of {found.key} in {span} {words} {found.target}"
+    which = "largest" if found.grows else "smallest"
+    if found.misses is None:
+        return f"{found.key} = {found.value:g}: all of {span} reaches {found.target}"
+    miss = next(probe for probe in found.probes if probe.value == found.misses)
+    words = "misses it" if miss.target == "missed" else "was not shown to"
+    return (
+        f"{found.key} = {found.value:g} is the {which} that reaches {found.target}; "
+        f"{found.misses:g} {words}"
+    )
+
+
+def consistency_text(found: Consistency) -> str:
+    """A row a node, and what the numbers should be."""
+    header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
+    rows = [
+        [
+            str(row.node),
+            f"{number(row.nees)} +- {row.width:.1g}",
+            number(row.expected),
+            f"{row.inside:.0%}",
+            number(row.nis),
+            number(row.expected_nis),
+            row.verdict,
+        ]
+        for row in found.rows
+    ]
+    if len(rows) > MOST_ROWS:
+        middle = [f"({len(rows) - MOST_ROWS} more)", *[""] * (len(header) - 1)]
+        rows = [*rows[: MOST_ROWS // 2], middle, *rows[-MOST_ROWS // 2 :]]
+    ends = f"{found.low:.4g} .. {found.high:.4g}"
+    scaled = f"{found.low / found.n:.4g} .. {found.high / found.n:.4g}"
+    return "\n".join(
+        [
+            table(header, rows),
+            "",
+            f"{found.runs:,} runs, n = {found.n}; +-: half width of the interval on the difference "
+            f"from what NEES should be, all nodes together at confidence {found.confidence:g}",
+            f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
+            f"chi-square bounds at {found.confidence:g} where P is exact",
+            *(f"note: {note}" for note in found.notes),
+        ]
+    )
+
+
+def comparison_text(found: Comparison) -> str:
+    """Directories side by side; a star marks what really differs from the first."""
+    numbered = [f"({k + 1})" for k in range(len(found.directories))]
+    lines = [
+        f"{mark} {directory}: {name}, {runs:,} run{'s' if runs > 1 else ''}"
+        for mark, directory, name, runs in zip(
+            numbered, found.directories, found.names, found.runs, strict=True
+        )
+    ]
+    rows = [
+        [
+            row.quantity if row.node < 0 else f"{row.quantity} of node {row.node}",
+            *map(_marked, row.entries),
+        ]
+        for row in found.rows
+    ]
+    if len(rows) > MOST_ROWS:
+        left_out = f"({len(rows) - MOST_ROWS} more; --json has all)"
+        rows = [*rows[: MOST_ROWS - 3], [left_out, *[""] * len(numbered)], *rows[-3:]]
+    lines += ["", table(["", *numbered], rows, left=1)]
+    notes = [
+        f"note: {mark} {note}"
+        for mark, told in zip(numbered, found.notes, strict=True)
+        for note in told
+    ]
+    lines += ["", *notes] if notes else []
+    methods = {e.method for row in found.rows for e in row.entries if e.method}
+    if methods - {"one run"}:
+        how = ", ".join(sorted(methods - {"one run"}))
+        lines += [
+            "",
+            f"* differs from (1) for certain; all marks together at confidence "
+            f"{found.confidence:g} ({how})",
+        ]
+    if "one run" in methods:
+        lines += ["", "differences of single runs are not marked: one run says nothing about luck"]
+    return "\n".join(lines)
+
+
+def _marked(entry: Entry) -> str:
+    return _with_error(entry.value, entry.se) + (" *" if entry.real else "  ")

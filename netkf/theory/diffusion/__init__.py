@@ -1,0 +1,1 @@
+"""Theory of the diffusion filter (D)."""

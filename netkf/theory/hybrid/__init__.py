@@ -1,0 +1,1 @@
+"""Theory of the hybrid filter (H): the bound (12), its steady state and limits."""

@@ -1,0 +1,237 @@
+"""The coupled Riccati equations H(12) of a scenario, as arrays.
+
+d P_i = A P_i + P_i A' + Q - P_i G_i P_i + sum_j c_ij (T P_j T' + q - P_i)
+
+``c_ij`` is the rate at which messages from j arrive at i times the weight they get. Sensors that
+sample add terms and jumps of their own, see theory/hybrid/samples.py. A message that
+took a fixed time d is predicted first, ``T = exp(A d)`` and ``q`` the noise of d seconds, and
+P_j is then the one from d seconds ago; without delay ``T = I``, ``q = 0``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+
+from netkf.algorithms.covariance_intersection import CovarianceIntersection
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.network.clocks import LinkClock
+from netkf.scenario.registry import spoken
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.observed import increments
+from netkf.theory.hybrid.samples import (
+    Jump,
+    Samples,
+    at_random,
+    by_readings,
+    clock_of,
+    jumps,
+    poisson_samples,
+)
+
+
+class Coupled(NamedTuple):
+    """A (n, n), Q (n, n), G (N, n, n) of increments, coupling (N, N) sparse, T (n, n), q (n, n),
+    delay (s), start (N, n, n), ``samples`` by Poisson clocks, ``jumps`` at known times.
+    """
+
+    A: FloatArray
+    Q: FloatArray
+    G: FloatArray
+    coupling: scipy.sparse.csr_array
+    T: FloatArray
+    q: FloatArray
+    delay: float
+    start: FloatArray
+    samples: tuple[Samples, ...] = ()
+    jumps: tuple[Jump, ...] = ()
+
+    @property
+    def talks(self) -> bool:
+        """Whether any message ever arrives."""
+        sent = any(jump.sent is not None and jump.sent.any() for jump in self.jumps)
+        return bool(self.coupling.nnz or any(s.heard.nnz for s in self.samples) or sent)
+
+    def only(self, node: int) -> Coupled:
+        """The equation of one node, alone."""
+        return self._replace(
+            G=self.G[node : node + 1],
+            start=self.start[node : node + 1],
+            coupling=scipy.sparse.csr_array((1, 1)),
+            samples=tuple(s.only(node) for s in self.samples),
+            jumps=tuple(
+                Jump(jump.time, {0: jump.seen[node]}, None)
+                for jump in self.jumps
+                if node in jump.seen
+            ),
+        )
+
+    def faster(self, factor: float) -> Coupled:
+        """With clocks of links, directions or nodes that tick so many times as often."""
+        return self._replace(coupling=factor * self.coupling)
+
+
+STEPS = (
+    "init",
+    "predict",
+    "update",
+    "emit",
+    "absorb",
+    "share",
+    "max_measurement_interval",
+    "steps",
+    "redraws_links",
+    "estimate",
+)
+
+
+def own_steps(algorithm: object, known: type, steps: tuple[str, ...] = STEPS) -> list[str]:
+    """The steps that a user's subclass defines itself; theorems about ``known`` are not about it.
+
+    Other weights are understood, they enter the equations.
+    """
+    mine = type(algorithm)
+    return [
+        name
+        for name in steps
+        if hasattr(known, name) and getattr(mine, name, None) is not getattr(known, name)
+    ]
+
+
+def not_promised(scenario: Scenario) -> str | None:
+    """Why H Theorem 2 does not speak about the scenario, in words; None where it does."""
+    algorithm, network = scenario.filter.algorithm, scenario.network
+    if not scenario.slotted and not algorithm.talks:
+        return _samples_not_promised(scenario)
+    name = type(algorithm).__name__
+    if not isinstance(algorithm, Hybrid):
+        return f"H(12) is about the hybrid filter in continuous time, not about {spoken(algorithm)}"
+    intersects = isinstance(algorithm, CovarianceIntersection)  # its resets give no larger P
+    own = own_steps(algorithm, CovarianceIntersection if intersects else Hybrid)
+    if own:
+        return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
+    assert isinstance(network.activation, LinkClock)
+    if not by_readings(scenario) and not network.activation.memoryless:
+        return (
+            f"not promised: the clocks of the {network.activation.at} are not Poisson processes, "
+            "and for other clocks of the same rate the mean covariance can lie above H(12)"
+        )
+    if network.channel.delay.fixed is None:
+        return "not promised: H(12) holds for no delay or a fixed one, and the delay is random"
+    bursts = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
+    return _samples_not_promised(scenario) if network.channel.loss.independent else bursts
+
+
+def _samples_not_promised(scenario: Scenario) -> str | None:
+    for node, place in at_random(scenario):
+        clock = clock_of(scenario.sensors[place.entry])
+        if clock is not None and not clock.memoryless:
+            return (
+                f"not promised: when node {node} samples is random and no Poisson process, and for "
+                "other clocks of the same rate the mean covariance can lie above the bound"
+            )
+    return None
+
+
+def promised(scenario: Scenario) -> None:
+    """Raise TheoryError with the reason where H Theorem 2 does not apply."""
+    reason = not_promised(scenario)
+    if reason is not None:
+        raise TheoryError(reason)
+
+
+def informations(scenario: Scenario) -> FloatArray:
+    """(N, n, n): ``G_i`` of the increments as the filters believe it; a pooled filter's is the same
+    at all nodes.
+    """
+    seen = [one.H.T @ np.linalg.solve(one.R, one.H) for one in increments(scenario)]
+    if scenario.filter.algorithm.pooled:
+        seen = seen * len(scenario.nodes)
+    return np.stack(seen)
+
+
+def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
+    """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times weight."""
+    index, size = scenario.topology.index, len(scenario.nodes)
+    rates = {} if by_readings(scenario) else scenario.effective_rates()
+    heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
+    values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
+    places = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
+    entries = scipy.sparse.coo_array((values, (places[:, 0], places[:, 1])), shape=(size, size))
+    matrix = scipy.sparse.csr_array(entries)
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def coupled(scenario: Scenario) -> Coupled:
+    """The equations of a scenario; raises TheoryError where H(12) does not apply."""
+    promised(scenario)
+    A, Q = scenario.belief
+    n = scenario.plant.n
+    delay = scenario.network.channel.delay.fixed or 0.0
+    if not scenario.filter.algorithm.talks:
+        delay = 0.0
+    T, q = np.eye(n), np.zeros((n, n))
+    if delay > 0.0:
+        table = riccati_table(A, Q, np.zeros((n, n)), delay)
+        q, _ = riccati_step(table, q, np.zeros(n), delay)
+        T = np.column_stack([riccati_step(table, q, e, delay)[1] for e in np.eye(n)])
+    start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
+    return Coupled(
+        A,
+        Q,
+        informations(scenario),
+        coupling(scenario),
+        T,
+        q,
+        delay,
+        start,
+        poisson_samples(scenario),
+        jumps(scenario),
+    )
+
+
+def balanced(scenario: Scenario) -> bool | None:
+    """Whether both directions of each link arrive at one rate, so that the limit is S of H(13);
+    None where the rates are not known beforehand.
+    """
+    if not np.isfinite(list(scenario.effective_rates().values())).all():
+        return None
+    c = coupling(scenario).toarray()
+    return bool(np.allclose(c, c.T, rtol=1e-12))
+
+
+def left_weights(scenario: Scenario) -> FloatArray:
+    """(N,): the weights with which the nodes' information enters when links tick ever faster.
+
+    The left null vector of the coupling, scaled to sum 1: 1/N where both directions of a link
+    arrive at one rate. Raises TheoryError where some node is never heard.
+    """
+    algorithm = scenario.filter.algorithm
+    if len(scenario.nodes) == 1:
+        return np.ones(1)
+    if not algorithm.talks:
+        raise TheoryError(f"the {spoken(algorithm)} filter does not talk, links mean nothing to it")
+    c = coupling(scenario).toarray()
+    size = len(c)
+    laplacian = np.diag(c.sum(axis=1)) - c
+    if balanced(scenario) is None:
+        raise TheoryError("how often messages arrive is not known beforehand (a recorded table?)")
+    if math.isclose(float(np.abs(c).max()), 0.0):
+        raise TheoryError("no message ever arrives")
+    laplacian /= np.abs(laplacian).max()
+    system = np.concatenate([laplacian.T, np.ones((1, size))])
+    target = np.concatenate([np.zeros(size), [1.0]])
+    w, _, rank, _ = np.linalg.lstsq(system, target, rcond=None)
+    if rank < size or not np.abs(system @ w - target).max() < RESIDUAL_WEIGHTS:
+        raise TheoryError("the messages that arrive do not join all nodes")
+    return np.asarray(np.maximum(w, 0.0) / np.maximum(w, 0.0).sum())
+
+
+RESIDUAL_WEIGHTS = 1e-9

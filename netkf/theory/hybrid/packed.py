@@ -1,0 +1,197 @@
+"""H(12) with each symmetric matrix kept as its upper triangle, a row of m = n (n + 1) / 2 numbers.
+
+Its parts then are what they are: one sparse product over neighbours for all entries at once, one
+small matrix for A P + P A' that is the same at all nodes, and P G P where there is a sensor, as
+``(P C)(P C)'`` with ``G = C C'``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+
+from netkf.linalg.arrays import FloatArray
+from netkf.theory.hybrid.coupled import Coupled
+from netkf.theory.hybrid.samples import Samples
+
+NO_INFORMATION = 1e-15  # eigenvalues of G, its diagonal made 1, that are rounding
+
+
+class Packed:
+    """The equations of a scenario, on rows ``Y`` (N, m)."""
+
+    def __init__(self, equations: Coupled) -> None:
+        self.equations = equations
+        n = len(equations.A)
+        self._i, self._j = np.triu_indices(n)
+        self.m = len(self._i)
+        places = np.zeros((n, n), dtype=np.int64)
+        places[self._i, self._j] = places[self._j, self._i] = np.arange(self.m)
+        self._places = places.reshape(-1)
+        self._basis = np.zeros((self.m, n, n))
+        self._basis[np.arange(self.m), self._i, self._j] = 1.0
+        self._basis[np.arange(self.m), self._j, self._i] = 1.0
+        drift = equations.A @ self._basis
+        self._own = self.pack(drift + np.swapaxes(drift, 1, 2))
+        self._predicted = self.pack(equations.T @ self._basis @ equations.T.T)
+        self.start = self.pack(equations.start)
+        self._Q, self._q = self.pack(equations.Q), self.pack(equations.q)
+        flows = [equations.coupling, *(s.heard for s in equations.samples)]
+        self.leaving = np.asarray(sum(flow.sum(axis=1) for flow in flows)).reshape(-1)
+        leave = scipy.sparse.diags_array(self.leaving)
+        self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
+        self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
+        self._C = _factors(equations.G[self._sensed])
+        self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
+
+    def pack(self, P: FloatArray) -> FloatArray:
+        """(..., n, n) to (..., m)."""
+        return np.ascontiguousarray(P[..., self._i, self._j])
+
+    def unpack(self, Y: FloatArray) -> FloatArray:
+        """(..., m) to (..., n, n)."""
+        n = len(self.equations.A)
+        return np.asarray(Y[..., self._places].reshape(*Y.shape[:-1], n, n))
+
+    def predicted(self, Y: FloatArray) -> FloatArray:
+        """(N, m): rows that took the delay to arrive."""
+        return np.asarray(Y @ self._predicted + self._q)
+
+    def slope(self, Y: FloatArray, sent: FloatArray | None = None) -> FloatArray:
+        """(N, m): the right-hand side where ``sent`` (N, m) arrives; without delay that is Y."""
+        if sent is None:
+            change = self._exchange @ Y + Y @ self._own + self._Q
+        else:
+            change = Y @ self._own + self._Q - self.leaving[:, None] * Y
+            change += self.equations.coupling @ self.predicted(sent)
+        M = self.unpack(Y[self._sensed]) @ self._C
+        change[self._sensed] -= self.pack(M @ np.swapaxes(M, 1, 2))
+        for group in self.equations.samples:
+            self._sample(change, group, self.unpack(Y), None if sent is None else self.unpack(sent))
+        return np.asarray(change)
+
+    def _sample(
+        self, change: FloatArray, group: Samples, P: FloatArray, sent: FloatArray | None
+    ) -> None:
+        """Add ``s (g(P) - P)``, and what arrives of estimates sent at samples."""
+        off = self.pack(group.told(P))
+        np.subtract.at(change, group.nodes, group.rate[:, None] * off)
+        if not group.heard.nnz:
+            return
+        if sent is None:
+            arriving = self.pack(P)[group.nodes] - off
+        else:
+            after = self.pack(sent)[group.nodes] - self.pack(group.told(sent))
+            arriving = self.predicted(after)
+        change += group.heard @ arriving
+
+    def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
+        """(order + 1, N, m): Taylor coefficients of the solution through ``Y``, without delay, in
+        powers of seconds / ``span``.
+
+        The right-hand side is quadratic: each coefficient follows from those before it.
+        """
+        series = np.empty((order + 1, *Y.shape))
+        series[0] = Y
+        # P G P is the sum of M_i M_j' over i + j = k with M = P C. Nodes come last, so that numpy
+        # runs along them; the half with i <= j and its transpose are enough.
+        n, r, seen = self._across.shape
+        every = np.empty((order, n, r, seen))
+        for k in range(order):
+            change = self._exchange @ series[k]
+            change += series[k] @ self._own
+            if k == 0:
+                change += self._Q
+            if seen:
+                rows = np.ascontiguousarray(series[k, self._sensed].T)
+                P = rows[self._places].reshape(n, n, seen)
+                np.einsum("ijs,jrs->irs", P, self._across, out=every[k])
+                before = (k + 1) // 2
+                half = np.einsum("kirs,kjrs->ijs", every[:before], every[k : k - before : -1])
+                square = half[self._i, self._j] + half[self._j, self._i]
+                if k % 2 == 0:
+                    middle = every[k // 2]
+                    square += np.einsum("irs,jrs->ijs", middle, middle)[self._i, self._j]
+                change[self._sensed] -= square.T
+            np.multiply(change, span / (k + 1), out=series[k + 1])
+        return series
+
+    def linear(self, P: FloatArray) -> Linear:
+        """H(12) made linear at ``P`` (N, n, n): with its gains, which a change of P leaves alone to
+        first order.
+        """
+        K = P @ self.equations.G
+        change = -(K[:, None] @ self._basis)
+        blocks = self.pack(change + np.swapaxes(change, -1, -2)) + self._own
+        blocks = blocks - self.leaving[:, None, None] * np.eye(self.m)
+        heard = [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
+        for group in self.equations.samples:
+            _, closed = group.gains(P)
+            closed = closed[:, None]
+            maps = self.pack(closed @ self._basis @ np.swapaxes(closed, -1, -2))
+            np.add.at(blocks, group.nodes, group.rate[:, None, None] * (maps - np.eye(self.m)))
+            if group.heard.nnz:
+                heard.append((group.heard, group.nodes, maps @ self._predicted))
+        return Linear(np.asarray(blocks), heard)
+
+    def driven(self, P: FloatArray) -> FloatArray:
+        """(N, m): what H(12) made linear at P adds whatever P is: Q, the noises of readings, and
+        those of messages under way.
+        """
+        G, q = self.equations.G, self.equations.q
+        right = self.pack(self.equations.Q + P @ G @ P + self.leaving[:, None, None] * q)
+        for group in self.equations.samples:
+            noise = self.pack(group.noise(P))
+            np.add.at(right, group.nodes, group.rate[:, None] * noise)
+            right += group.heard @ (noise @ self._predicted)
+        return np.asarray(right)
+
+
+class Linear(NamedTuple):
+    """``blocks`` (N, m, m): what becomes of each row by itself, ``X_i B_i``; ``heard``: rates (N,
+    S) of what arrives from nodes (S,), each row times a map (S, m, m) or one map (1, m, m).
+    """
+
+    blocks: FloatArray
+    heard: list[tuple[scipy.sparse.csr_array, np.ndarray, FloatArray]]
+
+    def arriving(self, X: FloatArray) -> FloatArray:
+        """(N, m): what arrives at each node of rows X (N, m)."""
+        total = np.zeros_like(X)
+        for rates, nodes, maps in self.heard:
+            total += rates @ (X[nodes][:, None] @ maps)[:, 0]
+        return total
+
+    def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
+        """(N m, N m): one sparse matrix, with what is arriving or without."""
+        size, m, _ = self.blocks.shape
+        shape = (size * m, size * m)
+        turned = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))
+        parts = (turned, np.arange(size), np.arange(size + 1))
+        whole = scipy.sparse.csr_array(scipy.sparse.bsr_array(parts, shape=shape))
+        for rates, nodes, maps in self.heard if arriving else ():
+            if len(maps) == 1 and len(nodes) == size:
+                whole = whole + scipy.sparse.kron(rates, maps[0].T, "csr")
+                continue
+            entries = scipy.sparse.coo_array(rates)
+            turned = np.swapaxes(maps, 1, 2)[entries.col] * entries.data[:, None, None]
+            rows = entries.row[:, None, None] * m + np.arange(m)[None, :, None]
+            columns = nodes[entries.col][:, None, None] * m + np.arange(m)[None, None, :]
+            places = np.broadcast_arrays(rows, columns)
+            flat = (turned.reshape(-1), tuple(place.reshape(-1) for place in places))
+            whole = whole + scipy.sparse.csr_array(scipy.sparse.coo_array(flat, shape=shape))
+        return scipy.sparse.csc_array(whole)
+
+
+def _factors(G: FloatArray) -> FloatArray:
+    """(S, n, r) C with ``C C' = G`` (S, n, n), r the largest rank."""
+    # Scaled to a diagonal of ones, so that the units of the states do not matter to what is small.
+    scale = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
+    divided = 1.0 / np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(G * divided[:, :, None] * divided[:, None, :])
+    kept = values > NO_INFORMATION
+    rank = int(kept.sum(axis=1).max(initial=0))
+    C = scale[:, :, None] * vectors * np.sqrt(np.where(kept, values, 0.0))[:, None, :]
+    return np.ascontiguousarray(C[:, :, C.shape[2] - rank :])

@@ -1,0 +1,110 @@
+"""Whether the covariances of H have a variance: second moments of a linear recursion above them.
+
+With the constant gains of the steady bound calP every node's covariance obeys a linear recursion
+that has mean calP and dominates P on every path (derived). Its second moments obey a linear
+equation, ``dY = L Y + Y L' + sum over outcomes of an activation, rate (J Y J' - Y)``; they stay
+finite, and so does the variance of P, where that equation is stable. For one blind scalar node with
+growth a this is rate > 4 a / (pi (2 - pi)).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse.linalg
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.network.clocks import Poisson
+from netkf.scenario.sampling import sampled_sensors
+from netkf.scenario.scenario import Scenario
+from netkf.theory.hybrid.steady import steady_covariance_bound
+
+LARGEST = 200  # entries of all covariances together
+
+
+def second_moment_rate(scenario: Scenario) -> float:
+    """Growth rate (1/s) of the second moments of that recursion; below 0 they stay finite.
+
+    For Poisson clocks with independent losses and no delay; raises TheoryError else, where the
+    steady bound does not exist (then the mean does not either), and for very large networks.
+    """
+    channel = scenario.network.channel
+    if not isinstance(scenario.network.activation, Poisson):
+        raise TheoryError("the second moments of P are known for Poisson clocks only")
+    if scenario.network.activation.at != "links" or sampled_sensors(scenario):
+        raise TheoryError("the second moments of P are known for clocks of links and increments")
+    if not channel.loss.independent or channel.delay.fixed != 0.0:
+        raise TheoryError("the second moments of P are known without bursts and delays only")
+    nodes, n = len(scenario.nodes), scenario.plant.n
+    size = nodes * n * n
+    if size > LARGEST:
+        raise TheoryError(f"the second moments of P have {size:,}^2 entries, too many to decide")
+    equation = _Equation(scenario, steady_covariance_bound(scenario))
+    if size == 1:
+        return float(equation(np.ones(1))[0])
+    operator = scipy.sparse.linalg.LinearOperator((size**2, size**2), equation, dtype=float)
+    start = np.tile(np.eye(n).reshape(-1), nodes)
+    first = np.outer(start, start).reshape(-1)
+    if size < 3:
+        dense = np.stack([equation(column) for column in np.eye(size**2)], axis=1)
+        return float(np.linalg.eigvals(dense).real.max())
+    try:
+        values = scipy.sparse.linalg.eigs(
+            operator, k=1, which="LR", v0=first, tol=1e-6, return_eigenvectors=False
+        )
+    except scipy.sparse.linalg.ArpackNoConvergence:
+        raise TheoryError("the growth of the second moments of P was not found") from None
+    return float(values.real.max())
+
+
+class _Equation:
+    """The right-hand side for second moments (N n n, N n n), flat."""
+
+    def __init__(self, scenario: Scenario, bound: FloatArray) -> None:
+        n, index = scenario.plant.n, scenario.topology.index
+        self._shape = (len(index), n * n, len(index), n * n)
+        eye = np.eye(n)
+        closed = [
+            model.A - P @ model.H.T @ np.linalg.solve(model.R, model.H)
+            for P, model in zip(bound, scenario.models, strict=True)
+        ]
+        self._own = np.array([np.kron(M, eye) + np.kron(eye, M) for M in closed])
+        self._mixing = np.zeros((len(index), len(index)))
+        self._outcomes: list[tuple[int, int, float, float, float]] = []
+        for i, j in scenario.topology.links:
+            self._add(scenario, i, j, index[i], index[j])
+
+    def _add(self, scenario: Scenario, i: int, j: int, a: int, b: int) -> None:
+        clock, channel = scenario.network.activation, scenario.network.channel
+        assert isinstance(clock, Poisson)
+        rate, loss = clock.mean_rate((i, j)), channel.loss
+        to_j = loss.mean_delivery((i, j), scenario.measured((i, j)))
+        to_i = loss.mean_delivery((j, i), scenario.measured((j, i)))
+        both = min(to_i, to_j) if channel.symmetric else to_i * to_j
+        at_i, at_j = scenario.weight(i, j), scenario.weight(j, i)
+        for x, y, chance, weight in ((a, b, to_i, at_i), (b, a, to_j, at_j)):
+            self._mixing[x, y] += rate * chance * weight
+            self._mixing[x, x] -= rate * chance * weight
+        self._outcomes += [
+            (a, b, rate * (to_i - both), at_i, 0.0),
+            (a, b, rate * (to_j - both), 0.0, at_j),
+            (a, b, rate * both, at_i, at_j),
+        ]
+
+    def __call__(self, flat: FloatArray) -> FloatArray:
+        Y = np.asarray(flat, dtype=np.float64).reshape(self._shape)
+        half = np.einsum("aij,ajbk->aibk", self._own, Y)
+        half += np.einsum("ac,cibk->aibk", self._mixing, Y)
+        other = np.einsum("bkl,aibl->aibk", self._own, Y)
+        other += np.einsum("bc,aick->aibk", self._mixing, Y)
+        result = half + other
+        for a, b, rate, at_a, at_b in self._outcomes:
+            if rate == 0.0:
+                continue
+            # (J - I) Y (J - I)', where J - I moves a towards b and b towards a
+            core = Y[a, :, a] - Y[a, :, b] - Y[b, :, a] + Y[b, :, b]
+            result[a, :, a] += rate * at_a * at_a * core
+            result[b, :, b] += rate * at_b * at_b * core
+            result[a, :, b] -= rate * at_a * at_b * core
+            result[b, :, a] -= rate * at_a * at_b * core
+        return np.asarray(result.reshape(-1))

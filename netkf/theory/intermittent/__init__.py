@@ -1,0 +1,1 @@
+"""Theory of intermittent observations (R): the random Riccati equation."""

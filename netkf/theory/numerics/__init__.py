@@ -1,0 +1,1 @@
+"""Functions of plain matrices: checked inputs, algebraic equations, gaps and moves."""

@@ -1,0 +1,145 @@
+"""Checked inputs and the algebraic equations that everything else in this room uses."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import ArrayLike, FloatArray, is_semidefinite, square_root, symmetric
+
+RESIDUAL = 1e-9
+
+
+def as_numbers(name: str, value: ArrayLike) -> FloatArray:
+    """Real numbers as an array, one number as 1 x 1; raises TheoryError otherwise."""
+    try:
+        if np.iscomplexobj(value):
+            raise TypeError
+        array: FloatArray = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        words = "must be a matrix of real numbers, rows of equal length"
+        raise TheoryError(f"{name} {words}, got a {type(value).__name__}") from None
+    return array.reshape(1, 1) if array.ndim == 0 else array
+
+
+def as_whole(name: str, value: object, least: int, most: float = np.inf) -> int:
+    """A whole number in range; raises TheoryError otherwise."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TheoryError(f"{name} must be an integer, got {value!r}")
+    if not least <= value <= most:
+        bound = f"at least {least}" if most == np.inf else f"an integer from {least} to {most:g}"
+        raise TheoryError(f"{name} must be {bound}, got {value!r}")
+    return int(value)
+
+
+def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
+    """A finite (n, n) float array, from a number where n is 1; raises TheoryError otherwise."""
+    array = as_numbers(name, value)
+    wanted = "square" if n is None else f"{n} x {n}"
+    if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
+        raise TheoryError(f"{name} must be a {wanted} matrix, its shape is {array.shape}")
+    if not np.isfinite(array).all():
+        raise TheoryError(f"{name} must be finite")
+    return np.asarray(array)
+
+
+def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
+    """A symmetric positive semidefinite (n, n) array; raises TheoryError otherwise."""
+    array = as_square(name, value, n)
+    if n == 0:
+        return array
+    if not np.allclose(array, array.T, rtol=1e-9, atol=1e-12 * np.abs(array).max()):
+        raise TheoryError(f"{name} must be symmetric")
+    if not is_semidefinite(array):
+        raise TheoryError(f"{name} must be positive semidefinite")
+    return symmetric(array)
+
+
+def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: float) -> FloatArray:
+    """The solution at time ``gap`` >= 0 (seconds) of dP = A P + P A' + Q - P G P from ``P``.
+
+    All matrices are (n, n); ``G = H' R^-1 H``, H (4b). Relative error about 1e-15 whatever the gap.
+    Raises TheoryError for wrong shapes, a P, Q or G that is not positive semidefinite, a negative
+    or infinite gap, and where the solution overflows.
+    """
+    drift = as_square("A", A)
+    n = len(drift)
+    start, noise, information = (
+        as_covariance(name, value, n) for name, value in (("P", P), ("Q", Q), ("G", G))
+    )
+    if not (np.isfinite(gap) and gap >= 0.0):
+        raise TheoryError(f"gap must be finite and not negative, got {gap!r}")
+    if gap == 0.0:
+        return start
+    with np.errstate(over="ignore", invalid="ignore"):
+        table = riccati_table(drift, noise, information, float(gap))
+        end, _ = riccati_step(table, start, np.zeros(n), float(gap))
+    if not np.isfinite(end).all():
+        raise TheoryError(f"the solution overflows before {gap:g} s: an undetectable mode grows")
+    return end
+
+
+def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
+    """The stabilising solution of 0 = A S + S A' + Q - S G S.
+
+    Raises TheoryError, naming the reason, where there is none, or where the residual or the
+    closed loop says that what was found is not one.
+    """
+    missing = undetectable(A, G)
+    if missing is not None:
+        raise TheoryError(
+            f"(A, H) is not detectable: the mode with eigenvalue {missing:.6g} is not seen"
+        )
+    try:
+        S = scipy.linalg.solve_continuous_are(A.T, square_root(G), Q, np.eye(len(A)))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise TheoryError(f"no stabilising solution of the Riccati equation: {error}") from None
+    # One step of Newton's method takes what is left of the residual away.
+    closed = A - S @ G
+    S = _solve_lyapunov(closed, Q + S @ G @ S)
+    residual = A @ S + S @ A.T + Q - S @ G @ S
+    size = np.abs(A @ S).max() + np.abs(Q).max() + np.abs(S @ G @ S).max()
+    if not np.abs(residual).max() <= RESIDUAL * size:
+        raise TheoryError(f"the Riccati equation was solved to {np.abs(residual).max():.1e} only")
+    if not np.linalg.eigvals(A - S @ G).real.max() < 0.0:
+        raise TheoryError("the solution found does not stabilise the filter")
+    return S
+
+
+def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """The solution of 0 = A X + X A' + Q for a stable A; raises TheoryError otherwise."""
+    if not np.linalg.eigvals(A).real.max() < 0.0:
+        raise TheoryError("the error dynamics are not stable, their covariance has no limit")
+    X = _solve_lyapunov(A, Q)
+    residual = np.abs(A @ X + X @ A.T + Q).max()
+    if not residual <= RESIDUAL * (np.abs(A @ X).max() + np.abs(Q).max()):
+        raise TheoryError(f"the Lyapunov equation was solved to {residual:.1e} only")
+    return X
+
+
+def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
+    return symmetric(np.asarray(scipy.linalg.solve_continuous_lyapunov(A, -Q), dtype=np.float64))
+
+
+def undetectable(A: FloatArray, G: FloatArray) -> complex | None:
+    """An eigenvalue of A with nonnegative real part whose mode G does not see, or None."""
+    return _hidden(A, G, only_unstable=True)
+
+
+def unobservable(A: FloatArray, G: FloatArray) -> complex | None:
+    """An eigenvalue of A whose mode G does not see (Popov, Belevitch, Hautus), or None."""
+    return _hidden(A, G, only_unstable=False)
+
+
+def _hidden(A: FloatArray, G: FloatArray, only_unstable: bool) -> complex | None:
+    n, size = len(A), max(float(np.linalg.norm(A, 2)), 1e-300)
+    seen = G / max(float(np.abs(G).max()), 1e-300) * size
+    for value in np.linalg.eigvals(A):
+        if only_unstable and value.real < -1e-12 * size:
+            continue
+        pencil = np.concatenate([A - value * np.eye(n), seen])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9 * size:
+            return complex(value)
+    return None

@@ -1,0 +1,1 @@
+"""Theory of the push-sum filter (P)."""

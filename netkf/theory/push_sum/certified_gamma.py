@@ -1,0 +1,178 @@
+"""How many averaging steps the push-sum filter needs: what P Theorems 5 and 6 certify, and exactly.
+
+The theorems bound error dynamics by small matrices of norms. Their constant c_B must be at least
+``max_i |A_i'|_P``; the one printed in P (37) need not be (its |A| lacks a transpose), so the larger
+of the two is used here. Corollary 2 does not follow from Theorem 5 and is not used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.push_sum.averaging import Averaging
+from netkf.theory.push_sum.disconnection import disconnection_probability
+from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
+from netkf.theory.push_sum.limits import consensus_gain_bound
+from netkf.theory.push_sum.mean_square import mean_radius, radius
+
+Moment = Literal["mean", "mean-square"]
+MOST_STEPS = 10**7
+MOST_EXACT = 1000
+
+
+class GammaConstants(NamedTuple):
+    """The constants of P Theorems 5 and 6.
+
+    contraction   : least lambda with A_C P_inf A_C' <= lambda P_inf, P (34)
+    printed, sharp: c_B of P (37), and max_i |A_i'|_P that it stands for
+    mean          : theta of the link probability, P (54)
+    mean_square   : theta of the disconnection probability, P (59)
+    """
+
+    contraction: float
+    printed: float
+    sharp: float
+    mean: float
+    mean_square: float
+
+
+def gamma_constants(scenario: Scenario) -> GammaConstants:
+    """The constants; raises TheoryError where a condition of the theorems fails: delta at or below
+    rho(L), a singular P_inf, links held over the steps or failing in one direction.
+    """
+    steps = estimation_steps(scenario)
+    law, P, N = steps.averaging, steps.limits.P, steps.limits.N
+    _conditions(scenario, law, P)
+    F, G = scenario.slot_belief[0], steps.limits.G
+    size = float(np.linalg.norm(P, 2))
+    joint = steps.closed.mean(axis=0)
+    gap = (1.0 - np.cos(np.pi / N)) / law.delta
+    theta = 1.0 - float(law.hears.min(initial=1.0)) * gap
+    cut = _cut(scenario, law)
+    return GammaConstants(
+        contraction=_norm(joint.T, P) ** 2,
+        printed=(1.0 + N * size * _norm(G, P)) * _norm(F, P),
+        sharp=max(_norm(closed.T, P) for closed in steps.closed),
+        mean=theta,
+        mean_square=(1.0 - cut) * theta**2 + cut,
+    )
+
+
+def _conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
+    least = consensus_gain_bound(scenario).radius
+    if not law.delta > least:
+        raise TheoryError(
+            f"P Theorems 5 and 6 need delta above rho(L) = {least:.6g}, it is {law.delta:g}"
+        )
+    if law.held:
+        raise TheoryError('P Theorems 5 and 6 need links = "fresh", a draw for each step')
+    if not np.array_equal(law.hears.min(axis=1), law.both):
+        raise TheoryError("P Theorems 5 and 6 need failures of both directions together")
+    if not np.linalg.eigvalsh(P)[0] > 1e-14 * np.abs(P).max():
+        raise TheoryError("P_inf is singular, so the norms of P (35) do not exist")
+
+
+def _cut(scenario: Scenario, law: Averaging) -> float:
+    """The disconnection probability, or the upper end of its interval."""
+    places, nodes = law.links, scenario.nodes
+    chances = {(nodes[i], nodes[j]): float(p) for (i, j), p in zip(places, law.both, strict=True)}
+    return disconnection_probability(scenario.topology, chances).high
+
+
+def _norm(A: FloatArray, P: FloatArray) -> float:
+    """|A|_P = sup over z of sqrt(z' A' P A z / z' P z), P (35)."""
+    return float(np.sqrt(scipy.linalg.eigh(A.T @ P @ A, P, eigvals_only=True)[-1]))
+
+
+def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = False) -> int:
+    """The smallest gamma that P Theorem 5 ("mean": asymptotically unbiased) or Theorem 6
+    ("mean-square": bounded) certifies, whatever gamma the scenario has.
+
+    With c_B as printed in P (37), or ``max_i |A_i'|_P`` where that is larger; ``sharp`` uses the
+    latter alone. Sufficient by far: see ``exact_minimum_gamma``. Raises TheoryError where no gamma
+    is certified.
+    """
+    constants = gamma_constants(scenario)
+    bound = constants.sharp if sharp else max(constants.printed, constants.sharp)
+    test = {"mean": theorem_5, "mean-square": theorem_6}[_moment(moment)]
+
+    def certified(gamma: int) -> bool:
+        return test(constants, bound, gamma) < 1.0
+
+    return _first(certified, constants)
+
+
+def _moment(moment: str) -> Moment:
+    if moment not in ("mean", "mean-square"):
+        raise TheoryError(f'moment must be "mean" or "mean-square", got {moment!r}')
+    return "mean" if moment == "mean" else "mean-square"
+
+
+def _first(certified: Callable[[int], bool], constants: GammaConstants) -> int:
+    """The bounds fall with gamma, so its first value is found by bisection."""
+    high = 1
+    while not certified(high):
+        high *= 2
+        if high > MOST_STEPS:
+            raise TheoryError(
+                f"no gamma up to {MOST_STEPS:,} is certified: lambda {constants.contraction:.6g}, "
+                f"theta {constants.mean:.6g} and {constants.mean_square:.6g} must lie below 1"
+            )
+    low = high // 2
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if certified(middle) else (middle, high)
+    return high
+
+
+def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
+    """rho(A_R(gamma)) of P (36) with c_B = ``bound``."""
+    far = constants.mean**gamma * bound
+    return _rho([[constants.contraction**0.5, far], [bound, far]])
+
+
+def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
+    """rho(A_S(gamma)) of P (45) with c_B = ``bound``."""
+    near, square = constants.contraction**0.5, bound * bound
+    one, both = constants.mean**gamma, constants.mean_square**gamma
+    return _rho(
+        [
+            [near * near, bound * near, bound * near, square],
+            [bound * one * near, bound * one * near, square * one, square * one],
+            [bound * one * near, square * one, bound * one * near, square * one],
+            [square * both] * 4,
+        ]
+    )
+
+
+def _rho(matrix: list[list[float]]) -> float:
+    return float(np.abs(np.linalg.eigvals(np.array(matrix))).max())
+
+
+def exact_minimum_gamma(
+    scenario: Scenario, moment: Moment = "mean-square", most: int = MOST_EXACT
+) -> int:
+    """The smallest gamma for which the exact radius of the moment's dynamics is below 1, whatever
+    gamma the scenario has: ``push_sum_radius`` for "mean-square".
+
+    Raises TheoryError where there is none up to ``most``.
+    """
+    steps, measure = estimation_steps(scenario), mean_radius
+    if _moment(moment) == "mean-square":
+        measure = radius
+    for gamma in range(1, most + 1):
+        if measure(_with(steps, gamma)) < 1.0:
+            return gamma
+    raise TheoryError(f"no gamma up to {most} has a {moment} radius below 1")
+
+
+def _with(steps: EstimationSteps, gamma: int) -> EstimationSteps:
+    return replace(steps, averaging=replace(steps.averaging, gamma=gamma))

@@ -1,0 +1,117 @@
+"""Steps 4 and 5 of the push-sum filter at the asymptotic gains, as one linear random system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.network.matchings import Broadcast
+from netkf.scenario.scenario import Scenario
+from netkf.theory.push_sum.averaging import Averaging
+from netkf.theory.push_sum.limits import PushSumLimits, push_sum_filter, push_sum_limits
+
+
+@dataclass(frozen=True, eq=False)
+class EstimationSteps:
+    """``e+ = (M (x) I)(diag(A_i) e + h)`` of the stacked errors, P (25).
+
+    averaging : the law of M
+    closed    : (N, n, n) A_i = (I - K_i H_i) F
+    process   : (N, n, n) I - K_i H_i, how the plant's noise enters h, P (27)
+    own       : (N, n, n) K_i R_i K_i', the sensors' part of its covariance
+    Q         : (n, n) of the plant
+    limits    : what the gains are made of
+    """
+
+    averaging: Averaging
+    closed: FloatArray
+    process: FloatArray
+    own: FloatArray
+    Q: FloatArray
+    limits: PushSumLimits
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """(n,) units in which P_inf has a diagonal of ones, but for states known almost exactly."""
+        variances = np.diagonal(self.limits.P)
+        return np.sqrt(np.maximum(variances, max(1e-12 * variances.max(), 1e-150)))
+
+    @cached_property
+    def scaled(self) -> FloatArray:
+        """(N, n, n) ``closed`` in those units."""
+        return np.asarray(self.closed * (self.scale / self.scale[:, None]))
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """(N n, N n) covariance of h."""
+        N, n, _ = self.closed.shape
+        whole = np.einsum("iab,bc,jdc->iajd", self.process, self.Q, self.process, optimize=True)
+        each = np.arange(N)
+        whole[each, :, each] += self.own
+        return symmetric(whole.reshape(N * n, N * n))
+
+
+def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> EstimationSteps:
+    """Steps 4 and 5 of a scenario, with its own links or others.
+
+    The filters' Q and R may differ from the truth, their F may not. Raises TheoryError where
+    asymptotic gains do not exist or the law of the links is not one of independent draws.
+    """
+    limits = push_sum_limits(scenario)
+    F, _ = scenario.slot_belief
+    plant = scenario.slot_plant
+    if not np.array_equal(F, plant.F):
+        raise TheoryError("the filters' F differs from the plant's: the error follows the state")
+    truth = [scenario.observation(node) for node in scenario.nodes]
+    pairs = list(zip(limits.gains, truth, strict=True))
+    process = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in pairs])
+    own = np.stack([K @ R @ K.T for K, (_, R) in pairs])
+    law = averaging_law(scenario) if averaging is None else averaging
+    return EstimationSteps(law, process @ F, process, own, plant.Q, limits)
+
+
+def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averaging:
+    """The links of step 5 as the channel makes them, or all with one ``delivery`` probability.
+
+    Raises TheoryError for recorded links, for losses that depend on the past and for delays by
+    which messages may come late.
+    """
+    algorithm, topology = push_sum_filter(scenario), scenario.topology
+    channel = scenario.network.channel
+    if not isinstance(scenario.network.activation, Broadcast):
+        raise TheoryError("recorded links are one outcome, not a law: no mean square is known")
+    delay, step = channel.delay.fixed, scenario.phase_length / algorithm.gamma
+    if delay is None or delay >= step:
+        raise TheoryError(
+            f"messages may come after their step of {step:.3g} s: give a fixed, shorter delay"
+        )
+    places = [[topology.index[i], topology.index[j]] for i, j in topology.links]
+    hears = _probabilities(scenario, delivery)
+    return Averaging(
+        nodes=len(topology.nodes),
+        links=np.array(places, dtype=np.int64).reshape(-1, 2),
+        hears=hears,
+        both=hears.min(axis=1) if channel.symmetric else hears.prod(axis=1),
+        delta=algorithm.delta,
+        gamma=algorithm.gamma,
+        held=algorithm.links == "held",
+    )
+
+
+def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
+    """(E, 2): that the first end of a link hears the second, and the other way round."""
+    loss, links = scenario.network.channel.loss, scenario.topology.links
+    if delivery is not None:
+        if not 0.0 <= delivery <= 1.0:
+            raise TheoryError(f"delivery must lie in [0, 1], got {delivery!r}")
+        return np.full((len(links), 2), float(delivery))
+    if not loss.independent:
+        name = type(loss).__name__
+        raise TheoryError(f"the draws of {name} depend on each other: no mean square is known")
+    ways = [[(j, i), (i, j)] for i, j in links]
+    hears = [[loss.mean_delivery(w, scenario.measured(w)) for w in both] for both in ways]
+    return np.array(hears, dtype=np.float64).reshape(-1, 2)

@@ -1,0 +1,102 @@
+"""What steps 2 and 3 of the push-sum filter come to, and the bounds on its consensus gain."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.push_sum import PushSum
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.network.graphs import Topology
+from netkf.scenario.push_sum import laplacian_radius
+from netkf.scenario.scenario import Scenario
+from netkf.theory.hybrid.coupled import own_steps
+from netkf.theory.intermittent.riccati import filtered_covariance
+
+
+class PushSumLimits(NamedTuple):
+    """What steps 2 and 3 come to, in the order of the nodes.
+
+    mass      : (N, n, n) of C~, P (16)
+    number    : (N,) of n~, P (17)
+    weight    : (N,) of w, P (18)
+    G         : (n, n) of every G^(i), the sum of all H_i' R_i^-1 H_i, P (10)
+    N         : of every N^(i), P (11)
+    P         : (n, n) of every P^(i): P_inf of P (12), the filtered covariance of the Kalman filter
+                that gets all readings
+    gains     : K^(i) = N P_inf H_i' R_i^-1, (n, p_i) each, P (13)
+    """
+
+    mass: FloatArray
+    number: FloatArray
+    weight: FloatArray
+    G: FloatArray
+    N: int
+    P: FloatArray
+    gains: tuple[FloatArray, ...]
+
+
+def push_sum_limits(scenario: Scenario) -> PushSumLimits:
+    """P Theorem 1, and Theorem 2 (in probability) when links fail in both directions together.
+
+    With what the filters believe of the plant and the sensors. Raises TheoryError where the graph
+    is not connected, where P_inf does not exist, for sensors whose H varies and for scenarios
+    without the push-sum filter.
+    """
+    push_sum_filter(scenario)
+    if any(sensor.varying for sensor in scenario.sensors):
+        raise TheoryError(
+            "the sensors' H differs from slot to slot: their information has no limit"
+        )
+    parts = len(scenario.topology.components)
+    if parts > 1:
+        raise TheoryError(f"the graph must be connected, it has {parts} parts")
+    models, degrees = scenario.slot_models, scenario.topology.degrees
+    share = np.array([degrees[node] + 1.0 for node in scenario.nodes])
+    share /= share.sum()
+    each = [np.linalg.solve(m.R, m.H).T for m in models]
+    G = symmetric(np.sum([e @ m.H for e, m in zip(each, models, strict=True)], axis=0))
+    pooled, N = scenario.pooled_slot_model, len(models)
+    P = filtered_covariance(pooled.F, pooled.Q, pooled.H, pooled.R)
+    gains = tuple(N * P @ e for e in each)
+    return PushSumLimits(share[:, None, None] * G, share * N, share, G, N, P, gains)
+
+
+def push_sum_filter(scenario: Scenario) -> PushSum:
+    """The filter of the scenario; raises TheoryError where it is not the push-sum filter."""
+    algorithm = scenario.filter.algorithm
+    name = type(algorithm).__name__
+    if not isinstance(algorithm, PushSum):
+        raise TheoryError(f"this is about the push-sum filter, and the scenario's is {name}")
+    own = own_steps(algorithm, PushSum)
+    if own:
+        raise TheoryError(f"this is about the push-sum filter, and {name} defines {own[0]} itself")
+    return algorithm
+
+
+class GainBound(NamedTuple):
+    """Three values that bound the consensus gain delta from below, the sharpest first.
+
+    radius : rho(L) of the Laplacian; above it P Theorems 3 to 6 speak, above half of it averaging
+             contracts
+    local  : largest sum over a link of its ends' degrees, at least rho(L); nodes can find it alone
+    nodes  : N, at least rho(L)
+    """
+
+    radius: float
+    local: int
+    nodes: int
+
+
+def consensus_gain_bound(graph: Scenario | Topology) -> GainBound:
+    """rho(L) and what bounds it from above. The largest degree of a node, or that plus one as P
+    has it, lies *below* rho(L) on every graph with a link. Raises TheoryError for directed graphs.
+    """
+    topology = graph.topology if isinstance(graph, Scenario) else graph
+    if topology.directed:
+        raise TheoryError("the graph must be undirected")
+    N, degrees = len(topology.nodes), topology.degrees
+    local = max((degrees[i] + degrees[j] for i, j in topology.links), default=0)
+    return GainBound(laplacian_radius(topology), local, N)

@@ -1,0 +1,67 @@
+"""How often nodes transmit: counted from the rows, whatever the blocks."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.runs.tables import summary_table
+from netkf.runs.transmissions import Transmissions
+from netkf.trace.schema import CODES, EVENT
+from tests.conftest import scenario_files
+
+
+def counted(rows, size):
+    found = Transmissions()
+    for first in range(0, len(rows), size):
+        found.add(rows[first : first + size])
+    return found
+
+
+@pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
+def test_blocks_do_not_matter(file):
+    """By hand: in slots the distinct (node, t, phase) of sends, under clocks every send, or where
+    nodes broadcast every transmission.
+    """
+    log = netkf.simulate(netkf.load(file, {"seed": 3})).log[:5000]
+    sends = log[log["kind"] == CODES["send"]]
+    keys = [(row["node"], row["t"], row["phase"]) for row in sends]
+    slotted = len(sends) and sends["phase"].min() >= 0
+    expected = Counter(int(key[0]) for key in (set(keys) if slotted else keys))
+    transmitted = log[log["kind"] == CODES["transmit"]]
+    if len(transmitted):
+        expected = Counter(transmitted["node"].tolist())
+    for size in (1, 7, 5000):
+        found = counted(log, size)
+        assert found.sent == Counter(sends["node"].tolist())
+        assert {node: found.of(node) for node in expected} == expected
+        assert found.total == expected.total()
+
+
+def broadcasts():
+    rows = np.zeros(6, dtype=EVENT)
+    rows["kind"] = [CODES[k] for k in ("transmit", "send", "send", "transmit", "transmit", "send")]
+    rows["node"], rows["peer"] = [4, 4, 4, 5, 4, 4], [-1, 5, 6, -1, -1, 5]
+    rows["t"], rows["phase"] = [1.0, 1.0, 1.0, 2.0, 3.0, 3.0], -1
+    return rows
+
+
+@pytest.mark.parametrize("size", [1, 2, 6])
+def test_a_broadcast_by_a_clock_is_one_transmission(size):
+    found = counted(broadcasts(), size)
+    assert (found.sent[4], found.sent[5]) == (3, 0)
+    assert (found.of(4), found.of(5), found.of(6)) == (2, 1, 0)  # node 5 had no hearer
+    assert found.total == 3
+
+
+def test_the_table_shows_transmissions_that_differ_from_messages():
+    messages = {"sent": 3, "delivered": 3, "lost": 0, "in_flight": 0, "transmissions": 2}
+    row = dict.fromkeys(("rms_error", "mean_trace", "bound", "ratio", "mean_nees"), 1.0)
+    summary = {"nodes": [{"node": 0, **row}], "overall": row, "messages": messages}
+    summary |= {"bound": "", "notes": ["something"], "limit": None, "central": None}
+    shown = summary_table(summary)
+    assert "messages: 3 sent in 2 transmissions, 3 delivered, 0 lost" in shown
+    assert "note: something" in shown
+    messages["transmissions"] = 3
+    assert "messages: 3 sent, 3 delivered" in summary_table(summary)

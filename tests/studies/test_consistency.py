@@ -1,0 +1,137 @@
+"""NEES and NIS: correct filters are as they should be, the cautious too; wrong ones not."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+import netkf
+from netkf.cli.main import main
+from netkf.core.errors import ScenarioError
+from netkf.studies.consistency import Seen, consistency, one_run, weighed
+from tests.checks.broken import Overconfident
+from tests.conftest import SCENARIOS
+
+GOSSIP = str(SCENARIOS / "gossip_ring.toml")
+
+
+@pytest.fixture
+def gossip():
+    return netkf.load(GOSSIP, {"horizon": 16.0, "probe": 1.0})
+
+
+def test_exact_filters_should_have_n_and_do(gossip):
+    found = consistency(gossip, runs=20, confidence=0.999, workers=1)
+    assert found
+    assert all(row.verdict == "as it should be" for row in found.rows)
+    np.testing.assert_allclose([row.expected for row in found.rows], 4.0, rtol=1e-9)
+    np.testing.assert_allclose([row.expected_nis for row in found.rows if row.node != 1], 1.0)
+    assert np.isnan(found.rows[1].nis)
+    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 20 * 4) / 20
+    assert (found.low, found.high) == pytest.approx((low, high))
+    assert min(row.inside for row in found.rows) > 0.8
+
+
+def test_cautious_filters_are_not_called_wrong(ring):
+    found = consistency(ring.replace({"horizon": 3.0}), runs=12, confidence=0.999, workers=1)
+    assert found
+    for row in found.rows:
+        assert row.expected < 1.9
+        assert row.verdict == "as it should be: P is conservative by design"
+
+
+def test_a_mismatched_model_is_as_bad_as_theory_says(gossip):
+    wrong = gossip.replace({"filter.model": {"R": [[0.2]]}})
+    found = consistency(wrong, runs=12, confidence=0.999, workers=1)
+    assert found
+    assert all("the filters' model makes P too small" in row.verdict for row in found.rows)
+
+
+def test_what_is_not_known_is_not_judged(gossip):
+    """A filter of one's own with a P that is four times too small."""
+    kind = f"{Overconfident.__module__}:{Overconfident.__name__}"
+    network = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}}
+    changes = {
+        "network": network,
+        "sensors": [{"nodes": [0, 1], "H": np.eye(4).tolist(), "R": np.eye(4).tolist()}],
+    }
+    other = gossip.replace({**changes, "filter": {"kind": kind}})
+    found = consistency(other, runs=12, workers=1)
+    assert found
+    for row in found.rows:
+        assert row.verdict == "above n; what it should be is not known"
+        assert row.nees == pytest.approx(16.0, rel=0.3)
+
+
+def test_nis_is_the_textbook_one(gossip):
+    """Local filters: the prediction from the last sample against the reading, in plain numpy."""
+    local = gossip.replace({"filter": {"kind": "local"}})
+    seen, run = one_run(local, 3, 2), netkf.simulate(local, seed=3, replica=2)
+    from netkf.rng.streams import Streams
+
+    path = local.slot_path(Streams(3, 2), 0, local.placed[0][0])
+    F, Q, (H, R) = local.plant.F, local.plant.Q, local.observation(0)
+    values = []
+    for k in range(1, 17):
+        v = path.reading(k, run.x[k]) - H @ F @ run.xhat[k - 1, 0]
+        S = H @ (F @ run.P[k - 1, 0] @ F.T + Q) @ H.T + R
+        values.append(v @ np.linalg.inv(S) @ v)
+    assert seen.nis[0] == pytest.approx(np.mean(values))
+    assert np.isnan(seen.nis[1])
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1.6, "larger"), (0.5, "smaller"), (1.0, "as it")])
+def test_errors_that_are_not_what_they_should_be_are_found(gossip, factor, words):
+    random, n, nodes = np.random.default_rng(8), 4, len(gossip.nodes)
+    runs = []
+    for _ in range(40):
+        samples = factor * random.chisquare(n, size=(10, nodes))
+        nothing = np.full(nodes, np.nan)
+        told = samples.mean(axis=0), np.full(nodes, 4.0), nothing, nothing
+        runs.append(Seen(samples, *told, np.array([np.inf]), np.array([True])))
+    found = weighed(gossip, runs, 0.999)
+    assert bool(found) == (factor == 1.0)
+    assert all(words in row.verdict for row in found.rows)
+    if factor == 1.0:
+        assert np.mean([row.inside for row in found.rows]) > 0.97
+
+
+def test_the_command_and_the_table_of_a_run_say_so(capsys, tmp_path):
+    short = ["--set", "horizon=6.0", "--set", "probe=1.0"]
+    arguments = ["consistency", GOSSIP, *short, "--runs", "10", "--workers", "1"]
+    assert main([*arguments, "--confidence", "0.999"]) == 0
+    printed = capsys.readouterr().out
+    assert "chi-square bounds" in printed
+    assert "as it should be" in printed
+    assert main([*arguments, "--json", "--confidence", "0.999"]) == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert found["n"] == 4
+    assert len(found["rows"]) == 5
+    ring = str(SCENARIOS / "poisson_ring.toml")
+    assert (
+        main(["run", ring, "--set", "horizon=1.0", "--no-plot", "--out", str(tmp_path / "o")]) == 0
+    )
+    assert "NEES below n = 2 is right" in capsys.readouterr().out
+
+
+def test_bad_requests_are_refused(gossip, capsys):
+    with pytest.raises(ScenarioError, match="runs: must be an integer of at least 10"):
+        consistency(gossip, runs=3)
+    assert main(["consistency", GOSSIP, "--confidence", "7"]) == 2
+    assert capsys.readouterr().err.startswith("netkf: confidence: must be")
+
+
+def test_the_summary_of_many_runs_has_chi_square_bounds(tmp_path, capsys):
+    out = tmp_path / "o"
+    arguments = ["run", GOSSIP, "--set", "horizon=40.0", "--runs", "12", "--workers", "1"]
+    assert main([*arguments, "--no-plot", "--trace", "full", "--out", str(out)]) == 0
+    found = json.loads((out / "summary.json").read_text())["nees"]
+    low, high = scipy.stats.chi2.ppf([0.025, 0.975], 12 * 4) / 12
+    assert (found["low"], found["high"]) == pytest.approx((low, high))
+    states = pd.read_parquet(out / "states.parquet")
+    means = states[states.t > 0.0].groupby(["t", "node"])["nees"].mean()
+    assert found["inside"] == pytest.approx(((means >= low) & (means <= high)).mean())
+    words = f"95% in {low:.4g} .. {high:.4g} where P is exact, here {found['inside']:.0%}"
+    assert words in capsys.readouterr().out

@@ -1,0 +1,522 @@
+"""Sweeps, sizing and comparisons: against formulas, single runs and simulations of one's own."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.optimize
+import scipy.stats
+
+import netkf
+from netkf.cli.main import main
+from netkf.core.errors import ScenarioError, TheoryError
+from netkf.scenario.reading import from_table
+from netkf.studies.compare import compare
+from netkf.studies.metrics import (
+    Figures,
+    bound_traces,
+    central_trace,
+    expected_errors_known,
+    one_expected_run,
+    one_run,
+    overall,
+    together,
+)
+from netkf.studies.parameter_grid import parse_grid, parse_interval
+from netkf.studies.size import size
+from netkf.studies.sweep import sweep, sweep_to_directory
+from netkf.studies.targets import Target, by_simulation, parse_target
+from tests.conftest import SCENARIOS
+
+RING = str(SCENARIOS / "poisson_ring.toml")
+RATE = "network.activation.rate"
+SCALAR = {
+    "plant": {"kind": "linear", "F": [[1.1]], "Q": [[1.0]], "period": 1.0, "cov": [[2.0]]},
+    "sensors": [{"nodes": [0, 1], "H": [[1.0]], "R": [[0.5]]}],
+    "network": {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+    "horizon": 12.0,
+    "probe": 1.0,
+}
+
+
+@pytest.fixture
+def short(ring):
+    return ring.replace({"horizon": 3.0})
+
+
+def scalar_traces(slots, predicts, R=0.5):
+    """The textbook recursion of one state with one reading a slot."""
+    P, found = 2.0, []
+    for _ in range(slots):
+        if predicts:
+            P = 1.1**2 * (P - P * P / (P + R)) + 1.0
+        else:
+            P = 1.1**2 * P + 1.0
+            P = P - P * P / (P + R)
+        found.append(P)
+    return np.mean(found)
+
+
+# Grids
+
+
+def test_grids_are_lists_ranges_tables_and_words():
+    texts = ["a.b=1,2.5", 'f={kind="local"},{kind="hybrid", epsilon=0.3}', "w=metropolis,fast"]
+    texts += ["n=1:5:3", "x=0:1:5", "R=[[1.0]],[[2.0, 3.0]]", 's="a,b",c']
+    grid = parse_grid(texts)
+    assert grid == {
+        "a.b": [1, 2.5],
+        "f": [{"kind": "local"}, {"kind": "hybrid", "epsilon": 0.3}],
+        "w": ["metropolis", "fast"],
+        "n": [1, 3, 5],
+        "x": [0.0, 0.25, 0.5, 0.75, 1.0],
+        "R": [[[1.0]], [[2.0, 3.0]]],
+        "s": ["a,b", "c"],
+    }
+    assert isinstance(grid["n"][0], int)
+    assert parse_interval("k.p=1:20") == ("k.p", 1, 20)
+    assert parse_interval("k=0.5:2") == ("k", 0.5, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["sweep", RING, "--vary", "rate"], "--vary: must be KEY.PATH=VALUE"),
+        (["sweep", RING, "--vary", f"{RATE}=1,2", "--vary", f"{RATE}=3"], "is varied twice"),
+        (["sweep", RING, "--vary", f"{RATE}=1,-2"], f"at {RATE} = -2: {RATE}: must be a finite"),
+        (["sweep", RING, "--vary", "network.activation.rat=1"], "is not a key here"),
+        (["sweep", RING, "--vary", f"{RATE}=1:5:1"], "must be START:STOP:COUNT"),
+        (["sweep", RING, "--vary", f"{RATE}=a:b:3"], "must be START:STOP:COUNT"),
+        (["sweep", RING, "--vary", f"{RATE}=1:2:9999", "--vary", "horizon=1:2:9"], "is a grid of"),
+        (["sweep", RING, "--vary", f"{RATE}=[1,"], "is not valid TOML"),
+        (["size", RING, "--vary", f"{RATE}=1", "--target", "mean_rms<=1"], "must be LOW:HIGH"),
+        (["size", RING, "--vary", f"{RATE}=5:1", "--target", "mean_rms<=1"], "lower to a higher"),
+        (["size", RING, "--vary", f"{RATE}=1:nan", "--target", "mean_rms<=1"], "must be LOW:HIGH"),
+        (["size", RING, "--vary", f"{RATE}=-1:2", "--target", "mean_rms<=1"], "above 0"),
+        (["size", RING, "--vary", "name=1:2", "--target", "mean_rms<=1"], "must be a number in"),
+        (["size", RING, "--vary", "plant.C=1:2", "--target", "mean_rms<=1"], "is not a key of"),
+        (
+            ["size", RING, "--vary", "network.graph.nodes=4.5:8", "--target", "mean_rms<=1"],
+            "LOW:HIGH must be integers",
+        ),
+        (["size", RING, "--vary", f"{RATE}=1:2", "--target", "rms<=1"], "--target: must be QUANT"),
+        (["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms<=-1"], "above 0"),
+        (["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms>=1"], "--target: must be"),
+        (
+            [
+                "size",
+                RING,
+                "--vary",
+                f"{RATE}=1:2",
+                "--vary",
+                "seed=1:2",
+                "--target",
+                "mean_rms<=1",
+            ],
+            "is given more than once",
+        ),
+        (
+            ["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms<=1", "--runs", "3"],
+            "--runs: must be an integer of at least 32",
+        ),
+        (
+            ["size", RING, "--vary", f"{RATE}=1:2", "--target", "mean_rms<=1", "--confidence", "2"],
+            "--confidence: must be a finite number",
+        ),
+        (["compare", "nowhere"], "nowhere: is not a directory"),
+        (["compare", str(SCENARIOS)], "is not the directory of a run"),
+    ],
+)
+def test_mistakes_are_refused_in_one_line_and_nothing_is_written(
+    arguments, words, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("netkf: ")
+    assert printed.err.count("\n") == 1
+    assert words in printed.err
+    assert list(tmp_path.iterdir()) == []
+
+
+# Sweeps
+
+
+def test_a_row_is_what_single_runs_say(short):
+    table = sweep(short, {RATE: [1.0, 6.0]}, runs=3, workers=1)
+    assert table[RATE].tolist() == [1.0, 6.0]
+    for rate, row in zip(table[RATE], table.to_dict("records"), strict=True):
+        scenario = short.replace({RATE: rate})
+        runs = [netkf.simulate(scenario, replica=k) for k in range(3)]
+        square = np.array(
+            [((r.x[1:, None] - r.xhat[1:]) ** 2).sum(axis=2).mean(axis=0) for r in runs]
+        )
+        trace = np.array([np.trace(r.P[1:], axis1=2, axis2=3).mean(axis=0) for r in runs])
+        node = square.mean(axis=0).argmax()
+        assert row["worst_rms"] == pytest.approx(np.sqrt(square.mean(axis=0).max()))
+        error = square[:, node].std(ddof=1) / np.sqrt(3) / (2.0 * row["worst_rms"])
+        assert row["worst_rms_se"] == pytest.approx(error)
+        assert row["mean_rms"] == pytest.approx(np.sqrt(square.mean()))
+        assert row["mean_trace"] == pytest.approx(trace.mean())
+        assert row["worst_trace"] == pytest.approx(trace.mean(axis=0).max())
+        assert row["sent"] == pytest.approx(np.mean([r.count("send") for r in runs]))
+        bound = netkf.theory.covariance_bound(scenario, scenario.times)[1:]
+        assert row["bound"] == pytest.approx(np.trace(bound, axis1=2, axis2=3).mean())
+        assert row["status"] == "complete"
+
+
+def test_places_meet_the_same_truth_and_workers_change_nothing(short):
+    """With a filter that does not talk the network makes no difference: equal to the last bit."""
+    grid = {RATE: [1.0, 6.0], "filter": [{"kind": "local"}, {"kind": "hybrid", "epsilon": 0.3}]}
+    one = sweep(short, grid, runs=4, workers=1)
+    assert one["worst_rms"][0] == one["worst_rms"][2]
+    assert one["worst_rms"][1] != one["worst_rms"][3]
+    assert one["filter"][0] == '{ kind = "local" }'
+    pd.testing.assert_frame_equal(sweep(short, grid, runs=4, workers=2), one)
+
+
+def test_the_command_writes_table_picture_and_manifest(tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["sweep", RING, "--set", "horizon=2.0", "--vary", f"{RATE}=1.0,4.0", "--runs", "2"]
+    assert main([*arguments, "--out", str(out), "--workers", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "network.activation.rate" in printed
+    assert "2 places of 2 runs" in printed
+    names = {"scenario.toml", "manifest.json", "sweep.parquet", "sweep.csv", "sweep.png"}
+    assert {p.name for p in out.iterdir()} == names
+    table = pd.read_parquet(out / "sweep.parquet")
+    pd.testing.assert_frame_equal(pd.read_csv(out / "sweep.csv"), table)
+    expected = sweep(netkf.load(RING, {"horizon": 2.0}), {RATE: [1.0, 4.0]}, runs=2, workers=1)
+    pd.testing.assert_frame_equal(table, expected)
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["status"] == "complete"
+    assert manifest["vary"] == {RATE: [1.0, 4.0]}
+    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    assert main([*arguments, "--out", str(out)]) == 2
+
+
+def test_json_of_a_sweep_is_one_document(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["sweep", RING, "--set", "horizon=1.0", "--vary", f"{RATE}=1.0,4.0", "--json"]
+    assert main([*arguments, "--workers", "1", "--no-plot"]) == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert [row[RATE] for row in found["rows"]] == [1.0, 4.0]
+    assert found["rows"][0]["mean_rms_se"] is None
+    assert (tmp_path / "runs" / "poisson-ring-sweep-1" / "sweep.csv").exists()
+
+
+def test_an_interrupted_sweep_keeps_its_rows(short, tmp_path):
+    def impatient(done, wanted):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep_to_directory(
+            short, {RATE: [1.0, 2.0]}, out=tmp_path / "o", workers=1, progress=impatient
+        )
+    manifest = json.loads((tmp_path / "o" / "manifest.json").read_text())
+    assert manifest["status"] == "interrupted"
+    assert manifest["runs"] == {"wanted": 2, "done": 1}
+    assert len(pd.read_csv(tmp_path / "o" / "sweep.csv")) == 1
+
+
+def test_references_are_the_textbook_recursion(build):
+    """Both nodes read the state with R = 0.5: together that is one reading with R = 0.25."""
+    for kind, predicts in (("local", False), ("central", False), ("gossip", True)):
+        changes = {**SCALAR, "filter": {"kind": kind}}
+        if kind == "gossip":
+            matching = {"kind": "matching", "protocol": "maximal"}
+            changes["network"] = {**SCALAR["network"], "activation": matching}
+        scenario = build(**changes)
+        assert central_trace(scenario) == pytest.approx(scalar_traces(12, predicts, R=0.25))
+        if kind == "gossip":
+            with pytest.raises(TheoryError):
+                bound_traces(scenario)
+            continue
+        R = 0.25 if kind == "central" else 0.5
+        np.testing.assert_allclose(bound_traces(scenario), scalar_traces(12, False, R))
+
+
+# Sizing
+
+
+@pytest.mark.parametrize("quantity", ["mean_trace", "worst_rms"])
+def test_theory_finds_the_root_of_the_recursion(build, quantity):
+    """A filter by itself is exact: the answer is that of the plain recursion to four digits."""
+    scenario = build(**SCALAR, filter={"kind": "local"})
+    limit = 0.7 if quantity == "mean_trace" else 0.7**0.5
+    found = size(scenario, "sensors.0.R.0.0", 0.1, 5.0, f"{quantity}<={limit!r}")
+    root = scipy.optimize.brentq(lambda R: scalar_traces(12, False, R) - 0.7, 0.1, 5.0)
+    assert found.by == "theory"
+    assert found.quantity == "exact: the covariance of filters that do not talk"
+    assert found.grows
+    assert found.value <= root < found.misses < 1.002 * found.value
+
+
+def test_a_bound_by_theory_is_kept_in_a_simulation_of_its_own(short):
+    found = size(short, RATE, 0.5, 50.0, "mean_trace<=3.0")
+    assert found
+    assert found.by == "theory"
+    assert "H(12)" in found.quantity
+    assert not found.grows
+    assert found.misses < found.value < 1.002 * found.misses
+    bound = [
+        bound_traces(short.replace({RATE: rate})).mean() for rate in (found.value, found.misses)
+    ]
+    assert bound[0] <= 3.0 < bound[1]
+    ensemble = netkf.monte_carlo(short.replace({RATE: found.value}), runs=40, seed=77, workers=1)
+    mean, error = ensemble.average[-1, 1], ensemble.se_average[-1, 1]
+    assert mean - 4.0 * error <= 3.0
+
+
+def test_simulation_brackets_what_a_long_simulation_says(build):
+    scenario = build(**SCALAR, filter={"kind": "intermittent"})
+    scenario = scenario.replace({"network.channel.loss": {"kind": "bernoulli", "delivery": 0.5}})
+    key = "network.channel.loss.delivery"
+    found = size(scenario, key, 0.05, 0.95, "worst_trace<=1.37", runs=128, workers=1)
+    assert found.by == "simulation"
+    assert found
+    assert not found.grows
+    assert found.misses < found.value
+    assert all(p.low <= p.quantity <= p.high for p in found.probes)
+    check = netkf.monte_carlo(scenario.replace({key: found.value}), runs=120, seed=99, workers=1)
+    assert check.average[:-1, 1].max() - 4.0 * check.se_average[:-1, 1].max() <= 1.37
+    missed = [p.value for p in found.probes if p.target == "missed"]
+    check = netkf.monte_carlo(scenario.replace({key: max(missed)}), runs=120, seed=99, workers=1)
+    assert check.average[:-1, 1].max() + 4.0 * check.se_average[:-1, 1].max() > 1.37
+
+
+def test_exact_errors_given_the_events_have_the_mean_of_squared_ones(build):
+    """And so little spread that the first batch decides what 200 runs would not."""
+    network = {"graph": {"kind": "path", "nodes": 2}}
+    network["activation"] = {"kind": "matching", "protocol": "one-edge", "lazy": 0.5}
+    network["channel"] = {"loss": {"kind": "bernoulli", "delivery": 0.5}}
+    sensors = [{"nodes": [0], "H": [[1.0]], "R": [[0.5]]}]
+    changes = {**SCALAR, "network": network, "sensors": sensors, "filter": {"kind": "gossip"}}
+    scenario = build(**changes)
+    assert expected_errors_known(scenario)
+    exact, plain = (
+        together([task(scenario, 0, k) for k in range(60)]) for task in (one_expected_run, one_run)
+    )
+    one, other = (overall(found.mean_square) for found in (exact, plain))
+    assert abs(one.value - other.value) < 4.0 * np.hypot(one.error, other.error)
+    assert one.error < 0.7 * other.error
+    assert overall(exact.trace) == overall(plain.trace)
+    found = size(
+        scenario, "network.channel.loss.delivery", 0.1, 1.0, "worst_rms<=2.4", runs=32, workers=1
+    )
+    assert "exact expected squared error" in found.quantity
+
+
+def test_integers_are_searched_as_integers(ring):
+    found = size(ring.replace({"horizon": 2.0}), "network.graph.nodes", 4, 40, "worst_trace<=3.5")
+    assert all(isinstance(probe.value, int) for probe in found.probes)
+    if found and found.misses is not None:
+        assert abs(found.value - found.misses) == 1
+
+
+def test_all_of_the_range_and_none_of_it(short):
+    every = size(short, RATE, 1.0, 2.0, "mean_trace<=100")
+    assert every.value == 1.0
+    assert every.misses is None
+    none = size(short, RATE, 1.0, 2.0, "mean_trace<=0.1")
+    assert not none
+    assert len(none.table) == 3
+
+
+def test_theory_that_does_not_tell_is_refused_or_replaced(short):
+    renewal = {"kind": "renewal", "distribution": "gamma", "shape": 4.0, "mean": 0.5}
+    other = short.replace({"network.activation": renewal})
+    with pytest.raises(TheoryError, match="not promised"):
+        size(other, "network.activation.mean", 0.1, 1.0, "mean_trace<=3.0", by="theory")
+    wrong = short.replace({"filter.model": {"R": [[0.5]]}})
+    with pytest.raises(TheoryError, match="model differs"):
+        size(wrong, RATE, 0.5, 5.0, "worst_rms<=3.0", by="theory")
+    sure = short.replace({"filter.cov": [[0.1, 0.0], [0.0, 0.1]]})
+    with pytest.raises(TheoryError, match="below the covariance of the first error"):
+        size(sure, RATE, 0.5, 5.0, "worst_rms<=3.0", by="theory")
+
+
+def test_a_quantity_that_is_not_monotone_is_told(monkeypatch, short):
+    values = {1.0: 5.0, 4.0: 1.0, 2.0: 6.0}
+
+    def made_up(scenario, target):
+        return values.get(scenario.network.activation.rate, 0.9), "made up"
+
+    for module in ("size", "search"):
+        monkeypatch.setattr(f"netkf.studies.{module}.by_theory", made_up)
+    found = size(short, RATE, 1.0, 4.0, "mean_trace<=2")
+    assert "NOT monotone between 1 and 2" in found.sure
+
+
+def test_the_command_says_the_value_or_that_there_is_none(capsys):
+    arguments = ["size", RING, "--set", "horizon=2.0", "--vary", f"{RATE}=0.5:50"]
+    assert main([*arguments, "--target", "mean_trace<=2.5"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "is the smallest that reaches mean_trace <= 2.5" in printed.out
+    assert main([*arguments, "--target", "mean_trace<=0.01", "--json"]) == 1
+    printed = capsys.readouterr()
+    assert printed.err == (f"netkf: no value of {RATE} in 0.5 .. 50 reaches mean_trace <= 0.01\n")
+    found = json.loads(printed.out, parse_constant=pytest.fail)
+    assert found["value"] is None
+    assert len(found["probes"]) == 3
+
+
+def test_intervals_hold_as_often_as_they_say():
+    """Of the largest of three means of skewed variables whose true values are known."""
+    random, misses, level = np.random.default_rng(5), 0, 0.1
+    for _ in range(300):
+        square = random.gamma(4.0, 0.25, size=(64, 3)) * [1.0, 1.0, 0.8]
+        figures = Figures(
+            square, square, np.zeros((64, 5)), np.zeros((64, 1)), np.full((64, 1), np.inf)
+        )
+        interval = by_simulation(figures, Target("worst_rms", 1.0), level, None)
+        misses += not interval.low <= 1.0 <= interval.high
+    assert misses <= scipy.stats.binom.ppf(0.999, 300, level)
+    assert parse_target(" worst_rms <= 0.5 ") == Target("worst_rms", 0.5)
+
+
+def test_a_run_that_diverges_has_errors_without_end():
+    square = np.ones((20, 2))
+    diverged = np.zeros((20, 1))
+    figures = Figures(square, square, np.zeros((20, 5)), diverged, np.full((20, 1), np.inf))
+    assert by_simulation(figures, Target("worst_rms", 2.0), 0.05, None).high == 1.0
+    diverged[3] = 1
+    interval = by_simulation(figures, Target("worst_rms", 2.0), 0.05, None)
+    assert interval.low == interval.high == np.inf
+
+
+def test_errors_of_a_truth_that_nobody_knows_are_no_target(tmp_path):
+    readings = "".join(f"{k}.0,0,{k}.5\n" for k in range(7))
+    (tmp_path / "r.csv").write_text(f"t,node,y0\n{readings}")
+    plant = {"kind": "unknown", "F": [[1.0]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
+    sensor = {"kind": "recorded", "nodes": [0], "path": "r.csv", "H": [[1.0]], "R": [[0.5]]}
+    table = {"format": 1, "name": "real", **SCALAR, "plant": plant, "sensors": [sensor]}
+    table |= {"network": {"graph": {"kind": "path", "nodes": 2}}, "filter": {"kind": "local"}}
+    scenario = from_table({**table, "horizon": 6.0}, tmp_path)
+    with pytest.raises(ScenarioError, match="there is no ground truth"):
+        size(scenario, "horizon", 2.0, 6.0, "worst_rms<=5")
+    table = sweep(scenario, {"horizon": [3.0, 6.0]}, workers=1)
+    assert table["worst_rms"].isna().all()
+    assert (table["mean_trace"] > 0.0).all()
+
+
+@pytest.mark.slow
+def test_decisions_are_right_as_often_as_they_say(build):
+    """Filters that do not talk: the exact mean square error at every value is their P."""
+    scenario = build(filter={"kind": "local"}, horizon=2.0)
+    key, limit, wrong, answers = "sensors.0.R.0.0", 0.87, 0, 0
+    exact = {}
+    for seed in range(20):
+        found = size(
+            scenario,
+            key,
+            0.05,
+            5.0,
+            f"mean_rms<={limit}",
+            by="simulation",
+            runs=128,
+            seed=seed,
+            confidence=0.9,
+            workers=1,
+        )
+        answers += found.value is not None
+        for probe in found.probes:
+            if probe.value not in exact:
+                exact[probe.value] = (
+                    bound_traces(scenario.replace({key: probe.value})).mean() ** 0.5
+                )
+            wrong += (probe.target == "reached") and exact[probe.value] > limit
+            wrong += (probe.target == "missed") and exact[probe.value] <= limit
+    assert wrong <= 5  # of 20 searches, each right as a whole with probability 0.9
+    assert answers >= 5
+
+
+# Comparisons
+
+
+@pytest.fixture(scope="module")
+def ensembles(tmp_path_factory):
+    """Four directories: slow and fast links, fast ones without states, and one single run."""
+    folder = tmp_path_factory.mktemp("runs")
+    common = ["--set", "horizon=3.0", "--no-plot", "--workers", "1"]
+    for name, rate, more in (
+        ("slow", 1.0, ["--runs", "8", "--trace", "full"]),
+        ("fast", 8.0, ["--runs", "8", "--trace", "full"]),
+        ("bare", 8.0, ["--runs", "8", "--trace", "none"]),
+        ("single", 8.0, []),
+    ):
+        arguments = ["run", RING, "--set", f"{RATE}={rate}", "--out", str(folder / name)]
+        assert main([*arguments, *common, *more]) == 0
+    return folder
+
+
+def rows_of(found):
+    return {(row.quantity, row.node): row.entries for row in found.rows}
+
+
+def test_pairs_are_compared_run_by_run(ensembles):
+    found = compare([ensembles / "slow", ensembles / "fast"], confidence=0.9)
+    entry = rows_of(found)["mean_trace", -1][1]
+    slow, fast = (pd.read_parquet(ensembles / n / "states.parquet") for n in ("slow", "fast"))
+    traces = [
+        s[s.t > 0.0].assign(trace=lambda d: d.P00 + d.P11).groupby("run")["trace"].mean()
+        for s in (slow, fast)
+    ]
+    gaps = traces[1] - traces[0]
+    judged = 6 + 6
+    low, high = scipy.stats.ttest_1samp(gaps, 0.0).confidence_interval(1.0 - 0.1 / judged)
+    assert entry.method == "paired"
+    assert (entry.low, entry.high) == pytest.approx((low, high))
+    assert entry.real
+    assert entry.difference == pytest.approx(gaps.mean())
+
+
+def test_others_are_compared_by_their_standard_errors(ensembles):
+    found = rows_of(compare([ensembles / "slow", ensembles / "bare"], confidence=0.9))
+    one, two = found["rms_error", 2]
+    assert two.method == "Welch"
+    test = scipy.stats.ttest_ind_from_stats(
+        two.value, two.se * np.sqrt(8), 8, one.value, one.se * np.sqrt(8), 8, equal_var=False
+    )
+    assert two.real == (test.pvalue < 0.1 / 12)
+    assert found["sent", -1][1].real
+
+
+def test_equal_ensembles_and_single_runs_are_not_marked(ensembles):
+    same = compare([ensembles / "fast", ensembles / "bare"])
+    assert not any(entry.real for row in same.rows for entry in row.entries)
+    single = rows_of(compare([ensembles / "fast", ensembles / "single"]))
+    assert single["mean_trace", -1][1].method == "one run"
+    assert single["mean_trace", -1][1].real is None
+
+
+def test_the_command_compares(ensembles, capsys):
+    directories = [str(ensembles / name) for name in ("slow", "fast", "single")]
+    assert main(["compare", *directories]) == 0
+    printed = capsys.readouterr().out
+    assert "* differs from (1) for certain" in printed
+    assert "one run says nothing about luck" in printed
+    assert main(["compare", *directories, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert found["runs"] == [8, 8, 1]
+    assert len(found["rows"][0]["entries"]) == 3
+
+
+def test_unfinished_and_spoilt_directories_are_refused(ensembles, tmp_path, capsys):
+    folder = Path(shutil.copytree(ensembles / "single", tmp_path / "copy"))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps({**manifest, "status": "interrupted"}))
+    with pytest.raises(ScenarioError, match="did not finish"):
+        compare([folder])
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    (folder / "summary.json").write_text('{"nodes": 3}')
+    with pytest.raises(ScenarioError, match=r"summary.json or manifest.json lacks"):
+        compare([folder])
+    (folder / "summary.json").write_text("{")
+    assert main(["compare", str(folder)]) == 2
+    assert "summary.json is missing or cannot be read" in capsys.readouterr().err
