@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 
 import numpy as np
@@ -19,7 +19,8 @@ from netkf.engines.soundness import sound
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import Recorder
+from netkf.trace.batch import RunBatch, batch_of_one
+from netkf.trace.recorder import MemorySink, Recorder
 
 
 class Rank(IntEnum):
@@ -70,6 +71,29 @@ class Engine(ABC):
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
         """Simulate up to the horizon; returns the status, complete or diverged."""
+
+    def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
+        """Yield the runs of consecutive ``replicas`` in order, as many at a time as suits the
+        engine; each run is to the last bit what ``run`` gives for its replica.
+        """
+        for replica in replicas:
+            yield self.batch_of_one(scenario, seed, replica)
+
+    def batch_of_one(self, scenario: Scenario, seed: int, replica: int) -> RunBatch:
+        """Simulate one replica with ``run`` and count its events."""
+        memory = MemorySink()
+        recorder = Recorder([memory], counted=True)
+        status = self.run(scenario, Streams(seed, replica), recorder, silent)
+        return recorded_batch(scenario, replica, memory, recorder, status)
+
+
+def recorded_batch(
+    scenario: Scenario, replica: int, memory: MemorySink, recorder: Recorder, status: str
+) -> RunBatch:
+    """The batch of one run from its recorder and the samples kept in memory."""
+    filters = 1 if scenario.hosted.pooled else len(scenario.nodes)
+    shape = filters, scenario.plant.n
+    return batch_of_one(replica, scenario.times, shape, memory, recorder, status)
 
 
 def broken(

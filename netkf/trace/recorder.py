@@ -207,6 +207,11 @@ class Recorder:
         return int(self._counts[CODES[kind]])
 
     @property
+    def counts(self) -> np.ndarray:
+        """(len(KINDS),) flushed events by kind."""
+        return self._counts.copy()
+
+    @property
     def total(self) -> int:
         """Events that were flushed."""
         return int(self._counts.sum())

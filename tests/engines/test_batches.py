@@ -1,0 +1,55 @@
+"""Batches of runs: every run of a batch is what it is alone."""
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.engines.compiled.engine import CompiledEngine
+from netkf.engines.simpy.engine import SimpyEngine
+from netkf.trace.schema import KINDS
+from tests.conftest import scenario_files
+
+SHORT = {"delayed_links": 6.0, "intel_lab": 240.0, "intel_lab_radio": 240.0, "push_sum_planar": 3.0}
+FILES = {file.stem: file for file in scenario_files()}
+UNSTABLE = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
+
+
+def assert_alone(scenario, engine, seed, replicas):
+    """The batches of ``run_many`` hold the runs of ``run``, to the last bit."""
+    done = []
+    for batch in engine.run_many(scenario, seed, replicas):
+        done += batch.replicas
+        for r, replica in enumerate(batch.replicas):
+            run = netkf.simulate(scenario, seed, replica, engine)
+            length, pooled = len(run.times), batch.xhat.shape[2] == 1
+            assert batch.lengths[r] == length
+            assert batch.status[r] == run.status
+            assert batch.exact_errors == run.exact_errors
+            assert {name: tuple(pair[r]) for name, pair in batch.sums.items()} == run.sums
+            np.testing.assert_array_equal(batch.counts[r], [run.count(kind) for kind in KINDS])
+            np.testing.assert_allclose(batch.times[:length], run.times, rtol=1e-12)
+            np.testing.assert_array_equal(batch.x[r, :length], run.x)
+            for name in ("xhat", "P", "error"):
+                found, expected = getattr(batch, name)[r, :length], getattr(run, name)
+                expected = expected[:, :1] if pooled else expected
+                np.testing.assert_array_equal(found, expected, err_msg=name)
+    assert done == list(replicas)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_compiled_batches_hold_the_runs_of_the_scenarios(name):
+    scenario = netkf.load(FILES[name])
+    horizon = min(scenario.horizon, SHORT.get(name, scenario.horizon))
+    assert_alone(scenario.replace({"horizon": horizon}), CompiledEngine(), 7, range(1, 4))
+
+
+@pytest.mark.parametrize("changes", [{}, {"filter": {"kind": "central"}}])
+def test_simpy_batches_hold_its_runs(ring, changes):
+    case = ring.replace({"horizon": 3.0, **changes})
+    assert_alone(case, SimpyEngine(), 3, range(2, 5))
+
+
+def test_batches_hold_runs_that_diverge(build):
+    grown = build(horizon=600.0, probe=10.0, plant=UNSTABLE, filter={"kind": "local"})
+    assert_alone(grown, CompiledEngine(), 0, range(3))
+    assert_alone(grown.replace({"horizon": 450.0}), SimpyEngine(), 0, range(2))
