@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 
 import netkf
-from netkf.cli.main import main, parse_changes
+from netkf.cli.main import main
+from netkf.cli.options import parse_changes
 from tests.conftest import SCENARIOS
 
 RING = str(SCENARIOS / "poisson_ring.toml")

@@ -7,7 +7,7 @@ import tomllib
 import pytest
 
 import netkf
-from netkf.cli.main import _parser
+from netkf.cli.main import make_parser
 from netkf.scenario.reading import from_table
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Belief, Scenario
@@ -64,8 +64,8 @@ def test_no_kind_is_described_that_does_not_exist():
 
 
 def test_shared_keys_columns_options_and_names_are_mentioned():
-    options = {o for a in _parser()._actions for o in a.option_strings if o.startswith("--")}
-    commands = _parser()._subparsers._group_actions[0].choices
+    options = {o for a in make_parser()._actions for o in a.option_strings if o.startswith("--")}
+    commands = make_parser()._subparsers._group_actions[0].choices
     for name, command in commands.items():
         assert f"netkf {name}" in TEXT
         options |= {o for a in command._actions for o in a.option_strings if o.startswith("--")}

@@ -1,1 +1,1 @@
-"""The command line: options, and one function for each command."""
+"""The command line: the parser, shared options, and one module for each command."""

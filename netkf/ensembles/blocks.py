@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError
 from netkf.engines.compiled.lots import together
-from netkf.runs.failures import told
+from netkf.runs.failures import explain_failure
 from netkf.scenario.plugins import in_words
 from netkf.scenario.registry import forget_other
 from netkf.scenario.scenario import Scenario
@@ -104,7 +104,7 @@ def block_result(scenario: Scenario, job: Job) -> Any:
                 job.size,
             )
     except Exception as error:
-        reason = told(scenario, error)
+        reason = explain_failure(scenario, error)
         if reason is error:
             raise
         raise reason from error

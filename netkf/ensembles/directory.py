@@ -19,7 +19,7 @@ from netkf.ensembles.pools import make_pool, workers_for
 from netkf.ensembles.replicas import Progress, block_size, replicate
 from netkf.ensembles.statistics import Tally, merge, reduced_run
 from netkf.ensembles.summary import summarise_ensemble
-from netkf.runs.failures import InterruptedRunError, told
+from netkf.runs.failures import InterruptedRunError, explain_failure
 from netkf.runs.files import (
     TraceTables,
     check_sources,
@@ -133,7 +133,7 @@ def runs_to_directory(
     except BaseException as error:
         status = "failed" if isinstance(error, Exception) else "interrupted"
         keeper.note(status, error)
-        reason = told(scenario, error, directory)
+        reason = explain_failure(scenario, error, directory)
         if isinstance(error, KeyboardInterrupt):
             reason = InterruptedRunError(directory, f"; go on with --resume --out {directory}")
         if reason is error:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import written_beside
 from netkf.runs.labels import by_design
-from netkf.runs.run import Finished
+from netkf.runs.run import CompletedRun
 from netkf.runs.summary import CONFIDENCE, NO_COVARIANCE, Promise, nees_bounds
 from netkf.scenario.scenario import Scenario
 
@@ -26,7 +26,7 @@ LONGEST_LEGEND = 72
 NO_TRUTH = "no ground truth: errors are unavailable"
 
 
-def run_picture(scenario: Scenario, finished: Finished) -> None:
+def run_picture(scenario: Scenario, finished: CompletedRun) -> None:
     """Write ``run.png``: errors, square roots of trace P over time against the bound and the
     limits, NEES, and the network with its link activity.
     """
@@ -96,7 +96,7 @@ def set_scale(axes: Any, values: FloatArray) -> None:
         axes.set_ylim(0.0, positive.max() * 1.06)
 
 
-def _errors(axes: Any, scenario: Scenario, finished: Finished) -> None:
+def _errors(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
     if not scenario.plant.shown:
         _estimates(axes, scenario, finished)
         return
@@ -124,7 +124,7 @@ def mark_unavailable(axes: Any, words: str) -> None:
     axes.axis("off")
 
 
-def _estimates(axes: Any, scenario: Scenario, finished: Finished) -> None:
+def _estimates(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
     """Without a truth there are no errors, but nodes that agree or do not."""
     times, first = np.array(finished.samples.times), np.array(finished.samples.first)
     draw_lines(axes, times, first, scenario)
@@ -134,7 +134,7 @@ def _estimates(axes: Any, scenario: Scenario, finished: Finished) -> None:
     draw_legend(axes)
 
 
-def _covariances(axes: Any, scenario: Scenario, finished: Finished) -> None:
+def _covariances(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
     if not finished.samples.covariance_given:
         mark_unavailable(axes, f"{NO_COVARIANCE}: trace P is unavailable")
         return
@@ -197,7 +197,7 @@ def draw_promises(axes: Any, times: FloatArray, promised: Promise) -> None:
             axes.axhline(math.sqrt(value), color="#2e8b57", ls=style, lw=1.1, label=words)
 
 
-def _network(figure: Figure, axes: Any, scenario: Scenario, finished: Finished) -> None:
+def _network(figure: Figure, axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
     topology = scenario.topology
     places = topology.positions or _layout(scenario)
     delivered = finished.samples.delivered

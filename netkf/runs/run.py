@@ -18,7 +18,7 @@ from netkf.engines.base import Engine, Progress, silent
 from netkf.linalg import compiling
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.rng.streams import Streams
-from netkf.runs.failures import told
+from netkf.runs.failures import explain_failure
 from netkf.runs.files import (
     ParquetSink,
     check_sources,
@@ -38,7 +38,7 @@ from netkf.trace.run import Run
 
 
 @dataclass(frozen=True, eq=False)
-class Finished:
+class CompletedRun:
     """What ``run_to_directory`` leaves: the directory, its summary, and what a picture needs."""
 
     directory: Path
@@ -57,9 +57,9 @@ def run_to_directory(
     engine: str | Engine = "auto",
     trace: str = "full",
     progress: Progress = silent,
-    finish: Callable[[Finished], None] | None = None,
+    finish: Callable[[CompletedRun], None] | None = None,
     replica: int = 0,
-) -> Finished:
+) -> CompletedRun:
     """Run once, as ``replica`` of an ensemble, and write scenario.toml, manifest.json, the Parquet
     tables and summary.json.
 
@@ -90,7 +90,7 @@ def run_to_directory(
         promised = promise(scenario, np.array(samples.times))
         counts = recorder.count, recorder.sums, _records(scenario, status, links)
         summary = _summary(directory, scenario, samples, promised, *counts)
-        finished = Finished(
+        finished = CompletedRun(
             directory, status, summary, samples, promised, recorder.total, seconds, chosen.name
         )
         if finish is not None:
@@ -105,7 +105,7 @@ def run_to_directory(
             with contextlib.suppress(OSError):
                 _summary(directory, scenario, samples, nothing, recorder.count, recorder.sums)
         manifest.write(status, _totals(recorder), done, error)
-        reason = told(scenario, error, directory)
+        reason = explain_failure(scenario, error, directory)
         if reason is error:
             raise
         raise reason from error

@@ -47,7 +47,7 @@ class Row(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Finished:
+class RunDirectory:
     """A run directory that was read: its manifest and its summary."""
 
     directory: Path
@@ -105,7 +105,7 @@ class Finished:
         return chosen.groupby("run")[columns[quantity]].mean()
 
 
-def read(directory: Path) -> Finished:
+def read(directory: Path) -> RunDirectory:
     """A finished run directory; raises ScenarioError where it is not one."""
     where = str(directory)
     if not directory.is_dir():
@@ -121,7 +121,7 @@ def read(directory: Path) -> Finished:
             words = f"holds a run that did not finish ({found[0].get('status')})"
             raise ScenarioError(where, words, None, "finish it with netkf run --resume")
     try:
-        finished = Finished(directory, found[0], found[1])
+        finished = RunDirectory(directory, found[0], found[1])
         _ = finished.runs, [finished.value(q, -1) for q in (*AVERAGES, *MESSAGES, *TRACES)]
         _ = [finished.value("rms_error", node) for node in finished.nodes]
     except (KeyError, TypeError, ValueError, AttributeError):
@@ -192,7 +192,9 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     )
 
 
-def _entry(first: Finished, other: Finished, quantity: str, node: int, level: float) -> Entry:
+def _entry(
+    first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float
+) -> Entry:
     value, se = other.value(quantity, node)
     entry = Entry(value, se)
     if other is first or value is None:
@@ -203,7 +205,7 @@ def _entry(first: Finished, other: Finished, quantity: str, node: int, level: fl
 
 
 def _paired(
-    first: Finished, other: Finished, quantity: str, node: int, level: float, entry: Entry
+    first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
     """Run by run, where both met the same truth."""
     end = min(first.rounding_from, other.rounding_from)
@@ -221,7 +223,7 @@ def _paired(
     )
 
 
-def _same_truth(first: Finished, other: Finished) -> bool:
+def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
     one, two = first.samples, other.samples
     if one is None or two is None or first.manifest.get("seed") != other.manifest.get("seed"):
         return False

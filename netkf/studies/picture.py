@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import written_beside
-from netkf.studies.sweep import Swept
+from netkf.studies.sweep import CompletedSweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,12 +23,12 @@ MOST_LETTERS = 90
 SPREAD = 20.0
 
 
-def sweep_picture(title: str, swept: Swept) -> bool:
+def sweep_picture(title: str, completed: CompletedSweep) -> bool:
     """Write ``sweep.png``: over one key the largest and the mean RMS error with two standard errors
     and the roots of bound and centralised trace; over two keys the largest, a line for each value
     of the second. False, and nothing, for more keys.
     """
-    keys, table = swept.keys, swept.table
+    keys, table = completed.keys, completed.table
     if len(keys) > 2 or (len(keys) == 2 and table[keys[1]].astype(str).nunique() > MOST_LINES):
         return False
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
@@ -51,7 +51,7 @@ def sweep_picture(title: str, swept: Swept) -> bool:
         words = "; ".join(filter(None, (which, bars)))
         axes.set_title(words, fontsize=8, loc="right", color=CENTRAL)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-        with written_beside(swept.directory / "sweep.png") as part:
+        with written_beside(completed.directory / "sweep.png") as part:
             figure.savefig(part, dpi=130, format="png")
     return True
 

@@ -16,7 +16,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer
 from netkf.ensembles.replicas import replicate
-from netkf.runs.failures import InterruptedRunError, told
+from netkf.runs.failures import InterruptedRunError, explain_failures
 from netkf.runs.files import (
     check_sources,
     new_directory,
@@ -102,14 +102,9 @@ def _rows(
 ) -> Iterator[Row]:
     with shared_pool(places[0].scenario, runs, *pool) as handed:
         for k, place in enumerate(places):
-            try:
+            with explain_failures(place.scenario):
                 task = partial(one_run, engine=choose_engine(engine, place.scenario))
                 found = replicate(task, place.scenario, runs, **handed)
-            except Exception as error:
-                reason = told(place.scenario, error)
-                if reason is error:
-                    raise
-                raise reason from error
             yield _row(place, together(found))
             if progress is not None:
                 progress(k + 1, len(places))
@@ -147,7 +142,7 @@ def _known(value: Callable[[], float]) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Swept:
+class CompletedSweep:
     """What ``sweep_to_directory`` leaves: the directory and its table."""
 
     directory: Path
@@ -165,8 +160,8 @@ def sweep_to_directory(
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
-    finish: Callable[[Swept], None] | None = None,
-) -> Swept:
+    finish: Callable[[CompletedSweep], None] | None = None,
+) -> CompletedSweep:
     """A sweep with sweep.parquet, sweep.csv, the base scenario.toml and a manifest.json; ``finish``
     adds what else belongs to the directory. What is interrupted keeps the rows that it had.
     """
@@ -197,9 +192,9 @@ def sweep_to_directory(
                 directory / "sweep.parquet", {str(name): column for name, column in table.items()}
             )
             write_text(directory / "sweep.csv", table.to_csv(index=False))
-        swept = Swept(directory, table, tuple(vary), time.perf_counter() - began)
+        completed = CompletedSweep(directory, table, tuple(vary), time.perf_counter() - began)
         if status == "complete" and finish is not None:
-            finish(swept)
+            finish(completed)
         notes["runs"] = {"wanted": runs * len(places), "done": runs * len(rows)}
         write_json(directory / "manifest.json", {**notes, "status": status})
-    return swept
+    return completed

@@ -185,7 +185,7 @@ def test_the_command_writes_table_picture_and_manifest(tmp_path, capsys):
     assert main([*arguments, "--out", str(out), "--workers", "1"]) == 0
     printed = capsys.readouterr().out
     assert "network.activation.rate" in printed
-    assert "2 places of 2 runs" in printed
+    assert "2 points of 2 runs" in printed
     names = {"scenario.toml", "manifest.json", "sweep.parquet", "sweep.csv", "sweep.png"}
     assert {p.name for p in out.iterdir()} == names
     table = pd.read_parquet(out / "sweep.parquet")

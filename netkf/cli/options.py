@@ -1,0 +1,147 @@
+"""Options that several commands share, and how the command line reads and prints values.
+
+Modules of this package import the rest of netkf inside functions, so that ``netkf --help`` and
+usage errors do not wait for numpy and numba.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from netkf.core.errors import quote
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+
+FAILED = 1
+"""Exit status of a command that ran and whose answer is no."""
+ENGINES = ("auto", "simpy", "processes", "compiled")
+Command = Callable[[argparse.Namespace], int]
+
+
+def add_command(commands: Any, name: str, command: Command, text: str) -> argparse.ArgumentParser:
+    """Return the parser of a new command; ``text`` is its help and its description."""
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(command=command)
+    return parser
+
+
+def add_scenario_command(
+    commands: Any, name: str, command: Command, text: str
+) -> argparse.ArgumentParser:
+    """Return the parser of a new command that takes a scenario file and ``--set``."""
+    parser = add_command(commands, name, command, text)
+    parser.add_argument("scenario", type=Path, help="scenario file (TOML)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY.PATH=VALUE",
+        help="override a key of the scenario; VALUE is written as in TOML",
+    )
+    return parser
+
+
+def add_seed(parser: argparse.ArgumentParser) -> None:
+    """Add ``--seed``."""
+    parser.add_argument("--seed", type=seed, help="root seed (default: the scenario's)")
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add ``--engine``."""
+    parser.add_argument(
+        "--engine",
+        default="auto",
+        choices=ENGINES,
+        help="auto takes the compiled engine if it can run the scenario, else SimPy",
+    )
+
+
+def add_pool(parser: argparse.ArgumentParser) -> None:
+    """Add ``--workers`` and ``--scheduler``, of which one may be given."""
+    pool = parser.add_mutually_exclusive_group()
+    pool.add_argument("--workers", type=count, help="number of processes (default: one per core)")
+    pool.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
+    parser.add_argument("--json", action="store_true", help="print one JSON document only")
+
+
+def add_no_plot(parser: argparse.ArgumentParser) -> None:
+    """Add ``--no-plot``."""
+    parser.add_argument("--no-plot", action="store_true", help="do not draw a picture")
+
+
+def add_vary(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
+    """Add ``--vary``, which can be repeated."""
+    parser.add_argument("--vary", action="append", required=True, metavar=metavar, help=text)
+
+
+def seed(text: str) -> int:
+    """Return the integer of ``--seed``; raises ArgumentTypeError."""
+    if not text.isdecimal() or len(text) > 30:
+        rule = "must be a non-negative integer of at most 30 digits"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return int(text)
+
+
+def replica(text: str) -> int:
+    """Return the integer of ``--replica``; raises ArgumentTypeError."""
+    if not text.isdecimal() or len(text) > 12:
+        rule = "must be an integer of at least 0"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return int(text)
+
+
+def count(text: str) -> int:
+    """Return the positive integer of ``--runs`` or ``--workers``; raises ArgumentTypeError."""
+    if not text.isdecimal() or len(text) > 12 or int(text) < 1:
+        rule = "must be an integer of at least 1"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return int(text)
+
+
+def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
+    """Return the values of ``key.path=value`` texts by key; unquoted words become strings.
+
+    Raises ScenarioError for a text without ``=`` or a value that is not TOML.
+    """
+    from netkf.scenario.values import split_setting, typed_value
+
+    pairs = [split_setting("--set", setting) for setting in settings]
+    return {key: typed_value("--set", key, text) for key, text in pairs}
+
+
+def load_scenario(options: argparse.Namespace) -> Scenario:
+    """Return the scenario of the command line, with ``--set`` and ``--seed`` applied."""
+    from netkf.scenario.reading import load
+
+    changes = parse_changes(options.set)
+    if getattr(options, "seed", None) is not None:
+        changes["seed"] = options.seed
+    return load(options.scenario, changes)
+
+
+def print_notes(notes: Sequence[str]) -> None:
+    """Print notes to stderr, one per line."""
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+def print_title(scenario: Scenario) -> None:
+    """Print the name of a scenario and its claim."""
+    print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
+
+
+def print_json(document: Any) -> None:
+    """Print a document as JSON; numbers that are not finite become null."""
+    from netkf.runs.files import finite
+
+    print(json.dumps(finite(document), indent=2))

@@ -1,0 +1,68 @@
+"""The progress line of a command."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+CLEAR_LINE = "\r\033[K"
+
+
+class ProgressLine:
+    """A line on stderr that each update overwrites and that is cleared at the end.
+
+    Nothing is printed if stderr is not a terminal. Use it as a context manager.
+    """
+
+    def __init__(self) -> None:
+        self._is_terminal, self._printed = sys.stderr.isatty(), False
+
+    def __enter__(self) -> ProgressLine:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._printed:
+            print(CLEAR_LINE, end="", file=sys.stderr, flush=True)
+
+    def show(self, text: str) -> None:
+        """Replace the line by a text."""
+        if self._is_terminal:
+            self._printed = True
+            print(f"{CLEAR_LINE}{text}", end="", file=sys.stderr, flush=True)
+
+    def simulated_time(self, horizon: float) -> Callable[[float], None]:
+        """Return a function of the simulated time (seconds) that shows the percentage done."""
+        shown = -1
+
+        def update(seconds: float) -> None:
+            # Engines report far more often than the percentage changes.
+            nonlocal shown
+            percent = int(100.0 * seconds / horizon)
+            if percent != shown:
+                shown = percent
+                self.show(f"{percent:3d} % of {horizon:g} simulated seconds")
+
+        return update
+
+    def counter(self, unit: str) -> Callable[[int, int], None]:
+        """Return a function of (done, wanted) that shows both and the time that is left."""
+        began: tuple[float, int] | None = None
+
+        def update(done: int, wanted: int) -> None:
+            nonlocal began
+            now = time.monotonic()
+            # The rate counts from the first report: a resumed ensemble does not begin at 0.
+            if began is None:
+                began = now, done
+            seconds, finished = now - began[0], done - began[1]
+            left = f", about {seconds * (wanted - done) / finished:.0f} s left" if finished else ""
+            self.show(f"{done:,} of {wanted:,} {unit}{left}")
+
+        return update

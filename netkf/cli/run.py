@@ -1,0 +1,186 @@
+"""``netkf run``: simulate a scenario once or many times and keep the results in a directory."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from netkf.cli import pictures
+from netkf.cli.options import (
+    add_engine,
+    add_no_plot,
+    add_pool,
+    add_scenario_command,
+    add_seed,
+    count,
+    load_scenario,
+    print_notes,
+    print_title,
+    replica,
+)
+from netkf.cli.progress import ProgressLine
+from netkf.core.errors import ScenarioError
+
+if TYPE_CHECKING:
+    from netkf.runs.run import CompletedRun
+    from netkf.scenario.scenario import Scenario
+
+MAX_LISTED_NODES = 12
+
+
+def add_parser(commands: Any) -> None:
+    """Add the options of ``netkf run``."""
+    text = "simulate a scenario and keep the results"
+    parser = add_scenario_command(commands, "run", run, text)
+    parser.add_argument("--runs", type=count, help="number of independent runs (default: 1)")
+    parser.add_argument(
+        "--replica", type=replica, help="run this replica of an ensemble (default: 0)"
+    )
+    add_seed(parser)
+    add_engine(parser)
+    parser.add_argument("--out", type=Path, help="directory of the run (default: runs/NAME-k)")
+    add_pool(parser)
+    parser.add_argument(
+        "--trace",
+        choices=["full", "first", "none"],
+        help="runs that keep tables of events and states (default: full for one run, else first)",
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="continue the runs of --out that were stopped"
+    )
+    add_no_plot(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command and return the exit status."""
+    many = (options.runs or 1) > 1
+    if many and options.replica is not None:
+        remedy = "leave out --runs or --replica"
+        raise ScenarioError("--replica", "is for a single run", options.replica, remedy)
+    if many and options.workers != 1 and options.scheduler is None:
+        # Worker processes import netkf while this one reads the scenario.
+        from netkf.ensembles.process_start import start_early
+
+        start_early()
+    scenario = load_scenario(options)
+    if threading.current_thread() is threading.main_thread():
+        # Batch systems stop jobs with SIGTERM: finish the files as after Ctrl-C.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if options.resume and options.out is None:
+        remedy = "add --out DIR with the directory of the run that was stopped"
+        raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
+    return _run_many(scenario, options) if many else _run_once(scenario, options)
+
+
+def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
+    from netkf.ensembles.directory import clear_unfinished
+    from netkf.runs.run import run_to_directory
+
+    if options.scheduler is not None:
+        raise ScenarioError("--scheduler", "is for several runs", options.scheduler, "add --runs R")
+    chosen = options.replica or 0
+    if options.resume and not clear_unfinished(options.out, scenario, chosen):
+        print(f"nothing left to do in {options.out}")
+        return 0
+    draw = None if options.no_plot else partial(pictures.draw_picture, pictures.RUN, scenario)
+    with ProgressLine() as line:
+        completed = run_to_directory(
+            scenario,
+            options.out,
+            options.engine,
+            options.trace or "full",
+            line.simulated_time(scenario.horizon),
+            draw,
+            chosen,
+        )
+    _print_summary(scenario, completed)
+    rate = completed.events / max(completed.seconds, 1e-9)
+    cost = f"{completed.seconds:.2f} s, {rate:,.0f} per second, engine {completed.engine}"
+    print(f"events: {completed.events:,} in {cost}")
+    if completed.status != "complete":
+        message = _describe_divergence(completed)
+        print(f"status: {message}")
+        print_notes([message])
+    print(f"written to {completed.directory}")
+    return 0
+
+
+def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
+    from netkf.ensembles.directory import runs_to_directory
+
+    draw = None
+    if not options.no_plot:
+        draw = partial(pictures.draw_picture, pictures.ENSEMBLE, scenario)
+        # Importing matplotlib takes a second, in which the workers already simulate.
+        loading = partial(pictures.load_drawing, pictures.ENSEMBLE)
+        threading.Thread(target=loading, daemon=True).start()
+    with ProgressLine() as line:
+        completed = runs_to_directory(
+            scenario,
+            options.runs,
+            options.out,
+            options.engine,
+            options.trace or "first",
+            workers=options.workers,
+            scheduler=options.scheduler,
+            resume=options.resume,
+            progress=line.counter("runs"),
+            finish=draw,
+        )
+    if completed is None:
+        print(f"nothing left to do in {options.out}")
+        return 0
+    _print_summary(scenario, completed)
+    _print_ensemble(completed, options.runs)
+    return 0
+
+
+def _print_summary(scenario: Scenario, completed: Any) -> None:
+    """Print the notes on a scenario and the summary of a completed run or ensemble."""
+    from netkf.runs.files import missing_modules
+    from netkf.runs.tables import summary_table
+
+    print_notes([*scenario.notes, *missing_modules(scenario)])
+    print_title(scenario)
+    print()
+    promised = completed.promised
+    print(summary_table(completed.summary, promised.limit_words, promised.notes))
+
+
+def _print_ensemble(completed: Any, runs: int) -> None:
+    """Print the cost of an ensemble, how many runs diverged, and its directory."""
+    ensemble, seconds = completed.ensemble, max(completed.seconds, 1e-9)
+    print(
+        f"averages over {runs:,} runs, +- one standard error; {completed.simulated:,} "
+        f"simulated in {seconds:.2f} s, {completed.simulated / seconds:,.1f} per second"
+    )
+    if ensemble.diverged:
+        message = f"{ensemble.diverged:,} of {runs:,} runs diverged and ended early"
+        print(f"status: diverged, {message}")
+        note = f"{message}; averages over time cover the samples before they ended"
+        print(f"note: {note}", file=sys.stderr)
+    print(f"written to {completed.directory}")
+
+
+def _describe_divergence(completed: CompletedRun) -> str:
+    """Return a sentence that says which nodes diverged and when."""
+    samples = completed.samples
+    nodes = samples.diverged
+    listed = ", ".join(map(str, nodes[:MAX_LISTED_NODES]))
+    listed += ", ..." if len(nodes) > MAX_LISTED_NODES else ""
+    which = f"node{'s' if len(nodes) > 1 else ''} {listed}"
+    problem = f"estimate or covariance of {which} is no longer finite"
+    if samples.ended_finite:
+        problem = f"covariance of {which} is no longer positive semidefinite"
+    left_out = ""
+    if samples.rounding_from is not None:
+        left_out = f"; errors are averaged before {samples.rounding_from:g} s"
+    return (
+        f"{completed.status}, the {problem} at {samples.times[-1]:g} s and the run ended "
+        f"there{left_out}"
+    )

@@ -1,0 +1,89 @@
+"""``netkf size``: find the smallest (or largest) value of a key that meets a target."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from netkf.cli.options import (
+    FAILED,
+    add_engine,
+    add_json,
+    add_pool,
+    add_scenario_command,
+    add_seed,
+    add_vary,
+    count,
+    load_scenario,
+    print_json,
+)
+from netkf.cli.progress import ProgressLine
+from netkf.core.errors import ScenarioError
+
+
+def add_parser(commands: Any) -> None:
+    """Add the options of ``netkf size``."""
+    text = "find the smallest (or largest) value of a key that meets a target"
+    parser = add_scenario_command(commands, "size", run, text)
+    add_vary(parser, "KEY.PATH=LOW:HIGH", "the key to search and its range")
+    parser.add_argument(
+        "--target",
+        required=True,
+        metavar="QUANTITY<=LIMIT",
+        help="quantities: worst_rms, mean_rms, worst_trace, mean_trace, within_central",
+    )
+    parser.add_argument(
+        "--by",
+        choices=["theory", "simulation"],
+        help="decide by theory or by simulation (default: theory if it has an answer)",
+    )
+    parser.add_argument(
+        "--runs", type=count, default=1000, help="at most this many runs per value (default: 1000)"
+    )
+    parser.add_argument(
+        "--confidence",
+        type=float,
+        default=0.95,
+        help="probability that all decisions are right (default: 0.95)",
+    )
+    add_seed(parser)
+    add_engine(parser)
+    add_pool(parser)
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command and return the exit status: 1 if no value meets the target."""
+    from netkf.studies.parameter_grid import parse_interval
+    from netkf.studies.size import size
+    from netkf.studies.tables import answer, sizing_text
+
+    if len(options.vary) > 1:
+        remedy = "size searches one key; sweep varies several"
+        raise ScenarioError("--vary", "is given more than once", options.vary, remedy)
+    key, low, high = parse_interval(options.vary[0])
+    with ProgressLine() as line:
+        sizing = size(
+            load_scenario(options),
+            key,
+            low,
+            high,
+            options.target,
+            options.by,
+            options.runs,
+            options.confidence,
+            workers=options.workers,
+            scheduler=options.scheduler,
+            engine=options.engine,
+            progress=line.show,
+        )
+    if options.json:
+        probes = [probe._asdict() for probe in sorted(sizing.probes)]
+        target = sizing.target._asdict()
+        print_json({**vars(sizing), "target": target, "probes": probes, "answer": answer(sizing)})
+    else:
+        print(sizing_text(sizing))
+    if not sizing:
+        print(f"netkf: {answer(sizing)}", file=sys.stderr)
+    return 0 if sizing else FAILED

@@ -1,0 +1,94 @@
+"""``netkf sweep``: simulate every point of a grid of parameters."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from netkf.cli import pictures
+from netkf.cli.options import (
+    add_engine,
+    add_json,
+    add_no_plot,
+    add_pool,
+    add_scenario_command,
+    add_seed,
+    add_vary,
+    count,
+    load_scenario,
+    print_json,
+    print_title,
+)
+from netkf.cli.progress import ProgressLine
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
+    from netkf.studies.sweep import CompletedSweep
+
+
+def add_parser(commands: Any) -> None:
+    """Add the options of ``netkf sweep``."""
+    text = "simulate every point of a grid of parameters, one row per point"
+    parser = add_scenario_command(commands, "sweep", run, text)
+    add_vary(
+        parser,
+        "KEY.PATH=V1,V2,...",
+        "values of a key, or START:STOP:COUNT; repeat it for a grid over several keys",
+    )
+    parser.add_argument("--runs", type=count, default=1, help="runs at each point (default: 1)")
+    parser.add_argument("--out", type=Path, help="directory (default: runs/NAME-sweep-k)")
+    add_no_plot(parser)
+    add_seed(parser)
+    add_engine(parser)
+    add_pool(parser)
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command and return the exit status."""
+    from netkf.studies.parameter_grid import parse_grid
+    from netkf.studies.sweep import sweep_to_directory
+
+    grid, scenario = parse_grid(options.vary), load_scenario(options)
+    with ProgressLine() as line:
+        completed = sweep_to_directory(
+            scenario,
+            grid,
+            options.runs,
+            options.out,
+            options.engine,
+            options.workers,
+            options.scheduler,
+            progress=line.counter("points"),
+            finish=None if options.no_plot else partial(_draw, scenario),
+        )
+    if options.json:
+        rows = completed.table.to_dict("records")
+        print_json({"directory": str(completed.directory), "rows": rows})
+    else:
+        _print_sweep(scenario, completed, options.runs)
+    return 0
+
+
+def _print_sweep(scenario: Scenario, completed: CompletedSweep, runs: int) -> None:
+    from netkf.studies.tables import sweep_text
+
+    print_title(scenario)
+    print(f"\n{sweep_text(completed.table, completed.keys)}\n")
+    points = len(completed.table)
+    line = f"{points:,} point{'s' if points > 1 else ''} of {runs:,} run{'s' if runs > 1 else ''}"
+    line += f" in {completed.seconds:.2f} s, all with the same random draws"
+    print(line + ("; +- one standard error" if runs > 1 else ""))
+    print(f"written to {completed.directory}")
+
+
+def _draw(scenario: Scenario, completed: CompletedSweep) -> None:
+    draw = pictures.load_drawing(pictures.SWEEP)
+    if draw is None:
+        pictures.print_missing()
+    elif not draw(scenario.name, completed):
+        reason = "it shows one or two keys, the second with few values"
+        print(f"no picture: {reason}", file=sys.stderr)
