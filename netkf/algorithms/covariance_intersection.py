@@ -9,8 +9,10 @@ from typing import ClassVar
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.kernels.root_update import intersect_roots
+from netkf.algorithms.registry import built_in
 
 
+@built_in("covariance-intersection")
 @dataclass(frozen=True, eq=False)
 class CovarianceIntersection(Hybrid):
     """The hybrid filter with covariance intersection in place of convex resets: weight ``epsilon``
@@ -20,6 +22,7 @@ class CovarianceIntersection(Hybrid):
     bounds E[P_i] here too; and P_i stays at least the covariance of the error, H (10).
     """
 
+    combination: ClassVar[str] = "intersection"
     inverts: ClassVar[bool] = True
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:

@@ -11,6 +11,7 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo
 from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.models import first_root
+from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, either, nested, setting, square
 from netkf.linalg.arrays import FloatArray
@@ -35,6 +36,7 @@ class DiffusionState(NamedTuple):
         return self.root @ self.root.T
 
 
+@built_in("diffusion")
 @dataclass(frozen=True, eq=False)
 class DiffusionFilter(Filter):
     """D Algorithm 1, (6)-(9), with any F in place of D's identity; slots show predictions.
@@ -56,6 +58,9 @@ class DiffusionFilter(Filter):
     )
     on_loss: str = setting(choice("renormalise", "keep-own"), default="renormalise")
 
+    paper: ClassVar[str] = "diffusion"
+    combination: ClassVar[str] = "shares"
+    P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
     schedule: ClassVar[tuple[str, ...]] = ("sense", "predict", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
     predicts: ClassVar[bool] = True

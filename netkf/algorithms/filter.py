@@ -176,6 +176,13 @@ class Filter(Part):
     pooled    one filter reads the sensors of all nodes at once
     needs_samples  increment sensors mean nothing to it
     newest_only    of several messages of one sender at one instant the newest counts
+    fixed_sensors  it adds up information, so the H of a sensor must not vary
+    paper        the paper whose theory and checks speak about it: rooms of that name
+    combination  how it combines what it hears, for the engines and the theory that know it:
+                 "convex", "intersection", "swap", "shares", "readings", "sums", "none"; "" where
+                 only its methods say it
+    P_by_design  how P compares with the covariance of its error in slots and under clocks:
+                 "larger", "smaller", or "" where they are equal or nothing is known
     """
 
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
@@ -189,6 +196,10 @@ class Filter(Part):
     pooled: ClassVar[bool] = False
     needs_samples: ClassVar[bool] = False
     newest_only: ClassVar[bool] = True
+    fixed_sensors: ClassVar[bool] = False
+    paper: ClassVar[str] = ""
+    combination: ClassVar[str] = ""
+    P_by_design: ClassVar[tuple[str, str]] = ("", "")
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -301,6 +312,13 @@ class Filter(Part):
         node l. None where ``weight`` says it.
         """
         return None
+
+    def check_scenario(self, scenario: Any) -> None:
+        """Raise ScenarioError where the rest of a ``netkf.Scenario`` does not fit this filter."""
+
+    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+        """What a user should know about this filter in a ``netkf.Scenario``, one line each."""
+        return ()
 
     def largest_degree(self) -> float:
         """The largest number of neighbours a node may have for the weights to make sense."""

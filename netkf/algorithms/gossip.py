@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
+from netkf.algorithms.registry import built_in
 
 
+@built_in("gossip")
 @dataclass(frozen=True, eq=False)
 class Gossip(Filter):
     """Paired nodes swap the pair (xhat, P) and go on with each other's; samples are predictions.
@@ -19,6 +21,8 @@ class Gossip(Filter):
     and the other is gone. Of several pairs that arrive at one instant the last sender's counts.
     """
 
+    paper: ClassVar[str] = "gossip"
+    combination: ClassVar[str] = "swap"
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "sense", "predict")
     clocks: ClassVar[tuple[str, ...]] = ("links",)
     predicts: ClassVar[bool] = True

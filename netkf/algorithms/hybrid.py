@@ -10,10 +10,12 @@ import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.kernels.root_update import combine_roots
+from netkf.algorithms.registry import built_in
 from netkf.core.fields import number, setting
 from netkf.linalg.arrays import FloatArray
 
 
+@built_in("hybrid")
 @dataclass(frozen=True, eq=False)
 class Hybrid(Filter):
     """Convex resets of estimate and covariance with weight ``epsilon`` for each neighbour heard.
@@ -24,6 +26,9 @@ class Hybrid(Filter):
 
     epsilon: float = setting(number(above=0.0, high=1.0))
 
+    paper: ClassVar[str] = "hybrid"
+    combination: ClassVar[str] = "convex"
+    P_by_design: ClassVar[tuple[str, str]] = ("", "larger")
     schedule: ClassVar[tuple[str, ...] | None] = None
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.models import first_root, sample_update
+from netkf.algorithms.registry import built_in
 from netkf.core.fields import choice, positive, setting
 from netkf.linalg.arrays import FloatArray
 
@@ -51,6 +52,7 @@ class IntermittentState(NamedTuple):
         return self.root @ self.root.T
 
 
+@built_in("intermittent")
 @dataclass(frozen=True, eq=False)
 class Intermittent(Filter):
     """Every node sends its reading to its neighbours and uses its own and those that arrive.
@@ -65,6 +67,8 @@ class Intermittent(Filter):
     late: str = setting(choice("exact", "drop"), default="exact")
     window: float | None = setting(positive, default=None)
 
+    paper: ClassVar[str] = "intermittent"
+    combination: ClassVar[str] = "readings"
     schedule: ClassVar[tuple[str, ...]] = ("sense", "exchange", "predict")
     clocks: ClassVar[tuple[str, ...]] = ("readings",)
     predicts: ClassVar[bool] = True

@@ -8,6 +8,7 @@ keep the mass; the stop rule of step 2.3 fires when all links of a node are down
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,9 @@ from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.square_root import lower_triangular
 from netkf.algorithms.kernels.stopping import RULES, stops
 from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
+from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, choice, integer, number, positive, setting
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import compilable
@@ -63,6 +66,7 @@ class PushSumState(NamedTuple):
         return self.root @ self.root.T
 
 
+@built_in("push-sum")
 @dataclass(frozen=True, eq=False)
 class PushSum(Filter):
     """In slots P Fig. 1, steps 1-6, samples are filtered; under node clocks broadcast rounds by
@@ -87,6 +91,11 @@ class PushSum(Filter):
     stop: str = setting(choice(*RULES), default="never")
     tolerance: float = setting(number(low=0.0), default=1e-6)
 
+    paper: ClassVar[str] = "push_sum"
+    combination: ClassVar[str] = "sums"
+    # Until others hear of its samples, a node counts them as if all nodes had taken them.
+    P_by_design: ClassVar[tuple[str, str]] = ("", "smaller")
+    fixed_sensors: ClassVar[bool] = True
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("nodes",)
     first_slot: ClassVar[int] = 1
@@ -183,6 +192,64 @@ class PushSum(Filter):
         if isinstance(payload, Offer):
             return running_sums.shift_offer(payload, offset)
         return payload + offset if len(payload) == len(offset) else payload
+
+    def check_scenario(self, scenario: Any) -> None:
+        """Raise ScenarioError where leader, delta or the sensors do not fit the slots."""
+        if not scenario.slotted:
+            return
+        self._check_leader(scenario)
+        for name in ("gamma", "delta"):
+            if getattr(self, name) is None:
+                words = "is missing for a plant in slots"
+                raise ScenarioError(f"filter.{name}", words, None, f"add {name} = ...")
+        self._check_gain(scenario.topology.laplacian_radius)
+        for k, sensor in enumerate(scenario.sensors):
+            if sensor.varying:
+                raise ScenarioError(
+                    f"sensors[{k}]",
+                    "must have a fixed H for the push-sum filter, which adds them up beforehand",
+                    None,
+                    "use linear sensors or another filter",
+                )
+        F, Q = scenario.slot_belief
+        if self.asymptotic and asymptotic_root(F, Q, scenario.node_infos[0].information) is None:
+            raise ScenarioError(
+                "filter.asymptotic",
+                "needs a steady covariance of the centralised filter, and there is none",
+                True,
+                "add sensors, or set it to false",
+            )
+
+    def _check_leader(self, scenario: Any) -> None:
+        nodes = scenario.nodes
+        if self.leader not in scenario.topology.index:
+            ids = ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
+            words, remedy = "must be a node of the graph", f"node ids here are {ids}"
+            raise ScenarioError("filter.leader", words, self.leader, remedy)
+
+    def _check_gain(self, radius: float) -> None:
+        if self.delta <= 0.5 * radius * (1.0 + 1e-12):
+            raise ScenarioError(
+                "filter.delta",
+                f"must be above rho(L) / 2 = {0.5 * radius:.6g}, or averaging does not contract",
+                self.delta,
+                f"give more than rho(L) = {radius:.6g}",
+            )
+
+    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+        """One line each: delta is below rho(L); settings of slots are not used under clocks."""
+        if not scenario.slotted:
+            fields = dataclasses.fields(self)
+            given = [f"filter.{f.name}" for f in fields if getattr(self, f.name) != f.default]
+            words = "not used under clocks, where push-sum keeps running sums"
+            return (f"{', '.join(given)}: {words}",) if given else ()
+        radius = scenario.topology.laplacian_radius
+        if self.delta >= radius:
+            return ()
+        return (
+            f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging contracts, "
+            "but P Theorems 3, 5 and 6 ask for more than rho(L)",
+        )
 
 
 @compilable

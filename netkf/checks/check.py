@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import math
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import partial
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.gossip import Gossip
-from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.push_sum import PushSum
-from netkf.checks import clocked, diffusion, gossip, hybrid, intermittent, push_sum
+from netkf.checks import clocked
 from netkf.checks.evidence import (
     BROKEN,
     NOT_PROMISED,
@@ -50,15 +45,6 @@ from netkf.trace.run import Run
 if TYPE_CHECKING:
     import pandas as pd
 
-PAPERS: tuple[tuple[type, ModuleType], ...] = (
-    (Hybrid, hybrid),
-    (Gossip, gossip),
-    (Intermittent, intermittent),
-    (DiffusionFilter, diffusion),
-    (PushSum, push_sum),
-)
-SLOTS_ONLY = (gossip, intermittent, push_sum)
-"""Modules with promises about slots; under clocks those of ``clocked`` are checked."""
 FEWEST, TWINS, SAME = 10, 10, 1e-6
 
 
@@ -92,9 +78,9 @@ class Verdict:
 def paper_of(scenario: Scenario) -> Any:
     """The module with the promises of the scenario's filter; raises TheoryError without one."""
     promised = promised_filter(scenario.filter.algorithm)
-    for kind, module in PAPERS:
-        if isinstance(promised, kind):
-            return clocked if module in SLOTS_ONLY and not scenario.slotted else module
+    if promised.paper:
+        module = importlib.import_module(f"netkf.checks.{promised.paper}")
+        return clocked if module.SLOTS_ONLY and not scenario.slotted else module
     raise TheoryError(f"nothing is promised of the {spoken(promised)} filter that could be checked")
 
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.push_sum import PushSum
 from netkf.checks.evidence import Finding, Promise, Row, identity
 from netkf.checks.exact import (
     as_computed,
@@ -98,6 +97,6 @@ HONEST = Promise(
 
 def promises(scenario: Scenario) -> tuple[Promise, ...]:
     """Push-sum conserves mass; its P is no bound, since a node counts its own samples N times."""
-    if isinstance(stand_in(scenario).filter.algorithm, PushSum):
+    if stand_in(scenario).hosted.combination == "sums":
         return (MASS_STAYS, *PROMISES)
     return (*PROMISES[:1], HONEST, *PROMISES[1:])

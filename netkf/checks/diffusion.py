@@ -27,6 +27,8 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory import error_covariance, information_level
 from netkf.trace.run import Run
 
+SLOTS_ONLY = False
+
 
 class Witness(NamedTuple):
     """What one run says at K slots: as :class:`Exact`, and ``alone`` (N, n, n), the exact

@@ -10,16 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.registry import built_in_class, overridden
 from netkf.checks.evidence import Finding, Row, identity, left_out, rounded_away
 from netkf.checks.laws import NEES, chi_squared, worst
 from netkf.checks.statistics import mean_ratio, off_by
 from netkf.core.errors import TheoryError
 from netkf.core.fields import Part
 from netkf.linalg.arrays import FloatArray
-from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.errors import diagonal_blocks, replayed_covariances
-from netkf.theory.hybrid.coupled import own_steps
 from netkf.trace.run import BLUR, Run, blurred, errors
 
 MOST = 1000
@@ -112,9 +111,9 @@ def promised_filter(algorithm: Any) -> Any:
     """A filter of this package: the given one, or the one that its class is derived from. Raises
     TheoryError for a class that is derived from none, of which nothing is promised.
     """
-    for kind in type(algorithm).__mro__:
-        if any(kind in family.values() for family in (KINDS["filter"], KINDS["slot filter"])):
-            return algorithm if not own_steps(algorithm, kind) else _like(kind, algorithm)
+    known = built_in_class(algorithm)
+    if known is not None:
+        return _like(known, algorithm) if overridden(algorithm) else algorithm
     name = type(algorithm).__name__
     raise TheoryError(
         f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which one "

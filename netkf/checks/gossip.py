@@ -35,6 +35,9 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.gossip.matchings import effective_matching
 from netkf.trace.run import Run
 
+SLOTS_ONLY = True
+"""Whether the paper speaks about slots alone; under clocks those of ``clocked`` are checked."""
+
 WINDOW = 40
 HUGE = 1e9  # root of a covariance that every other one is below
 FAR = 30.0  # factor of the other start's root

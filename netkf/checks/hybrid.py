@@ -30,6 +30,8 @@ from netkf.theory.hybrid.second_moments import second_moment_rate
 from netkf.theory.numerics.matrices import undetectable
 from netkf.trace.run import Run
 
+SLOTS_ONLY = False
+
 BOUND, SLOPE = 0.1, 0.3  # tolerances: relative excess over the bound, exponent of the distance to S
 SETTLED, LONGEST = 0.01, 1e5
 

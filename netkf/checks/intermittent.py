@@ -42,6 +42,9 @@ from netkf.theory.intermittent.scalar_law import ScalarLaw, scalar_law
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
+SLOTS_ONLY = True
+"""Whether the paper speaks about slots alone; under clocks those of ``clocked`` are checked."""
+
 FAR = 30.0  # factor of the other start's root
 ROUNDING = 1e-8
 SHARE, LAW = 0.05, 0.2  # tolerances: of probabilities, of distances of laws

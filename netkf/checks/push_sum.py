@@ -26,6 +26,9 @@ from netkf.theory import (
 )
 from netkf.trace.run import Run
 
+SLOTS_ONLY = True
+"""Whether the paper speaks about slots alone; under clocks those of ``clocked`` are checked."""
+
 MASS, CLOSE = 1e-9, 0.01
 SQUARE, BIAS = 0.3, 0.2  # tolerances: relative mean square, squared bias
 HEAVY = 0.885  # mean-square radius from which the sample mean has no variance worth the name

@@ -71,6 +71,13 @@ class Topology:
         return degrees
 
     @cached_property
+    def laplacian_radius(self) -> float:
+        """rho(L), the largest eigenvalue of the Laplacian of all links."""
+        from netkf.network.spectra import laplacian_radius
+
+        return laplacian_radius(self)
+
+    @cached_property
     def directions(self) -> tuple[Link, ...]:
         """(sender, receiver) of all messages that can be sent: both ways unless directed."""
         back = () if self.directed else tuple((j, i) for i, j in self.links)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.push_sum import PushSum
+from netkf.algorithms.registry import overridden
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import balanced, own_steps
+from netkf.theory.hybrid.coupled import balanced
 
 
 def limit_words(scenario: Scenario) -> str:
@@ -27,13 +24,10 @@ def by_design(scenario: Scenario) -> str:
     error; empty if neither is known.
     """
     algorithm = scenario.filter.algorithm
-    designs = (CovarianceIntersection, Hybrid, DiffusionFilter, PushSum)
-    kind = next((kind for kind in designs if isinstance(algorithm, kind)), None)
-    if kind is None or own_steps(algorithm, kind) or not scenario.topology.links:
+    design = scenario.hosted.P_by_design[0 if scenario.slotted else 1]
+    if overridden(algorithm) or not scenario.topology.links:
         return ""
-    if kind is PushSum:
-        return "" if scenario.slotted else "smaller"
-    return "larger" if scenario.filters_know_the_truth else ""
+    return "" if design == "larger" and not scenario.filters_know_the_truth else design
 
 
 def nees_words(scenario: Scenario) -> str:

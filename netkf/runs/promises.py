@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.push_sum import PushSum
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import finite
 from netkf.runs.labels import limit_words, mismatch_words, without_delay
-from netkf.runs.push_sum_promises import push_sum_lines, push_sum_promises
 from netkf.runs.tables import MOST_NODES, number, table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
@@ -26,6 +24,7 @@ from netkf.theory import (
     steady_covariance_bound,
     true_limit_covariance,
 )
+from netkf.theory.common.papers import paper_function
 from netkf.theory.hybrid.steady import steady_by_node
 
 MARKS = {True: "holds", False: "FAILS", None: "unknown"}
@@ -50,8 +49,9 @@ def promises(scenario: Scenario) -> dict[str, Any]:
             for a, s, h, e in rows.itertuples(index=False)
         ],
     }
-    if isinstance(scenario.filter.algorithm, PushSum) and scenario.slotted:
-        found["push_sum"] = push_sum_promises(scenario)
+    own = paper_function(scenario, "promises", "slot_promises") if scenario.slotted else None
+    if own is not None:
+        found[scenario.hosted.paper] = own(scenario)
     elif scenario.slotted:
         found["slot_central_covariance"] = _value(lambda: _slot_central(scenario))
     if scenario.slotted:
@@ -104,8 +104,10 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
         lines += textwrap.wrap(
             row["evidence"], 94, initial_indent=" " * 11, subsequent_indent=" " * 11
         )
-    if "push_sum" in found:
-        return "\n".join([*lines, "", *push_sum_lines(found["push_sum"])])
+    paper = scenario.hosted.paper
+    if paper and paper in found:
+        own_lines = paper_function(scenario, "promises", "slot_lines")(found[paper], number)
+        return "\n".join([*lines, "", *own_lines])
     if scenario.slotted:
         value = found["slot_central_covariance"]
         words = value["reason"] or number(value["trace"])

@@ -16,7 +16,6 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.combination import check_invertible, check_regressor, check_weights
 from netkf.scenario.compatibility import check_activation, check_readings, check_time
-from netkf.scenario.push_sum import check_push_sum
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import spoken
 from netkf.scenario.sampling import check_sampling, uses_grid
@@ -43,9 +42,9 @@ def check(scenario: Scenario) -> None:
     check_sampling(scenario)
     if scenario.slotted:
         _slots(scenario)
-        check_push_sum(scenario)
     elif uses_grid(scenario):
         _sensing_period(scenario)
+    scenario.hosted.check_scenario(scenario)
 
 
 def _times(scenario: Scenario) -> None:

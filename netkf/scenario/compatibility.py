@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
@@ -87,7 +86,7 @@ def _readings(scenario: Scenario, key: str, sensor: Sensor) -> None:
             None,
             "remove it, or derive the class from netkf.parts.Filter",
         )
-    if hosted.needs_samples and sensor.varying and isinstance(algorithm, PushSum):
+    if sensor.varying and hosted.fixed_sensors:
         raise ScenarioError(
             key,
             f"must have a fixed H for the {name} filter, which adds up information",

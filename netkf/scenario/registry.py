@@ -6,15 +6,9 @@ import importlib
 import sys
 from pathlib import Path
 
-from netkf.algorithms.baselines import Central, Local
-from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.gossip import Gossip
-from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.push_sum import PushSum
+from netkf.algorithms.registry import built_in_filters
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, nearest, quote
@@ -101,16 +95,7 @@ KINDS: dict[str, dict[str, type[Part]]] = {
         "lognormal": channels.LognormalDelay,
         "recorded": recorded.RecordedDelay,
     },
-    "filter": {
-        "hybrid": Hybrid,
-        "covariance-intersection": CovarianceIntersection,
-        "gossip": Gossip,
-        "intermittent": Intermittent,
-        "diffusion": DiffusionFilter,
-        "push-sum": PushSum,
-        "local": Local,
-        "central": Central,
-    },
+    "filter": {**built_in_filters()},
     "slot activation": {
         "matching": matchings.Matching,
         "broadcast": matchings.Broadcast,

@@ -189,10 +189,13 @@ class Scenario(Part):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """One line each about what a user should know before anything runs."""
-        from netkf.scenario.push_sum import push_sum_notes
         from netkf.scenario.records import record_notes
 
-        notes = (*push_sum_notes(self), *record_notes(self), *sampling.sampling_notes(self))
+        notes = (
+            *self.hosted.scenario_notes(self),
+            *record_notes(self),
+            *sampling.sampling_notes(self),
+        )
         return (*self.topology.notes, *notes)
 
     @property

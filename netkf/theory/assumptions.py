@@ -6,20 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.push_sum import PushSum
 from netkf.network.clocks import LinkClock, RecordedClock
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import Row, knowledge, of_the_truth
-from netkf.theory.common.slot_assumptions import slot_rows
+from netkf.theory.common.papers import paper_function
+from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.hybrid.coupled import balanced
 from netkf.theory.hybrid.samples import at_random, by_readings, clock_of
 from netkf.theory.numerics.matrices import unobservable
-from netkf.theory.push_sum.assumptions import push_sum_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,20 +30,27 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
     """
     import pandas as pd
 
-    if isinstance(scenario.filter.algorithm, PushSum) and scenario.slotted:
-        return pd.DataFrame(push_sum_rows(scenario), columns=COLUMNS)
-    if scenario.slotted:
-        rows = slot_rows(scenario)
-    else:
-        rows = _plant(scenario)
-        if scenario.filter.algorithm.talks:
-            rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
-    rows += _start(scenario)
+    rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
+def _slot_rows(scenario: Scenario) -> list[Row]:
+    paper_rows = paper_function(scenario, "assumptions", "slot_rows")
+    if paper_rows is None:
+        return [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
+    rows: list[Row] = paper_rows(scenario)
+    return rows
+
+
+def _clock_rows(scenario: Scenario) -> list[Row]:
+    rows = _plant(scenario)
+    if scenario.filter.algorithm.talks:
+        rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
+    return [*rows, *start_rows(scenario, "H (9), (10)")]
+
+
 def _graph(scenario: Scenario) -> list[Row]:
-    topology, algorithm = scenario.topology, scenario.filter.algorithm
+    topology = scenario.topology
     parts = len(topology.components)
     rows: list[Row] = [
         (
@@ -58,19 +62,8 @@ def _graph(scenario: Scenario) -> list[Row]:
             + (", directed" if topology.directed else ""),
         )
     ]
-    if isinstance(algorithm, Hybrid):
-        most = max(topology.degrees.values())
-        low = 1.0 - algorithm.epsilon * most
-        rows.append(
-            (
-                "Pi is doubly stochastic, 0 < epsilon <= 1/max degree",
-                "H (5)",
-                low >= -1e-12,
-                f"epsilon {algorithm.epsilon:g}, largest degree {most}, least diagonal entry "
-                f"{low:.3g}",
-            )
-        )
-    return rows
+    weights = paper_function(scenario, "assumptions", "weight_rows")
+    return [*rows, *weights(scenario)] if weights is not None else rows
 
 
 def _plant(scenario: Scenario) -> list[Row]:
@@ -203,28 +196,3 @@ def _channel(scenario: Scenario) -> list[Row]:
             else "the limit is not S but weighs the nodes differently",
         ),
     ]
-
-
-def _start(scenario: Scenario) -> list[Row]:
-    plant, worst = scenario.plant, np.inf
-    for node in scenario.nodes:
-        mean, cov = scenario.start(node)
-        offset = plant.start_mean - mean
-        gap = cov - plant.start_cov - np.outer(offset, offset)
-        worst = min(worst, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
-    return [
-        (
-            "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
-            _start_source(scenario),
-            *of_the_truth(
-                scenario, worst >= -1e-12, f"least eigenvalue of the difference {worst:.3g}"
-            ),
-        )
-    ]
-
-
-def _start_source(scenario: Scenario) -> str:
-    if not scenario.slotted:
-        return "H (9), (10)"
-    diffuses = isinstance(scenario.filter.algorithm, DiffusionFilter)
-    return "P_i consistent from the start; D does without" if diffuses else "G (10)"

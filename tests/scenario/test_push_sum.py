@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.scenario.push_sum import MOST_DENSE, laplacian_radius
+from netkf.network.spectra import MAX_DENSE
 from tests.conftest import SCENARIOS
 
 PLANAR = SCENARIOS / "push_sum_planar.toml"
@@ -84,7 +84,7 @@ def test_records_of_other_steps_or_links_are_refused(row, words, tmp_path):
 def test_delta_is_noted_below_rho_and_refused_at_half_of_it():
     scenario = netkf.load(PLANAR)
     assert "filter.delta = 4.01 is below rho(L) = 6.68003" in scenario.notes[0]
-    radius = laplacian_radius(scenario.topology)
+    radius = scenario.topology.laplacian_radius
     for share, notes in ((0.5 + 1e-9, 1), (1.0 - 1e-9, 1), (1.0, 0), (1.5, 0)):
         assert len(scenario.replace({"filter.delta": share * radius}).notes) == notes
     with pytest.raises(netkf.ScenarioError):
@@ -92,10 +92,10 @@ def test_delta_is_noted_below_rho_and_refused_at_half_of_it():
     assert scenario.replace({"filter": {"kind": "central"}}).notes == ()
 
 
-@pytest.mark.parametrize("size", [12, MOST_DENSE + 100])
+@pytest.mark.parametrize("size", [12, MAX_DENSE + 100])
 def test_rho_is_the_largest_eigenvalue_of_the_laplacian(size):
     graph = {"kind": "regular", "nodes": size, "degree": 3, "seed": 2}
     scenario = netkf.load(PLANAR, {"network.graph": graph, "filter.delta": 7.0})
     L = networkx.laplacian_matrix(networkx.Graph(scenario.topology.links)).toarray()
     expected = np.linalg.eigvalsh(L.astype(float))[-1]
-    assert laplacian_radius(scenario.topology) == pytest.approx(expected, rel=1e-9)
+    assert scenario.topology.laplacian_radius == pytest.approx(expected, rel=1e-9)

@@ -6,6 +6,7 @@ import scipy.stats
 
 import netkf
 from netkf import theory
+from netkf.theory.hybrid.steady import steady_by_node
 
 RUNS = 20_000
 
@@ -229,11 +230,11 @@ def test_thresholds(build):
     for s, exists in ((1.05, True), (0.95, False)):
         alone = scalar(build, a, None, {"kind": "poisson", "rate": s}, {"kind": "local"})
         if exists:
-            P = theory.steady.steady_by_node(alone)[0, 0, 0]
+            P = steady_by_node(alone)[0, 0, 0]
             # 0 = 2 a P + 1 - s P^2 / (P + 1)
             assert 2 * a * P + 1.0 == pytest.approx(s * P**2 / (P + 1.0), rel=1e-9)
         else:
-            assert np.isnan(theory.steady.steady_by_node(alone)[0]).all()
+            assert np.isnan(steady_by_node(alone)[0]).all()
 
 
 def test_remote_estimation_over_one_link_in_closed_form(build):

@@ -8,61 +8,27 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from netkf.algorithms.baselines import Local
-from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.gossip import Gossip
-from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.push_sum import PushSum
+from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observed import Observed, hosts_of, in_slots, sampled
-from netkf.theory.common.rules import Readings, Rule, Sent, estimates_rule
+from netkf.theory.common.papers import paper_module
+from netkf.theory.common.rules import Rule, Sent
 from netkf.theory.common.stacked_errors import Clock, Errors
-from netkf.theory.hybrid.coupled import own_steps
 from netkf.theory.numerics.gaps import Gap
-from netkf.theory.push_sum.errors import Averages, RunningTotals, known_sums
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
-
-KNOWN = (
-    CovarianceIntersection,
-    Hybrid,
-    DiffusionFilter,
-    Gossip,
-    Intermittent,
-    PushSum,
-    Local,
-)
-"""Filters whose equations are known here, a class before the one that it derives from."""
-
-PHASES = {
-    DiffusionFilter: ("sense", "predict", "exchange"),
-    Gossip: ("exchange", "sense", "predict"),
-    Intermittent: ("sense", "exchange", "predict"),
-    PushSum: ("exchange", "predict", "sense", "exchange"),
-    Local: ("predict", "sense"),
-}
-"""What happens in a slot, in its order."""
 
 
 def replay(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
     """(T, M n, M n): covariance of the errors of M hosts at ``run.times``, M = 1 where all nodes
     share one filter; and (T, M, n, n), their P.
     """
-    algorithm = scenario.filter.algorithm
-    known = next((k for k in KNOWN if isinstance(algorithm, k)), None)
-    if known is None:
-        raise TheoryError(f"no exact error covariance for {type(algorithm).__name__}")
-    own = own_steps(algorithm, known)
-    if own:
-        words = f"{type(algorithm).__name__} defines {own[0]} itself"
-        raise TheoryError(f"the exact error covariance is not known: {words}")
+    errors_known(scenario)
     errors = Errors(scenario, len(hosts_of(scenario)))
     if scenario.slotted:
-        moments = _slots(scenario, run, errors, known)
+        moments = _slots(scenario, run, errors)
     else:
         moments = _instants(scenario, run, errors)
     pairs = [(errors.covariance(), errors.covariances()) for _ in moments]
@@ -70,6 +36,19 @@ def replay(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
         n = errors.n
         return np.empty((0, errors.hosts * n, errors.hosts * n)), np.empty((0, errors.hosts, n, n))
     return np.array([whole for whole, _ in pairs]), np.array([P for _, P in pairs])
+
+
+def errors_known(scenario: Scenario) -> None:
+    """Raise TheoryError where the equations of the filter are not known here."""
+    algorithm = scenario.filter.algorithm
+    name = type(algorithm).__name__
+    if not scenario.hosted.combination:
+        raise TheoryError(f"no exact error covariance for {name}")
+    own = overridden(algorithm)
+    if own:
+        raise TheoryError(
+            f"the exact error covariance is not known: {name} defines {own[0]} itself"
+        )
 
 
 def delivered(scenario: Scenario, run: Run) -> list[Sent]:
@@ -96,7 +75,7 @@ def delivered(scenario: Scenario, run: Run) -> list[Sent]:
 def _instants(scenario: Scenario, run: Run, errors: Errors) -> Iterator[None]:
     """Stops where the run was sampled."""
     messages = delivered(scenario, run)
-    rule, clock = _rule(scenario, run, errors, messages), Clock(scenario, errors)
+    rule, clock = _rule(scenario, errors, run, messages), Clock(scenario, errors)
     samples = sampled(scenario, run)
     leaving, coming = _by_time(messages, 3), _by_time(messages, 4)
     happens = iter(sorted({*samples, *leaving, *coming, *rule.times}))
@@ -111,15 +90,6 @@ def _instants(scenario: Scenario, run: Run, errors: Errors) -> Iterator[None]:
             following = next(happens, np.inf)
         rule.passed(*clock.advance(time))
         yield
-
-
-def rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
-    """The places of nodes that began a broadcast, by time."""
-    found: dict[float, list[int]] = {}
-    rows = run.log[run.log["kind"] == CODES["transmit"]]
-    for time, node in zip(rows["t"].tolist(), rows["node"].tolist(), strict=True):
-        found.setdefault(time, []).append(scenario.topology.index[node])
-    return found
 
 
 def _exchanged(scenario: Scenario, run: Run) -> dict[tuple[int, int], list[Sent]]:
@@ -141,34 +111,27 @@ def _by_time(messages: list[Sent], column: int) -> dict[float, list[Sent]]:
     return found
 
 
-def _rule(scenario: Scenario, run: Run, errors: Errors, messages: list[Sent]) -> Rule:
-    algorithm = scenario.filter.algorithm
-    if isinstance(algorithm, Intermittent):
-        return Readings(scenario, errors, messages)
-    if isinstance(algorithm, PushSum):
-        return RunningTotals(scenario, errors, rounds(scenario, run))
-    return estimates_rule(scenario, errors)
+def _rule(scenario: Scenario, errors: Errors, run: Run, messages: list[Sent]) -> Rule:
+    if not scenario.hosted.paper:
+        return Rule(scenario, errors)
+    made: Rule = paper_module(scenario, "errors").rule(scenario, errors, run, messages)
+    return made
 
 
-def _slots(scenario: Scenario, run: Run, errors: Errors, known: type) -> Iterator[None]:
+def _slots(scenario: Scenario, run: Run, errors: Errors) -> Iterator[None]:
     """Stops where the run was sampled: before a slot, or after it for filters whose samples are
     filtered.
     """
-    phases, plant = PHASES[known], scenario.slot_plant
+    phases, plant = scenario.hosted.schedule or (), scenario.slot_plant
     F, Q = scenario.slot_belief
     noise = square_root(plant.Q)
     gap = Gap(plant.F, F, plant.F - F, noise, noise, square_root(Q))
-    if known is PushSum:
-        known_sums(scenario, run)
-        rule: Rule = Averages(scenario, errors, run)
-    else:
-        rule = _rule(scenario, run, errors, [])
+    rule = _rule(scenario, errors, run, [])
     readings, arrivals = in_slots(scenario, run), _exchanged(scenario, run)
-    filtered = phases[-1] != "predict" and known is not DiffusionFilter
     slot = 0
     for until in np.round(run.times / plant.period).astype(int).tolist():
         while slot < until:
-            at = slot + 1 if filtered else slot
+            at = slot if scenario.hosted.predicts else slot + 1
             _slot(rule, gap, phases, at, readings(at), arrivals)
             slot += 1
         yield

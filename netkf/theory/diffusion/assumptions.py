@@ -8,18 +8,20 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED, UNKNOWN_LAW, Row, recorded_channel
+from netkf.theory.common.plant_assumptions import start_rows
 from netkf.theory.diffusion.information import information_level
 
 MOST_NODES = 500
 
 
-def diffusion_rows(scenario: Scenario) -> list[Row]:
-    """(assumption, source, holds, evidence) of each."""
+def slot_rows(scenario: Scenario) -> list[Row]:
+    """(assumption, source, holds, evidence) of each assumption."""
     return [
         *_weights(scenario),
         *_plant(scenario),
         _information(scenario),
         _arrivals(scenario),
+        *start_rows(scenario, "P_i consistent from the start; D does without"),
     ]
 
 

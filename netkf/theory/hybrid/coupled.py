@@ -16,9 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 
-from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
@@ -77,43 +76,15 @@ class Coupled(NamedTuple):
         return self._replace(coupling=factor * self.coupling)
 
 
-STEPS = (
-    "init",
-    "predict",
-    "update",
-    "emit",
-    "absorb",
-    "share",
-    "max_measurement_interval",
-    "steps",
-    "redraws_links",
-    "estimate",
-)
-
-
-def own_steps(algorithm: object, known: type, steps: tuple[str, ...] = STEPS) -> list[str]:
-    """The steps that a user's subclass defines itself; theorems about ``known`` are not about it.
-
-    Other weights are understood, they enter the equations.
-    """
-    mine = type(algorithm)
-    return [
-        name
-        for name in steps
-        if hasattr(known, name) and getattr(mine, name, None) is not getattr(known, name)
-    ]
-
-
 def not_promised(scenario: Scenario) -> str | None:
     """Why H Theorem 2 does not speak about the scenario, in words; None where it does."""
     algorithm, network = scenario.filter.algorithm, scenario.network
     if not scenario.slotted and not algorithm.talks:
         return _samples_not_promised(scenario)
     name = type(algorithm).__name__
-    if not isinstance(algorithm, Hybrid):
+    if scenario.hosted.paper != "hybrid":
         return f"H(12) is about the hybrid filter in continuous time, not about {spoken(algorithm)}"
-    intersects = isinstance(algorithm, CovarianceIntersection)  # its resets give no larger P
-    own = own_steps(algorithm, CovarianceIntersection if intersects else Hybrid)
+    own = overridden(algorithm)  # built-in resets by intersection give no larger P
     if own:
         return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
     assert isinstance(network.activation, LinkClock)

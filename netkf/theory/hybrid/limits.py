@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 
-from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.scenario.registry import name_of, spoken
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import Coupled, informations, left_weights, own_steps, promised
+from netkf.theory.hybrid.coupled import Coupled, informations, left_weights, promised
 from netkf.theory.hybrid.samples import Samples, by_readings, jumps, poisson_samples
 from netkf.theory.hybrid.steady import steady_state
 from netkf.theory.intermittent.riccati import filtered_covariance
@@ -28,9 +28,9 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     """
     A, Q = scenario.belief
     algorithm = scenario.filter.algorithm
-    if algorithm.talks and not isinstance(algorithm, Hybrid):
+    if algorithm.talks and scenario.hosted.combination != "convex":
         raise TheoryError(f"H(13) is about the hybrid filter, not about {spoken(algorithm)}")
-    if algorithm.talks and (own := own_steps(algorithm, Hybrid)):
+    if algorithm.talks and (own := overridden(algorithm)):
         name = spoken(algorithm)
         if ":" in name_of("filter", algorithm):
             name = f"{type(algorithm).__name__}, which defines {own[0]} itself"

@@ -22,7 +22,7 @@ from netkf.theory.push_sum.mean_square import mean_radius, radius
 HEAVY = 0.885
 
 
-def push_sum_rows(scenario: Scenario) -> list[Row]:
+def slot_rows(scenario: Scenario) -> list[Row]:
     """(assumption, source, holds, evidence) of each."""
     return [
         *_plant(scenario),

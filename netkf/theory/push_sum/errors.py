@@ -232,3 +232,22 @@ class RunningTotals(Rule):
         errors.stack.put(host, (np.eye(n) - gain @ U) @ errors.stack.form(host) - gain @ form)
         errors.roots[host] = root
         self._weights[host] = after
+
+
+def _rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
+    """The places of nodes that began a broadcast, by time."""
+    found: dict[float, list[int]] = {}
+    rows = run.log[run.log["kind"] == CODES["transmit"]]
+    for time, node in zip(rows["t"].tolist(), rows["node"].tolist(), strict=True):
+        found.setdefault(time, []).append(scenario.topology.index[node])
+    return found
+
+
+def rule(scenario: Scenario, errors: Errors, run: Run, messages: Sequence[Sent]) -> Rule:
+    """The moves of this filter along the messages of a run; raises TheoryError where the errors in
+    slots are not known.
+    """
+    if not scenario.slotted:
+        return RunningTotals(scenario, errors, _rounds(scenario, run))
+    known_sums(scenario, run)
+    return Averages(scenario, errors, run)

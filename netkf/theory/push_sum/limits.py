@@ -7,12 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.push_sum import PushSum
+from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.graphs import Topology
-from netkf.scenario.push_sum import laplacian_radius
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import own_steps
 from netkf.theory.intermittent.riccati import filtered_covariance
 
 
@@ -70,7 +69,7 @@ def push_sum_filter(scenario: Scenario) -> PushSum:
     name = type(algorithm).__name__
     if not isinstance(algorithm, PushSum):
         raise TheoryError(f"this is about the push-sum filter, and the scenario's is {name}")
-    own = own_steps(algorithm, PushSum)
+    own = overridden(algorithm, PushSum)
     if own:
         raise TheoryError(f"this is about the push-sum filter, and {name} defines {own[0]} itself")
     return algorithm
@@ -99,4 +98,4 @@ def consensus_gain_bound(graph: Scenario | Topology) -> GainBound:
         raise TheoryError("the graph must be undirected")
     N, degrees = len(topology.nodes), topology.degrees
     local = max((degrees[i] + degrees[j] for i, j in topology.links), default=0)
-    return GainBound(laplacian_radius(topology), local, N)
+    return GainBound(topology.laplacian_radius, local, N)

@@ -1,4 +1,4 @@
-"""The assumptions of G (C.1, S.1, D.1) and of R about scenarios in slots."""
+"""The assumptions of R about a scenario in slots."""
 
 from __future__ import annotations
 
@@ -6,122 +6,25 @@ import itertools
 
 import numpy as np
 
-from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.gossip import Gossip
-from netkf.algorithms.intermittent import Intermittent
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import RECORDED, Row, knowledge, of_the_truth, recorded_channel
-from netkf.theory.diffusion.assumptions import diffusion_rows
-from netkf.theory.gossip.matchings import (
-    detecting_walk,
-    effective_matching,
-    mean_matching,
-    primitive,
-)
+from netkf.theory.common.evidence import RECORDED, Row, recorded_channel
+from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.intermittent.riccati import contraction_radius, critical_probability, unseen
 
-SHOWN, MOST_HEARD = 12, 8
+MAX_SHOWN, MAX_HEARD = 12, 8
 OFTEN = "readings arrive often enough for a bounded mean (sufficient)"
 
 
 def slot_rows(scenario: Scenario) -> list[Row]:
-    """(assumption, source, holds, evidence) of each."""
-    algorithm = scenario.filter.algorithm
-    if isinstance(algorithm, DiffusionFilter):
-        return list[Row](diffusion_rows(scenario))
-    rows = _plant(scenario)
-    if isinstance(algorithm, Gossip):
-        return [*_matching(scenario), *rows, *_walk(scenario), *_swaps(scenario)]
-    if isinstance(algorithm, Intermittent):
-        return [*rows, *_readings(scenario), *_arrivals(scenario)]
-    return rows
-
-
-def _plant(scenario: Scenario) -> list[Row]:
-    plant = scenario.slot_plant
-    least = float(np.linalg.eigvalsh(plant.Q)[0])
-    idle = unseen(plant.F.T, plant.Q)
-    words = "every mode that does not decay is driven by the noise"
-    if idle is not None:
-        words = f"the mode with eigenvalue {idle:.6g} is not driven"
-    positive = f"least eigenvalue {least:.3g}; sufficient for the uniqueness of the limit law"
+    """(assumption, source, holds, evidence) of each assumption."""
     return [
-        (
-            "(F, Q^1/2) is stabilisable",
-            "G S.1, R Theorem 9",
-            *of_the_truth(scenario, idle is None, words),
-        ),
-        (
-            "Q is positive definite",
-            "G II-A, R Theorem 9",
-            *of_the_truth(scenario, least > 0.0, positive),
-        ),
-        knowledge(scenario, "G (10), R (15)", "same F, Q and R"),
+        *slot_plant_rows(scenario),
+        *_readings(scenario),
+        *_arrivals(scenario),
+        *start_rows(scenario, "G (10)"),
     ]
-
-
-def _matching(scenario: Scenario) -> list[Row]:
-    name = "the mean matching is irreducible and aperiodic"
-    try:
-        mean = _mean(scenario)
-    except TheoryError as error:
-        return [(name, "G C.1", None, f"not decided: {error}")]
-    irreducible, aperiodic, period = primitive(mean)
-    if not irreducible:
-        words = "some nodes are never reached from others"
-    elif not aperiodic:
-        words = (
-            f"it has period {period}: tokens visit the two halves of the network in turn, and "
-            "filters can blow up though every sensor is observable"
-        )
-    else:
-        words = f"least positive entry {mean[mean > 0.0].min():.3g}"
-    return [(name, "G C.1", irreducible and aperiodic, words)]
-
-
-def _mean(scenario: Scenario) -> FloatArray:
-    """Abar, with the losses where they are known: a lost swap leaves both alone."""
-    try:
-        return effective_matching(scenario)
-    except TheoryError:
-        return mean_matching(scenario)
-
-
-def _walk(scenario: Scenario) -> list[Row]:
-    name = "some walk on the network detects the state (weak detectability)"
-    try:
-        walk = detecting_walk(scenario)
-    except TheoryError as error:
-        return [(name, "G D.1", None, f"not decided: {error}")]
-    if walk is None:
-        return [
-            (
-                name,
-                "G D.1",
-                False,
-                "no walk of up to 40 steps has an invertible Gramian; D.1 is "
-                "sufficient, not necessary: a mode that decays by itself need not be seen",
-            )
-        ]
-    shown = ", ".join(map(str, walk[:SHOWN])) + (", ..." if len(walk) > SHOWN else "")
-    return [(name, "G D.1", True, f"the Gramian of the walk ({shown}) is invertible")]
-
-
-def _swaps(scenario: Scenario) -> list[Row]:
-    channel = scenario.network.channel
-    certain = type(channel.loss).__name__ == "NoLoss"
-    holds = certain or channel.symmetric
-    words = (
-        "nothing is lost"
-        if certain
-        else "both messages of a pair are lost together: a swap or none"
-        if holds
-        else "one of two messages may be lost: a pair is then copied and the other one is gone, so "
-        "tokens are no permutation any more"
-    )
-    return [("every exchange is a swap", "G (10)", holds, words)]
 
 
 def _sight(scenario: Scenario) -> dict[int, FloatArray]:
@@ -145,7 +48,8 @@ def _readings(scenario: Scenario) -> list[Row]:
     blind = [node for node, H in sight.items() if unseen(F, H) is not None]
     words = "its own readings and its neighbours' see every mode that does not decay"
     if blind:
-        words = f"not at node{'s' if len(blind) > 1 else ''} {', '.join(map(str, blind[:SHOWN]))}"
+        several, listed = "s" if len(blind) > 1 else "", ", ".join(map(str, blind[:MAX_SHOWN]))
+        words = f"not at node{several} {listed}"
     return [(name, "R Theorem 9", not blind, words)]
 
 
@@ -185,7 +89,7 @@ def _often_enough(scenario: Scenario) -> Row:
         if unseen(F, own) is None or unseen(F, H) is not None:
             continue
         heard = [(i, j) for i, j in scenario.topology.directions if j == node and i in sensing]
-        if len(heard) > MOST_HEARD:
+        if len(heard) > MAX_HEARD:
             return (OFTEN, "R (32)", None, f"not decided: node {node} hears {len(heard)} sensors")
         radius = contraction_radius(F, _arriving(scenario, own, heard))
         if worst is None or radius > worst[0]:

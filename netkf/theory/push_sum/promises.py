@@ -1,4 +1,4 @@
-"""What ``netkf theory`` says of the push-sum filter: P section 4, and the exact mean squares."""
+"""The results of ``netkf theory`` for the push-sum filter: P section 4, exact mean squares."""
 
 from __future__ import annotations
 
@@ -8,24 +8,19 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import TheoryError
-from netkf.runs.tables import number
 from netkf.scenario.scenario import Scenario
-from netkf.theory import (
-    central_covariance,
-    consensus_gain_bound,
-    disconnection_probability,
-    exact_minimum_gamma,
-    minimum_gamma,
-    push_sum_error_covariance,
-    push_sum_limits,
-    push_sum_radius,
-)
+from netkf.theory.hybrid.limits import central_covariance
+from netkf.theory.push_sum.certified_gamma import exact_minimum_gamma, minimum_gamma
+from netkf.theory.push_sum.covariance import push_sum_error_covariance
+from netkf.theory.push_sum.disconnection import disconnection_probability
+from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
+from netkf.theory.push_sum.mean_square import push_sum_radius
 
 MOST_STATES = 120  # of all nodes together; beyond it a search over gamma takes minutes
 MOST_STEPS = 20
 
 
-def push_sum_promises(scenario: Scenario) -> dict[str, Any]:
+def slot_promises(scenario: Scenario) -> dict[str, Any]:
     """Values by name, each ``{"value", "reason"}``; plain JSON values."""
 
     def p_inf() -> float:
@@ -68,8 +63,8 @@ def _value(function: Callable[[], Any]) -> dict[str, Any]:
         return {"value": None, "reason": str(error)}
 
 
-def push_sum_lines(found: dict[str, Any]) -> list[str]:
-    """The same for a terminal."""
+def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]:
+    """The promises as lines for a terminal; ``number`` formats a value."""
 
     def shown(name: str, make: Callable[[Any], str] = number) -> str:
         value = found[name]

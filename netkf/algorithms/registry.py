@@ -1,0 +1,66 @@
+"""The built-in filters: each registers in its own file, and everything else finds it here.
+
+A filter's file says what the rest of the package must know of it: its name in scenario files, the
+paper whose theory and checks speak about it (packages ``netkf.theory.<paper>`` and
+``netkf.checks.<paper>``), and how it combines what it hears (``Filter.combination``).
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from functools import cache
+from typing import TypeVar
+
+import netkf.algorithms
+from netkf.algorithms.filter import STEPS, Filter
+
+F = TypeVar("F", bound=type[Filter])
+
+_REGISTERED: dict[str, type[Filter]] = {}
+
+WEIGHING = ("share", "max_measurement_interval", "steps", "redraws_links")
+"""Methods besides STEPS that theorems rely on; other weights of links are known to the theory."""
+
+TRAITS = ("schedule", "clocks", "predicts", "first_slot", "pairwise", "talks", "pooled",
+          "newest_only")  # fmt: skip
+"""Class variables that theorems rely on."""
+
+
+def built_in(name: str) -> Callable[[F], F]:
+    """Register a filter class under its ``name`` in scenario files."""
+
+    def register(cls: F) -> F:
+        _REGISTERED[name] = cls
+        return cls
+
+    return register
+
+
+@cache
+def built_in_filters() -> dict[str, type[Filter]]:
+    """All built-in filters by name."""
+    for module in pkgutil.iter_modules(netkf.algorithms.__path__, "netkf.algorithms."):
+        if not module.ispkg:
+            importlib.import_module(module.name)
+    return dict(sorted(_REGISTERED.items()))
+
+
+def built_in_class(algorithm: object) -> type[Filter] | None:
+    """The built-in class of a filter, or the one that a user's class is derived from."""
+    known = set(built_in_filters().values())
+    return next((cls for cls in type(algorithm).__mro__ if cls in known), None)
+
+
+def overridden(algorithm: object, known: type | None = None) -> list[str]:
+    """Methods and class variables that a user's class defines anew, other than weights of links:
+    theorems about the built-in class (``known``) do not speak about it.
+    """
+    known = known or built_in_class(algorithm)
+    mine = type(algorithm)
+    return [
+        name
+        for name in (*STEPS, *WEIGHING, *TRAITS)
+        if hasattr(known, name) and getattr(mine, name, None) is not getattr(known, name)
+    ]

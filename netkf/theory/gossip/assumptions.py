@@ -1,0 +1,90 @@
+"""The assumptions of G about a scenario in slots: C.1, S.1, D.1."""
+
+from __future__ import annotations
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import Row
+from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
+from netkf.theory.gossip.matchings import (
+    detecting_walk,
+    effective_matching,
+    mean_matching,
+    primitive,
+)
+
+MAX_SHOWN = 12
+
+
+def slot_rows(scenario: Scenario) -> list[Row]:
+    """(assumption, source, holds, evidence) of each assumption."""
+    return [
+        *_matching(scenario),
+        *slot_plant_rows(scenario),
+        *_walk(scenario),
+        *_swaps(scenario),
+        *start_rows(scenario, "G (10)"),
+    ]
+
+
+def _matching(scenario: Scenario) -> list[Row]:
+    name = "the mean matching is irreducible and aperiodic"
+    try:
+        mean = _mean(scenario)
+    except TheoryError as error:
+        return [(name, "G C.1", None, f"not decided: {error}")]
+    irreducible, aperiodic, period = primitive(mean)
+    if not irreducible:
+        words = "some nodes are never reached from others"
+    elif not aperiodic:
+        words = (
+            f"it has period {period}: tokens visit the two halves of the network in turn, and "
+            "filters can blow up though every sensor is observable"
+        )
+    else:
+        words = f"least positive entry {mean[mean > 0.0].min():.3g}"
+    return [(name, "G C.1", irreducible and aperiodic, words)]
+
+
+def _mean(scenario: Scenario) -> FloatArray:
+    """Abar, with the losses where they are known: a lost swap leaves both alone."""
+    try:
+        return effective_matching(scenario)
+    except TheoryError:
+        return mean_matching(scenario)
+
+
+def _walk(scenario: Scenario) -> list[Row]:
+    name = "some walk on the network detects the state (weak detectability)"
+    try:
+        walk = detecting_walk(scenario)
+    except TheoryError as error:
+        return [(name, "G D.1", None, f"not decided: {error}")]
+    if walk is None:
+        return [
+            (
+                name,
+                "G D.1",
+                False,
+                "no walk of up to 40 steps has an invertible Gramian; D.1 is "
+                "sufficient, not necessary: a mode that decays by itself need not be seen",
+            )
+        ]
+    shown = ", ".join(map(str, walk[:MAX_SHOWN])) + (", ..." if len(walk) > MAX_SHOWN else "")
+    return [(name, "G D.1", True, f"the Gramian of the walk ({shown}) is invertible")]
+
+
+def _swaps(scenario: Scenario) -> list[Row]:
+    channel = scenario.network.channel
+    certain = type(channel.loss).__name__ == "NoLoss"
+    holds = certain or channel.symmetric
+    words = (
+        "nothing is lost"
+        if certain
+        else "both messages of a pair are lost together: a swap or none"
+        if holds
+        else "one of two messages may be lost: a pair is then copied and the other one is gone, so "
+        "tokens are no permutation any more"
+    )
+    return [("every exchange is a swap", "G (10)", holds, words)]
