@@ -1,8 +1,9 @@
-"""The same jobs with other people's tools: filterpy and Stone Soup objects in a heapq loop, scipy's
-solve_ivp on the stacked bound (12), a plain numpy loop for the random Riccati equation.
+"""The same jobs with other people's tools: filterpy and Stone Soup objects in a loop over ticks,
+filterpy and simdkalman on series of readings, batched numpy, scipy's solve_ivp on the stacked bound
+(12), a plain numpy loop for the random Riccati equation.
 
-Part of ``python -m tests.benchmarks.compiled``; tests/benchmarks/test_peers.py holds the results of
-each pair against each other.
+Part of ``python -m tests.benchmarks``; tests/benchmarks/test_peers.py holds the results of each
+pair against each other.
 """
 
 import datetime
@@ -18,47 +19,43 @@ import scipy.sparse.linalg
 import netkf
 from netkf.theory.hybrid.coupled import coupled
 from netkf.theory.hybrid.packed import Packed
-from tests.benchmarks.engine import RING
 
 EPOCH = datetime.datetime(2000, 1, 1)
 
 
 class Tick(NamedTuple):
+    """A tick of a link, and the laws (F, Q) of the time since the last ones of its ends."""
+
     t: float
     link: tuple[int, int]
     delivered: bool
-
-
-def planar(nodes=1000, rate=2.0):
-    """Two independent axes of poisson_ring's plant (n = 4) on a random graph of degree 8; as there
-    every third node has a sensor, of both positions.
-    """
-    A, B = (np.kron(np.eye(2), M).tolist() for M in ([[0.0, 1.0], [-1.0, 0.1]], [[0.0], [1.0]]))
-    H, R = np.kron(np.eye(2), [[1.0, 0.0]]).tolist(), [[0.25, 0.0], [0.0, 0.25]]
-    eye = np.eye(4).tolist()
-    graph = {"kind": "regular", "nodes": nodes, "degree": 8, "seed": 1, "connected": True}
-    return netkf.load(RING).replace(
-        {
-            "plant": {"kind": "diffusion", "A": A, "B": B, "mean": [0.0] * 4, "cov": eye},
-            "sensors": [{"nodes": list(range(0, nodes, 3)), "H": H, "R": R}],
-            "network.graph": graph,
-            "network.activation.rate": rate,
-            "filter.epsilon": 0.1,
-            "filter.cov": eye,
-        }
-    )
+    gaps: tuple[float, ...]
+    laws: tuple[tuple[np.ndarray, np.ndarray], ...]
 
 
 def clocks(case, most):
-    """The first ``most`` ticks of Poisson clocks, from a heap of the next tick of each link."""
+    """The first ``most`` ticks of Poisson clocks, from a heap of the next tick of each link: t, the
+    link, and whether messages arrive.
+    """
     random = np.random.default_rng(1)
     mean, delivery = 1.0 / case.network.activation.rate, case.network.channel.loss.delivery
     heap = [(random.exponential(mean), link) for link in case.topology.links]
     heapq.heapify(heap)
     for _ in range(most):
         t, link = heap[0]
-        yield Tick(t, link, random.random() < delivery)
+        yield t, link, random.random() < delivery
         heapq.heapreplace(heap, (t + random.exponential(mean), link))
+
+
+def with_laws(case, ticks):
+    """A list of Tick: no transition matrix is worked out while others are timed."""
+    now, found = dict.fromkeys(case.nodes, 0.0), []
+    for t, link, delivered in ticks:
+        gaps = tuple(t - now[node] for node in link)
+        now.update(dict.fromkeys(link, t))
+        laws = tuple(discrete(case.truth, gap) for gap in gaps)
+        found.append(Tick(t, link, delivered, gaps, laws))
+    return found
 
 
 def discrete(truth, gap):
@@ -79,25 +76,22 @@ def filterpy_job(case, ticks):
     from filterpy.kalman import KalmanFilter
 
     n, epsilon, seen = case.plant.n, case.filter.algorithm.epsilon, sensors(case)
-    random, now, nodes = np.random.default_rng(2), dict.fromkeys(case.nodes, 0.0), {}
+    random, nodes = np.random.default_rng(2), {}
     for node in case.nodes:
         nodes[node] = KalmanFilter(dim_x=n, dim_z=len(seen[node][1]) if node in seen else 1)
         nodes[node].P = np.array(case.start(node)[1])
-    made = 0
-    for made, (t, (i, j), delivered) in enumerate(ticks, start=1):  # noqa: B007 - counted
-        for h in (i, j):
-            gap, now[h] = t - now[h], t
-            F, Q = discrete(case.truth, gap)
+    for _, link, delivered, gaps, laws in ticks:
+        for h, gap, (F, Q) in zip(link, gaps, laws, strict=True):
             nodes[h].predict(F=F, Q=Q)
             if h in seen:
                 H, R = seen[h]
                 nodes[h].update(random.normal(size=(len(R), 1)), R=R / gap, H=H)
         if delivered:
-            a, b = nodes[i], nodes[j]
+            a, b = (nodes[h] for h in link)
             mean, cov = epsilon * (b.x - a.x), epsilon * (b.P - a.P)
             a.x, a.P, b.x, b.P = a.x + mean, a.P + cov, b.x - mean, b.P - cov
     every = [nodes[node] for node in case.nodes]
-    return made, np.array([k.x[:, 0] for k in every]), np.array([k.P for k in every])
+    return len(ticks), np.array([k.x[:, 0] for k in every]), np.array([k.P for k in every])
 
 
 def stone_soup_job(case, ticks):
@@ -113,36 +107,27 @@ def stone_soup_job(case, ticks):
     n, epsilon, seen = case.plant.n, case.filter.algorithm.epsilon, sensors(case)
 
     class Plant(LinearGaussianTransitionModel):
-        gap = (None, None, None)
-
+        law = None
         ndim_state = n
 
-        def _discrete(self, time_interval):
-            gap = time_interval.total_seconds()
-            if self.gap[0] != gap:
-                self.gap = (gap, *discrete(case.truth, gap))
-            return self.gap
+        def matrix(self, **_):
+            return self.law[0]
 
-        def matrix(self, time_interval, **_):
-            return self._discrete(time_interval)[1]
+        def covar(self, **_):
+            return self.law[1]
 
-        def covar(self, time_interval, **_):
-            return self._discrete(time_interval)[2]
-
-    random, nodes = np.random.default_rng(2), {}
-    predictor, updater = KalmanPredictor(Plant()), KalmanUpdater(None)
+    random, nodes, plant = np.random.default_rng(2), {}, Plant()
+    predictor, updater = KalmanPredictor(plant), KalmanUpdater(None)
     for node in case.nodes:
         cov = np.array(case.start(node)[1])
         nodes[node] = GaussianState(np.zeros((n, 1)), cov, timestamp=EPOCH)
-    made = 0
-    for made, (t, (i, j), delivered) in enumerate(ticks, start=1):  # noqa: B007 - counted
+    for t, link, delivered, gaps, laws in ticks:
         moment = EPOCH + datetime.timedelta(seconds=t)
-        for h in (i, j):
-            before = nodes[h].timestamp
+        for h, gap, law in zip(link, gaps, laws, strict=True):
+            plant.law = law
             nodes[h] = predictor.predict(nodes[h], timestamp=moment)
             if h in seen:
                 H, R = seen[h]
-                gap = (moment - before).total_seconds()
                 model = LinearGaussian(n, list(range(len(R))), R / gap)
                 model.matrix = lambda H=H, **_: H
                 reading = Detection(
@@ -150,6 +135,7 @@ def stone_soup_job(case, ticks):
                 )
                 nodes[h] = updater.update(SingleHypothesis(nodes[h], reading))
         if delivered:
+            i, j = link
             a, b = nodes[i], nodes[j]
             mean = epsilon * (b.state_vector - a.state_vector)
             cov = epsilon * (b.covar - a.covar)
@@ -157,7 +143,96 @@ def stone_soup_job(case, ticks):
             nodes[j] = GaussianState(b.state_vector - mean, b.covar - cov, timestamp=moment)
     every = [nodes[node] for node in case.nodes]
     means = np.array([np.asarray(k.state_vector, dtype=float)[:, 0] for k in every])
-    return made, means, np.array([np.asarray(k.covar) for k in every])
+    return len(ticks), means, np.array([np.asarray(k.covar) for k in every])
+
+
+def series(case, count):
+    """Readings (S, K, p) of ``count`` paths of a plant in slots, slots 1 to K, by all sensors."""
+    random, (F, Q) = np.random.default_rng(3), (case.plant.F, case.plant.Q)
+    H, R = pooled(case)
+    x = random.multivariate_normal(case.plant.start_mean, case.plant.start_cov, count)
+    found = np.empty((count, len(case.times) - 1, len(H)))
+    for k in range(found.shape[1]):
+        x = x @ F.T + random.multivariate_normal(np.zeros(len(F)), Q, count)
+        noise = random.multivariate_normal(np.zeros(len(R)), R, count)
+        found[:, k] = x @ H.T + noise
+    return found
+
+
+def pooled(case):
+    """H and R of all sensors together."""
+    seen = sensors(case).values()
+    return np.concatenate([H for H, _ in seen]), scipy.linalg.block_diag(*(R for _, R in seen))
+
+
+def simdkalman_filter(case, readings):
+    """Filtered means (S, K, n) and covariances (S, K, n, n) of all series at once."""
+    import simdkalman
+
+    H, R = pooled(case)
+    model = simdkalman.KalmanFilter(case.plant.F, case.plant.Q, H, R)
+    F, Q = case.plant.F, case.plant.Q
+    start = F @ case.plant.start_mean, F @ case.plant.start_cov @ F.T + Q  # before a reading
+    found = model.compute(
+        readings, 0, *start, smoothed=False, filtered=True, observations=False
+    ).filtered.states
+    return found.mean, found.cov
+
+
+def filterpy_filter(case, readings):
+    """The same, one series after the other."""
+    from filterpy.kalman import KalmanFilter
+
+    (H, R), n = pooled(case), case.plant.n
+    means = np.empty((*readings.shape[:2], n))
+    covs = np.empty((*readings.shape[:2], n, n))
+    for s, ys in enumerate(readings):
+        f = KalmanFilter(dim_x=n, dim_z=len(H))
+        f.F, f.Q, f.H, f.R = case.plant.F, case.plant.Q, H, R
+        f.x, f.P = case.plant.start_mean.reshape(n, 1).copy(), case.plant.start_cov.copy()
+        for k, y in enumerate(ys):
+            f.predict()
+            f.update(y)
+            means[s, k], covs[s, k] = f.x[:, 0], f.P
+    return means, covs
+
+
+def batched_gossip(job, runs, seed=1):
+    """x (R, T, n), xhat (R, T, N, n) and P (R, T, N, n, n) of ``runs`` runs side by side in numpy.
+
+    ``job`` is that of the hand-written kernel, ``jobs.in_slots(case)``.
+    """
+    probe, (F, Q, root), (mean, cov, first), H, rows, ends, times = job
+    random, (N, n) = np.random.default_rng(seed), (len(rows), len(F))
+    shape, every = (runs, N), np.arange(runs)
+    x = mean + random.standard_normal((runs, n)) @ first.T
+    m, P = np.broadcast_to(mean, (*shape, n)).copy(), np.broadcast_to(cov, (*shape, n, n)).copy()
+    seeing = np.flatnonzero(rows)
+    assert (rows[seeing] == 1).all(), "one reading a slot at most"
+    h = H[seeing, 0]
+    kept = [], [], []
+    for slot in range((times - 1) * probe + 1):
+        if slot % probe == 0:
+            for part, now in zip(kept, (x, m, P), strict=True):
+                part.append(now.copy())
+        if slot > 0:
+            partner = np.tile(np.arange(N), (runs, 1))
+            order = random.random((runs, len(ends))).argsort(axis=1)
+            for links in order.T:  # greedy: a link in each run at once
+                i, j = ends[links].T
+                free = (partner[every, i] == i) & (partner[every, j] == j)
+                r, i, j = every[free], i[free], j[free]
+                partner[r, i], partner[r, j] = j, i
+            m, P = m[every[:, None], partner], P[every[:, None], partner]
+        some, y = P[:, seeing], x @ h.T + random.standard_normal((runs, len(seeing)))
+        Ph = np.einsum("rkij,kj->rki", some, h)
+        gain = Ph / (1.0 + np.einsum("rki,ki->rk", Ph, h))[..., None]
+        innovation = y - np.einsum("rki,ki->rk", m[:, seeing], h)
+        m[:, seeing] += gain * innovation[..., None]
+        P[:, seeing] = some - gain[..., None] * Ph[..., None, :]
+        m, P = m @ F.T, F @ P @ F.T + Q
+        x = x @ F.T + random.standard_normal((runs, n)) @ root.T
+    return tuple(np.stack(part, axis=1) for part in kept)
 
 
 class StackedBound:
@@ -233,4 +308,4 @@ def ticks_of(run):
     places = np.flatnonzero(kinds == "tick")
     for k, (a, b) in enumerate(pairwise([*places, len(log)])):
         row = log.iloc[places[k]]
-        yield Tick(float(row.t), (int(row.node), int(row.peer)), "absorb" in kinds[a:b])
+        yield float(row.t), (int(row.node), int(row.peer)), "absorb" in kinds[a:b]

@@ -1,24 +1,29 @@
 """What an event costs as the network grows, and how long a run takes to start.
 
     python -m tests.benchmarks.scale [--events 1000000] [--links 100 1000 10000] [--plot FILE]
+    python -m tests.benchmarks.scale --nodes 10000 100000
 
 Hybrid filters on regular graphs of degree 8, the compiled engine, every row to Parquet. A line a
 size: seconds until the first event (draws of all links, tables of all nodes), nanoseconds an event
 from then on, bytes a row, and the peak memory of the process so far, by the operating system.
+
+``--nodes``: ``netkf run`` on rings of so many nodes instead, everything it does included; processor
+time and peak memory of the command, after a first one that compiles.
 """
 
 import argparse
+import os
 import resource
+import sys
 import tempfile
 import time
 from pathlib import Path
 
-import netkf
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.rng.streams import Streams
 from netkf.runs.files import ParquetSink
 from netkf.trace.recorder import Recorder
-from tests.benchmarks.engine import RING
+from tests.benchmarks.cases import SCENARIOS, load
 
 ROWS_A_TICK = 6.4
 
@@ -30,7 +35,7 @@ def scenario(links, events):
     changes = {"network.graph": graph, "filter.epsilon": 0.1, "horizon": horizon, "probe": horizon}
     # A plant that stays bounded by itself: most nodes are far from both sensors.
     changes["plant.A"] = [[0.0, 1.0], [-1.0, -0.1]]
-    return netkf.load(RING).replace({**changes, "network.activation.rate": rate})
+    return load("poisson_ring").replace({**changes, "network.activation.rate": rate})
 
 
 def measured(case):
@@ -53,12 +58,38 @@ def measured(case):
     return started[0] - began, 1e9 * (ended - started[0]) / events, events, size / events
 
 
+def command(nodes, folder):
+    """Seconds of processor time and peak MiB of ``netkf run`` on a ring of 2 s."""
+    out = Path(folder) / f"ring-{nodes}"
+    settings = [f'network.graph={{kind="cycle", nodes={nodes}}}', "horizon=2.0", "probe=1.0"]
+    words = [sys.executable, "-m", "netkf", "run", str(SCENARIOS / "poisson_ring.toml")]
+    for setting in settings:
+        words += ["--set", setting]
+    child = os.posix_spawn(sys.executable, [*words, "--out", str(out), "--no-plot"], os.environ)
+    _, status, usage = os.wait4(child, 0)  # of this child alone
+    assert status == 0, f"netkf run ended with {os.waitstatus_to_exitcode(status)}"
+    return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
+
+
+def commands(sizes):
+    with tempfile.TemporaryDirectory() as folder:
+        command(6, folder)
+        found = [(nodes, *command(nodes, folder)) for nodes in sizes]
+    print(f"{'nodes':>8} {'CPU, s':>8} {'MiB':>6}")
+    for nodes, seconds, peak in found:
+        print(f"{nodes:8,} {seconds:8.1f} {peak:6.0f}")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--events", type=int, default=1_000_000)
     parser.add_argument("--links", type=int, nargs="+", default=[100, 1000, 10_000, 100_000])
     parser.add_argument("--plot", type=Path, help="a picture of cost against size")
+    parser.add_argument("--nodes", type=int, nargs="+", help="run the command line on rings")
     options = parser.parse_args()
+    if options.nodes:
+        commands(options.nodes)
+        return
     measured(scenario(100, 1000))  # loads what is compiled
     print(
         f"{'links':>8} {'events':>12} {'start, s':>9} {'ns/event':>9} {'bytes/row':>10} {'MiB':>6}"

@@ -5,12 +5,12 @@ import pytest
 
 import netkf
 from netkf.algorithms.kernels.chains import advance, alphabet
-from tests.benchmarks import compiled, peers
+from tests.benchmarks import cases, peers
 
 
 @pytest.fixture(scope="module")
 def small():
-    return peers.planar(18).replace({"horizon": 2.0, "probe": 2.0, "filter.epsilon": 0.125})
+    return cases.planar(18, 2.0, 8).replace({"probe": 2.0})
 
 
 @pytest.mark.parametrize("job", [peers.filterpy_job, peers.stone_soup_job])
@@ -20,7 +20,7 @@ def test_a_job_by_hand_makes_the_covariances_of_a_run(small, job):
     poor = {"nodes": [0, 3], "H": [[1.0, 0, 0, 0], [0, 0, 1.0, 0]], "R": [[1e9, 0], [0, 1e9]]}
     case = small.replace({"sensors": [poor]})
     run = netkf.simulate(case)
-    ticks = list(peers.ticks_of(run))
+    ticks = peers.with_laws(case, peers.ticks_of(run))
     made, _, P = job(case, ticks)
     assert made == (run.events.kind == "tick").sum() > 100
     last = dict.fromkeys(case.nodes, 0.0)
@@ -34,11 +34,23 @@ def test_a_job_by_hand_makes_the_covariances_of_a_run(small, job):
 def test_both_jobs_by_hand_have_the_same_ticks_and_states(small):
     pytest.importorskip("filterpy")
     pytest.importorskip("stonesoup")
-    theirs = peers.filterpy_job(small, peers.clocks(small, 200))
-    others = peers.stone_soup_job(small, peers.clocks(small, 200))
+    ticks = peers.with_laws(small, peers.clocks(small, 200))
+    theirs, others = peers.filterpy_job(small, ticks), peers.stone_soup_job(small, ticks)
     assert theirs[0] == others[0] == 200
     for a, b in zip(theirs[1:], others[1:], strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-3)  # moments are whole microseconds
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)
+
+
+def test_central_filters_by_others_agree_and_have_netkfs_covariances():
+    pytest.importorskip("filterpy")
+    pytest.importorskip("simdkalman")
+    case = cases.central().replace({"horizon": 5.0})
+    readings = peers.series(case, 3)
+    means, covs = peers.simdkalman_filter(case, readings)
+    for a, b in zip(peers.filterpy_filter(case, readings), (means, covs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-12)
+    P = netkf.simulate(case).P[1:, 0]
+    np.testing.assert_allclose(covs, np.broadcast_to(P, covs.shape), rtol=1e-8, atol=1e-12)
 
 
 def test_the_stacked_system_has_the_bound(small):
@@ -60,10 +72,3 @@ def test_plain_chains_end_where_compiled_ones_do():
     )
     plain = peers.plain_chains(roots, words, F, Q, H, R)
     np.testing.assert_allclose(ends @ np.swapaxes(ends, 1, 2), plain, rtol=1e-8)
-
-
-def test_a_row_refuses_runs_that_did_not_do_the_same():
-    with pytest.raises(AssertionError, match="the same events"):
-        compiled.compared("swaps", 1, lambda: 3, lambda: 2)
-    with pytest.raises(AssertionError, match="the same events"):
-        compiled.compared("the first two swaps", 1, lambda: 3, lambda: 1, most=2)

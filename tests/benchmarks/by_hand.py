@@ -1,0 +1,685 @@
+"""Hand-written numba kernels of whole runs, one for each filter, which set the limits of speed.
+
+Each does one job and nothing else, as a competent person would write it: one compiled call makes
+all runs, draws truth, readings, links and losses inside the loop and keeps x, xhat and P at the
+probes, without a trace. Covariance form, no allocation in a step. Nothing of netkf is used;
+tests/benchmarks/test_by_hand.py holds the statistics of both against each other.
+
+Arrays are float64 or int64, ``random`` is a ``numpy.random.Generator``, ``size`` a tuple of n
+zeros: its length is known when the kernel is compiled, so that loops over states are unrolled (two
+to three times as fast). R runs, T probes, N nodes, L links, n states, p rows of a reading. Results:
+``x`` (R, T, n), ``xhat`` (R, T, N, n), ``P`` (R, T, N, n, n).
+"""
+
+import numba
+import numpy as np
+
+kernel = numba.njit(nogil=True, error_model="numpy", fastmath=True, cache=True)
+
+STEP = 0.125
+"""Seconds: of the grid on which the path of a diffusion is drawn, and the longest time over which
+readings are summed up before they are used. Summing them up costs 0.2 % of P in these examples.
+"""
+
+SPAN, BINS, ORDER = 1.0, 16, 4
+"""Laws of a gap of at most SPAN seconds: Taylor series about the middle of each of BINS parts."""
+
+
+# Steps of a Kalman filter
+
+
+@kernel
+def predict(size, F, Q, m, S, k, work):
+    """m <- F m, S <- F S F' + Q of entry k of m (K, n) and S (K, n, n); ``work`` (n + 1, n)."""
+    n = len(size)
+    for i in range(n):
+        for j in range(n):
+            s = 0.0
+            for c in range(n):
+                s += F[i, c] * S[k, c, j]
+            work[i, j] = s
+        s = 0.0
+        for c in range(n):
+            s += F[i, c] * m[k, c]
+        work[n, i] = s
+    for i in range(n):
+        m[k, i] = work[n, i]
+        for j in range(i + 1):
+            s = Q[i, j]
+            for c in range(n):
+                s += work[i, c] * F[j, c]
+            S[k, i, j] = s
+            S[k, j, i] = s
+
+
+@kernel
+def update(size, y, H, node, row, m, S, k, gain):
+    """Use the scalar reading y = h x + v, h = H[node, row], var(v) = 1, in entry k; ``gain`` (n,)
+    is work.
+    """
+    n = len(size)
+    s, d = 1.0, y
+    for i in range(n):
+        g = 0.0
+        for j in range(n):
+            g += S[k, i, j] * H[node, row, j]
+        gain[i] = g
+        s += H[node, row, i] * g
+        d -= H[node, row, i] * m[k, i]
+    s = 1.0 / s
+    for i in range(n):
+        g = gain[i] * s
+        m[k, i] += g * d
+        for j in range(n):
+            S[k, i, j] -= g * gain[j]
+
+
+@kernel
+def invert(size, S, k):
+    """S[k]^-1 in place, of a positive definite matrix: sweeps over the diagonal."""
+    n = len(size)
+    for pivot in range(n):
+        d = 1.0 / S[k, pivot, pivot]
+        for i in range(n):
+            if i != pivot:
+                f = S[k, i, pivot] * d
+                for j in range(n):
+                    if j != pivot:
+                        S[k, i, j] -= f * S[k, pivot, j]
+                S[k, i, pivot] = -f
+        for j in range(n):
+            S[k, pivot, j] *= d
+        S[k, pivot, pivot] = d
+
+
+@kernel
+def read(size, random, H, node, row, x):
+    """h x + v, h = H[node, row], var(v) = 1."""
+    s = random.standard_normal()
+    for i in range(len(size)):
+        s += H[node, row, i] * x[i]
+    return s
+
+
+@kernel
+def draw_state(size, random, mean, root, x):
+    """x ~ N(mean, root root')."""
+    n = len(size)
+    for i in range(n):
+        x[i] = mean[i]
+    for j in range(n):
+        z = random.standard_normal()
+        for i in range(n):
+            x[i] += root[i, j] * z
+
+
+@kernel
+def move_state(size, random, F, root, x, work):
+    """x <- F x + w, cov(w) = root root'."""
+    n = len(size)
+    for i in range(n):
+        work[i] = 0.0
+    for j in range(n):
+        z, v = random.standard_normal(), x[j]
+        for i in range(n):
+            work[i] += F[i, j] * v + root[i, j] * z
+    for i in range(n):
+        x[i] = work[i]
+
+
+@kernel
+def start_filters(mean, cov, m, S):
+    """Every node knows mean and covariance of x(0)."""
+    for k in range(len(m)):
+        m[k] = mean
+        S[k] = cov
+
+
+@kernel
+def keep(size, truth, m, S, run, probe, x, xhat, P):
+    """The states of all nodes as results of a probe."""
+    n = len(size)
+    for i in range(n):
+        x[run, probe, i] = truth[i]
+    for k in range(len(m)):
+        for i in range(n):
+            xhat[run, probe, k, i] = m[k, i]
+            for j in range(n):
+                P[run, probe, k, i, j] = S[k, i, j]
+
+
+# The gossip filter
+
+
+@kernel
+def keep_places(size, truth, m, S, at, run, probe, x, xhat, P):
+    """``keep``, node k is at place ``at[k]``."""
+    n = len(size)
+    for i in range(n):
+        x[run, probe, i] = truth[i]
+    for k in range(len(at)):
+        for i in range(n):
+            xhat[run, probe, k, i] = m[at[k], i]
+            for j in range(n):
+                P[run, probe, k, i, j] = S[at[k], i, j]
+
+
+@kernel
+def draw_matching(random, ends, order, paired):
+    """Links (L, 2) in random order, each taken if both ends are free: ``paired`` (N,) says with
+    whom, a node that stays alone with itself.
+    """
+    for i in range(len(paired)):
+        paired[i] = i
+    for k in range(len(order) - 1, -1, -1):
+        other = int(random.random() * (k + 1))
+        link = order[other]
+        order[other], order[k] = order[k], link
+        i, j = ends[link, 0], ends[link, 1]
+        if paired[i] == i and paired[j] == j:
+            paired[i], paired[j] = j, i
+
+
+@kernel
+def gossip(size, random, probe, plant, start, H, rows, ends, x, xhat, P):
+    """Gossip along random maximal matchings; states are predictions, one every ``probe`` slots.
+
+    ``plant`` is F, Q and a root of Q; ``start`` mean, covariance and its root; the first
+    ``rows[i]`` rows of ``H[i]`` (p, n) are those of node i, readings have noise of variance 1.
+    """
+    n, (runs, times, N, _) = len(size), xhat.shape
+    F, Q, root = plant
+    m, S = np.empty((N, n)), np.empty((N, n, n))
+    truth, line, work = np.empty(n), np.empty(n), np.empty((n + 1, n))
+    order, paired, at = np.arange(len(ends)), np.empty(N, np.int64), np.empty(N, np.int64)
+    for r in range(runs):
+        draw_state(size, random, start[0], start[2], truth)
+        start_filters(start[0], start[1], m, S)
+        at[:] = np.arange(N)
+        for slot in range((times - 1) * probe + 1):
+            if slot % probe == 0:
+                keep_places(size, truth, m, S, at, r, slot // probe, x, xhat, P)
+            if slot > 0:
+                draw_matching(random, ends, order, paired)
+                for i in range(N):  # nodes swap the places of their states
+                    if i < paired[i]:
+                        at[i], at[paired[i]] = at[paired[i]], at[i]
+            for i in range(N):
+                for row in range(rows[i]):
+                    y = read(size, random, H, i, row, truth)
+                    update(size, y, H, i, row, m, S, at[i], line)
+                predict(size, F, Q, m, S, at[i], work)
+            move_state(size, random, F, root, truth, line)
+
+
+# The Kalman filter with intermittent observations
+
+
+@kernel
+def intermittent(size, random, probe, plant, start, H, rows, ends, delivery, x, xhat, P):
+    """Each node uses its own readings and those of its neighbours that arrive, in one direction
+    with the other; predictions; arguments as for ``gossip``.
+    """
+    n, (runs, times, N, _) = len(size), xhat.shape
+    F, Q, root = plant
+    m, S, y = np.empty((N, n)), np.empty((N, n, n)), np.empty(H.shape[:2])
+    truth, line, work = np.empty(n), np.empty(n), np.empty((n + 1, n))
+    for r in range(runs):
+        draw_state(size, random, start[0], start[2], truth)
+        start_filters(start[0], start[1], m, S)
+        for slot in range((times - 1) * probe + 1):
+            if slot % probe == 0:
+                keep(size, truth, m, S, r, slot // probe, x, xhat, P)
+            for i in range(N):
+                for row in range(rows[i]):
+                    y[i, row] = read(size, random, H, i, row, truth)
+                    update(size, y[i, row], H, i, row, m, S, i, line)
+            for link in range(len(ends)):
+                if random.random() < delivery:
+                    for side in range(2):
+                        i, j = ends[link, side], ends[link, 1 - side]
+                        for row in range(rows[i]):
+                            update(size, y[i, row], H, i, row, m, S, j, line)
+            for i in range(N):
+                predict(size, F, Q, m, S, i, work)
+            move_state(size, random, F, root, truth, line)
+
+
+# The diffusion filter
+
+
+@kernel
+def combine(size, first, senders, weights, m, S, Y, z, k, xhat):
+    """Covariance intersection at node k: S^-1 = sum w Y, m = S sum w z, where Y (N, n, n) and
+    z (N, n) are information and information times estimate; the senders of node k, itself among
+    them, are ``senders[first[k]:first[k + 1]]``, each with its weight.
+    """
+    n = len(size)
+    for i in range(n):
+        xhat[i] = 0.0
+        for j in range(n):
+            S[k, i, j] = 0.0
+    for e in range(first[k], first[k + 1]):
+        w, other = weights[e], senders[e]
+        for i in range(n):
+            xhat[i] += w * z[other, i]
+            for j in range(n):
+                S[k, i, j] += w * Y[other, i, j]
+    invert(size, S, k)
+    for i in range(n):
+        s = 0.0
+        for j in range(n):
+            s += S[k, i, j] * xhat[j]
+        m[k, i] = s
+
+
+@kernel
+def diffusion(size, random, probe, plant, believed, noise, start, regressors, senders, x, xhat, P):
+    """Regression: update, predict, combine with the neighbours; predictions.
+
+    ``plant`` is F and a root of Q, ``believed`` the filters' Q and standard deviation of a reading,
+    ``noise`` the true one; ``start`` mean and root of x(0), mean and covariance of the filters;
+    ``regressors``: A, B with a root of cov(xi), C and the start of each node's, (N, ...);
+    ``senders``: offsets (N + 1,), senders and weights.
+    """
+    n, (runs, times, N, _) = len(size), xhat.shape
+    (A, B, C, first_s), (F, root), (Q, sigma) = regressors, plant, believed
+    m, S, Y, z = np.empty((N, n)), np.empty((N, n, n)), np.empty((N, n, n)), np.empty((N, n))
+    truth, line, work = np.empty(n), np.empty(n), np.empty((n + 1, n))
+    s, phi, moved = np.empty(first_s.shape), np.empty((1, 1, n)), np.empty(first_s.shape[1])
+    white = 1.0 / sigma
+    for r in range(runs):
+        draw_state(size, random, start[0], start[1], truth)
+        start_filters(start[2], start[3], m, S)
+        s[:] = first_s
+        for slot in range((times - 1) * probe + 1):
+            if slot % probe == 0:
+                keep(size, truth, m, S, r, slot // probe, x, xhat, P)
+            for k in range(N):
+                y = noise * random.standard_normal()
+                for i in range(n):
+                    v = 0.0
+                    for j in range(s.shape[1]):
+                        v += C[k, i, j] * s[k, j]
+                    y += v * truth[i]
+                    phi[0, 0, i] = v * white
+                update(size, y * white, phi, 0, 0, m, S, k, line)
+                predict(size, F, Q, m, S, k, work)
+                for i in range(len(moved)):
+                    moved[i] = 0.0
+                    for j in range(len(moved)):
+                        moved[i] += A[k, i, j] * s[k, j]
+                for j in range(B.shape[2]):
+                    xi = random.standard_normal()
+                    for i in range(len(moved)):
+                        moved[i] += B[k, i, j] * xi
+                for i in range(len(moved)):
+                    s[k, i] = moved[i]
+                for i in range(n):
+                    for j in range(n):
+                        Y[k, i, j] = S[k, i, j]
+                invert(size, Y, k)
+                for i in range(n):
+                    z[k, i] = 0.0
+                    for j in range(n):
+                        z[k, i] += Y[k, i, j] * m[k, j]
+            for k in range(N):
+                combine(size, senders[0], senders[1], senders[2], m, S, Y, z, k, line)
+            move_state(size, random, F, root, truth, line)
+
+
+# The push-sum filter
+
+
+@kernel
+def exchange_mass(size, random, ends, share, delivery, mass, before):
+    """Each end of a link that is up sends its share, one over its degree plus 1, of its mass."""
+    n = len(size)
+    entries = 2 + n * (n + 1) // 2
+    for i in range(len(mass)):
+        for e in range(entries):
+            before[i, e] = share[i] * mass[i, e]
+    for link in range(len(ends)):
+        if random.random() < delivery:
+            i, j = ends[link, 0], ends[link, 1]
+            for e in range(entries):
+                d = before[j, e] - before[i, e]
+                mass[i, e] += d
+                mass[j, e] -= d
+
+
+@kernel
+def average(size, random, ends, delivery, factor, m, z):
+    """One averaging step over the links that are up."""
+    n = len(size)
+    for i in range(len(m)):
+        for a in range(n):
+            z[i, a] = m[i, a]
+    for link in range(len(ends)):
+        if random.random() < delivery:
+            i, j = ends[link, 0], ends[link, 1]
+            for a in range(n):
+                d = factor * (z[j, a] - z[i, a])
+                m[i, a] += d
+                m[j, a] -= d
+
+
+@kernel
+def use_network(size, y, H, rows, own, mass, m, S, k, line):
+    """S <- (S^-1 + G)^-1 with what node k takes the information G of the network to be, and its own
+    readings with N times the gain, N what it takes the number of nodes to be.
+    """
+    n, number = len(size), 1.0
+    invert(size, S, k)
+    if mass[k, 0] > 0.0:
+        factor = 1.0 / mass[k, 0]
+        number = mass[k, 1] * factor
+        for i in range(n):
+            for j in range(i + 1):
+                S[k, i, j] += factor * mass[k, 2 + i * (i + 1) // 2 + j]
+                S[k, j, i] = S[k, i, j]
+    else:
+        for i in range(n):
+            for j in range(n):
+                S[k, i, j] += own[k, i, j]
+    invert(size, S, k)
+    if rows[k]:
+        for i in range(n):
+            line[i] = 0.0
+        for row in range(rows[k]):
+            d = y[row]
+            for i in range(n):
+                d -= H[k, row, i] * m[k, i]
+            for i in range(n):
+                line[i] += d * H[k, row, i]
+        for i in range(n):
+            s = 0.0
+            for j in range(n):
+                s += S[k, i, j] * line[j]
+            m[k, i] += number * s
+
+
+@kernel
+def push_sum(size, random, probe, plant, start, H, rows, ends, delivery, steps, factor, x, xhat, P):
+    """Push-sum with ``steps`` averaging steps of gain ``factor``; estimates, one every ``probe``
+    slots. Node 0 starts with the weight; links fail anew in each exchange, both ways at once;
+    arguments as for ``gossip``.
+    """
+    n, (runs, times, N, _) = len(size), xhat.shape
+    F, Q, root = plant
+    m, S, z, y = np.empty((N, n)), np.empty((N, n, n)), np.empty((N, n)), np.empty(H.shape[1])
+    truth, line, work = np.empty(n), np.empty(n), np.empty((n + 1, n))
+    share, own = np.ones(N), np.zeros((N, n, n))
+    mass, before = np.empty((N, 2 + n * (n + 1) // 2)), np.empty((N, 2 + n * (n + 1) // 2))
+    for i, j in ends:
+        share[i] += 1.0
+        share[j] += 1.0
+    share[:] = 1.0 / share
+    for k in range(N):
+        for row in range(rows[k]):
+            own[k] += np.outer(H[k, row], H[k, row])
+    for r in range(runs):
+        draw_state(size, random, start[0], start[2], truth)
+        start_filters(start[0], start[1], m, S)
+        for k in range(N):
+            mass[k, 0], mass[k, 1] = k == 0, 1.0
+            for i in range(n):
+                for j in range(i + 1):
+                    mass[k, 2 + i * (i + 1) // 2 + j] = own[k, i, j]
+        for slot in range((times - 1) * probe + 1):
+            if slot > 0:
+                move_state(size, random, F, root, truth, line)
+                exchange_mass(size, random, ends, share, delivery, mass, before)
+                for k in range(N):
+                    predict(size, F, Q, m, S, k, work)
+                    for row in range(rows[k]):
+                        y[row] = read(size, random, H, k, row, truth)
+                    use_network(size, y, H, rows, own, mass, m, S, k, line)
+                for _ in range(steps):
+                    average(size, random, ends, delivery, factor, m, z)
+            if slot % probe == 0:
+                keep(size, truth, m, S, r, slot // probe, x, xhat, P)
+
+
+# The hybrid filter in continuous time
+
+
+@kernel
+def integrals(size, random, law, path):
+    """``path`` (K, 2 n): state and its integral from time 0, on a grid; ``law``: transition (2 n,
+    2 n) and a root of the covariance over a step.
+    """
+    F, root = law
+    for k in range(len(path) - 1):
+        for i in range(2 * len(size)):
+            path[k + 1, i] = 0.0
+        for j in range(2 * len(size)):
+            z, v = random.standard_normal(), path[k, j]
+            for i in range(2 * len(size)):
+                path[k + 1, i] += F[i, j] * v + root[i, j] * z
+
+
+@kernel
+def integral(size, path, k, u, h):
+    """h times the integral of x at time (k + u) STEP: the cubic that agrees with the integral and
+    the state at both ends of the step.
+    """
+    n, a, b, da, db = len(size), 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        a += h[i] * path[k, n + i]
+        b += h[i] * path[k + 1, n + i]
+        da += h[i] * path[k, i]
+        db += h[i] * path[k + 1, i]
+    d = b - a
+    return a + u * u * (3.0 - 2.0 * u) * d + STEP * u * (1.0 - u) * ((1.0 - u) * da - u * db)
+
+
+@kernel
+def laws(table, gap, count, law):
+    """The first ``count`` entries of the table (BINS, ORDER + 1, E) at a gap of at most SPAN."""
+    k = min(int(gap * (BINS / SPAN)), BINS - 1)
+    s = gap - (k + 0.5) * (SPAN / BINS)
+    for e in range(count):
+        v = table[k, ORDER, e]
+        for j in range(ORDER - 1, -1, -1):
+            v = table[k, j, e] + s * v
+        law[e] = v
+
+
+@kernel
+def move(size, law, m, S, k, work):
+    """``predict`` with F and the lower triangle of Q from the start of ``law``."""
+    n = len(size)
+    for i in range(n):
+        for j in range(n):
+            s = 0.0
+            for c in range(n):
+                s += law[i * n + c] * S[k, c, j]
+            work[i, j] = s
+        s = 0.0
+        for c in range(n):
+            s += law[i * n + c] * m[k, c]
+        work[n, i] = s
+    for i in range(n):
+        m[k, i] = work[n, i]
+        for j in range(i + 1):
+            s = law[n * n + i * (i + 1) // 2 + j]
+            for c in range(n):
+                s += work[i, c] * law[j * n + c]
+            S[k, i, j] = s
+            S[k, j, i] = s
+
+
+@kernel
+def flow(size, seen, law, dy, m, S, k, E, d, work):
+    """Move over a gap and use the integrals ``dy`` (p,) of the readings over it.
+
+    ``law`` is F, lower triangle of Q; W (p, n) with E dy = W xhat; C (n, p), the covariance of what
+    noise adds to the state and to the integral; lower triangle of the variance S0 of the latter and
+    of the noise of readings. Gain and new covariance are those of E = F P W' + C and W P W' + S0.
+    """
+    n, p = len(size), len(seen)
+    W = n * n + n * (n + 1) // 2
+    C = W + p * n
+    S0 = C + n * p
+    # E (n + p, p): P W' below, whose product with F comes above
+    for r in range(p):
+        d[r] = dy[r]
+        for i in range(n):
+            s = 0.0
+            for j in range(n):
+                s += S[k, i, j] * law[W + r * n + j]
+            work[n + 1 + r, i] = s
+            d[r] -= law[W + r * n + i] * m[k, i]
+        for i in range(n):
+            s = law[C + i * p + r]
+            for j in range(n):
+                s += law[i * n + j] * work[n + 1 + r, j]
+            E[r, i] = s
+    move(size, law, m, S, k, work)
+    # Elimination row by row: reading r is used with what the rows before it left.
+    for r in range(p):
+        for c in range(r + 1):
+            s = law[S0 + r * (r + 1) // 2 + c]
+            for j in range(n):
+                s += law[W + r * n + j] * work[n + 1 + c, j]
+            E[p + r, c] = s
+    for r in range(p):
+        v = 1.0 / E[p + r, r]
+        for i in range(n):
+            g = E[r, i] * v
+            m[k, i] += g * d[r]
+            for j in range(n):
+                S[k, i, j] -= g * E[r, j]
+        for c in range(r + 1, p):
+            f = E[p + c, r] * v
+            d[c] -= f * d[r]
+            for i in range(n):
+                E[c, i] -= f * E[r, i]
+            for b in range(r + 1, c + 1):
+                E[p + c, b] -= f * E[p + b, r]
+
+
+@kernel
+def advance(size, seen, random, table, sensor, path, t, k, rows, now, used, m, S, scratch):
+    """Node k to time t in steps of at most SPAN, those with readings of at most STEP."""
+    law, dy, E, d, work = scratch
+    n, p = len(size), len(seen)
+    H, noise = sensor
+    plain = n * n + n * (n + 1) // 2
+    longest = STEP if rows[k] else SPAN
+    while now[k] < t:
+        gap = min(t - now[k], longest)
+        end = t if t - now[k] <= longest else now[k] + longest
+        if not rows[k]:
+            laws(table, gap, plain, law)
+            move(size, law, m, S, k, work)
+        else:
+            laws(table, gap, plain + 2 * p * n + p * (p + 1) // 2, law)
+            cell = min(int(end / STEP), len(path) - 2)
+            for r in range(p):
+                total = integral(size, path, cell, end / STEP - cell, H[r])
+                dy[r] = total - used[k, r]
+                used[k, r] = total
+            root = np.sqrt(gap)
+            for c in range(p):
+                z = root * random.standard_normal()
+                for r in range(c, p):
+                    dy[r] += noise[r, c] * z
+            flow(size, seen, law, dy, m, S, k, E, d, work)
+        now[k] = end
+
+
+@kernel
+def hybrid(
+    size, seen, random, times, step_law, table, start, sensor, rows, ends, clock, x, xhat, P
+):
+    """Kalman-Bucy filters whose pairs reset each other when their link ticks.
+
+    ``times`` (T,) are multiples of STEP; ``step_law`` of state and integral over STEP; ``table`` of
+    ``flow``; ``start`` mean, covariance and its root; ``sensor`` H (p, n) and a root of the noise
+    intensity, of nodes whose ``rows`` is not 0; ``clock``: rate of a link, probability that both
+    messages arrive, epsilon. Returns the number of ticks.
+    """
+    n, p, (runs, _, N, _) = len(size), len(seen), xhat.shape
+    rate, delivery, epsilon = clock
+    m, S, now, used = np.empty((N, n)), np.empty((N, n, n)), np.empty(N), np.empty((N, p))
+    path = np.zeros((int(times[-1] / STEP + 0.5) + 1, 2 * n))
+    E, work = np.empty((2 * p, max(n, p))), np.empty((n + 1 + p, n))
+    scratch = np.empty(table.shape[2]), np.empty(p), E, np.empty(p), work
+    mean_gap, ticks = 1.0 / (rate * len(ends)), 0
+    for r in range(runs):
+        draw_state(size, random, start[0], start[2], path[0])
+        integrals(size, random, step_law, path)
+        start_filters(start[0], start[1], m, S)
+        now[:], used[:], t = 0.0, 0.0, 0.0
+        for probe in range(len(times)):
+            while True:
+                t += mean_gap * random.standard_exponential()
+                if t > times[probe]:
+                    break
+                ticks += 1
+                draw = random.random() * len(ends)
+                link = int(draw)
+                if draw - link < delivery:  # where messages are lost nothing happens
+                    i, j = ends[link, 0], ends[link, 1]
+                    advance(
+                        size,
+                        seen,
+                        random,
+                        table,
+                        sensor,
+                        path,
+                        t,
+                        i,
+                        rows,
+                        now,
+                        used,
+                        m,
+                        S,
+                        scratch,
+                    )
+                    advance(
+                        size,
+                        seen,
+                        random,
+                        table,
+                        sensor,
+                        path,
+                        t,
+                        j,
+                        rows,
+                        now,
+                        used,
+                        m,
+                        S,
+                        scratch,
+                    )
+                    for a in range(n):
+                        v = epsilon * (m[j, a] - m[i, a])
+                        m[i, a] += v
+                        m[j, a] -= v
+                        for b in range(n):
+                            v = epsilon * (S[j, a, b] - S[i, a, b])
+                            S[i, a, b] += v
+                            S[j, a, b] -= v
+            for k in range(N):
+                advance(
+                    size,
+                    seen,
+                    random,
+                    table,
+                    sensor,
+                    path,
+                    times[probe],
+                    k,
+                    rows,
+                    now,
+                    used,
+                    m,
+                    S,
+                    scratch,
+                )
+            t = times[probe]  # clocks have no memory
+            keep(size, path[int(t / STEP + 0.5)], m, S, r, probe, x, xhat, P)
+    return ticks

@@ -1,0 +1,198 @@
+"""The arguments of the hand-written kernels, from a scenario: ``prepared(case, runs)`` gives a call
+that makes runs, and its results.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from tests.benchmarks import by_hand
+from tests.benchmarks.by_hand import BINS, ORDER, SPAN, STEP
+
+
+class Results(NamedTuple):
+    """Of R runs: x (R, T, n), xhat (R, T, N, n), P (R, T, N, n, n)."""
+
+    x: np.ndarray
+    xhat: np.ndarray
+    P: np.ndarray
+
+    @classmethod
+    def empty(cls, case, runs):
+        times, nodes, n = len(case.times), len(case.nodes), case.plant.n
+        shapes = (times, n), (times, nodes, n), (times, nodes, n, n)
+        return cls(*(np.empty((runs, *shape)) for shape in shapes))
+
+    @property
+    def errors(self):
+        """(R, T, N, n)."""
+        return self.x[:, :, None] - self.xhat
+
+
+def prepared(case, runs, seed=1):
+    """A call that makes a number of runs, ``runs`` at once, and the results of the last ones."""
+    results = Results.empty(case, runs)
+    kernel, before, after = JOBS[type(case.filter.algorithm).__name__](case)
+    random = np.random.default_rng(seed)
+    size = (0,) * case.plant.n
+
+    def call(count=runs):
+        for first in range(0, count, runs):
+            some = [part[: count - first] for part in results]
+            kernel(size, *before, random, *after, *some)
+
+    return call, results
+
+
+def root_of(Q):
+    """L with L L' = Q, lower triangular up to the zeros of a singular Q."""
+    values, vectors = np.linalg.eigh(np.array(Q))
+    return np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T)[1].T.copy()
+
+
+def ends_of(case):
+    """(L, 2) places of nodes, in the order of their ids."""
+    places = {node: k for k, node in enumerate(case.nodes)}
+    return np.array([[places[i], places[j]] for i, j in case.topology.links], dtype=np.int64)
+
+
+def started(case):
+    """Mean and covariance of x(0) and a root of it."""
+    cov = np.array(case.plant.start_cov)
+    return np.array(case.plant.start_mean), cov, root_of(cov)
+
+
+def whitened(case):
+    """H (N, p, n) and numbers of rows (N,) of readings whose noise has variance 1."""
+    sensors = {node: case.observation(node) for node in case.sensing}
+    most = max(len(R) for _, R in sensors.values())
+    H, rows = np.zeros((len(case.nodes), most, case.plant.n)), np.zeros(len(case.nodes), np.int64)
+    for k, node in enumerate(case.nodes):
+        if node in sensors:
+            h, R = sensors[node]
+            rows[k] = len(R)
+            H[k, : len(R)] = np.linalg.solve(np.linalg.cholesky(R), h)
+    return H, rows
+
+
+def probe_slots(case):
+    """Slots from probe to probe."""
+    return round((case.times[1] - case.times[0]) / case.plant.period)
+
+
+def in_slots(case):
+    """What all jobs in slots share: slots between probes, plant, start, sensors, links."""
+    F, Q = np.array(case.plant.F), np.array(case.plant.Q)
+    plant = F, Q, root_of(Q)
+    return probe_slots(case), plant, started(case), *whitened(case), ends_of(case)
+
+
+def delivery(case):
+    return getattr(case.network.channel.loss, "delivery", 1.0)
+
+
+def gossip(case):
+    return by_hand.gossip, (), in_slots(case)
+
+
+def intermittent(case):
+    return by_hand.intermittent, (), (*in_slots(case), delivery(case))
+
+
+def push_sum(case):
+    settings = case.filter.algorithm
+    rest = delivery(case), settings.gamma, 1.0 / settings.delta
+    return by_hand.push_sum, (), (*in_slots(case), *rest)
+
+
+def senders_of(case):
+    """Offsets (N + 1,), senders and weights: those of a node after each other, itself first."""
+    places = {node: k for k, node in enumerate(case.nodes)}
+    heard = {node: [(node, case.own_weights[node])] for node in case.nodes}
+    for sender, receiver in case.topology.directions:
+        heard[receiver].append((sender, case.weight(receiver, sender)))
+    pairs = [pair for node in case.nodes for pair in heard[node]]
+    first = np.cumsum([0, *(len(heard[node]) for node in case.nodes)])
+    senders = np.array([places[sender] for sender, _ in pairs])
+    return first, senders, np.array([weight for _, weight in pairs])
+
+
+def regressors_of(case):
+    """A, B with a root of cov(xi), C and the start of each node's."""
+    owners = {node: sensor for sensor in case.sensors for node in sensor.nodes}
+    sensors = [owners[node] for node in case.nodes]
+    B = [sensor.B @ root_of(sensor.xi_cov) for sensor in sensors]
+    rest = ([getattr(sensor, name) for sensor in sensors] for name in ("A", "C", "start"))
+    A, C, start = (np.array(part) for part in rest)
+    return A, np.array(B), C, start
+
+
+def diffusion(case):
+    entries = range(len(case.sensors))
+    (R,), (believed,) = ({case.noise(k, which).item() for k in entries} for which in (False, True))
+    plant = np.array(case.plant.F), root_of(case.plant.Q)
+    _, Q = case.slot_belief
+    mean, cov = case.start(case.nodes[0])
+    start = np.array(case.plant.start_mean), root_of(case.plant.start_cov), mean.copy(), cov.copy()
+    model = np.array(Q), np.sqrt(believed)
+    rest = np.sqrt(R), start, regressors_of(case), senders_of(case)
+    return by_hand.diffusion, (), (probe_slots(case), plant, model, *rest)
+
+
+def laws(A, B, H, V):
+    """Taylor coefficients (BINS, ORDER + 1, E) of ``by_hand.flow``'s laws in the gap, and the law
+    of state and integral over STEP.
+    """
+    (n, p), double = (len(A), len(H)), np.zeros((2 * len(A),) * 2)
+    double[:n, :n], double[n:, :n] = A, np.eye(n)
+    spread = np.zeros((2 * n, 2 * n))
+    spread[:n, :n] = B @ B.T
+
+    def over(gap):
+        """Transition and covariance (2 n, 2 n), Van Loan."""
+        block = np.block([[-double, spread], [np.zeros_like(double), double.T]])
+        M = scipy.linalg.expm(block * gap)
+        F = M[2 * n :, 2 * n :].T
+        return F, F @ M[: 2 * n, 2 * n :]
+
+    def entries(F, Q, V):
+        low_n, low_p = np.tril_indices(n), np.tril_indices(p)
+        parts = F[:n, :n], Q[:n, :n][low_n], H @ F[n:, :n], Q[:n, n:] @ H.T
+        return np.concatenate([*(part.ravel() for part in parts), (H @ Q[n:, n:] @ H.T + V)[low_p]])
+
+    table = []
+    for k in range(BINS):
+        gap = (k + 0.5) * SPAN / BINS
+        F, Q = over(gap)
+        coefficients, factor = [entries(F, Q, V * gap)], 1.0
+        for j in range(1, ORDER + 1):  # derivatives in the gap
+            F, Q = double @ F, double @ Q + Q @ double.T + (spread if j == 1 else 0.0)
+            factor /= j
+            coefficients.append(factor * entries(F, Q, V * (j == 1)))
+        table.append(coefficients)
+    F, Q = over(STEP)
+    return np.array(table), (F, root_of(Q))
+
+
+def hybrid(case):
+    seen = {node: case.observation(node) for node in case.sensing}
+    H, V = (np.array(part) for part in next(iter(seen.values())))
+    assert all((h == H).all() and (R == V).all() for h, R in seen.values()), "one kind of sensor"
+    table, step_law = laws(np.array(case.plant.A), np.array(case.plant.B), H, V)
+    rows = np.array([len(H) * (node in seen) for node in case.nodes])
+    clock = case.network.activation.rate, delivery(case), case.filter.algorithm.epsilon
+    before = ((0,) * len(H),)
+    times = np.array(case.times)
+    sensor = H, np.linalg.cholesky(V)
+    after = times, step_law, table, started(case), sensor, rows, ends_of(case), clock
+    return by_hand.hybrid, before, after
+
+
+JOBS = {
+    "Gossip": gossip,
+    "Intermittent": intermittent,
+    "PushSum": push_sum,
+    "DiffusionFilter": diffusion,
+    "Hybrid": hybrid,
+}

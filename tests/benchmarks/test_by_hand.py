@@ -1,0 +1,78 @@
+"""The hand-written kernels do netkf's jobs: means over runs agree within intervals.
+
+Of two samples with independent seeds; each node's mean square error and mean trace of P over the
+samples after time 0. In continuous time the kernel uses integrals of readings, which costs it 0.2 %
+of P.
+"""
+
+import numpy as np
+import pytest
+
+import netkf
+from tests.benchmarks import cases, jobs, peers
+
+STANDARD_ERRORS, SHARE = 4.5, 0.004
+
+
+def averages(results):
+    """(R, N, 2): mean square error and mean trace of P of each run and node."""
+    errors = (results.errors[:, 1:] ** 2).sum(axis=3).mean(axis=1)
+    traces = np.trace(results.P[:, 1:], axis1=3, axis2=4).mean(axis=1)
+    return np.stack([errors, traces], axis=2)
+
+
+def agree(case, runs, results):
+    ensemble = netkf.monte_carlo(case, runs, seed=5, workers=1)
+    expected, se = (part[:-1, :2] for part in (ensemble.average, ensemble.se_average))
+    each = averages(results)
+    mean, other = each.mean(axis=0), each.std(axis=0) / np.sqrt(len(each))
+    close = STANDARD_ERRORS * np.sqrt(se**2 + other**2) + SHARE * expected
+    assert (np.abs(mean - expected) <= close).all()
+    assert (se + other < 0.2 * expected).all(), "runs enough to tell"
+    assert (results.P[:, 0] == results.P[0, 0]).all(), "the start"
+
+
+def hybrid():
+    return cases.load("poisson_ring").replace({"horizon": 10.0, "probe": 1.0}), 400
+
+
+def gossip():
+    return cases.load("gossip_ring").replace({"horizon": 60.0, "probe": 3.0}), 300
+
+
+def push_sum():
+    return cases.load("push_sum_planar").replace({"horizon": 10.0, "probe": 0.5}), 200
+
+
+def diffusion():
+    return cases.load("diffusion_regression").replace({"horizon": 60.0, "probe": 4.0}), 200
+
+
+def intermittent():
+    # P of the scenario itself has no variance.
+    changes = {"network.channel.loss.delivery": 0.9, "horizon": 40.0}
+    return cases.load("intermittent_scalar").replace(changes), 400
+
+
+@pytest.mark.parametrize("make", [hybrid, gossip, push_sum, diffusion, intermittent])
+def test_means_over_runs_agree(make):
+    case, runs = make()
+    call, results = jobs.prepared(case, 4 * runs)
+    call()
+    agree(case, runs, results)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "case", [cases.planar(12, 5.0), cases.diffusion(10).replace({"horizon": 100.0, "probe": 5.0})]
+)
+def test_means_over_runs_agree_in_higher_dimensions(case):
+    call, results = jobs.prepared(case, 1000)
+    call()
+    agree(case, 300, results)
+
+
+def test_batched_numpy_agrees_too():
+    case, runs = gossip()
+    job = (*jobs.in_slots(case), len(case.times))
+    agree(case, runs, jobs.Results(*peers.batched_gossip(job, 2 * runs)))
