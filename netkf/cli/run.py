@@ -149,7 +149,7 @@ def _print_summary(scenario: Scenario, completed: Any) -> None:
     print_title(scenario)
     print()
     promised = completed.promised
-    print(summary_table(completed.summary, promised.limit_words, promised.notes))
+    print(summary_table(completed.summary, promised.limit_label, promised.notes))
 
 
 def _print_ensemble(completed: Any, runs: int) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from netkf.ensembles.moments import Moments
 from netkf.ensembles.statistics import Tally, Trace
-from netkf.runs.files import written_beside
+from netkf.runs.files import write_atomically
 
 PARTS = ("samples", "averages", "messages")
 
@@ -34,7 +34,7 @@ class KeptBlocks:
     def save(self, number: int, tally: Tally) -> None:
         """A block with the traces that its runs left."""
         self._folder.mkdir(exist_ok=True)
-        with written_beside(self._file(number)) as part, part.open("wb") as opened:
+        with write_atomically(self._file(number)) as part, part.open("wb") as opened:
             np.savez(opened, **_as_arrays(tally))
 
     def load(self, number: int) -> Tally:

@@ -33,7 +33,7 @@ from netkf.runs.files import (
 from netkf.runs.provenance import versions
 from netkf.runs.run import Manifest
 from netkf.runs.simulate import choose_engine
-from netkf.runs.summary import Promise, promise
+from netkf.runs.summary import PromisedTraces, promise_traces
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import resolved, to_toml
 
@@ -49,7 +49,7 @@ class FinishedEnsemble:
     status: str
     summary: dict[str, Any]
     ensemble: Ensemble
-    promised: Promise
+    promised: PromisedTraces
     simulated: int
     seconds: float
 
@@ -153,7 +153,7 @@ def _write(
     engine: str,
     trace: str,
     blocks: KeptBlocks,
-) -> tuple[Path, str, dict[str, Any], Ensemble, Promise]:
+) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
     """All files but the manifest."""
     ensemble = ensemble_of(scenario, whole, scenario.seed, engine)
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))
@@ -162,7 +162,7 @@ def _write(
         for run in blocks.traces():
             tables.add(*run)
         tables.close()
-    promised = promise(scenario, scenario.times)
+    promised = promise_traces(scenario, scenario.times)
     summary = summarise_ensemble(scenario, whole, promised)
     write_json(directory / "summary.json", summary)
     status = "diverged" if ensemble.diverged else "complete"

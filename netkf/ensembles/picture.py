@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from netkf.ensembles.directory import FinishedEnsemble
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.files import written_beside
+from netkf.runs.files import write_atomically
 from netkf.runs.plots import (
     NO_TRUTH,
     RELAY,
@@ -21,8 +21,8 @@ from netkf.runs.plots import (
     draw_lines,
     draw_nees,
     draw_promises,
-    evenly_spaced,
     mark_unavailable,
+    select_evenly,
     set_scale,
 )
 from netkf.runs.summary import NO_COVARIANCE
@@ -55,7 +55,7 @@ def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
         name = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
         title = f"{name} ({runs:,} runs)"
         figure.suptitle(fill(title, 105), fontsize=10, x=0.01, ha="left")
-        with written_beside(finished.directory / "run.png") as part:
+        with write_atomically(finished.directory / "run.png") as part:
             figure.savefig(part, dpi=130, format="png")
 
 
@@ -74,7 +74,7 @@ def _bands(
     sensing = [node in scenario.placed for node in scenario.nodes]
     for colour, words in ((SENSING, "with a sensor"), (RELAY, "without")):
         axes.plot([], [], color=colour, label=f"{words}, two standard errors")
-    for k in evenly_spaced(np.arange(len(scenario.nodes))):
+    for k in select_evenly(np.arange(len(scenario.nodes))):
         ends = (np.sqrt(np.maximum(trace[:, k] + s * spread[:, k], 0.0)) for s in (-1.0, 1.0))
         colour = SENSING if sensing[k] else RELAY
         axes.fill_between(times, *ends, color=colour, alpha=0.2, lw=0)

@@ -8,12 +8,14 @@ import numpy as np
 
 from netkf.ensembles.statistics import MESSAGES, Tally
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.summary import CONFIDENCE, Promise, nees_bounds, notes_of
+from netkf.runs.summary import CONFIDENCE, PromisedTraces, nees_bounds, summary_notes
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
 
 
-def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> dict[str, Any]:
+def summarise_ensemble(
+    scenario: Scenario, tally: Tally, promised: PromisedTraces
+) -> dict[str, Any]:
     """The keys of one run's summary. ``rms_error`` is the root of the mean square error of all
     runs; a key that ends in ``_se`` is a standard error.
     """
@@ -31,9 +33,9 @@ def summarise_ensemble(scenario: Scenario, tally: Tally, promised: Promise) -> d
         "overall": rows[-1],
         "limit": promised.limit,
         "central": promised.central,
-        "bound": promised.words or "H(12), promised by H Theorem 2",
+        "bound": promised.reason or "H(12), promised by H Theorem 2",
         "rounding_from": blurred,
-        "notes": notes_of(scenario, blurred, bool(np.isfinite(mean[:, 1]).any())),
+        "notes": summary_notes(scenario, blurred, bool(np.isfinite(mean[:, 1]).any())),
         "messages": dict(zip(MESSAGES, messages, strict=True)),
         "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
     }
@@ -64,7 +66,7 @@ def _chi_square(scenario: Scenario, tally: Tally) -> dict[str, float]:
     return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": inside}
 
 
-def _bounds(scenario: Scenario, promised: Promise) -> list[float | None]:
+def _bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
     """Averages of the bound over the samples after time 0, of the nodes and of all."""
     if promised.bound is None:
         return [None] * (len(scenario.nodes) + 1)

@@ -1,4 +1,4 @@
-"""Run directories: written beside and renamed, so that a reader never sees half a file."""
+"""Files of run directories, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ STATE_ENCODING = {"use_dictionary": ["run", "t", "node"]}
 
 
 @contextlib.contextmanager
-def written_beside(path: Path) -> Iterator[Path]:
-    """Where to write a file that gets its name when it is whole; what was begun is removed where it
-    does not come to that.
+def write_atomically(path: Path) -> Iterator[Path]:
+    """Yield the path of a temporary file that replaces ``path`` at the end of the body.
+
+    A reader never sees half a file; if the body raises, the temporary file is removed.
     """
     part = path.with_name(path.name + ".part")
     try:
@@ -51,18 +52,18 @@ def written_beside(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """A whole text file at once."""
-    with written_beside(path) as part:
+    """Write a text file, whole or not at all."""
+    with write_atomically(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """A JSON file whose numbers are all finite (others become null)."""
+    """Write a JSON file; numbers that are not finite become null."""
     write_text(path, json.dumps(finite(value), indent=2) + "\n")
 
 
 def finite(value: Any) -> Any:
-    """The same value with None for numbers that JSON does not know."""
+    """Return a plain JSON value: numpy numbers become Python ones, and None if not finite."""
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -73,7 +74,10 @@ def finite(value: Any) -> Any:
 
 
 def new_directory(wanted: Path | None, name: str) -> Path:
-    """Make the directory of a run: ``wanted``, new or empty, or the first free runs/NAME-k."""
+    """Create and return the directory of a run: ``wanted``, or the first free runs/NAME-k.
+
+    Raises ScenarioError if ``wanted`` cannot be created or is not empty.
+    """
     if wanted is None:
         safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)[:100].strip(".")
         tries = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
@@ -94,7 +98,7 @@ def new_directory(wanted: Path | None, name: str) -> Path:
     return wanted
 
 
-OWN = (
+OWN_FILES = (
     "scenario.toml",
     "manifest.json",
     "events.parquet",
@@ -103,13 +107,13 @@ OWN = (
     "summary.json",
     "run.png",
 )
-"""What a run directory holds."""
+"""Files of a run directory that netkf writes."""
 
 
 def remove_own(directory: Path, scenario: Scenario) -> None:
-    """Remove what a run of this scenario left in its directory, and nothing else."""
+    """Remove the files that a run of this scenario left in its directory, and no others."""
     modules = [file.name for file in module_files(scenario).values() if file is not None]
-    names = [*OWN, *modules, *(source.name for source in source_files(scenario))]
+    names = [*OWN_FILES, *modules, *(source.name for source in source_files(scenario))]
     for name in names:
         for file in (directory / name, directory / f"{name}.part"):
             file.unlink(missing_ok=True)
@@ -119,16 +123,17 @@ def remove_own(directory: Path, scenario: Scenario) -> None:
 
 
 def check_sources(scenario: Scenario) -> None:
-    """Raise ScenarioError for a file whose copy would stand in the way of the run's own."""
+    """Raise ScenarioError for a file of the scenario with the name of a file of run directories."""
     for source in source_files(scenario):
-        if source.name in OWN:
+        if source.name in OWN_FILES:
             words = "is a name that run directories use themselves"
             raise ScenarioError("path", words, source.name, "rename the file")
 
 
 def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None) -> None:
-    """The scenario as resolved, with the files it names and the modules that lie beside it, and
-    another root ``seed`` where one is given; it gives the same run again.
+    """Write scenario.toml with all defaults filled in, and copy the files and modules it names.
+
+    ``seed`` replaces the root seed of the scenario. The copy reproduces the run.
     """
     for source in source_files(scenario):
         target = directory / source.name
@@ -143,7 +148,7 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
 
 
 def scenario_digest(scenario: Scenario) -> str:
-    """SHA-256 of the scenario as resolved and of the files and modules that go with it."""
+    """Return the SHA-256 of a resolved scenario and of the files and modules that it names."""
     digest = hashlib.sha256(to_toml(resolved(scenario)).encode())
     files = {source.name: source.full for source in source_files(scenario)}
     files |= {f"{name}.py": file for name, file in module_files(scenario).items() if file}
@@ -153,7 +158,7 @@ def scenario_digest(scenario: Scenario) -> str:
 
 
 def missing_modules(scenario: Scenario) -> list[str]:
-    """One line about each module that a run directory needs and does not hold."""
+    """Return a sentence about each module that a run needs and its directory does not hold."""
     return [
         f"the run directory needs the Python module {name}, which was not copied into it: it is no "
         "single file beside the scenario"
@@ -163,7 +168,7 @@ def missing_modules(scenario: Scenario) -> list[str]:
 
 
 class ParquetSink(Sink):
-    """Streams events and states to Parquet, one row group a block, so that memory stays bounded."""
+    """Streams events and states to Parquet, one row group per block, so that memory is bounded."""
 
     anywhere: ClassVar[bool] = True
 
@@ -176,7 +181,7 @@ class ParquetSink(Sink):
         self._rows = 0
 
     def events(self, rows: np.ndarray) -> None:
-        """A row group."""
+        """Write a block of EVENT rows as a row group."""
         if self._events is not None:
             self._events.write(event_columns(rows, self._replica, self._first))
             self._first += len(rows)
@@ -184,7 +189,7 @@ class ParquetSink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Gathered into row groups."""
+        """Collect samples until they fill a row group."""
         if self._states is not None:
             self._samples.append((t, x, xhat, P, error))
             self._rows += len(t) * len(self._nodes)
@@ -203,7 +208,7 @@ class ParquetSink(Sink):
         )
 
     def close(self) -> None:
-        """Finish the files and give them their names."""
+        """Finish the files and rename them from NAME.part."""
         self._flush()
         for table, empty in (
             (self._events, lambda: event_columns(np.empty(0, dtype=EVENT), 0, 0)),
@@ -214,7 +219,7 @@ class ParquetSink(Sink):
 
 
 class TraceTables:
-    """``events.parquet`` and ``states.parquet`` of several runs, one after the other."""
+    """Writes events.parquet and states.parquet of several runs, one run after the other."""
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
         self._nodes, self._shown = scenario.nodes, scenario.plant.shown
@@ -233,7 +238,7 @@ class TraceTables:
         P: FloatArray,
         error: FloatArray,
     ) -> None:
-        """All of one run: EVENT rows, and samples as in ``netkf.Run``."""
+        """Append one run: its EVENT rows, and its samples with the shapes of ``netkf.Run``."""
         states = state_table(replica, times, self._nodes, x, xhat, P, error, self._shown)
         for gathered, columns in zip(
             self._gathered, (event_columns(log, replica, 0), states), strict=True
@@ -251,20 +256,22 @@ class TraceTables:
         self._rows = 0
 
     def close(self) -> None:
-        """Finish the files and give them their names."""
+        """Finish the files and rename them from NAME.part."""
         self._flush()
         self._events.close(None)
         self._states.close(None)
 
 
 def write_table(path: Path, columns: dict[str, Any]) -> None:
-    """A whole Parquet file at once."""
+    """Write columns as a Parquet file."""
     table = _Table(path)
     table.write(columns)
     table.close(None)
 
 
 class _Table:
+    """A Parquet file under construction; its schema is that of the first rows."""
+
     def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
         self._path, self._part = path, path.with_name(path.name + ".part")
         self._encoding = encoding or {}
@@ -276,7 +283,7 @@ class _Table:
         if self._writer is None:
             schema, how = table.schema, self._encoding
             self._writer = pq.ParquetWriter(self._part, schema, compression="zstd", **how)
-        self._failed = True  # half a row group is no file
+        self._failed = True  # stays so if writing raises: half a row group is no file
         self._writer.write_table(table)
         self._failed = False
 

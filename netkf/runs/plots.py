@@ -1,4 +1,4 @@
-"""The picture of a run. The only module that knows matplotlib."""
+"""The picture of a run, and the panels that it shares with the picture of an ensemble."""
 
 from __future__ import annotations
 
@@ -14,63 +14,72 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.files import written_beside
+from netkf.runs.files import write_atomically
 from netkf.runs.labels import by_design
 from netkf.runs.run import CompletedRun
-from netkf.runs.summary import CONFIDENCE, NO_COVARIANCE, Promise, nees_bounds
+from netkf.runs.summary import CONFIDENCE, NO_COVARIANCE, PromisedTraces, nees_bounds
 from netkf.scenario.scenario import Scenario
 
-SENSING, RELAY, PROMISE, DARK = "#c1440e", "#3b6ea5", "#222222", "#555555"
-MOST_LINES = 60
+SENSING, RELAY, PROMISE, DARK, EXACT = "#c1440e", "#3b6ea5", "#222222", "#555555", "#2e8b57"
+MAX_LINES = 60
+"""Curves of single nodes in one panel; of larger networks an even selection is drawn."""
+MAX_LABELLED_NODES = 60
 LONGEST_LEGEND = 72
+"""Characters of a legend that fit in one row."""
 NO_TRUTH = "no ground truth: errors are unavailable"
+Positions = dict[int, tuple[float, float]]
 
 
-def run_picture(scenario: Scenario, finished: CompletedRun) -> None:
-    """Write ``run.png``: errors, square roots of trace P over time against the bound and the
-    limits, NEES, and the network with its link activity.
+def run_picture(scenario: Scenario, completed: CompletedRun) -> None:
+    """Write ``run.png``: errors, square roots of trace P over time beside the bound and the limits,
+    NEES, and the network with the activity of its links.
     """
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         rows = 3 if scenario.plant.shown else 2
         figure = Figure(figsize=(11.0, 1.0 + 2.7 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(rows, 2, width_ratios=[1.15, 1.0])
-        _errors(figure.add_subplot(grid[0, 0]), scenario, finished)
-        _covariances(figure.add_subplot(grid[1, 0]), scenario, finished)
+        draw_above = _draw_errors if scenario.plant.shown else _draw_estimates
+        draw_above(figure.add_subplot(grid[0, 0]), scenario, completed)
+        _draw_covariances(figure.add_subplot(grid[1, 0]), scenario, completed)
         if scenario.plant.shown:
-            samples = finished.samples
-            draw_nees(
-                figure.add_subplot(grid[2, 0]), np.array(samples.times), samples.nees, scenario
-            )
-        _network(figure, figure.add_subplot(grid[:, 1]), scenario, finished)
+            samples = completed.samples
+            axes = figure.add_subplot(grid[2, 0])
+            draw_nees(axes, np.array(samples.times), samples.nees, scenario)
+        _draw_network(figure, figure.add_subplot(grid[:, 1]), scenario, completed)
         title = scenario.name if not scenario.claim else f"{scenario.name}: {scenario.claim}"
         figure.suptitle(fill(title, 130), fontsize=10, x=0.01, ha="left")
-        with written_beside(finished.directory / "run.png") as part:
+        with write_atomically(completed.directory / "run.png") as part:
             figure.savefig(part, dpi=130, format="png")
 
 
-def evenly_spaced(places: np.ndarray) -> np.ndarray:
-    """At most MOST_LINES of them."""
-    if len(places) <= MOST_LINES:
-        return places
-    return np.asarray(places[np.linspace(0, len(places) - 1, MOST_LINES).astype(int)])
+def select_evenly(indices: np.ndarray) -> np.ndarray:
+    """Return at most MAX_LINES of the indices, evenly spaced."""
+    if len(indices) <= MAX_LINES:
+        return indices
+    return np.asarray(indices[np.linspace(0, len(indices) - 1, MAX_LINES).astype(int)])
 
 
 def draw_lines(axes: Any, times: FloatArray, values: FloatArray, scenario: Scenario) -> None:
-    """A thin line a node, sensing nodes on top; at most MOST_LINES evenly chosen ones."""
+    """Draw the columns of ``values`` (T, N) over ``times`` (T,), sensing nodes on top."""
     sensing = np.array([node in scenario.placed for node in scenario.nodes])
+    width = 1.1 if len(scenario.nodes) <= 12 else 0.5
     for group, colour, order in ((~sensing, RELAY, 1), (sensing, SENSING, 2)):
-        places = evenly_spaced(np.flatnonzero(group))
-        segments = [np.column_stack([times, values[:, k]]) for k in places]
-        width = 1.1 if len(scenario.nodes) <= 12 else 0.5
-        axes.add_collection(
-            LineCollection(segments, colors=colour, linewidths=width, alpha=0.6, zorder=order)
+        indices = select_evenly(np.flatnonzero(group))
+        # One collection is far faster than a line for each node.
+        lines = LineCollection(
+            [np.column_stack([times, values[:, k]]) for k in indices],
+            colors=colour,
+            linewidths=width,
+            alpha=0.6,
+            zorder=order,
         )
+        axes.add_collection(lines)
     axes.autoscale()
 
 
 def draw_legend(axes: Any) -> None:
-    """Draw the legend of what has a label, beside the axes where it would hide curves."""
+    """Draw the legend of all labelled curves above the axes, where it hides none of them."""
     labels = axes.get_legend_handles_labels()[1]
     if not labels:
         return
@@ -87,7 +96,7 @@ def draw_legend(axes: Any) -> None:
 
 
 def set_scale(axes: Any, values: FloatArray) -> None:
-    """Logarithmic where the values span more than a factor of 100."""
+    """Choose a logarithmic scale if the largest value is more than 100 times the median."""
     positive = values[np.isfinite(values) & (values > 0.0)]
     if positive.size and positive.max() > 100.0 * np.median(positive):
         axes.set_yscale("log")
@@ -96,21 +105,18 @@ def set_scale(axes: Any, values: FloatArray) -> None:
         axes.set_ylim(0.0, positive.max() * 1.06)
 
 
-def _errors(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
-    if not scenario.plant.shown:
-        _estimates(axes, scenario, finished)
-        return
-    times = np.array(finished.samples.times)
-    error = np.sqrt(np.array(finished.samples.sq_error))
+def mark_unavailable(axes: Any, message: str) -> None:
+    """Replace a panel without data by a message."""
+    axes.text(0.0, 0.5, message, color=DARK)
+    axes.axis("off")
+
+
+def _draw_errors(axes: Any, scenario: Scenario, completed: CompletedRun) -> None:
+    times = np.array(completed.samples.times)
+    error = np.sqrt(np.array(completed.samples.sq_error))
     draw_lines(axes, times, error, scenario)
-    axes.plot(
-        times,
-        np.sqrt((error**2).mean(axis=1)),
-        color=PROMISE,
-        lw=1.6,
-        label="root mean square of all",
-        zorder=3,
-    )
+    rms = np.sqrt((error**2).mean(axis=1))
+    axes.plot(times, rms, color=PROMISE, lw=1.6, label="root mean square of all", zorder=3)
     axes.plot([], [], color=SENSING, label="nodes with a sensor")
     axes.plot([], [], color=RELAY, label="nodes without")
     set_scale(axes, error)
@@ -118,15 +124,9 @@ def _errors(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
     draw_legend(axes)
 
 
-def mark_unavailable(axes: Any, words: str) -> None:
-    """A panel without data."""
-    axes.text(0.0, 0.5, words, color=DARK)
-    axes.axis("off")
-
-
-def _estimates(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
-    """Without a truth there are no errors, but nodes that agree or do not."""
-    times, first = np.array(finished.samples.times), np.array(finished.samples.first)
+def _draw_estimates(axes: Any, scenario: Scenario, completed: CompletedRun) -> None:
+    """Draw estimates instead of errors: without ground truth only agreement can be seen."""
+    times, first = np.array(completed.samples.times), np.array(completed.samples.first)
     draw_lines(axes, times, first, scenario)
     axes.plot([], [], color=SENSING, label="nodes with a sensor")
     axes.plot([], [], color=RELAY, label="nodes without; no ground truth")
@@ -134,12 +134,12 @@ def _estimates(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
     draw_legend(axes)
 
 
-def _covariances(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
-    if not finished.samples.covariance_given:
+def _draw_covariances(axes: Any, scenario: Scenario, completed: CompletedRun) -> None:
+    if not completed.samples.covariance_given:
         mark_unavailable(axes, f"{NO_COVARIANCE}: trace P is unavailable")
         return
-    times, promised = np.array(finished.samples.times), finished.promised
-    root = np.sqrt(np.maximum(np.array(finished.samples.trace), 0.0))
+    times, promised = np.array(completed.samples.times), completed.promised
+    root = np.sqrt(np.maximum(np.array(completed.samples.trace), 0.0))
     draw_lines(axes, times, root, scenario)
     draw_promises(axes, times, promised)
     shown = root if promised.bound is None else np.concatenate([root, np.sqrt(promised.bound)])
@@ -149,119 +149,114 @@ def _covariances(axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
 
 
 def draw_nees(axes: Any, times: FloatArray, nees: Any, scenario: Scenario, runs: int = 1) -> None:
-    """NEES of every node, (T, N), a mean over the runs, and where it lies when P is exact."""
+    """Draw NEES (T, N), a mean over ``runs`` runs, and the interval that holds it if P is exact."""
     values = np.array(nees)
     if not np.isfinite(values).any():
         mark_unavailable(axes, "NEES is unavailable: it needs an error and a regular P")
         return
     draw_lines(axes, times, values, scenario)
     axes.plot(times, values.mean(axis=1), color=PROMISE, lw=1.6, label="mean of all", zorder=3)
-    words = f"{CONFIDENCE:.0%} where P is exact"
     low, high = nees_bounds(scenario.plant.n, runs)
-    axes.axhspan(low, high, color="#2e8b57", alpha=0.15, label=words)
+    axes.axhspan(low, high, color=EXACT, alpha=0.15, label=f"{CONFIDENCE:.0%} where P is exact")
     design = by_design(scenario)
     label = f"n = {scenario.plant.n}" + (f", P is {design} by design" if design else "")
-    axes.axhline(scenario.plant.n, color="#2e8b57", lw=1.1, label=label)
+    axes.axhline(scenario.plant.n, color=EXACT, lw=1.1, label=label)
     set_scale(axes, np.append(values, high))
     axes.set(ylabel="NEES" if runs == 1 else "mean NEES", xlabel="simulated seconds")
     draw_legend(axes)
 
 
-def draw_promises(axes: Any, times: FloatArray, promised: Promise) -> None:
-    """Draw the bound over time and the limits, as square roots of traces."""
+def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> None:
+    """Draw the bound over ``times`` (T,) and the limits, as square roots of traces."""
     if promised.bound is not None:
         bound = np.sqrt(promised.bound)
-        axes.plot(
-            times,
-            bound.max(axis=1),
-            color=PROMISE,
-            ls="--",
-            lw=1.3,
-            label="bound H(12): largest",
-            zorder=3,
-        )
-        axes.plot(
-            times,
-            bound.min(axis=1),
-            color=PROMISE,
-            ls=":",
-            lw=1.3,
-            label="and smallest",
-            zorder=3,
-        )
-    for value, words, style in (
-        (promised.limit, promised.limit_words, "-."),
+        look = {"color": PROMISE, "lw": 1.3, "zorder": 3}
+        axes.plot(times, bound.max(axis=1), ls="--", label="bound H(12): largest", **look)
+        axes.plot(times, bound.min(axis=1), ls=":", label="and smallest", **look)
+    for value, label, style in (
+        (promised.limit, promised.limit_label, "-."),
         (promised.central, "centralised filter", "-"),
     ):
         if math.isfinite(value):
-            axes.axhline(math.sqrt(value), color="#2e8b57", ls=style, lw=1.1, label=words)
+            axes.axhline(math.sqrt(value), color=EXACT, ls=style, lw=1.1, label=label)
 
 
-def _network(figure: Figure, axes: Any, scenario: Scenario, finished: CompletedRun) -> None:
-    topology = scenario.topology
-    places = topology.positions or _layout(scenario)
-    delivered = finished.samples.delivered
-    pairs = sorted({(min(i, j), max(i, j)) for i, j in topology.links})
-    counts = np.array([delivered.get(pair, 0) for pair in pairs], dtype=float)
-    if len(counts):
-        share = counts / max(float(counts.max()), 1.0)
-        axes.add_collection(
-            LineCollection(
-                [(places[i], places[j]) for i, j in pairs],
-                linewidths=0.3 + 2.2 * share,
-                colors=DARK,
-                alpha=0.45,
-                zorder=1,
-            )
-        )
+def _draw_network(figure: Figure, axes: Any, scenario: Scenario, completed: CompletedRun) -> None:
+    """Draw nodes coloured by their error (trace of P without ground truth), and links."""
+    positions = scenario.topology.positions or _layout(scenario)
+    _draw_links(axes, scenario, positions, completed.samples.delivered)
     key = "rms_error" if scenario.plant.shown else "mean_trace"
-    shade = {row["node"]: row[key] for row in finished.summary["nodes"]}
-    for sensing, marker, words in ((False, "o", "relays"), (True, "s", "has a sensor")):
-        nodes = [n for n in scenario.nodes if (n in scenario.placed) == sensing]
-        if not nodes:
-            continue
-        xy = np.array([places[n] for n in nodes])
-        values = [shade[n] for n in scenario.nodes if math.isfinite(shade[n])] or [0.0, 1.0]
-        dots = axes.scatter(
-            xy[:, 0],
-            xy[:, 1],
-            c=[shade[n] for n in nodes],
-            marker=marker,
-            cmap="viridis_r",
-            vmin=min(values),
-            vmax=max(values),
-            s=max(12.0, min(90.0, 4000.0 / len(scenario.nodes))),
-            edgecolors=PROMISE,
-            linewidths=0.5,
-            zorder=2,
-            label=words,
-        )
-    if len(scenario.nodes) <= 60:
+    shades = {row["node"]: row[key] for row in completed.summary["nodes"]}
+    dots = _draw_nodes(axes, scenario, positions, shades)
+    if len(scenario.nodes) <= MAX_LABELLED_NODES:
         for node in scenario.nodes:
-            axes.annotate(
-                str(node),
-                places[node],
-                xytext=(4, 4),
-                textcoords="offset points",
-                fontsize=7,
-                color=DARK,
-                zorder=3,
-            )
+            style = {"fontsize": 7, "color": DARK, "zorder": 3}
+            offset = {"xytext": (4, 4), "textcoords": "offset points"}
+            axes.annotate(str(node), positions[node], **offset, **style)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.axis("off")
     axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))
-    total = finished.summary["messages"]
-    words = f"{total['sent']:,} messages"
-    if total["transmissions"] < total["sent"]:
-        words += f" in {total['transmissions']:,} transmissions"
-    words = f"links as wide as they delivered; {words}, {total['lost']:,} lost"
-    axes.set_title(words, fontsize=9)
+    axes.set_title(_network_title(completed.summary["messages"]), fontsize=9)
     label = "RMS error" if scenario.plant.shown else "mean trace P"
     figure.colorbar(dots, ax=axes, shrink=0.5, label=label, pad=0.01)
 
 
-def _layout(scenario: Scenario) -> dict[int, tuple[float, float]]:
+def _draw_links(
+    axes: Any, scenario: Scenario, positions: Positions, delivered: dict[tuple[int, int], int]
+) -> None:
+    """Draw each link as wide as the number of messages that it delivered."""
+    pairs = sorted({(min(i, j), max(i, j)) for i, j in scenario.topology.links})
+    if not pairs:
+        return
+    counts = np.array([delivered.get(pair, 0) for pair in pairs], dtype=float)
+    lines = LineCollection(
+        [(positions[i], positions[j]) for i, j in pairs],
+        linewidths=0.3 + 2.2 * counts / max(float(counts.max()), 1.0),
+        colors=DARK,
+        alpha=0.45,
+        zorder=1,
+    )
+    axes.add_collection(lines)
+
+
+def _draw_nodes(
+    axes: Any, scenario: Scenario, positions: Positions, shades: dict[int, float]
+) -> Any:
+    """Draw the nodes, squares with a sensor and circles without; return what a colour bar needs."""
+    finite = [value for value in shades.values() if math.isfinite(value)] or [0.0, 1.0]
+    dots = None
+    for sensing, marker, label in ((False, "o", "relays"), (True, "s", "has a sensor")):
+        nodes = [n for n in scenario.nodes if (n in scenario.placed) == sensing]
+        if not nodes:
+            continue
+        xy = np.array([positions[n] for n in nodes])
+        dots = axes.scatter(
+            xy[:, 0],
+            xy[:, 1],
+            c=[shades[n] for n in nodes],
+            marker=marker,
+            cmap="viridis_r",
+            vmin=min(finite),
+            vmax=max(finite),
+            s=max(12.0, min(90.0, 4000.0 / len(scenario.nodes))),
+            edgecolors=PROMISE,
+            linewidths=0.5,
+            zorder=2,
+            label=label,
+        )
+    return dots
+
+
+def _network_title(messages: dict[str, Any]) -> str:
+    sent = f"{messages['sent']:,} messages"
+    if messages["transmissions"] < messages["sent"]:
+        sent += f" in {messages['transmissions']:,} transmissions"
+    return f"links as wide as they delivered; {sent}, {messages['lost']:,} lost"
+
+
+def _layout(scenario: Scenario) -> Positions:
+    """Return positions of the nodes for a topology that has none of its own."""
     topology = scenario.topology
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(topology.nodes)  # in their order, which is that around a circle
@@ -271,6 +266,6 @@ def _layout(scenario: Scenario) -> dict[int, tuple[float, float]]:
         placed: dict[int, Any] = networkx.circular_layout(graph)
     elif len(topology.nodes) <= 150:
         placed = networkx.kamada_kawai_layout(graph)
-    else:
+    else:  # Kamada-Kawai needs all shortest paths, too slow for large graphs
         placed = networkx.spring_layout(graph, seed=0, iterations=30)
     return {node: (float(x), float(y)) for node, (x, y) in placed.items()}

@@ -12,7 +12,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import finite
 from netkf.runs.labels import limit_words, mismatch_words, without_delay
-from netkf.runs.tables import MOST_NODES, number, table
+from netkf.runs.tables import MAX_NODES, number, shorten, table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
@@ -141,7 +141,5 @@ def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
         [str(node), *(number(c["trace"][k] if c["trace"] else None) for c in columns)]
         for k, node in enumerate(scenario.nodes)
     ]
-    if len(rows) > MOST_NODES:
-        middle = [f"({len(rows) - MOST_NODES} more)", "", ""]
-        rows = [*rows[: MOST_NODES // 2], middle, *rows[-MOST_NODES // 2 :]]
-    return table(["node", f"at {scenario.horizon:g} s", "steady state"], rows)
+    header = ["node", f"at {scenario.horizon:g} s", "steady state"]
+    return table(header, shorten(rows, MAX_NODES))

@@ -1,4 +1,4 @@
-"""What the last bit of a result depends on besides the scenario: packages and the processor."""
+"""Packages and hardware that results depend on, bit for bit, besides the scenario."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 from netkf.core.version import __version__
 
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "simpy", "networkx")
-"""Arithmetic and draws (numpy, scipy), code that is compiled (numba, llvmlite), the order of events
-(simpy) and drawn graphs (networkx). pandas and pyarrow write numbers as they are.
+"""Arithmetic and random draws (numpy, scipy), compiled code (numba, llvmlite), order of events
+(simpy) and random graphs (networkx). pandas and pyarrow are left out: they do not change numbers.
 """
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that results depend on, bit for bit."""
+    """Return the versions of the packages that results depend on, bit for bit."""
     return dict(_versions())
 
 
@@ -39,8 +39,8 @@ def _versions() -> dict[str, str]:
 
 @cache
 def machine() -> dict[str, Any]:
-    """The architecture, the processor for which numba compiles, and the vector instructions that
-    numpy has found: libraries choose their code by them.
+    """Return the architecture, the processor for which numba compiles, and the vector instructions
+    that numpy has found. Libraries choose their code, and so their rounding, by them.
     """
     found = {"architecture": platform.machine(), "system": platform.system()}
     try:
@@ -53,6 +53,6 @@ def machine() -> dict[str, Any]:
 
 
 def _build() -> dict[str, Any]:
-    """How numpy was built."""
-    shown: Any = np.show_config(mode="dicts")
-    return dict(shown or {})
+    """Return the build configuration of numpy."""
+    configuration: Any = np.show_config(mode="dicts")
+    return dict(configuration or {})

@@ -1,4 +1,4 @@
-"""``netkf run``: one run from a scenario to a directory with everything that happened."""
+"""``netkf run``: simulate a scenario once and write a directory with its results."""
 
 from __future__ import annotations
 
@@ -28,24 +28,35 @@ from netkf.runs.files import (
 )
 from netkf.runs.provenance import machine, versions
 from netkf.runs.simulate import choose_engine
-from netkf.runs.summary import Promise, SummarySink, conserved, promise, summarise
+from netkf.runs.summary import (
+    PromisedTraces,
+    SummarySink,
+    conserved_sums,
+    promise_traces,
+    summarise,
+)
 from netkf.runs.transmissions import SentPerLink
 from netkf.scenario.plugins import in_words
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
-from netkf.trace.recorder import Recorder
+from netkf.trace.recorder import Recorder, Sink
 from netkf.trace.run import Run
+
+ENDINGS = {"failed": "failed", "interrupted": "was interrupted"}
 
 
 @dataclass(frozen=True, eq=False)
 class CompletedRun:
-    """What ``run_to_directory`` leaves: the directory, its summary, and what a picture needs."""
+    """A run that was written to ``directory``, with its summary and the samples for a picture.
+
+    events: number of events; seconds: wall-clock time of the simulation without compiling.
+    """
 
     directory: Path
     status: str
     summary: dict[str, Any]
     samples: SummarySink
-    promised: Promise
+    promised: PromisedTraces
     events: int
     seconds: float
     engine: str
@@ -63,98 +74,160 @@ def run_to_directory(
     """Run once, as ``replica`` of an ensemble, and write scenario.toml, manifest.json, the Parquet
     tables and summary.json.
 
-    ``trace`` is full, first (the same for a single run) or none (no tables). ``finish`` adds what
-    else belongs to the directory, before the manifest says that it is complete. A run that is
-    interrupted or fails keeps what it had: the files are finished, the manifest says
-    ``interrupted``, or ``failed`` with the error. Raises ScenarioError and EngineError before
-    anything is written, InterruptedRunError (a KeyboardInterrupt) when interrupted, and EngineError
-    where a plugged-in class fails.
+    ``trace`` is full, first (the same for a single run) or none (no tables). ``finish`` adds its
+    files to the directory before the manifest says that the run is complete. A run that is
+    interrupted or fails keeps its results until then: the files are finished, the manifest says
+    ``interrupted``, or ``failed`` with the error.
+
+    Raises ScenarioError and EngineError before anything is written, InterruptedRunError (a
+    KeyboardInterrupt) when interrupted, and EngineError if a user's class fails.
     """
     replica = integer(low=0)("replica", replica)
     chosen = choose_engine(engine, scenario)
-    check_sources(scenario)
-    directory = new_directory(out, scenario.name)
-    write_scenario(directory, scenario)
-    samples, tables = SummarySink(), ParquetSink(directory, scenario, replica, trace != "none")
-    links = _link_counts(scenario)
-    recorder = Recorder([samples, tables, *links])
-    manifest = Manifest(directory, scenario.name, scenario.seed, replica, chosen.name)
-    # Written at once, so that a run that is killed outright says that it did not finish.
-    manifest.write("interrupted", {})
-    began, compiled, done = time.perf_counter(), compiling.seconds_spent(), False
+    output = _create_output(scenario, out, scenario.seed, replica, chosen.name, trace != "none")
+    recorder = Recorder(output.sinks)
+    done = False
     try:
-        status = chosen.run(scenario, Streams(scenario.seed, replica), recorder, progress)
-        compiled = compiling.seconds_spent() - compiled
-        seconds, done = time.perf_counter() - began - compiled, status == "complete"
-        tables.close()
-        promised = promise(scenario, np.array(samples.times))
-        counts = recorder.count, recorder.sums, _records(scenario, status, links)
-        summary = _summary(directory, scenario, samples, promised, *counts)
-        finished = CompletedRun(
-            directory, status, summary, samples, promised, recorder.total, seconds, chosen.name
+        status, seconds = _simulate(chosen, scenario, replica, recorder, progress)
+        done = status == "complete"
+        output.tables.close()
+        promised = promise_traces(scenario, np.array(output.samples.times))
+        summary = output.write_summary(promised, recorder.count, recorder.sums, status)
+        completed = CompletedRun(
+            output.directory,
+            status,
+            summary,
+            output.samples,
+            promised,
+            recorder.total,
+            seconds,
+            chosen.name,
         )
         if finish is not None:
-            finish(finished)
+            finish(completed)
     except BaseException as error:
-        status = "failed" if isinstance(error, Exception) else "interrupted"
-        for finished_off in (recorder.flush, tables.close):
-            with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
-                finished_off()
-        if not (directory / "summary.json").exists():
-            nothing = Promise(None, np.nan, np.nan, f"not computed: the run {ENDS[status]}")
-            with contextlib.suppress(OSError):
-                _summary(directory, scenario, samples, nothing, recorder.count, recorder.sums)
-        manifest.write(status, _totals(recorder), done, error)
-        reason = explain_failure(scenario, error, directory)
-        if reason is error:
+        _keep_partial_results(output, recorder, done, error)
+        explained = explain_failure(scenario, error, output.directory)
+        if explained is error:
             raise
-        raise reason from error
-    manifest.write(status, _totals(recorder), done)
-    return finished
+        raise explained from error
+    output.manifest.write(status, _totals(recorder), done)
+    return completed
 
 
 def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     """Write a run that is in memory as ``netkf run`` would have: scenario.toml, manifest.json, the
-    Parquet tables and summary.json; returns the directory, which must be new or empty.
+    Parquet tables and summary.json; return the directory, which must be new or empty.
 
     The scenario.toml carries the run's seed; running it again gives the same files for replica 0.
-    Raises ScenarioError where the run is of another scenario.
+    Raises ScenarioError if the run belongs to another scenario.
     """
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         rule = "must be a run of this scenario: its nodes or its state differ"
         raise ScenarioError("run", rule, run, "save it with the scenario it was simulated from")
-    check_sources(scenario)
-    folder = new_directory(Path(directory), scenario.name)
-    write_scenario(folder, scenario, run.seed)
-    manifest = Manifest(folder, scenario.name, run.seed, run.replica, run.engine)
-    manifest.write("interrupted", {})
-    samples, tables = SummarySink(), ParquetSink(folder, scenario, run.replica, True)
-    links = _link_counts(scenario)
-    for sink in (samples, tables, *links):
+    output = _create_output(scenario, Path(directory), run.seed, run.replica, run.engine, True)
+    for sink in output.sinks:
         sink.events(run.log)
         sink.exact_errors = run.exact_errors
         sink.states(run.times, run.x, run.xhat, run.P, run.error)
-    tables.close()
-    counts = run.count, run.sums, _records(scenario, run.status, links)
-    _summary(folder, scenario, samples, promise(scenario, run.times), *counts)
+    output.tables.close()
+    output.write_summary(promise_traces(scenario, run.times), run.count, run.sums, run.status)
     totals: dict[str, Any] = {"events": len(run.log), "fingerprint": run.fingerprint}
     totals |= {"simpy": run.stats} if run.stats else {}
-    manifest.write(run.status, totals, run.status == "complete")
-    return folder
+    output.manifest.write(run.status, totals, run.status == "complete")
+    return output.directory
 
 
-def _link_counts(scenario: Scenario) -> list[SentPerLink]:
-    """What counts the messages of each link, if a record of losses or delays needs it."""
+@dataclass(frozen=True, eq=False)
+class _Output:
+    """The directory of a run with the sinks that fill it; ``links`` is empty or counts the messages
+    of each link, which only records of losses or delays need.
+    """
+
+    directory: Path
+    scenario: Scenario
+    samples: SummarySink
+    tables: ParquetSink
+    links: list[SentPerLink]
+    manifest: Manifest
+
+    @property
+    def sinks(self) -> list[Sink]:
+        """All sinks, to record a run with."""
+        return [self.samples, self.tables, *self.links]
+
+    def write_summary(
+        self,
+        promised: PromisedTraces,
+        count: Callable[[str], int],
+        sums: dict[str, tuple[float, float]],
+        status: str,
+    ) -> dict[str, Any]:
+        """Write and return summary.json; ``count`` gives the number of events of a kind."""
+        messages = {
+            "sent": count("send"),
+            "delivered": count("deliver"),
+            "lost": count("lost") + count("late"),
+        }
+        summary = summarise(self.scenario, self.samples, promised, messages)
+        if sums:
+            summary["conserved"] = conserved_sums(sums)
+        # A run that ended early says nothing about how much of a record it would have used.
+        if status == "complete":
+            usage = record_usage(self.scenario, self.links[0].sent if self.links else {})
+            summary |= {"records": usage} if usage else {}
+        write_json(self.directory / "summary.json", summary)
+        return summary
+
+
+def _create_output(
+    scenario: Scenario, out: Path | None, seed: int, replica: int, engine: str, tables: bool
+) -> _Output:
+    """Create the run directory with its scenario and a manifest; ``tables`` asks for Parquet files.
+
+    Raises ScenarioError if the directory is not empty or a file of the scenario is in the way.
+    """
+    check_sources(scenario)
+    directory = new_directory(out, scenario.name)
+    write_scenario(directory, scenario, seed)
     channel = scenario.network.channel
     by_message = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
-    return [SentPerLink()] if by_message else []
+    manifest = Manifest(directory, scenario.name, seed, replica, engine)
+    # Written at once, so that a run that is killed outright says that it did not finish.
+    manifest.write("interrupted", {})
+    return _Output(
+        directory,
+        scenario,
+        SummarySink(),
+        ParquetSink(directory, scenario, replica, tables),
+        [SentPerLink()] if by_message else [],
+        manifest,
+    )
 
 
-def _records(scenario: Scenario, status: str, links: list[SentPerLink]) -> dict[str, Any]:
-    """What the run used of its records; nothing of a run that did not reach the horizon."""
-    if status != "complete":
-        return {}
-    return record_usage(scenario, links[0].sent if links else {})
+def _simulate(
+    engine: Engine, scenario: Scenario, replica: int, recorder: Recorder, progress: Progress
+) -> tuple[str, float]:
+    """Return the status of a run and its wall-clock seconds, those spent compiling left out."""
+    began, compiled = time.perf_counter(), compiling.seconds_spent()
+    status = engine.run(scenario, Streams(scenario.seed, replica), recorder, progress)
+    compiled = compiling.seconds_spent() - compiled
+    return status, time.perf_counter() - began - compiled
+
+
+def _keep_partial_results(
+    output: _Output, recorder: Recorder, done: bool, error: BaseException
+) -> None:
+    """Finish the files of a run that stopped with ``error`` and write the error to its manifest."""
+    status = "failed" if isinstance(error, Exception) else "interrupted"
+    for finish in (recorder.flush, output.tables.close):
+        with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
+            finish()
+    if not (output.directory / "summary.json").exists():
+        unknown = PromisedTraces(None, np.nan, np.nan, f"not computed: the run {ENDINGS[status]}")
+        with contextlib.suppress(OSError):
+            output.write_summary(unknown, recorder.count, recorder.sums, status)
+    output.manifest.write(status, _totals(recorder), done, error)
 
 
 def _totals(recorder: Recorder) -> dict[str, Any]:
@@ -162,35 +235,9 @@ def _totals(recorder: Recorder) -> dict[str, Any]:
     return totals | ({"simpy": recorder.stats} if recorder.stats else {})
 
 
-ENDS = {"failed": "failed", "interrupted": "was interrupted"}
-
-
-def _summary(
-    directory: Path,
-    scenario: Scenario,
-    samples: SummarySink,
-    promised: Promise,
-    count: Callable[[str], int],
-    sums: dict[str, tuple[float, float]],
-    records: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    messages = {
-        "sent": count("send"),
-        "delivered": count("deliver"),
-        "lost": count("lost") + count("late"),
-    }
-    summary = summarise(scenario, samples, promised, messages)
-    if sums:
-        summary["conserved"] = conserved(sums)
-    if records:
-        summary["records"] = records
-    write_json(directory / "summary.json", summary)
-    return summary
-
-
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """``manifest.json`` of a directory of one run, or of ``wanted`` runs from ``replica`` on."""
+    """The manifest.json of a directory of one run, or of ``wanted`` runs from ``replica`` on."""
 
     directory: Path
     name: str
@@ -206,7 +253,7 @@ class Manifest:
         done: int = 0,
         error: BaseException | None = None,
     ) -> None:
-        """Say how the run stands."""
+        """Write manifest.json with the status, the totals and the number of runs that are done."""
         manifest: dict[str, Any] = {
             "name": self.name,
             "versions": versions(),

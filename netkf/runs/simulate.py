@@ -1,4 +1,4 @@
-"""One run: choose an engine, record, return."""
+"""Simulate a scenario once, in memory."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ ENGINES = ("auto", "simpy", "compiled")
 
 
 def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
-    """The engine of a name: ``simpy`` (or ``processes``), ``compiled``, or ``auto``, which is
-    compiled where that can run the scenario. Raises EngineError where an engine cannot run it.
+    """Return the engine of a name: ``simpy`` (or ``processes``), ``compiled``, or ``auto``, that is
+    ``compiled`` if that engine can run the scenario and ``simpy`` otherwise.
+
+    Raises EngineError for an unknown name and if the engine cannot run the scenario.
     """
     if isinstance(name, Engine):
         engine: Engine = name
@@ -51,10 +53,12 @@ def simulate(
     sinks: Sequence[Sink] = (),
     progress: Progress = silent,
 ) -> Run:
-    """Run a scenario once and keep all of it in memory.
+    """Run a scenario once and return all events and samples.
 
-    ``seed`` defaults to the scenario's; runs of one seed differ by ``replica``. More ``sinks``
-    receive the same rows and samples as they come. Raises EngineError and ScenarioError.
+    ``seed`` defaults to the scenario's; runs of one seed differ by ``replica``. Additional
+    ``sinks`` receive the same rows and samples during the run.
+
+    Raises EngineError if no engine can run the scenario, ScenarioError for bad arguments.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "simulate takes a netkf.Scenario", scenario, LOAD)
@@ -76,11 +80,12 @@ def collect(
     engine: str,
     status: str,
 ) -> Run:
-    """A Run from what a recorder gathered."""
+    """Return the Run of a finished simulation whose recorder fed ``memory``."""
     count, n = len(scenario.nodes), scenario.plant.n
     shapes = (), (n,), (count, n), (count, n, n), (count, n)
-    nothing = tuple(np.empty((0, *shape)) for shape in shapes)
-    columns = zip(nothing, *memory.samples, strict=True)
+    # Empty arrays in front give the right shapes to a run without samples.
+    empty = tuple(np.empty((0, *shape)) for shape in shapes)
+    columns = zip(empty, *memory.samples, strict=True)
     times, x, xhat, P, error = (np.concatenate(column) for column in columns)
     return Run(
         times=times,

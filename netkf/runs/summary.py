@@ -1,4 +1,4 @@
-"""What a run comes to: errors and covariances per node against what theory promises."""
+"""The summary of a run: errors and covariances per node beside the bounds of theory."""
 
 from __future__ import annotations
 
@@ -24,11 +24,15 @@ CONFIDENCE = 0.95
 
 
 class SummarySink(Sink):
-    """Keeps per sample and node what tables and pictures need: squared error, trace of P, NEES, the
-    ``first`` component of the estimate; and how many messages each node sent and each link
-    delivered. ``rounding_from`` is the first sample at which the state is so large that rounding
-    blurs the errors (unstable plants over long horizons, where errors are subtracted), ``diverged``
-    are the nodes whose estimate or covariance was broken at the last one.
+    """Reduces samples to the numbers that tables and pictures need.
+
+    times            : T sample times in seconds
+    sq_error, trace, nees, first : for each of them (N,) squared error, trace of P, NEES and first
+                       component of the estimate
+    delivered        : messages delivered over each link, both directions together
+    rounding_from    : time of the first sample whose errors rounding blurs because the state is too
+                       large (unstable plants over long horizons); None without one
+    diverged         : nodes whose estimate or covariance was not usable at the last sample
     """
 
     anywhere: ClassVar[bool] = True
@@ -45,7 +49,7 @@ class SummarySink(Sink):
         self.transmissions = Transmissions()
 
     def events(self, rows: np.ndarray) -> None:
-        """Deliveries of each link are counted, both directions together."""
+        """Count the messages of a block of EVENT rows."""
         self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
         arrived = rows[rows["kind"] == CODES["deliver"]]
@@ -57,7 +61,7 @@ class SummarySink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Reduced at once."""
+        """Reduce a block of samples; P (T, N, n, n) is not kept."""
         if not len(t):
             return
         sq_error, nees = errors(error, P)
@@ -72,39 +76,42 @@ class SummarySink(Sink):
 
     @property
     def covariance_given(self) -> bool:
-        """Whether the filters give a covariance."""
+        """True if the filter gives a covariance, or no sample was taken."""
         return not self.trace or any(np.isfinite(trace).any() for trace in self.trace)
 
     @property
     def ended_finite(self) -> bool:
-        """Whether errors and covariances were finite at the last sample."""
+        """True if errors and covariances were finite at the last sample."""
         return bool(np.isfinite([self.sq_error[-1], self.trace[-1]]).all())
 
 
 NO_COVARIANCE = "the filter gives no covariance"
 
 
-class Used(NamedTuple):
-    """Places of the samples that averages of errors and of covariances are over."""
+class SampleIndices(NamedTuple):
+    """Indices of the samples to average errors and covariances over."""
 
     errors: np.ndarray
     covariances: np.ndarray
 
 
-def averaged_samples(times: FloatArray, rounding_from: float, diverged: bool) -> Used:
-    """Those after time 0, or all where none is; without the last one of a run that ``diverged``;
-    of errors, and of covariances that outgrow all bounds, without those that rounding blurs.
+def averaged_samples(times: FloatArray, rounding_from: float, diverged: bool) -> SampleIndices:
+    """Return which of the samples at ``times`` (T,) are averaged.
+
+    These are the samples after time 0 (all of them if there is none later), without the last sample
+    of a run that ``diverged``. Errors that rounding blurs are left out, and so are the covariances
+    at the same times if the run diverged, since they outgrow all bounds.
     """
     kept = times[: len(times) - 1] if diverged and len(times) > 1 else times
     after = kept > 0.0 if (kept > 0.0).any() else np.ones(len(kept), dtype=bool)
     clear = after & (kept < rounding_from)
     covariances = clear if diverged and clear.any() else after
-    return Used(np.flatnonzero(clear), np.flatnonzero(covariances))
+    return SampleIndices(np.flatnonzero(clear), np.flatnonzero(covariances))
 
 
 def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
-    """Between which the mean NEES of one sample over the runs lies with CONFIDENCE where P is
-    exact, since their sum is chi-square with ``runs n`` degrees of freedom.
+    """Return the interval that holds the mean NEES of one sample over ``runs`` runs with
+    probability CONFIDENCE if P is exact: the sum is chi-square with ``runs n`` degrees of freedom.
     """
     ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
     low, high = (2.0 * float(gammaincinv(0.5 * runs * n, end)) / runs for end in ends)
@@ -112,38 +119,41 @@ def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Promise:
-    """What H(12) and (13) say at the sample times; ``words`` says why where they say nothing.
+class PromisedTraces:
+    """Traces that theory promises for a run.
 
-    bound (T, N): trace of H(12); limit, central: traces of S and of the centralised covariance,
-    nan where they do not exist; limit_words names the limit, notes are what to know about both.
+    bound       : (T, N) traces of H(12) at the sample times; None if it does not apply
+    limit       : trace of the limit S of H(13), nan if it does not exist
+    central     : trace of the covariance of the centralised filter, nan if it does not exist
+    reason      : why there is no bound, or empty
+    limit_label : name of the limit in tables and pictures
+    notes       : sentences to print beside them
     """
 
     bound: FloatArray | None
     limit: float
     central: float
-    words: str
-    limit_words: str = "limit S of H(13)"
+    reason: str
+    limit_label: str = "limit S of H(13)"
     notes: tuple[str, ...] = ()
 
 
-def promise(scenario: Scenario, times: FloatArray) -> Promise:
-    """Computed for the sample times of a run."""
-    bound, words = None, ""
+def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
+    """Return the bounds and limits of a scenario at the sample ``times`` (T,) of a run."""
+    bound, reason = None, ""
     try:
         if len(times):
             bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
     except TheoryError as error:
-        words = str(error)
-    return Promise(
+        reason = str(error)
+    notes = (_steady_note(scenario), mismatch_words(scenario), nees_words(scenario))
+    return PromisedTraces(
         bound,
         _trace(limit_covariance, scenario),
         _trace(central_covariance, scenario),
-        words or not_promised(scenario) or "",
+        reason or not_promised(scenario) or "",
         limit_words(scenario),
-        tuple(
-            filter(None, (word(scenario) for word in (_steady_note, mismatch_words, nees_words)))
-        ),
+        tuple(filter(None, notes)),
     )
 
 
@@ -163,36 +173,16 @@ def _trace(function: Any, scenario: Scenario) -> float:
 
 
 def summarise(
-    scenario: Scenario, sink: SummarySink, promised: Promise, messages: dict[str, int]
+    scenario: Scenario, sink: SummarySink, promised: PromisedTraces, messages: dict[str, int]
 ) -> dict[str, Any]:
-    """Per node and overall: time-averaged RMS error, mean trace of P, bound and their ratio, mean
-    NEES over the samples after time 0 (errors and NEES without those that rounding blurs), messages
-    that each node sent, and how often it transmitted; messages sent, delivered, lost and still on
-    their way. Nan where there is no sample or no covariance.
+    """Return the summary of a run, as in summary.json.
+
+    It has, per node and overall, the RMS error and the mean trace of P over time, the mean bound
+    and their ratio, the mean NEES over the samples after time 0, and the messages sent and
+    transmissions of each node; then the totals of messages. Errors and NEES leave out the samples
+    that rounding blurs. Numbers are nan if there is no sample or no covariance.
     """
-    blurred = np.inf if sink.rounding_from is None else sink.rounding_from
-    used = averaged_samples(np.array(sink.times), blurred, bool(sink.diverged))
-    places = (used.errors, used.covariances, used.errors)
-    with np.errstate(all="ignore"):
-        mean_square, trace, nees = (
-            np.array(values)[kept].mean(axis=0)
-            if len(kept)
-            else np.full(len(scenario.nodes), np.nan)
-            for kept, values in zip(places, (sink.sq_error, sink.trace, sink.nees), strict=True)
-        )
-        bound = None if promised.bound is None else promised.bound[used.covariances].mean(axis=0)
-        nodes = [
-            _row(node, mean_square[k], trace[k], None if bound is None else bound[k], nees[k])
-            for k, node in enumerate(scenario.nodes)
-        ]
-        overall = _row(
-            -1,
-            mean_square.mean(),
-            trace.mean(),
-            None if bound is None else bound.mean(),
-            nees.mean(),
-        )
-    del overall["node"]
+    nodes, overall = _average_rows(scenario, sink, promised)
     counts = sink.transmissions
     for row in nodes:
         row |= {"sent": counts.sent[row["node"]], "transmissions": counts.of(row["node"])}
@@ -201,9 +191,9 @@ def summarise(
         "overall": overall,
         "limit": promised.limit,
         "central": promised.central,
-        "bound": promised.words or "H(12), promised by H Theorem 2",
+        "bound": promised.reason or "H(12), promised by H Theorem 2",
         "rounding_from": sink.rounding_from,
-        "notes": notes_of(scenario, sink.rounding_from, sink.covariance_given),
+        "notes": summary_notes(scenario, sink.rounding_from, sink.covariance_given),
         "messages": {
             **messages,
             "transmissions": counts.total,
@@ -212,8 +202,39 @@ def summarise(
     }
 
 
-def notes_of(scenario: Scenario, rounding_from: float | None, covariance_given: bool) -> list[str]:
-    """What to know about the averages of a run or of an ensemble, a line each."""
+def _average_rows(
+    scenario: Scenario, sink: SummarySink, promised: PromisedTraces
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return a row of averages over time for each node, and one for all nodes together."""
+    blurred = np.inf if sink.rounding_from is None else sink.rounding_from
+    used = averaged_samples(np.array(sink.times), blurred, bool(sink.diverged))
+    square = _mean(sink.sq_error, used.errors, scenario)
+    trace = _mean(sink.trace, used.covariances, scenario)
+    nees = _mean(sink.nees, used.errors, scenario)
+    bound = np.full(len(scenario.nodes), None)
+    with np.errstate(all="ignore"):  # ratios to a bound of 0, and diverged runs
+        if promised.bound is not None:
+            bound = promised.bound[used.covariances].mean(axis=0)
+        overall = _row(
+            square.mean(), trace.mean(), nees.mean(), None if bound[0] is None else bound.mean()
+        )
+        columns = zip(scenario.nodes, square, trace, nees, bound, strict=True)
+        nodes = [{"node": node, **_row(*values)} for node, *values in columns]
+    return nodes, overall
+
+
+def _mean(values: list[FloatArray], indices: np.ndarray, scenario: Scenario) -> FloatArray:
+    """Return the mean (N,) of the samples at ``indices`` of T arrays (N,), nan without any."""
+    if not len(indices):
+        return np.full(len(scenario.nodes), np.nan)
+    with np.errstate(all="ignore"):
+        return np.asarray(np.array(values)[indices].mean(axis=0))
+
+
+def summary_notes(
+    scenario: Scenario, rounding_from: float | None, covariance_given: bool
+) -> list[str]:
+    """Return notes on the averages of a run or of an ensemble, one sentence each."""
     notes = [] if covariance_given else [NO_COVARIANCE]
     if rounding_from is not None and scenario.plant.shown:
         notes.append(
@@ -223,9 +244,9 @@ def notes_of(scenario: Scenario, rounding_from: float | None, covariance_given: 
     return notes
 
 
-def conserved(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
-    """What exchanges should conserve, summed over all nodes: exact, at the last sample, and how far
-    that is off, relative to the exact value.
+def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
+    """Return the sums over all nodes that exchanges should conserve: the exact value, the total at
+    the last sample and its relative deviation.
     """
     return {
         name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
@@ -233,9 +254,8 @@ def conserved(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
     }
 
 
-def _row(node: int, mean_square: Any, trace: Any, bound: Any, nees: Any) -> dict[str, Any]:
+def _row(mean_square: Any, trace: Any, nees: Any, bound: Any) -> dict[str, Any]:
     return {
-        "node": node,
         "rms_error": float(np.sqrt(mean_square)),
         "mean_trace": float(trace),
         "bound": None if bound is None else float(bound),

@@ -3,24 +3,39 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from netkf.scenario.usage import usage_notes
 
-MOST_NODES = 30
-DRIFTED = 1e-9  # far above rounding
+MAX_NODES = 30
+"""Rows of a table with one row per node; longer tables show the ends of the list."""
+DRIFT_TOLERANCE = 1e-9
+"""Relative drift of a conserved sum that rounding cannot explain."""
+COLUMNS = {
+    "rms_error": "RMS error",
+    "mean_trace": "mean trace P",
+    "bound": "bound",
+    "ratio": "ratio",
+    "mean_nees": "NEES",
+}
 
 
 def number(value: float | None) -> str:
-    """Four significant digits; a dash where there is no number."""
+    """Format a number with four significant digits; a dash if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return "-"
     return f"{value:.4g}"
 
 
+def standard_error(error: float | None) -> str:
+    """Format a standard error as `` +- 0.1``; empty if it is None or not finite."""
+    known = error is not None and math.isfinite(error)
+    return f" +- {error:.1g}" if known else ""
+
+
 def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
-    """Aligned columns, the first ``left`` to the left and the others to the right."""
+    """Return aligned columns, the first ``left`` to the left and the others to the right."""
     widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
     lines = [
         "  ".join(
@@ -32,93 +47,112 @@ def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
 
+def shorten(rows: list[list[str]], most: int) -> list[list[str]]:
+    """Return at most ``most`` rows, the first and the last, with a row that counts the rest."""
+    if len(rows) <= most:
+        return rows
+    omitted = [f"({len(rows) - most} more)", *[""] * (len(rows[0]) - 1)]
+    return [*rows[: most // 2], omitted, *rows[-most // 2 :]]
+
+
 def summary_table(
     summary: dict[str, Any], limit: str = "limit S of H(13)", notes: Sequence[str] = ()
 ) -> str:
-    """The table that ends a run: nodes (the worst and the best where there are many), all of them
-    together, what ``notes`` say about the promise, and the messages; ``limit`` names the limit.
+    """Return the table that ends a run.
+
+    It has a row per node (the best and the worst of large networks), one for all nodes, the
+    ``notes`` on the bound, the limits (``limit`` names the first), and the messages.
     """
-    nodes = sorted(summary["nodes"], key=lambda row: row["node"])
-    shown, left_out = nodes, 0
-    if len(nodes) > MOST_NODES:
-        ranked = sorted(nodes, key=lambda row: -_key(row["rms_error"]))
-        half = MOST_NODES // 2
-        chosen = {row["node"] for row in (*ranked[:half], *ranked[-half:])}
-        shown = [row for row in nodes if row["node"] in chosen]
-        left_out = len(nodes) - len(shown)
-    rows = [_cells(str(row["node"]), row) for row in shown]
-    if left_out:
-        rows.append([f"({left_out} more)", *[""] * 5])
-    rows.append(_cells("all", summary["overall"]))
-    header = ["node", "RMS error", "mean trace P", "bound", "ratio", "NEES"]
-    sent = summary["messages"]
-    lines = [table(header, rows), ""]
-    if left_out:
-        lines.insert(
-            1,
-            f"the {MOST_NODES // 2} nodes with the largest and the "
-            f"{MOST_NODES // 2} with the smallest RMS error; all are in summary.json",
-        )
-    if all(row["bound"] is None for row in nodes):
+    lines = list(_node_table(summary))
+    if all(row["bound"] is None for row in summary["nodes"]):
         lines.append(f"bound: {summary['bound']}")
     lines += [f"note: {note}" for note in (*summary["notes"], *notes)]
-    references = [
-        f"{words} {number(value)}"
-        for words, value in (
-            (limit, summary["limit"]),
-            ("centralised filter", summary["central"]),
-        )
-        if value is not None and math.isfinite(value)
-    ]
-    if references:
-        lines.append("traces to compare: " + ", ".join(references))
-    if math.isfinite(summary.get("nees", {}).get("inside", math.nan)):
-        found = summary["nees"]
-        lines.append(
-            f"NEES of one sample, mean over the runs: {found['confidence']:.0%} in "
-            f"{number(found['low'])} .. {number(found['high'])} where P is exact, here "
-            f"{found['inside']:.0%}"
-        )
+    lines += _limit_lines(summary, limit)
+    lines += _nees_lines(summary.get("nees", {}))
     if "conserved" in summary:
         lines.append("mass: " + _conserved(summary["conserved"]))
-    lines.append(
-        f"messages: {_count(sent['sent'])} sent{_transmissions(sent)}, "
-        f"{_count(sent['delivered'])} delivered, {_count(sent['lost'])} lost"
-        + (f", {_count(sent['in_flight'])} on their way at the end" if sent["in_flight"] else "")
-    )
+    lines.append(_message_line(summary["messages"]))
     lines += [f"note: {note}" for note in usage_notes(summary.get("records", {}))]
     return "\n".join(lines)
 
 
-def _transmissions(sent: dict[str, Any]) -> str:
-    """Where a message that is broadcast is sent to several and transmitted once."""
-    count = sent.get("transmissions")
-    return "" if count is None or count == sent["sent"] else f" in {_count(count)} transmissions"
+def _node_table(summary: dict[str, Any]) -> Iterator[str]:
+    nodes = sorted(summary["nodes"], key=lambda row: row["node"])
+    shown = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
+    omitted = len(nodes) - len(shown)
+    rows = [_cells(str(row["node"]), row) for row in shown]
+    if omitted:
+        rows.append([f"({omitted} more)", *[""] * len(COLUMNS)])
+    rows.append(_cells("all", summary["overall"]))
+    yield table(["node", *COLUMNS.values()], rows)
+    if omitted:
+        half = MAX_NODES // 2
+        yield (
+            f"the {half} nodes with the largest and the {half} with the smallest RMS error; all "
+            "are in summary.json"
+        )
+    yield ""
 
 
-def _conserved(found: dict[str, Any]) -> str:
-    words = [
-        f"{name} {number(sums['total'])} of {number(sums['exact'])} ({sums['drift']:+.1e})"
-        for name, sums in found.items()
-    ]
-    worst = max(abs(sums["drift"]) for sums in found.values())
-    lost = ", drifting: directions of a link do not fail together" if worst > DRIFTED else ""
-    return ", ".join(words) + lost
+def _best_and_worst(nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows with the largest and the smallest RMS errors, in their order."""
+    ranked = sorted(nodes, key=lambda row: -_sort_key(row["rms_error"]))
+    half = MAX_NODES // 2
+    chosen = {row["node"] for row in (*ranked[:half], *ranked[-half:])}
+    return [row for row in nodes if row["node"] in chosen]
 
 
-def _key(value: float | None) -> float:
+def _sort_key(value: float | None) -> float:
+    """Return the value, or inf for an error that is unknown: such a node is worth a look."""
     return math.inf if value is None or not math.isfinite(value) else value
 
 
 def _cells(name: str, row: dict[str, Any]) -> list[str]:
-    keys = ("rms_error", "mean_trace", "bound", "ratio", "mean_nees")
-    return [name, *(number(row[key]) + _give_or_take(row.get(f"{key}_se")) for key in keys)]
+    return [name, *(number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS)]
 
 
-def _give_or_take(error: float | None) -> str:
-    known = error is not None and math.isfinite(error)
-    return f" +- {error:.1g}" if known else ""
+def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
+    traces = {limit: summary["limit"], "centralised filter": summary["central"]}
+    known = [
+        f"{label} {number(value)}"
+        for label, value in traces.items()
+        if value is not None and math.isfinite(value)
+    ]
+    return ["traces to compare: " + ", ".join(known)] if known else []
+
+
+def _nees_lines(nees: dict[str, Any]) -> list[str]:
+    if not math.isfinite(nees.get("inside", math.nan)):
+        return []
+    return [
+        f"NEES of one sample, mean over the runs: {nees['confidence']:.0%} in "
+        f"{number(nees['low'])} .. {number(nees['high'])} where P is exact, here "
+        f"{nees['inside']:.0%}"
+    ]
+
+
+def _message_line(messages: dict[str, Any]) -> str:
+    transmissions = messages.get("transmissions")
+    line = f"messages: {_count(messages['sent'])} sent"
+    # A broadcast is one transmission and a message to each node in range.
+    if transmissions is not None and transmissions != messages["sent"]:
+        line += f" in {_count(transmissions)} transmissions"
+    line += f", {_count(messages['delivered'])} delivered, {_count(messages['lost'])} lost"
+    if messages["in_flight"]:
+        line += f", {_count(messages['in_flight'])} on their way at the end"
+    return line
+
+
+def _conserved(sums: dict[str, dict[str, float]]) -> str:
+    totals = [
+        f"{name} {number(found['total'])} of {number(found['exact'])} ({found['drift']:+.1e})"
+        for name, found in sums.items()
+    ]
+    worst = max(abs(found["drift"]) for found in sums.values())
+    drifting = ", drifting: directions of a link do not fail together"
+    return ", ".join(totals) + (drifting if worst > DRIFT_TOLERANCE else "")
 
 
 def _count(value: float) -> str:
+    """Format a count, or a mean of counts with one decimal."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"

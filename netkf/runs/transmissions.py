@@ -1,4 +1,4 @@
-"""How often each node sent and transmitted: a broadcast is sent to many and transmitted once."""
+"""Counts of messages and transmissions: a broadcast sends several messages in one transmission."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ TRANSMIT = KINDS.index("transmit")
 
 
 class Transmissions:
-    """Counts of each node, from blocks of EVENT rows as they come.
+    """Counts the messages and the transmissions of each node in blocks of EVENT rows.
 
-    Under clocks a broadcast has a ``transmit`` row, and without such rows every message is a
-    transmission of its own. In slots what a node sends in one step of an exchange is one.
+    Under clocks a broadcast has a ``transmit`` row; without such rows every message is a
+    transmission of its own. In slots all messages of a node in one step of an exchange are one
+    transmission.
     """
 
     def __init__(self) -> None:
@@ -32,7 +33,7 @@ class Transmissions:
         self._senders: set[int] = set()
 
     def add(self, rows: np.ndarray) -> None:
-        """Count a block that follows the one before."""
+        """Count the next block of EVENT rows; blocks come in the order of the run."""
         sends = rows[rows["kind"] == SEND]
         _count(self.sent, sends["node"])
         _count(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
@@ -41,7 +42,7 @@ class Transmissions:
         self._add_slots(sends[in_slots])
 
     def _add_slots(self, sends: np.ndarray) -> None:
-        """Steps follow each other: a step that goes on from the last block is counted once."""
+        """Count senders of each step; a step that continues from the last block is counted once."""
         if not len(sends):
             return
         t, phase = sends["t"], sends["phase"]
@@ -54,27 +55,27 @@ class Transmissions:
         self._in_slots.update(distinct - self._senders)
         step = np.zeros(len(sends), dtype=np.int64)
         step[begins] = 1
-        nodes, place = np.unique(sends["node"], return_inverse=True)
-        pairs = np.unique(np.cumsum(step) * len(nodes) + place)
+        nodes, index = np.unique(sends["node"], return_inverse=True)
+        pairs = np.unique(np.cumsum(step) * len(nodes) + index)  # (step, sender), once each
         _count(self._in_slots, nodes[pairs[pairs >= len(nodes)] % len(nodes)])
         single = len(ends) == 2
         self._senders = self._senders | distinct if single else set(last.tolist())
         self._step = float(t[-1]), int(phase[-1])
 
     def of(self, node: int) -> int:
-        """How often a node transmitted."""
+        """Return the number of transmissions of a node."""
         clocks = self._broadcasts if self._broadcasts else self._under_clocks
         return self._in_slots[node] + clocks[node]
 
     @property
     def total(self) -> int:
-        """How often all nodes transmitted."""
+        """Number of transmissions of all nodes."""
         clocks = self._broadcasts if self._broadcasts else self._under_clocks
         return self._in_slots.total() + clocks.total()
 
 
 class SentPerLink(Sink):
-    """Counts the messages of each directed link, lost ones included."""
+    """Counts the messages that were sent over each directed link, lost ones included."""
 
     anywhere: ClassVar[bool] = True
 
@@ -82,7 +83,7 @@ class SentPerLink(Sink):
         self.sent: Counter[Link] = Counter()
 
     def events(self, rows: np.ndarray) -> None:
-        """Sends."""
+        """Count the messages of a block of EVENT rows."""
         sends = rows[rows["kind"] == SEND]
         ends = np.column_stack([sends["node"], sends["peer"]])
         pairs, counts = np.unique(ends, axis=0, return_counts=True)
@@ -92,7 +93,7 @@ class SentPerLink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Not counted."""
+        """Ignore samples."""
 
 
 def _count(counter: Counter[int], nodes: np.ndarray) -> None:

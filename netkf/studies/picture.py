@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.files import written_beside
+from netkf.runs.files import write_atomically
 from netkf.studies.sweep import CompletedSweep
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def sweep_picture(title: str, completed: CompletedSweep) -> bool:
         words = "; ".join(filter(None, (which, bars)))
         axes.set_title(words, fontsize=8, loc="right", color=CENTRAL)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-        with written_beside(completed.directory / "sweep.png") as part:
+        with write_atomically(completed.directory / "sweep.png") as part:
             figure.savefig(part, dpi=130, format="png")
     return True
 

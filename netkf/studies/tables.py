@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from netkf.runs.tables import number, table
+from netkf.runs.tables import number, shorten, standard_error, table
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.consistency import Consistency
 from netkf.studies.search import Sizing
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = ("worst_rms", "mean_rms", "mean_trace", "bound", "central")
-MOST_ROWS = 40
+MAX_ROWS = 40
 LONGEST = 30
 
 
@@ -31,10 +30,7 @@ def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
         ]
         for row in found.to_dict("records")
     ]
-    if len(rows) > MOST_ROWS:
-        middle = [f"({len(rows) - MOST_ROWS} more)", *[""] * (len(header) - 1)]
-        rows = [*rows[: MOST_ROWS // 2], middle, *rows[-MOST_ROWS // 2 :]]
-    return table(header, rows)
+    return table(header, shorten(rows, MAX_ROWS))
 
 
 def _short(value: Any) -> str:
@@ -43,8 +39,7 @@ def _short(value: Any) -> str:
 
 
 def _with_error(value: float | None, error: float | None) -> str:
-    known = error is not None and math.isfinite(error)
-    return number(value) + (f" +- {error:.1g}" if known else "")
+    return number(value) + standard_error(error)
 
 
 def sizing_text(found: Sizing) -> str:
@@ -96,14 +91,11 @@ def consistency_text(found: Consistency) -> str:
         ]
         for row in found.rows
     ]
-    if len(rows) > MOST_ROWS:
-        middle = [f"({len(rows) - MOST_ROWS} more)", *[""] * (len(header) - 1)]
-        rows = [*rows[: MOST_ROWS // 2], middle, *rows[-MOST_ROWS // 2 :]]
     ends = f"{found.low:.4g} .. {found.high:.4g}"
     scaled = f"{found.low / found.n:.4g} .. {found.high / found.n:.4g}"
     return "\n".join(
         [
-            table(header, rows),
+            table(header, shorten(rows, MAX_ROWS)),
             "",
             f"{found.runs:,} runs, n = {found.n}; +-: half width of the interval on the difference "
             f"from what NEES should be, all nodes together at confidence {found.confidence:g}",
@@ -130,9 +122,9 @@ def comparison_text(found: Comparison) -> str:
         ]
         for row in found.rows
     ]
-    if len(rows) > MOST_ROWS:
-        left_out = f"({len(rows) - MOST_ROWS} more; --json has all)"
-        rows = [*rows[: MOST_ROWS - 3], [left_out, *[""] * len(numbered)], *rows[-3:]]
+    if len(rows) > MAX_ROWS:
+        left_out = f"({len(rows) - MAX_ROWS} more; --json has all)"
+        rows = [*rows[: MAX_ROWS - 3], [left_out, *[""] * len(numbered)], *rows[-3:]]
     lines += ["", table(["", *numbered], rows, left=1)]
     notes = [
         f"note: {mark} {note}"

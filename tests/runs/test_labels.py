@@ -15,7 +15,7 @@ ONE_WAY = {"loss": {"kind": "per-link"}, "symmetric": False}
 def said(scenario, folder):
     """What `netkf theory` says about a scenario, and what the table of its run does."""
     done = run_to_directory(scenario, folder / "out")
-    table = summary_table(done.summary, done.promised.limit_words, done.promised.notes)
+    table = summary_table(done.summary, done.promised.limit_label, done.promised.notes)
     return promises_text(scenario, promises(scenario)), table
 
 
@@ -45,11 +45,11 @@ def test_a_limit_without_the_delay_says_so(build, tmp_path):
 def test_the_picture_uses_the_words_of_the_table(build, tmp_path):
     from matplotlib.figure import Figure
 
-    from netkf.runs.plots import _covariances
+    from netkf.runs.plots import _draw_covariances
 
     scenario = weighted(build, tmp_path)
     axes = Figure().add_subplot()
-    _covariances(axes, scenario, run_to_directory(scenario, tmp_path / "out"))
+    _draw_covariances(axes, scenario, run_to_directory(scenario, tmp_path / "out"))
     assert "weighted limit (not S of H(13))" in axes.get_legend_handles_labels()[1]
 
 

@@ -10,7 +10,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.engines.simpy.engine import SimpyEngine
-from netkf.runs.files import new_directory, written_beside
+from netkf.runs.files import new_directory, write_atomically
 from netkf.runs.run import run_to_directory
 from tests.conftest import SCENARIOS, scenario_files
 
@@ -307,7 +307,7 @@ def test_a_file_has_its_name_when_it_is_whole(tmp_path):
     file.write_text("before")
 
     def half():
-        with written_beside(file) as part:
+        with write_atomically(file) as part:
             part.write_text("half")
             raise KeyboardInterrupt
 
@@ -315,7 +315,7 @@ def test_a_file_has_its_name_when_it_is_whole(tmp_path):
         half()
     assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
     assert file.read_text() == "before"
-    with written_beside(file) as part:
+    with write_atomically(file) as part:
         part.write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
     assert file.read_text() == "whole"
