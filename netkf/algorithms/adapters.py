@@ -1,7 +1,7 @@
-"""Filters of the two former contracts, made into filters of the present one.
+"""Adapters from the deprecated contracts ``FlowFilter`` and ``SlotFilter`` to ``Filter``.
 
-Classes of users that derive from ``FlowFilter`` (continuous time) or ``SlotFilter`` (slots) go on
-working; they run in the one kind of time that they were written for.
+User classes that derive from ``FlowFilter`` (continuous time) or ``SlotFilter`` (slots) keep
+working, each in the kind of time that it was written for.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from netkf.linalg.arrays import FloatArray
 AnyFilter = Filter | FlowFilter | SlotFilter
 
 
-def adapted(algorithm: AnyFilter) -> Filter:
-    """The filter itself, or one of the present contract that calls it."""
+def adapt(algorithm: AnyFilter) -> Filter:
+    """Return ``algorithm``, wrapped if it keeps a deprecated contract."""
     if isinstance(algorithm, FlowFilter):
         return FlowAdapter(algorithm)
     if isinstance(algorithm, SlotFilter):
@@ -35,7 +35,7 @@ def adapted(algorithm: AnyFilter) -> Filter:
 
 
 class _Adapter(Filter):
-    """What both have in common. Attributes of the class are those of the filter it calls."""
+    """Forwards what both contracts share; class variables are copied from the wrapped filter."""
 
     def __init__(self, inner: Any) -> None:
         for name in ("talks", "pooled", "inverts"):
@@ -45,54 +45,54 @@ class _Adapter(Filter):
     inner: Any
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
-        """As the filter says it."""
+        """Return ``xhat`` (n,) and ``P`` (n, n) of the wrapped filter."""
         xhat, P = self.inner.estimate(state)
         return xhat, P
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """As the filter says it."""
+        """Return the wrapped filter's weight for a message."""
         return float(self.inner.weight(degree, peer_degree))
 
     def largest_degree(self) -> float:
-        """As the filter says it."""
+        """Return the largest degree that the wrapped filter allows."""
         return float(self.inner.largest_degree())
 
 
 class FlowAdapter(_Adapter):
-    """A flow filter: increments and messages over clocks; it knows no samples."""
+    """Runs a ``FlowFilter``: increments and messages under clocks, no samples."""
 
     schedule = None
     clocks = CLOCKS[:-1]  # all but after samples
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Its state at time 0."""
+        """Return the state at time 0."""
         return self.inner.init(model, mean, cov)
 
     def predict(self, state: Any, gap: float) -> Any:
-        """``flow``."""
+        """Call ``flow``."""
         return self.inner.flow(state, gap)
 
     def update(self, state: Any, reading: Any) -> Any:
-        """``measure``."""
+        """Call ``measure`` with the increments of the last gap; a sample is a TypeError."""
         if not isinstance(reading, Increments):
             raise TypeError("a FlowFilter takes increments only; derive from netkf.parts.Filter")
         return self.inner.measure(state, reading)
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """``emit``, which leaves the state as it is."""
+        """Call ``emit``, which does not change the state."""
         return state, self.inner.emit(state)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """``absorb`` of (weight, payload, age)."""
+        """Call ``absorb`` with (weight, payload, age) of each message."""
         return self.inner.absorb(state, [tuple(message[1:]) for message in messages])
 
     def max_measurement_interval(self, state: Any) -> float:
-        """``stretch``."""
+        """Call ``stretch``."""
         return float(self.inner.stretch(state))
 
 
 class SlotAdapter(_Adapter):
-    """A slot filter; its ``sense`` predicts as it likes."""
+    """Runs a ``SlotFilter``, whose ``sense`` includes the prediction."""
 
     clocks = ()
 
@@ -103,41 +103,41 @@ class SlotAdapter(_Adapter):
             object.__setattr__(self, name, getattr(inner, name))
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """``init`` and ``place``."""
+        """Call ``init`` and then ``place``."""
         role = Role(node.node, node.degree, node.nodes, node.information, node.own_weight)
         return self.inner.place(self.inner.init(model, mean, cov), role)
 
     def update(self, state: Any, reading: Reading) -> Any:
-        """``sense``."""
+        """Call ``sense``."""
         return self.inner.sense(state, reading)
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """``emit``, which leaves the state as it is."""
+        """Call ``emit``, which does not change the state."""
         return state, self.inner.emit(state, exchange.phase)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """``absorb`` of (weight, payload, age)."""
+        """Call ``absorb`` with (weight, payload, age) of each message."""
         return self.inner.absorb(state, exchange.phase, [tuple(m[1:]) for m in messages])
 
     def steps(self, phase: int) -> int:
-        """As the filter says it."""
+        """Return how often the wrapped filter repeats exchange number ``phase``."""
         return int(self.inner.steps(phase))
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """``redraws``."""
+        """Call ``redraws``."""
         return bool(self.inner.redraws(phase, step))
 
     def stopped(self, state: Any) -> bool:
-        """As the filter says it."""
+        """Return True once the wrapped filter has frozen its network estimate."""
         return bool(self.inner.stopped(state))
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """As the filter says it."""
+        """Return the wrapped filter's conserved quantities by name."""
         conserved: dict[str, float] = self.inner.conserved(state)
         return conserved
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """As the filter says it."""
+        """Return the wrapped filter's matrix of weights (N, N), or None."""
         weights: FloatArray | None = self.inner.pair_weights
         return weights

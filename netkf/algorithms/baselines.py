@@ -1,4 +1,4 @@
-"""The two ends of every comparison: no communication at all, and all of it at once."""
+"""The two baselines of every comparison: no communication, and all readings at one place."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Local(Filter):
     talks: ClassVar[bool] = False
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Nothing arrives; the state stays."""
+        """Return the state: nothing arrives."""
         return state
 
     shift = Filter.shift  # affine

@@ -26,7 +26,7 @@ class CovarianceIntersection(Hybrid):
     inverts: ClassVar[bool] = True
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """D (8) and (9) with values from before the reset."""
+        """Combine by D (8) and (9), with values from before the reset."""
         weights, means, roots = self._pairs(state, messages)
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)

@@ -27,7 +27,7 @@ CLOCKS = ("links", "directions", "nodes", "readings")
 
 
 class Model(Protocol):
-    """What one node believes about the plant and its own sensors (algorithms.models)."""
+    """The plant and its own sensors as one node assumes them (algorithms.models)."""
 
     @property
     def information(self) -> FloatArray:
@@ -36,26 +36,26 @@ class Model(Protocol):
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Estimate (n,) and root (n, n) of its covariance ``gap`` seconds later. With increment
-        sensors the root counts the readings of the gap already.
+        """Return estimate (n,) and root (n, n) of its covariance ``gap`` seconds later. With
+        increment sensors the root counts the readings of the gap already.
         """
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """The same for another node's estimate, which has no readings: ``age`` seconds later."""
+        """Return the same ``age`` seconds later for a received estimate, without readings."""
 
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
-        """The estimate (n,) once the increments of the gap that just passed are used."""
+        """Return the estimate (n,) after the increments of the gap that just passed."""
 
     def max_interval(self, root: FloatArray) -> float:
-        """Seconds of increments that may be used at once from this root on."""
+        """Return the seconds of increments that may be used at once from this root on."""
 
 
 class NodeInfo(NamedTuple):
-    """What a node may know about itself and the network before anything happens.
+    """Facts that a node may know about itself and the network at time 0.
 
     node: its id; degree: nodes that it can hear when no link fails; receivers: nodes that can hear
     it; nodes: how many there are in all; own_weight: what is left to it when the messages of all
@@ -73,9 +73,9 @@ class NodeInfo(NamedTuple):
 
 
 class Exchange(NamedTuple):
-    """When something is sent or absorbed: simulated ``time`` in seconds; under clocks the nodes
-    that may hear (``receivers``, of ``emit``); in slots the ``slot`` and which exchange of it
-    (``phase``) and which repetition of that (``step``), both from 0.
+    """The circumstances of ``emit`` or ``absorb``: simulated ``time`` in seconds; under clocks the
+    nodes that may hear (``receivers``, for ``emit``); in slots the ``slot``, the number of the
+    exchange in it (``phase``) and of its repetition (``step``), all counted from 0.
     """
 
     time: float = 0.0
@@ -86,8 +86,8 @@ class Exchange(NamedTuple):
 
 
 class Message(NamedTuple):
-    """What arrived: from whom, the weight it is given, what it carries, and how many seconds ago
-    it was sent.
+    """A message that arrived: its sender, the weight it is given, its payload, and its age in
+    seconds.
     """
 
     sender: int
@@ -108,8 +108,8 @@ class Reading(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """What increment sensors (p rows in all) saw over the last ``gap`` seconds: ``moments`` (2 p,)
-    ``int dy`` and then ``int (2 (s - a) / gap - 1) dy``, see core/legendre.
+    """Increments of sensors (p rows in all) over the last ``gap`` seconds: ``moments`` (2 p,) are
+    ``int dy`` and then ``int (2 (s - a) / gap - 1) dy``, see linalg/legendre.
     """
 
     moments: FloatArray
@@ -130,7 +130,7 @@ class State(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What a message carries: the sender's estimate and the root of its covariance."""
+    """The usual payload: the sender's estimate and the root of its covariance."""
 
     xhat: FloatArray
     root: FloatArray
@@ -142,7 +142,7 @@ class Estimate(NamedTuple):
 
 
 STEPS = ("init", "predict", "update", "emit", "absorb", "estimate")
-"""The methods that make up what a filter does."""
+"""The methods that define a filter."""
 
 FORMER = {
     "flow": "predict(state, gap)",
@@ -153,12 +153,12 @@ FORMER = {
     "programme": "schedule",
     "redraws": "redraws_links(phase, step)",
 }
-"""Methods of FlowFilter and SlotFilter, and what a Filter defines in their place."""
+"""Methods of the deprecated FlowFilter and SlotFilter, and their replacements in Filter."""
 
 
 @dataclass(frozen=True, eq=False)
 class Filter(Part):
-    """What a node does with its readings and with what it hears.
+    """The contract of node algorithms: how readings and messages change a node's state.
 
     The base class is a Kalman filter on the node's own readings; a filter that talks defines at
     least ``absorb``. Class variables say where it runs:
@@ -212,21 +212,21 @@ class Filter(Part):
                 raise TypeError(f"{cls.__name__}.{name} must take ({', '.join(wanted[1:])})")
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """The state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
+        """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
         from netkf.algorithms.models import first_root
 
         return State(mean, first_root(cov), model)
 
     def predict(self, state: Any, gap: float) -> Any:
-        """The state ``gap`` > 0 seconds later (in slots a period). Where the node has increment
-        sensors its covariance counts their readings already, its estimate does not yet.
+        """Return the state ``gap`` > 0 seconds later (in slots a period). If the node has increment
+        sensors, its covariance counts their readings already, its estimate does not yet.
         """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root)
 
     def update(self, state: Any, reading: Any) -> Any:
-        """The state once a reading is used: a sample at this instant (``Reading``; in slots every
-        node gets one a slot, of no rows where it has no sensor), or the increments of the interval
+        """Return the state after a reading: a sample at this instant (``Reading``; in slots every
+        node gets one a slot, without rows if it has no sensor), or the increments of the interval
         that just passed (``Increments``).
         """
         from netkf.algorithms.models import sample_update
@@ -241,24 +241,24 @@ class Filter(Part):
         return state._replace(xhat=xhat, root=root)
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """The state after sending, and what is sent to all ``exchange.receivers`` (in slots: in
-        this step); None: nothing is sent.
+        """Return the state after sending and the payload for all ``exchange.receivers`` (in slots:
+        of this step); a payload of None sends nothing.
         """
         return state, Estimate(state.xhat, state.root)
 
     @abstractmethod
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """The state after all messages of this instant, in the order of their senders, are used
-        together. In slots it is called for every node when the inbox of a step closes, with no
-        message too. Payloads are left as they are.
+        """Return the state after all messages of this instant, sorted by sender, are used together.
+        In slots it is called for every node when the inbox of a step closes, even without
+        messages. Payloads must not be changed.
         """
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
-        """``xhat`` (n,) and ``P`` (n, n) of the node now; None where the filter has no P."""
+        """Return ``xhat`` (n,) and ``P`` (n, n) of the node now; P is None if the filter has none."""
         return state.xhat, state.root @ state.root.T
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """The state with ``offset`` (n,) added to the estimate and to all that is like one.
+        """Return the state with ``offset`` (n,) added to the estimate and to everything like one.
 
         Filters that are affine in readings and payloads commute with such a shift of the truth,
         and their errors are then simulated to all digits on unstable plants (``commutes``). A class
@@ -267,15 +267,15 @@ class Filter(Part):
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """The same for what is under way; ``offset`` refers to the time it was sent."""
+        """Return a payload under way shifted alike; ``offset`` refers to the time of sending."""
         return payload._replace(xhat=payload.xhat + offset)
 
     def accepts(self, payload: Any, age: float) -> bool:
-        """Under clocks: whether a message that took ``age`` seconds is of use; else it is late."""
+        """Return False if a message of this ``age`` in seconds is too late to use (under clocks)."""
         return True
 
     def max_measurement_interval(self, state: Any) -> float:
-        """Seconds of increments that ``update`` may use at once from this state on.
+        """Return the seconds of increments that ``update`` may use at once from this state on.
 
         A large covariance shrinks fast, and the weights of readings change as fast: on the time
         scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
@@ -283,33 +283,33 @@ class Filter(Part):
         return float(state.model.max_interval(state.root))
 
     def steps(self, phase: int) -> int:
-        """How often exchange number ``phase`` of a slot is repeated; its time is shared evenly."""
+        """Return how often exchange number ``phase`` of a slot is repeated, in equal shares of it."""
         return 1
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """Whether the links draw new outcomes in a step, else each keeps its last one; True in the
-        first.
+        """Return True if links draw new outcomes in this step; else each keeps its last one. The
+        first step always draws.
         """
         return True
 
     def stopped(self, state: Any) -> bool:
-        """Whether the node has permanently frozen what it learned from the others."""
+        """Return True once the node has permanently frozen its network estimate."""
         return False
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """Quantities by name, as one number or as terms of a sum, whose sums over all nodes no
-        exchange should change; a run reports how far the sums have drifted.
+        """Return quantities by name, each a number or the terms of a sum, whose sums over all nodes
+        no exchange should change; a run reports how far they have drifted.
         """
         return {}
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
+        """Return the weight that a node of ``degree`` links gives to one of ``peer_degree``."""
         return 1.0 / (1.0 + max(degree, peer_degree))
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """(N, N) in the order of node ids: entry [l, i] is the weight node i gives to a message of
-        node l. None where ``weight`` says it.
+        """Matrix (N, N) in the order of node ids: entry [l, i] is the weight that node i gives to a
+        message of node l. None if ``weight`` gives the weights.
         """
         return None
 
@@ -321,12 +321,12 @@ class Filter(Part):
         return ()
 
     def largest_degree(self) -> float:
-        """The largest number of neighbours a node may have for the weights to make sense."""
+        """Return the largest number of neighbours for which the weights make sense."""
         return np.inf
 
 
 def _takes(method: Any, count: int) -> bool:
-    """Whether a method can be called with so many arguments, and names none as SlotFilter did."""
+    """Return True if a method takes ``count`` arguments and none by the name of SlotFilter's."""
     parameters = inspect.signature(method).parameters
     kinds = [parameter.kind for parameter in parameters.values()]
     several = inspect.Parameter.VAR_POSITIONAL in kinds
@@ -334,8 +334,10 @@ def _takes(method: Any, count: int) -> bool:
 
 
 def commutes(algorithm: Filter) -> bool:
-    """Whether the filter commutes with a shift of the truth, as far as its class says so: ``shift``
-    is defined by the class that defines the last of its STEPS, or by one derived from that.
+    """Return True if the class declares that the filter commutes with a shift of the truth.
+
+    It declares so if ``shift`` is defined by the class that defines the last of its STEPS, or by
+    one derived from that.
     """
     order = type(algorithm).__mro__
 

@@ -1,9 +1,10 @@
-"""Flow filters: the former contract of filters in continuous time, for classes of users.
+"""Flow filters: the deprecated contract for user filters in continuous time.
 
-New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a
-flow filter. It is a frozen dataclass of parameters, its state a NamedTuple of arrays that nothing
-changes in place; every method returns a new one. The host calls ``flow`` and then, where the node
-has sensors, ``measure`` for the interval that just passed, and ``emit``/``absorb`` for messages.
+New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` wraps a flow
+filter as one. A flow filter is a frozen dataclass of parameters. Its state is a NamedTuple of
+arrays that are never changed in place; every method returns a new one. The engine calls ``flow``
+and then, if the node has sensors, ``measure`` for the interval that just passed, and ``emit`` and
+``absorb`` for messages.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import in_place
 
 Reading = Increments
-"""What the sensors of a node saw over the last ``gap`` seconds."""
+"""Increments of a node's sensors over the last ``gap`` seconds."""
 
 
 class FlowState(NamedTuple):
@@ -36,7 +37,7 @@ class FlowState(NamedTuple):
 
 
 class Payload(NamedTuple):
-    """What a message carries: the sender's estimate and covariance when it was sent."""
+    """The content of a message: estimate and covariance of the sender at the time of sending."""
 
     xhat: FloatArray
     P: FloatArray
@@ -44,7 +45,7 @@ class Payload(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FlowFilter(Part):
-    """The contract of every filter in continuous time.
+    """The deprecated contract of filters in continuous time.
 
     The base class is the Kalman-Bucy filter of H (4a), (4b); filters differ mostly in ``absorb``.
     ``talks`` says whether its nodes exchange messages, ``pooled`` whether one filter reads the
@@ -56,23 +57,23 @@ class FlowFilter(Part):
     pooled: ClassVar[bool] = False
 
     def init(self, model: FlowModel, mean: FloatArray, cov: FloatArray) -> Any:
-        """The state at time 0."""
+        """Return the state at time 0."""
         return FlowState(mean, cov, model)
 
     def flow(self, state: Any, gap: float) -> Any:
-        """The state ``gap`` > 0 seconds later; its covariance counts the readings of the gap
+        """Return the state ``gap`` > 0 seconds later. Its covariance counts the readings of the gap
         already, its estimate does not yet.
         """
         P, xhat = riccati_step(state.model.riccati, state.P, state.xhat, gap)
         return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
-        """The state once the readings of the gap that just passed are used."""
+        """Return the state after the readings of the gap that just passed."""
         xhat = gain_update(state.model.gains, state.P, state.xhat, reading.moments, reading.gap)
         return state._replace(xhat=xhat)
 
     def stretch(self, state: Any) -> float:
-        """Seconds of readings that ``measure`` may use at once from this state on.
+        """Return the seconds of readings that ``measure`` may use at once from this state on.
 
         A large covariance shrinks fast, and the weights of readings change as fast: on the time
         scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
@@ -80,37 +81,40 @@ class FlowFilter(Part):
         return usable(float((state.P * state.model.information).sum()))
 
     def emit(self, state: Any) -> Any:
-        """What the node sends now."""
+        """Return the payload that the node sends now."""
         return Payload(state.xhat, state.P)
 
     @abstractmethod
     def absorb(self, state: Any, messages: Sequence[tuple[float, Any, float]]) -> Any:
-        """The state after all ``(weight, payload, age)`` that arrived at this instant, at most
-        one from each neighbour, are used together. Payloads are left as they are.
+        """Return the state after using all ``(weight, payload, age)`` that arrived at this instant
+        together, at most one from each neighbour. Payloads must not be changed.
         """
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:
-        """``xhat`` (n,) and ``P`` (n, n) of the node now."""
+        """Return ``xhat`` (n,) and ``P`` (n, n) of the node now."""
         return state.xhat, state.P
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
+        """Return the weight that a node of ``degree`` links gives to one of ``peer_degree``."""
         return 1.0 / (1.0 + max(degree, peer_degree))
 
     def largest_degree(self) -> float:
-        """The largest number of links a node may have for the weights to make sense."""
+        """Return the largest number of links for which the weights make sense."""
         return np.inf
 
 
 @in_place
 def stretch_end(now: float, time: float, stretch: float) -> float:
-    """Where a stretch of readings ends: by ``time``, and not where it begins."""
+    """Return the end of a measurement interval that begins at ``now``, at most ``time``.
+
+    An interval too short to change the clock would repeat for ever; it ends at ``time`` instead.
+    """
     end = now + stretch
     return end if now < end < time else time
 
 
 def predict(model: FlowModel, payload: Payload, age: float) -> Payload:
-    """A payload moved ``age`` seconds on by the model alone, without readings."""
+    """Return a payload predicted ``age`` seconds ahead by the model, without readings."""
     if age <= 0.0:
         return payload
     P, xhat = riccati_step(model.prediction, payload.P, payload.xhat, age)

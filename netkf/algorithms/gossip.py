@@ -30,7 +30,7 @@ class Gossip(Filter):
     pairwise: ClassVar[bool] = True
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """The partner's pair, predicted to now, in place of the own one."""
+        """Replace the node's pair by the partner's, predicted to now."""
         if not messages:
             return state
         _, _, pair, age = messages[-1]

@@ -32,7 +32,7 @@ class Hybrid(Filter):
     schedule: ClassVar[tuple[str, ...] | None] = None
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """H (7) and (9): all right-hand sides are values from before the reset."""
+        """Reset by H (7) and (9); all right-hand sides are values from before the reset."""
         weights, means, roots = self._pairs(state, messages)
         xhat, root = combine_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
@@ -40,7 +40,7 @@ class Hybrid(Filter):
     def _pairs(
         self, state: State, messages: Sequence[Message]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Weights (k,), estimates (k, n) and roots (k, n, n) of now, the own ones first."""
+        """Return weights (k,), estimates (k, n) and roots (k, n, n) of now, the node's own first."""
         own = max(0.0, 1.0 - sum(message.weight for message in messages))
         pairs = [(state.xhat, state.root)]
         pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]
@@ -48,11 +48,11 @@ class Hybrid(Filter):
         return np.array([own, *(message.weight for message in messages)]), means, roots
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """``epsilon`` on every link."""
+        """Return ``epsilon``, the weight of every link."""
         return self.epsilon
 
     def largest_degree(self) -> float:
-        """``1 / epsilon``: beyond it a node's own weight would be negative."""
+        """Return ``1 / epsilon``; with more neighbours the node's own weight would be negative."""
         return (1.0 + 1e-12) / self.epsilon
 
     shift = Filter.shift  # affine: the weights sum to one

@@ -1,4 +1,4 @@
-"""What one node believes about the plant and its own sensors, in both kinds of time."""
+"""Models: what a node assumes about the plant and its own sensors, in both kinds of time."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ STRETCH = 1.0
 
 
 class Backward(NamedTuple):
-    """How information moves over a gap: ``inverse`` (n, n) e^{-A gap}, ``fading`` the factor that
-    keeps it bounded (algorithms.running_sums).
+    """Transition of information over a gap: ``inverse`` (n, n) is e^{-A gap}, and ``fading`` is the
+    factor that keeps it bounded (algorithms.running_sums).
     """
 
     inverse: FloatArray
@@ -53,37 +53,37 @@ class FlowModel:
 
     @cached_property
     def riccati(self) -> RiccatiTable:
-        """The flow of P with this node's readings."""
+        """Table of the Riccati flow of P with this node's readings."""
         return riccati_table(self.A, self.Q, self.information, self.horizon)
 
     @cached_property
     def prediction(self) -> RiccatiTable:
-        """The flow of P without readings."""
+        """Table of the Riccati flow of P without readings."""
         return riccati_table(self.A, self.Q, np.zeros_like(self.A), self.horizon)
 
     @cached_property
     def gains(self) -> GainTable:
-        """How this node's readings are used."""
+        """Table of the gains with which this node's increments are used."""
         return gain_table(self.A, self.Q, self.H, self.R, self.interval)
 
     @cached_property
     def flow(self) -> FlowTable:
-        """How the root of P moves with this node's readings."""
+        """Table of the flow of the root of P with this node's readings."""
         return flow_table(self.A, self.Q, self.H, self.R, self.horizon)
 
     @cached_property
     def blind_flow(self) -> FlowTable:
-        """How the root of P moves without readings."""
+        """Table of the flow of the root of P without readings."""
         nothing = np.zeros((0, len(self.A)))
         return flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
 
     @cached_property
     def forgetting(self) -> float:
-        """The fastest rate at which the plant forgets its state, 1/s; 0 if it never does."""
+        """Fastest decay rate of the plant in 1/s, or 0 if no mode decays."""
         return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
 
     def backward(self, gap: float) -> Backward:
-        """How information that refers to a state moves to the state ``gap`` seconds later."""
+        """Return the transition of information about the state to ``gap`` seconds later."""
         if not self.A.any():
             return Backward(np.eye(len(self.A)), 1.0)
         inverse = np.asarray(scipy.linalg.expm(-gap * self.A))
@@ -92,14 +92,14 @@ class FlowModel:
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """``gap`` seconds later; the root counts the readings of the gap."""
+        """Return estimate and root ``gap`` seconds later; the root counts the readings of the gap."""
         root, xhat = flow_root(self.flow, root, xhat, gap)
         return xhat, root
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """``age`` seconds later without readings."""
+        """Return estimate and root ``age`` seconds later, without readings."""
         if age <= 0.0:
             return xhat, root
         root, xhat = flow_root(self.blind_flow, root, xhat, age)
@@ -108,11 +108,11 @@ class FlowModel:
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
-        """The estimate once the increments of the gap are used, see algorithms/kernels/gains."""
+        """Return the estimate after the increments of the gap, see algorithms/kernels/gains."""
         return gain_update_root(self.gains, root, xhat, moments, gap)
 
     def max_interval(self, root: FloatArray) -> float:
-        """See ``Filter.max_measurement_interval``."""
+        """Return the longest measurement interval, see ``Filter.max_measurement_interval``."""
         seen = self.flow.seen[0] @ root
         return usable(float((seen * seen).sum()))
 
@@ -144,7 +144,7 @@ class SlotModel:
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """One slot for each period of the gap."""
+        """Return estimate and root after one slot for each period of the gap."""
         for _ in range(round(gap / self.period)):
             xhat, root = self.F @ xhat, predict_root(root, self.F, self.root_Q)
         return xhat, root
@@ -152,37 +152,37 @@ class SlotModel:
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """The same: a message is used in the slot in which it was sent."""
+        """Return them unchanged: a message is used in the slot in which it was sent."""
         return xhat, root
 
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
-        """There are no increments in slots."""
+        """Raise TypeError: there are no increments in slots."""
         raise TypeError("increments belong to continuous time")
 
     def max_interval(self, root: FloatArray) -> float:
-        """Unbounded: there are no increments in slots."""
+        """Return infinity: there are no increments in slots."""
         return math.inf
 
 
 @in_place
 def usable(rate: float) -> float:
-    """Seconds of readings that may be used at once from a P on with ``rate = trace(P G)``, see
+    """Return the seconds of readings that may be used at once for ``rate = trace(P G)``, see
     ``Filter.max_measurement_interval``.
     """
     return STRETCH / rate if rate > 0.0 else math.inf
 
 
 def first_root(cov: FloatArray) -> FloatArray:
-    """The lower triangular root (n, n) of a first covariance."""
+    """Return the lower triangular root (n, n) of an initial covariance."""
     return lower_root(square_root(cov))
 
 
 def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Estimate (n,) and root (n, n) after a sample ``y = H x + v``, cov(v) = R, p > 0 rows."""
+    """Return estimate (n,) and root (n, n) after a sample ``y = H x + v``, cov(v) = R, p > 0 rows."""
     noise = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
     root, xhat, _ = update_with_sample(root, xhat, y, H, noise)
     return xhat, root

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.adapters import AnyFilter, adapted
+from netkf.algorithms.adapters import AnyFilter, adapt
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.kernels.gains import longest_interval
@@ -257,7 +257,7 @@ class Scenario(Part):
     @cached_property
     def hosted(self) -> Filter:
         """The filter of every node, as engines call it."""
-        return adapted(self.filter.algorithm)
+        return adapt(self.filter.algorithm)
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
