@@ -254,7 +254,7 @@ class Filter(Part):
         """
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
-        """Return ``xhat`` (n,) and ``P`` (n, n) of the node now; P is None if the filter has none."""
+        """Return ``xhat`` (n,) and ``P`` (n, n) now; P is None if the filter has none."""
         return state.xhat, state.root @ state.root.T
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
@@ -271,7 +271,7 @@ class Filter(Part):
         return payload._replace(xhat=payload.xhat + offset)
 
     def accepts(self, payload: Any, age: float) -> bool:
-        """Return False if a message of this ``age`` in seconds is too late to use (under clocks)."""
+        """Return False if a message of this ``age`` (seconds, under clocks) is too late to use."""
         return True
 
     def max_measurement_interval(self, state: Any) -> float:
@@ -283,7 +283,7 @@ class Filter(Part):
         return float(state.model.max_interval(state.root))
 
     def steps(self, phase: int) -> int:
-        """Return how often exchange number ``phase`` of a slot is repeated, in equal shares of it."""
+        """Return how often exchange number ``phase`` of a slot is repeated, in equal times."""
         return 1
 
     def redraws_links(self, phase: int, step: int) -> bool:

@@ -40,7 +40,7 @@ class Hybrid(Filter):
     def _pairs(
         self, state: State, messages: Sequence[Message]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return weights (k,), estimates (k, n) and roots (k, n, n) of now, the node's own first."""
+        """Return weights (k,), estimates (k, n) and roots (k, n, n) now, the node's own first."""
         own = max(0.0, 1.0 - sum(message.weight for message in messages))
         pairs = [(state.xhat, state.root)]
         pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]

@@ -92,7 +92,7 @@ class FlowModel:
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and root ``gap`` seconds later; the root counts the readings of the gap."""
+        """Return estimate and root ``gap`` seconds later; the root counts the gap's readings."""
         root, xhat = flow_root(self.flow, root, xhat, gap)
         return xhat, root
 
@@ -182,7 +182,7 @@ def first_root(cov: FloatArray) -> FloatArray:
 def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return estimate (n,) and root (n, n) after a sample ``y = H x + v``, cov(v) = R, p > 0 rows."""
+    """Return estimate (n,) and root (n, n) after a sample ``y = H x + v`` of p > 0 rows."""
     noise = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
     root, xhat, _ = update_with_sample(root, xhat, y, H, noise)
     return xhat, root

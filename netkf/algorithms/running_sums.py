@@ -32,12 +32,12 @@ from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.models import Backward, first_root, sample_update
 from netkf.linalg.arrays import FloatArray
 
-SHOWN = 1e-4
-"""How exactly a total must grow by what is offered, in parts of it; or else nothing is offered."""
+MIN_ACCURACY = 1e-4
+"""Relative accuracy with which a total must grow by what is offered, else nothing is offered."""
 
 
 class Offer(NamedTuple):
-    """What a broadcast carries: which one it is of its sender, and the running ``total``."""
+    """The payload of a broadcast: its number at its sender, and the running ``total``."""
 
     number: int
     total: FloatArray
@@ -67,7 +67,7 @@ class RunningSums(NamedTuple):
 
 
 def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> RunningSums:
-    """Weight 1, and nothing sent."""
+    """Return the state at time 0: weight 1, nothing sent."""
     n = len(mean)
     return RunningSums(
         xhat=mean,
@@ -83,15 +83,15 @@ def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Runn
 
 
 def predict(state: RunningSums, gap: float) -> RunningSums:
-    """The state ``gap`` seconds later."""
+    """Return the state ``gap`` seconds later."""
     xhat, root = state.model.predict(state.xhat, state.root, gap)
     back = state.model.backward(gap)
-    heard = {sender: aged(offer, back) for sender, offer in state.heard.items()}
+    heard = {sender: predict_offer(offer, back) for sender, offer in state.heard.items()}
     return state._replace(xhat=xhat, root=root, sent=_moved(state.sent, back), heard=heard)
 
 
-def aged(offer: Offer, back: Backward) -> Offer:
-    """An offer in terms of a later state."""
+def predict_offer(offer: Offer, back: Backward) -> Offer:
+    """Return an offer that refers to a later state."""
     return offer._replace(total=_moved(offer.total, back))
 
 
@@ -105,7 +105,7 @@ def _moved(total: FloatArray, back: Backward) -> FloatArray:
 
 
 def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
-    """One round. Estimate and covariance stay: all masses shrink by one factor."""
+    """Offer one round. Estimate and covariance stay: all masses shrink by one factor."""
     if state.receivers == 0:
         return state, None
     n = len(state.xhat)
@@ -116,7 +116,7 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
     # The node gives up exactly what its total grew by, for each receiver. A node that hears nobody
     # has less and less; what its total cannot show for rounding, it keeps, and says what it said.
     grown, share = float(sent[0] - state.sent[0]), float(mass[0]) / (state.receivers + 1)
-    if abs(grown - share) > SHOWN * share:
+    if abs(grown - share) > MIN_ACCURACY * share:
         return state._replace(rounds=state.rounds + 1), Offer(state.rounds, state.sent)
     weight = state.weight - state.receivers * grown
     return state._replace(weight=weight, sent=sent, rounds=state.rounds + 1), Offer(
@@ -130,7 +130,7 @@ def hear(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
     for message in messages:
         news: Offer = message.payload
         if message.age > 0.0:
-            news = aged(news, state.model.backward(message.age))
+            news = predict_offer(news, state.model.backward(message.age))
         last = heard.get(message.sender)
         if last is not None and news.number <= last.number:
             continue

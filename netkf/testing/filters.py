@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.adapters import FlowAdapter, SlotAdapter, adapted
+from netkf.algorithms.adapters import FlowAdapter, SlotAdapter, adapt
 from netkf.algorithms.filter import CLOCKS, Filter, commutes
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.slot import SlotFilter
@@ -56,7 +56,7 @@ def check_filter(filter: Any, /, **settings: Any) -> None:
     from netkf.testing.trials import trials
 
     part = made(filter, (Filter, FlowFilter, SlotFilter), settings)
-    hosted = adapted(part)
+    hosted = adapt(part)
     watched = Watched(hosted, part, former_names(hosted))
     watched.pickled()
     _class_variables(watched)
