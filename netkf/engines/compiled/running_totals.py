@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.root_flow import transform
-from netkf.algorithms.running_sums import SHOWN
+from netkf.algorithms.running_sums import MIN_ACCURACY
 from netkf.engines.compiled.late_readings import use_instant
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray
@@ -147,7 +147,7 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
     # The node gives up exactly what its total grows by, for each receiver, or nothing.
     before, share = sent[h, 0], weight / (receivers + 1)
     grown = (before + share) - before
-    if abs(grown - share) > SHOWN * share:
+    if abs(grown - share) > MIN_ACCURACY * share:
         return True
     fill_inverse_root(inverse, state.root, h)
     for i in range(n):
