@@ -27,7 +27,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, limit_covariance, steady_covariance_bound
 from netkf.theory.hybrid.coupled import coupling, not_promised
 from netkf.theory.hybrid.second_moments import second_moment_rate
-from netkf.theory.numerics.matrices import undetectable
+from netkf.theory.numerics.matrices import undetectable_mode
 from netkf.trace.run import Run
 
 SLOTS_ONLY = False
@@ -70,7 +70,7 @@ def _variance(scenario: Scenario) -> Row:
     blind = [
         node
         for node, model in zip(scenario.nodes, scenario.models, strict=True)
-        if undetectable(model.A, model.H.T @ np.linalg.solve(model.R, model.H)) is not None
+        if undetectable_mode(model.A, model.H.T @ np.linalg.solve(model.R, model.H)) is not None
     ]
     if not blind:
         return Row(name, source, True, "every node detects the state by itself, so P is bounded")

@@ -2,7 +2,7 @@
 
 from netkf.theory.assumptions import assumptions
 from netkf.theory.common.errors import error_covariance
-from netkf.theory.common.requirements import demanding
+from netkf.theory.common.requirements import require_scenario
 from netkf.theory.diffusion.information import information_level
 from netkf.theory.gossip.matchings import detecting_walk, mean_matching
 from netkf.theory.hybrid.bounds import covariance_bound
@@ -61,7 +61,7 @@ __all__ = [
     "true_limit_covariance",
 ]
 
-globals().update(demanding({name: globals()[name] for name in __all__}))
+globals().update(require_scenario({name: globals()[name] for name in __all__}))
 
 
 def __dir__() -> list[str]:

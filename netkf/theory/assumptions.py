@@ -11,12 +11,12 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import Row, knowledge, of_the_truth
+from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
 from netkf.theory.common.papers import paper_function
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.hybrid.coupled import balanced
 from netkf.theory.hybrid.samples import at_random, by_readings, clock_of
-from netkf.theory.numerics.matrices import unobservable
+from netkf.theory.numerics.matrices import unobservable_mode
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,25 +34,25 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def _slot_rows(scenario: Scenario) -> list[Row]:
+def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     paper_rows = paper_function(scenario, "assumptions", "slot_rows")
     if paper_rows is None:
         return [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
-    rows: list[Row] = paper_rows(scenario)
+    rows: list[AssumptionRow] = paper_rows(scenario)
     return rows
 
 
-def _clock_rows(scenario: Scenario) -> list[Row]:
+def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     rows = _plant(scenario)
     if scenario.filter.algorithm.talks:
         rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
     return [*rows, *start_rows(scenario, "H (9), (10)")]
 
 
-def _graph(scenario: Scenario) -> list[Row]:
+def _graph(scenario: Scenario) -> list[AssumptionRow]:
     topology = scenario.topology
     parts = len(topology.components)
-    rows: list[Row] = [
+    rows: list[AssumptionRow] = [
         (
             "the graph is undirected and connected",
             "H II-B a",
@@ -66,18 +66,18 @@ def _graph(scenario: Scenario) -> list[Row]:
     return [*rows, *weights(scenario)] if weights is not None else rows
 
 
-def _plant(scenario: Scenario) -> list[Row]:
+def _plant(scenario: Scenario) -> list[AssumptionRow]:
     plant = scenario.truth
-    lost = unobservable(plant.A.T, plant.Q)
+    lost = unobservable_mode(plant.A.T, plant.Q)
     information = np.zeros((plant.n, plant.n))
     fixed = not any(sensor.varying for sensor in scenario.sensors)
     for node in scenario.sensing if fixed else ():
         information += _own_information(scenario, node)
-    hidden = unobservable(plant.A, information)
+    hidden = unobservable_mode(plant.A, information)
     alone = [
         node
         for node in scenario.nodes
-        if fixed and unobservable(plant.A, _own_information(scenario, node)) is None
+        if fixed and unobservable_mode(plant.A, _own_information(scenario, node)) is None
     ]
     seen = (
         f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
@@ -89,20 +89,20 @@ def _plant(scenario: Scenario) -> list[Row]:
         if lost is None
         else f"the mode with eigenvalue {lost:.6g} is not driven"
     )
-    observable = of_the_truth(scenario, hidden is None, seen)
+    observable = judge_plant(scenario, hidden is None, seen)
     return [
-        ("(A, B) is controllable", "H II-A", *of_the_truth(scenario, lost is None, driven)),
+        ("(A, B) is controllable", "H II-A", *judge_plant(scenario, lost is None, driven)),
         (
             "(A, H) is observable, all sensors together",
             "H II-A",
             *(observable if fixed else (None, "H differs from reading to reading")),
         ),
-        knowledge(scenario, "H (4)", "same A, B and R"),
+        true_model_row(scenario, "H (4)", "same A, B and R"),
         *_sampling(scenario),
     ]
 
 
-def _sampling(scenario: Scenario) -> list[Row]:
+def _sampling(scenario: Scenario) -> list[AssumptionRow]:
     """Of sensors that sample: whether their times are Poisson processes, or known beforehand."""
     if not sampled_sensors(scenario):
         return []
@@ -125,7 +125,7 @@ def _own_information(scenario: Scenario, node: int) -> np.ndarray:
     return information
 
 
-def _clocks(scenario: Scenario) -> list[Row]:
+def _clocks(scenario: Scenario) -> list[AssumptionRow]:
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if by_readings(scenario):
@@ -163,7 +163,7 @@ def _clocks(scenario: Scenario) -> list[Row]:
     ]
 
 
-def _channel(scenario: Scenario) -> list[Row]:
+def _channel(scenario: Scenario) -> list[AssumptionRow]:
     channel = scenario.network.channel
     fixed, symmetric = channel.delay.fixed, balanced(scenario)
     return [

@@ -72,7 +72,7 @@ def test_closed_forms_of_large_graphs():
 
 def test_an_interval_where_it_is_not_exact(monkeypatch):
     exact = theory.disconnection_probability(T1, 0.7)
-    monkeypatch.setattr(disconnection, "MOST_PARTITIONS", 3)
+    monkeypatch.setattr(disconnection, "MAX_PARTITIONS", 3)
     found = theory.disconnection_probability(T1, 0.7, samples=40_000)
     assert not found.exact
     assert found.low < exact < found.high

@@ -1,1 +1,1 @@
-"""Exact covariances along the events of a run, and requirements that functions share."""
+"""Exact error covariances along the events of a run, and helpers that the papers share."""

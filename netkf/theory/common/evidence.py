@@ -1,4 +1,7 @@
-"""What a record does not show: the law that it came from. Rows of assumptions then say None."""
+"""Rows of the table of assumptions, and verdicts where data come from records.
+
+A record is one outcome and does not show the law that it came from: the verdict is then None.
+"""
 
 from __future__ import annotations
 
@@ -6,29 +9,35 @@ from netkf.network.channels import Channel
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.scenario import Scenario
 
-Row = tuple[str, str, bool | None, str]
+AssumptionRow = tuple[str, str, bool | None, str]
 """assumption, source, holds (None: not known), evidence."""
 
-UNKNOWN_LAW = "the state or readings are recorded, and nobody knows their law"
-RECORDED = "losses or delays are recorded: one outcome, not a law"
-SAME = "the filters know the plant and the sensors"
+UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
+RECORDED_CHANNEL = "losses or delays are recorded: one outcome, not a law"
+TRUE_MODEL = "the filters know the plant and the sensors"
 
 
-def recorded_channel(channel: Channel) -> bool:
-    """Whether losses or delays are read from a table."""
+def is_recorded(channel: Channel) -> bool:
+    """Return True if losses or delays are read from a table."""
     return isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
 
 
-def knowledge(scenario: Scenario, source: str, matrices: str) -> Row:
-    """Whether the filters have the true model, which only those who draw everything know."""
+def true_model_row(scenario: Scenario, source: str, matrices: str) -> AssumptionRow:
+    """Return the row that says if the filters' model is the true one; ``matrices`` names it.
+
+    The verdict is None for recorded states or readings, which have no known model.
+    """
     if not scenario.drawn:
-        return SAME, source, None, UNKNOWN_LAW
+        return TRUE_MODEL, source, None, UNKNOWN_LAW
     same = scenario.filters_know_the_truth
-    return SAME, source, same, matrices if same else "filter.model differs from the truth"
+    return TRUE_MODEL, source, same, matrices if same else "filter.model differs from the truth"
 
 
-def of_the_truth(scenario: Scenario, holds: bool, words: str) -> tuple[bool | None, str]:
-    """A verdict about the plant's own matrices, which are assumed where the state is recorded."""
+def judge_plant(scenario: Scenario, holds: bool, evidence: str) -> tuple[bool | None, str]:
+    """Return verdict and evidence about the plant's own matrices.
+
+    Where the state is recorded these matrices are an assumption, and the verdict is None.
+    """
     if scenario.plant.drawn:
-        return holds, words
-    return None, f"assumed, not known: {words}"
+        return holds, evidence
+    return None, f"assumed, not known: {evidence}"

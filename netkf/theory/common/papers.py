@@ -1,4 +1,4 @@
-"""Where the theory of a filter's paper is: ``netkf.theory.<paper>``, as the filter's file says."""
+"""Lookup of modules of ``netkf.theory.<paper>`` by the paper that the filter's class names."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from netkf.scenario.scenario import Scenario
 
 
 def paper_module(scenario: Scenario, name: str) -> ModuleType:
-    """The module ``name`` of the paper that speaks about the scenario's filter, which has one."""
+    """Import module ``name`` of the paper of the scenario's filter, which must name one."""
     return importlib.import_module(f"netkf.theory.{scenario.hosted.paper}.{name}")
 
 
 def paper_function(scenario: Scenario, module: str, name: str) -> Any:
-    """A function of that module; None where the paper, the module or the function is missing."""
+    """Return a function of a paper's module, or None if paper, module or function is missing."""
     paper = scenario.hosted.paper
     if not paper or importlib.util.find_spec(f"netkf.theory.{paper}.{module}") is None:
         return None

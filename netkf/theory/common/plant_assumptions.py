@@ -1,40 +1,41 @@
-"""Assumptions that several papers share: about the plant in slots, and about how filters start."""
+"""Assumptions that several papers share: the plant in slots, and the filters' first covariances."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import Row, knowledge, of_the_truth
-from netkf.theory.intermittent.riccati import unseen
+from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
+from netkf.theory.intermittent.riccati import undetectable_slot_mode
 
 
-def slot_plant_rows(scenario: Scenario) -> list[Row]:
-    """Rows about F and Q, G S.1 and R Theorem 9."""
+def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return rows about F and Q: stabilisable, Q definite, true model (G S.1, R Theorem 9)."""
     plant = scenario.slot_plant
     least = float(np.linalg.eigvalsh(plant.Q)[0])
-    idle = unseen(plant.F.T, plant.Q)
-    words = "every mode that does not decay is driven by the noise"
+    # (F, Q^1/2) is stabilisable if and only if (F', Q^1/2) is detectable.
+    idle = undetectable_slot_mode(plant.F.T, plant.Q)
+    evidence = "every mode that does not decay is driven by the noise"
     if idle is not None:
-        words = f"the mode with eigenvalue {idle:.6g} is not driven"
+        evidence = f"the mode with eigenvalue {idle:.6g} is not driven"
     positive = f"least eigenvalue {least:.3g}; sufficient for the uniqueness of the limit law"
     return [
         (
             "(F, Q^1/2) is stabilisable",
             "G S.1, R Theorem 9",
-            *of_the_truth(scenario, idle is None, words),
+            *judge_plant(scenario, idle is None, evidence),
         ),
         (
             "Q is positive definite",
             "G II-A, R Theorem 9",
-            *of_the_truth(scenario, least > 0.0, positive),
+            *judge_plant(scenario, least > 0.0, positive),
         ),
-        knowledge(scenario, "G (10), R (15)", "same F, Q and R"),
+        true_model_row(scenario, "G (10), R (15)", "same F, Q and R"),
     ]
 
 
-def start_rows(scenario: Scenario, source: str) -> list[Row]:
-    """A row: the first covariances of the filters are at least those of their errors."""
+def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
+    """Return one row: each P_i(0) is at least the second moment of the node's first error."""
     plant, worst = scenario.plant, np.inf
     for node in scenario.nodes:
         mean, cov = scenario.start(node)
@@ -45,7 +46,7 @@ def start_rows(scenario: Scenario, source: str) -> list[Row]:
         (
             "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
             source,
-            *of_the_truth(
+            *judge_plant(
                 scenario, worst >= -1e-12, f"least eigenvalue of the difference {worst:.3g}"
             ),
         )

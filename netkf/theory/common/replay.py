@@ -1,5 +1,7 @@
-"""The events of a run replayed on stacked errors: one driver for clocks and one for slots, over the
-same moves (theory/stacked_errors.py) and the same rules of filters (theory/rules.py).
+"""Replay of a run's events on stacked errors.
+
+One driver for clocks and one for slots, over the same operations on errors
+(theory/common/stacked_errors.py) and the same rules of filters (theory/common/error_rules.py).
 """
 
 from __future__ import annotations
@@ -12,34 +14,38 @@ from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observed import Observed, hosts_of, in_slots, sampled
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import (
+    HostObservations,
+    nodes_by_host,
+    slot_observations,
+    timed_observations,
+)
 from netkf.theory.common.papers import paper_module
-from netkf.theory.common.rules import Rule, Sent
-from netkf.theory.common.stacked_errors import Clock, Errors
-from netkf.theory.numerics.gaps import Gap
+from netkf.theory.common.stacked_errors import ErrorPropagator, StackedErrors
+from netkf.theory.numerics.prediction import Prediction
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 
-def replay(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
-    """(T, M n, M n): covariance of the errors of M hosts at ``run.times``, M = 1 where all nodes
-    share one filter; and (T, M, n, n), their P.
+def replay_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
+    """Return the joint error covariance (T, M n, M n) of M hosts at ``run.times``, and their P.
+
+    P is (T, M, n, n); M = 1 if all nodes share one pooled filter. Raises TheoryError for a filter
+    whose equations are not known here.
     """
-    errors_known(scenario)
-    errors = Errors(scenario, len(hosts_of(scenario)))
-    if scenario.slotted:
-        moments = _slots(scenario, run, errors)
-    else:
-        moments = _instants(scenario, run, errors)
-    pairs = [(errors.covariance(), errors.covariances()) for _ in moments]
+    require_known_filter(scenario)
+    errors = StackedErrors(scenario, len(nodes_by_host(scenario)))
+    replay = _replay_slots if scenario.slotted else _replay_instants
+    pairs = [(errors.covariance(), errors.covariances()) for _ in replay(scenario, run, errors)]
     if not pairs:
         n = errors.n
         return np.empty((0, errors.hosts * n, errors.hosts * n)), np.empty((0, errors.hosts, n, n))
-    return np.array([whole for whole, _ in pairs]), np.array([P for _, P in pairs])
+    return np.array([joint for joint, _ in pairs]), np.array([P for _, P in pairs])
 
 
-def errors_known(scenario: Scenario) -> None:
-    """Raise TheoryError where the equations of the filter are not known here."""
+def require_known_filter(scenario: Scenario) -> None:
+    """Raise TheoryError if the equations of the scenario's filter are not known here."""
     algorithm = scenario.filter.algorithm
     name = type(algorithm).__name__
     if not scenario.hosted.combination:
@@ -51,11 +57,12 @@ def errors_known(scenario: Scenario) -> None:
         )
 
 
-def delivered(scenario: Scenario, run: Run) -> list[Sent]:
-    """All messages of a run that arrived to be used, in the order of their arrival."""
+def delivered_messages(scenario: Scenario, run: Run) -> list[SentMessage]:
+    """Return all messages of a run that arrived and were used, in the order of their arrival."""
     index, log = scenario.topology.index, run.log
     sends = log[log["kind"] == CODES["send"]]
-    times = dict(
+    # A message is known by its sender, receiver and number; `deliver` rows name the receiver first.
+    sent_at = dict(
         zip(
             zip(*(sends[c].tolist() for c in ("node", "peer", "message")), strict=True),
             sends["t"].tolist(),
@@ -67,90 +74,97 @@ def delivered(scenario: Scenario, run: Run) -> list[Sent]:
     for t, node, peer, message in zip(
         *(rows[c].tolist() for c in ("t", "node", "peer", "message")), strict=True
     ):
-        sent = times.get((peer, node, message), t)
-        found.append(Sent(index[peer], index[node], message, sent, t))
+        sent = sent_at.get((peer, node, message), t)
+        found.append(SentMessage(index[peer], index[node], message, sent, t))
     return found
 
 
-def _instants(scenario: Scenario, run: Run, errors: Errors) -> Iterator[None]:
-    """Stops where the run was sampled."""
-    messages = delivered(scenario, run)
-    rule, clock = _rule(scenario, errors, run, messages), Clock(scenario, errors)
-    samples = sampled(scenario, run)
-    leaving, coming = _by_time(messages, 3), _by_time(messages, 4)
-    happens = iter(sorted({*samples, *leaving, *coming, *rule.times}))
-    following = next(happens, np.inf)
+def _replay_instants(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
+    """Replay a run in continuous time; yield at each of ``run.times``."""
+    messages = delivered_messages(scenario, run)
+    rule = _rule(scenario, errors, run, messages)
+    propagator = ErrorPropagator(scenario, errors)
+    samples = timed_observations(scenario, run)
+    leaving = _group_by_time(messages, SentMessage._fields.index("time"))
+    arriving = _group_by_time(messages, SentMessage._fields.index("arrives"))
+    instants = iter(sorted({*samples, *leaving, *arriving, *rule.times}))
+    following = next(instants, np.inf)
     for time in run.times.tolist():
         while following <= time:
-            rule.passed(*clock.advance(following))
+            rule.elapse(*propagator.advance(following))
+            # At one instant nodes sample before they send, and send before they receive.
             rule.sense(following, samples.get(following, {}))
             rule.send(leaving.get(following, ()))
-            if following in coming:
-                rule.arrive(following, coming[following])
-            following = next(happens, np.inf)
-        rule.passed(*clock.advance(time))
+            if following in arriving:
+                rule.arrive(following, arriving[following])
+            following = next(instants, np.inf)
+        rule.elapse(*propagator.advance(time))
         yield
 
 
-def _exchanged(scenario: Scenario, run: Run) -> dict[tuple[int, int], list[Sent]]:
-    """By slot and exchange, the messages that were in time."""
+def _exchanged_messages(scenario: Scenario, run: Run) -> dict[tuple[int, int], list[SentMessage]]:
+    """Return the messages that arrived in time, by slot and number of the exchange."""
     rows, index = run.log[run.log["kind"] == CODES["deliver"]], scenario.topology.index
     slots = scenario.slot_plant.slots_of(rows["t"])
-    found: dict[tuple[int, int], list[Sent]] = {}
+    found: dict[tuple[int, int], list[SentMessage]] = {}
     columns = (slots, *(rows[c] for c in ("phase", "node", "peer", "message")))
     for slot, phase, node, peer, message in zip(*(c.tolist() for c in columns), strict=True):
-        sent = Sent(index[peer], index[node], message, slot, slot)
+        sent = SentMessage(index[peer], index[node], message, slot, slot)
         found.setdefault((slot, max(phase, 0)), []).append(sent)
     return found
 
 
-def _by_time(messages: list[Sent], column: int) -> dict[float, list[Sent]]:
-    found: dict[float, list[Sent]] = {}
+def _group_by_time(messages: list[SentMessage], column: int) -> dict[float, list[SentMessage]]:
+    found: dict[float, list[SentMessage]] = {}
     for message in messages:
         found.setdefault(message[column], []).append(message)
     return found
 
 
-def _rule(scenario: Scenario, errors: Errors, run: Run, messages: list[Sent]) -> Rule:
+def _rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: list[SentMessage]
+) -> ErrorRule:
     if not scenario.hosted.paper:
-        return Rule(scenario, errors)
-    made: Rule = paper_module(scenario, "errors").rule(scenario, errors, run, messages)
+        return ErrorRule(scenario, errors)
+    made: ErrorRule = paper_module(scenario, "errors").rule(scenario, errors, run, messages)
     return made
 
 
-def _slots(scenario: Scenario, run: Run, errors: Errors) -> Iterator[None]:
-    """Stops where the run was sampled: before a slot, or after it for filters whose samples are
-    filtered.
+def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
+    """Replay a run in slots; yield at each of ``run.times``.
+
+    A sample shows the state before its slot for filters that predict, else the state after it.
     """
     phases, plant = scenario.hosted.schedule or (), scenario.slot_plant
     F, Q = scenario.slot_belief
     noise = square_root(plant.Q)
-    gap = Gap(plant.F, F, plant.F - F, noise, noise, square_root(Q))
+    prediction = Prediction(plant.F, F, plant.F - F, noise, noise, square_root(Q))
     rule = _rule(scenario, errors, run, [])
-    readings, arrivals = in_slots(scenario, run), _exchanged(scenario, run)
-    slot = 0
+    observe, arrivals = slot_observations(scenario, run), _exchanged_messages(scenario, run)
+    done = 0
     for until in np.round(run.times / plant.period).astype(int).tolist():
-        while slot < until:
-            at = slot if scenario.hosted.predicts else slot + 1
-            _slot(rule, gap, phases, at, readings(at), arrivals)
-            slot += 1
+        while done < until:
+            slot = done if scenario.hosted.predicts else done + 1
+            _replay_slot(rule, prediction, phases, slot, observe(slot), arrivals)
+            done += 1
         yield
 
 
-def _slot(
-    rule: Rule,
-    gap: Gap,
+def _replay_slot(
+    rule: ErrorRule,
+    prediction: Prediction,
     phases: tuple[str, ...],
     slot: int,
-    seen: Observed,
-    arrivals: dict[tuple[int, int], list[Sent]],
+    observations: HostObservations,
+    arrivals: dict[tuple[int, int], list[SentMessage]],
 ) -> None:
+    """Apply the phases of one slot in the filter's order."""
     exchange = 0
     for phase in phases:
         if phase == "predict":
-            rule.errors.predict(gap)
+            rule.errors.predict(prediction)
         elif phase == "sense":
-            rule.sense(slot, seen)
+            rule.sense(slot, observations)
         else:
             rule.exchange(slot, exchange, arrivals.get((slot, exchange), []))
             exchange += 1

@@ -1,4 +1,4 @@
-"""What every function about a scenario demands, said once where users call it."""
+"""The check that functions of ``netkf.theory`` are called with a scenario."""
 
 from __future__ import annotations
 
@@ -11,24 +11,28 @@ from netkf.core.errors import ScenarioError
 from netkf.scenario.scenario import Scenario
 
 
-def demanding(functions: dict[str, Any]) -> dict[str, Any]:
-    """Those of the functions that begin with a scenario, so that they refuse anything else."""
+def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
+    """Wrap each function whose first parameter is a Scenario, so that it refuses anything else.
+
+    Returns the wrapped functions by name. They raise ScenarioError, which says how to load one.
+    """
     found = {}
     for name, function in functions.items():
         if inspect.isfunction(function):
             first = next(iter(inspect.signature(function).parameters.values()), None)
             if first is not None and first.annotation == "Scenario":
-                found[name] = _demanding(name, function)
+                found[name] = _check_first_argument(name, function)
     return found
 
 
-def _demanding(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
-    def demands(scenario: Any, *args: Any, **kwargs: Any) -> Any:
+    def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:
         if not isinstance(scenario, Scenario):
             remedy = f"load it first: netkf.theory.{name}(netkf.load(path))"
             raise ScenarioError("", f"theory.{name} takes a netkf.Scenario", scenario, remedy)
         return function(scenario, *args, **kwargs)
 
-    demands.__module__, demands.__qualname__ = "netkf.theory", name  # so that it can be pickled
-    return demands
+    # Pickle finds a function by these two names: the wrapper replaces the original under them.
+    checked.__module__, checked.__qualname__ = "netkf.theory", name
+    return checked

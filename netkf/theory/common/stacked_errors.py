@@ -1,8 +1,9 @@
-"""Errors of all estimates of a run in one stack, the roots of their P, and how time moves them.
+"""Errors of all estimates of a run in one stack, roots of their P, and their propagation in time.
 
-An estimate is a node's, a copy of it under way, or what a node's will be once a reading has come;
-names are any hashable values, a node's is its place. The state itself is kept where the errors
-follow it, since the filters' A (or F) differs from the plant's.
+An estimate is a node's, a copy of it in a message under way, or a version of a node's estimate that
+will include a reading still under way. Names are any hashable values, a node's is its index. The
+state itself is stacked too if the errors depend on it, because the filters' A (or F) differs from
+the plant's.
 """
 
 from __future__ import annotations
@@ -15,211 +16,243 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.gaps import Drift, Flow, Gap, lower_root, state_over
-from netkf.theory.numerics.moves import Seen, kalman
-from netkf.theory.numerics.stack import Stack
+from netkf.theory.common.observations import increment_observations
+from netkf.theory.numerics.prediction import (
+    ErrorFlow,
+    Prediction,
+    Predictor,
+    propagate_state,
+    triangular_root,
+)
+from netkf.theory.numerics.stack import GaussianStack
+from netkf.theory.numerics.updates import Observation, update_covariance_root
 
 STATE = "state"
-Part = tuple[Hashable, FloatArray]
+Term = tuple[Hashable, FloatArray]
+"""An estimate and the matrix (n, n) by which its error is multiplied."""
 
 
-class Errors:
-    """``roots`` has P of each estimate; ``owner`` the node whose increments it uses, None for an
-    estimate under way, which is only predicted.
+class StackedErrors:
+    """Errors of the estimates of M hosts and of copies of them.
+
+    roots   : a square root (n, n) of P for each estimate
+    owner   : the host whose increments an estimate uses; None for a message, which is only
+              predicted
+    follows : whether the errors depend on the state
     """
 
     def __init__(self, scenario: Scenario, hosts: int) -> None:
         self.n, self.hosts = scenario.plant.n, hosts
-        self.stack = Stack(self.n)
+        self.stack = GaussianStack(self.n)
         self.roots: dict[Hashable, FloatArray] = {}
         self.owner: dict[Hashable, int | None] = {}
         first = square_root(np.asarray(scenario.plant.start_cov))
+        # All estimates start at known means, so that their first errors have the same inputs.
         columns = self.stack.inputs(first.shape[1])
-        self._state(scenario, first, columns)
+        self.follows = _errors_follow_state(scenario)
+        if self.follows:
+            self.stack.put(STATE, np.zeros((self.n, 0)))
+            self.stack.add(STATE, columns, first)
         for host, node in enumerate(scenario.nodes[:hosts]):
             self.stack.put(host, np.zeros((self.n, 0)))
             self.stack.add(host, columns, first)
             self.roots[host] = square_root(np.asarray(scenario.start(node)[1]))
             self.owner[host] = host
 
-    def _state(self, scenario: Scenario, first: FloatArray, columns: slice) -> None:
-        if scenario.slotted:
-            differs = not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F)
-        else:
-            differs = not np.array_equal(scenario.belief[0], scenario.truth.A)
-        self.follows = differs
-        if differs:
-            self.stack.put(STATE, np.zeros((self.n, 0)))
-            self.stack.add(STATE, columns, first)
-
     def covariance(self) -> FloatArray:
-        """(M n, M n) of the errors of the M hosts."""
+        """Return the joint covariance (M n, M n) of the errors of the hosts."""
         return self.stack.covariance(range(self.hosts))
 
     def covariances(self) -> FloatArray:
-        """(M, n, n): P of the hosts."""
+        """Return P (M, n, n) of the hosts."""
         S = np.stack([self.roots[host] for host in range(self.hosts)])
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
     def copy(self, name: Hashable, new: Hashable, owner: int | None) -> None:
-        """A further estimate that starts as another one is."""
+        """Copy estimate ``name`` to ``new``, which from now on has the given owner."""
         self.stack.put(new, self.stack.form(name))
         self.roots[new], self.owner[new] = self.roots[name], owner
 
     def drop(self, names: Sequence[Hashable]) -> None:
-        """Forget estimates."""
+        """Remove estimates."""
         self.stack.drop(names)
         for name in names:
             del self.roots[name], self.owner[name]
 
     def replace(self, name: Hashable, other: Hashable) -> None:
-        """``name`` becomes ``other``, which keeps its owner."""
+        """Move estimate ``name`` to ``other``, which keeps its owner."""
         self.stack.rename(name, other)
         self.roots[other] = self.roots.pop(name)
         del self.owner[name]
 
-    def readings(self, seen: Mapping[int, Seen]) -> dict[int, slice]:
-        """The inputs that are the noises of readings, by node; to be used before any other move."""
-        ends = np.cumsum([0, *(len(one.H) for one in seen.values())]).tolist()
+    def reading_noises(self, observations: Mapping[int, Observation]) -> dict[int, slice]:
+        """Return new inputs for the noises of readings, by host.
+
+        Use the columns before any other operation that adds inputs.
+        """
+        ends = np.cumsum([0, *(len(one.H) for one in observations.values())]).tolist()
         columns = self.stack.inputs(ends[-1])
         begin = columns.start
         return {
-            node: slice(begin + a, begin + b)
-            for node, a, b in zip(seen, ends, ends[1:], strict=False)
+            host: slice(begin + a, begin + b)
+            for host, a, b in zip(observations, ends, ends[1:], strict=False)
         }
 
-    def update(self, name: Hashable, seen: Seen, columns: slice) -> None:
-        """Use a reading whose noise is ``seen.root`` times the inputs in ``columns``."""
-        if not len(seen.H):
+    def update(self, name: Hashable, observation: Observation, columns: slice) -> None:
+        """Update an estimate; the noise is ``observation.root`` times the inputs in ``columns``."""
+        if not len(observation.H):
             return
-        left, K, root = kalman(self.roots[name], seen)
-        self.move(name, left, root)
-        self.stack.add(name, columns, -K @ seen.root)
+        closed, K, root = update_covariance_root(self.roots[name], observation)
+        self.multiply(name, closed, root)
+        self.stack.add(name, columns, -K @ observation.root)  # e+ = (I - K H) e - K v
 
-    def move(self, name: Hashable, matrix: FloatArray, root: FloatArray) -> None:
-        """Multiply an error by a matrix."""
+    def multiply(self, name: Hashable, matrix: FloatArray, root: FloatArray) -> None:
+        """Multiply an error by a matrix (n, n) and set the root of its P."""
         self.stack.put(name, matrix @ self.stack.form(name))
         self.roots[name] = root
 
-    def combine(self, changes: Mapping[Hashable, tuple[FloatArray, Sequence[Part]]]) -> None:
-        """Give estimates new roots and errors ``sum W e`` of values from before, all at once."""
+    def combine(self, changes: Mapping[Hashable, tuple[FloatArray, Sequence[Term]]]) -> None:
+        """Set roots and errors ``sum W e`` of several estimates from their values before."""
         forms = {
-            name: np.asarray(sum(W @ self.stack.form(source) for source, W in parts))
-            for name, (_, parts) in changes.items()
+            name: np.asarray(sum(W @ self.stack.form(source) for source, W in terms))
+            for name, (_, terms) in changes.items()
         }
         self.stack.put_all(forms)
         self.roots.update({name: root for name, (root, _) in changes.items()})
 
-    def predict(self, gap: Gap) -> slice:
-        """Move everything over a gap without increments; returns the inputs of the plant."""
-        columns = self.stack.inputs(gap.error_noise.shape[1])
+    def predict(self, step: Prediction) -> slice:
+        """Predict all estimates, and the state; return the columns of the plant's inputs."""
+        columns = self.stack.inputs(step.error_noise.shape[1])
         names = list(self.roots)
-        moved = gap.error @ self.stack.forms(names)
+        moved = step.error @ self.stack.forms(names)
         if self.follows:
             x = self.stack.form(STATE)
-            moved += gap.follow @ x
-            self.stack.put(STATE, gap.state @ x)
-            self.stack.add(STATE, columns, gap.state_noise)
-        moved[:, :, columns] += gap.error_noise
+            moved += step.follow @ x
+            self.stack.put(STATE, step.state @ x)
+            self.stack.add(STATE, columns, step.state_noise)
+        moved[:, :, columns] += step.error_noise
         self.stack.put_all(dict(zip(names, moved, strict=True)))
+        # Copies share the array of their root, which is then predicted once.
         known: dict[int, FloatArray] = {}
-        for name in names:  # copies share their roots, which are then moved once
+        for name in names:
             S = self.roots[name]
             if id(S) not in known:
-                known[id(S)] = _predicted(S, gap)
+                known[id(S)] = _predict_root(S, step)
         self.roots = {name: known[id(S)] for name, S in self.roots.items()}
         return columns
 
 
-def _predicted(S: FloatArray, gap: Gap) -> FloatArray:
-    whole = np.concatenate([gap.error @ S, gap.root], axis=1)
-    return lower_root(whole)
+def _errors_follow_state(scenario: Scenario) -> bool:
+    """Return True if the filters' A (or F) differs from the plant's."""
+    if scenario.slotted:
+        return not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F)
+    return not np.array_equal(scenario.belief[0], scenario.truth.A)
 
 
-class Increments(NamedTuple):
-    """The flows of a run with increment sensors: of each host, and of what is under way."""
+def _predict_root(S: FloatArray, step: Prediction) -> FloatArray:
+    return triangular_root(np.concatenate([step.error @ S, step.root], axis=1))
 
-    hosts: list[Flow]
-    blind: Flow
+
+class IncrementFlows(NamedTuple):
+    """Flows of errors in a run with increment sensors.
+
+    hosts    : of each host
+    messages : of estimates under way, which use no readings
+    plant    : the true A (n, n) and B (n, m)
+    """
+
+    hosts: list[ErrorFlow]
+    messages: ErrorFlow
     plant: tuple[FloatArray, FloatArray]
 
 
-class Clock:
-    """Moves errors through continuous time."""
+class ErrorPropagator:
+    """Propagates stacked errors through continuous time, from 0 on."""
 
-    def __init__(self, scenario: Scenario, errors: Errors) -> None:
+    def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         self._errors, self._now = errors, 0.0
-        self._flows = _increments(scenario, errors.hosts)
+        self._flows = _increment_flows(scenario, errors.hosts)
         A, B = scenario.truth.A, scenario.truth.B
         A_f, Q_f = scenario.belief
+        # The filters' B is only known by B B' = Q; the plant's own is as good if it has that Q.
         B_f = B if np.array_equal(B @ B.T, Q_f) else square_root(Q_f)
-        self.drift = Drift(A, B, A_f, B_f)
+        self._predictor = Predictor(A, B, A_f, B_f)
 
     def advance(self, time: float) -> tuple[float, slice | None, FloatArray | None]:
-        """To a time; the gap, and where there are no increments the plant's inputs over it and
-        what they add to the state.
+        """Advance to ``time`` (seconds); return the arguments of ``ErrorRule.elapse``.
+
+        They are the gap and, if no sensor senses increments, the columns of the plant's inputs over
+        it and the matrix (n, k) by which these enter the state.
         """
         gap = time - self._now
         if gap <= 0.0:
             return 0.0, None, None
         self._now = time
         if self._flows is None:
-            move = self.drift(gap)
-            return gap, self._errors.predict(move), move.state_noise
-        unit = min(flow.unit for flow in (*self._flows.hosts, self._flows.blind))
+            step = self._predictor(gap)
+            return gap, self._errors.predict(step), step.state_noise
+        # The series and the quadrature of a flow hold over one unit only.
+        unit = min(flow.unit for flow in (*self._flows.hosts, self._flows.messages))
         steps = math.ceil(gap / unit)
         for _ in range(steps):
             self._step(gap / steps)
         return gap, None, None
 
+    def _estimates_by_flow(self) -> list[tuple[ErrorFlow, list[Hashable]]]:
+        """Return the estimates that share a flow, so that they are propagated together."""
+        flows = self._flows
+        assert flows is not None
+        groups: dict[int, tuple[ErrorFlow, list[Hashable]]] = {}
+        for name, owner in self._errors.owner.items():
+            flow = flows.messages if owner is None else flows.hosts[owner]
+            groups.setdefault(id(flow), (flow, []))[1].append(name)
+        return list(groups.values())
+
     def _step(self, gap: float) -> None:
+        """Propagate all estimates, and the state, over ``gap`` seconds, at most one unit."""
         flows, errors = self._flows, self._errors
         assert flows is not None
-        groups: dict[int, tuple[Flow, list[Hashable]]] = {}
-        for name, owner in errors.owner.items():
-            flow = flows.blind if owner is None else flows.hosts[owner]
-            groups.setdefault(id(flow), (flow, []))[1].append(name)
+        # The plant's noise at the 8 nodes of the quadrature enters all errors; the noises of the
+        # increments take n inputs for each estimate.
         n, common = errors.n, 8 * flows.plant[1].shape[1]
         columns = errors.stack.inputs(common + n * len(errors.roots))
         shared = slice(columns.start, columns.start + common)
         x = errors.stack.form(STATE) if errors.follows else None
         place = shared.stop
-        for flow, names in groups.values():
-            moved = flow.move(np.stack([errors.roots[name] for name in names]), gap)
+        for flow, names in self._estimates_by_flow():
+            moved = flow.transition(np.stack([errors.roots[name] for name in names]), gap)
             forms = moved.transition @ errors.stack.forms(names)
             if x is not None:
                 forms += moved.follow @ x
             forms[:, :, shared] += moved.response
             for k, name in enumerate(names):
-                # a version of a node's estimate has the increments of the node
                 forms[k, :, place : place + moved.own.shape[2]] += moved.own[k]
                 place += n
                 errors.roots[name] = moved.root[k]
             errors.stack.put_all(dict(zip(names, forms, strict=True)))
         if x is not None:
-            F, response = state_over(flows.plant, gap)
+            F, response = propagate_state(flows.plant, gap)
             errors.stack.put(STATE, F @ x)
             errors.stack.add(STATE, shared, response)
 
 
-def _increments(scenario: Scenario, hosts: int) -> Increments | None:
-    """None where all readings are samples."""
-    from netkf.theory.common.observed import increments
-
-    seen = increments(scenario)
-    if not any(len(one.H) for one in seen):
+def _increment_flows(scenario: Scenario, hosts: int) -> IncrementFlows | None:
+    """Return the flows of a scenario, or None if no sensor senses increments."""
+    observations = increment_observations(scenario)
+    if not any(len(one.H) for one in observations):
         return None
     A, Q = scenario.belief
     plant = (scenario.truth.A, scenario.truth.B)
     B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
-    made: dict[bytes, Flow] = {}
+    made: dict[bytes, ErrorFlow] = {}
 
-    def flow(one: Seen) -> Flow:
+    def flow(one: Observation) -> ErrorFlow:
+        # Hosts with equal sensors share a flow, and are then propagated together.
         key = b"|".join(part.tobytes() for part in one)
         if key not in made:
-            made[key] = Flow(A, B, one.H, one.R, one.root, plant)
+            made[key] = ErrorFlow(A, B, one.H, one.R, one.root, plant)
         return made[key]
 
     empty = np.zeros((0, 0))
-    blind = flow(Seen(np.zeros((0, scenario.plant.n)), empty, empty))
-    return Increments([flow(one) for one in seen[:hosts]], blind, plant)
+    unobserved = flow(Observation(np.zeros((0, scenario.plant.n)), empty, empty))
+    return IncrementFlows([flow(one) for one in observations[:hosts]], unobserved, plant)

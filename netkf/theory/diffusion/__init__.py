@@ -1,1 +1,1 @@
-"""Theory of the diffusion filter (D)."""
+"""Theory of the diffusion filter (D): assumptions, the information condition, exact errors."""

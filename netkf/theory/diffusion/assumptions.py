@@ -7,14 +7,14 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import RECORDED, UNKNOWN_LAW, Row, recorded_channel
+from netkf.theory.common.evidence import RECORDED_CHANNEL, UNKNOWN_LAW, AssumptionRow, is_recorded
 from netkf.theory.common.plant_assumptions import start_rows
 from netkf.theory.diffusion.information import information_level
 
-MOST_NODES = 500
+MAX_NODES = 500
 
 
-def slot_rows(scenario: Scenario) -> list[Row]:
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """(assumption, source, holds, evidence) of each assumption."""
     return [
         *_weights(scenario),
@@ -34,7 +34,7 @@ def weight_matrix(scenario: Scenario) -> FloatArray:
     return matrix
 
 
-def _weights(scenario: Scenario) -> list[Row]:
+def _weights(scenario: Scenario) -> list[AssumptionRow]:
     W = weight_matrix(scenario)
     unbalanced = float(np.abs(W.sum(axis=1) - 1.0).max())
     diameter = _diameter(W > 0.0)
@@ -74,7 +74,7 @@ def _diameter(arcs: np.ndarray) -> int | None:
     return size if reached.all() else None
 
 
-def _plant(scenario: Scenario) -> list[Row]:
+def _plant(scenario: Scenario) -> list[AssumptionRow]:
     plant = scenario.slot_plant
     F, Q = scenario.slot_belief
     least = float(np.linalg.eigvalsh(Q)[0])
@@ -106,10 +106,10 @@ def _plant(scenario: Scenario) -> list[Row]:
     ]
 
 
-def _information(scenario: Scenario) -> Row:
+def _information(scenario: Scenario) -> AssumptionRow:
     name = "the sensors together excite every direction (sufficient)"
-    if len(scenario.sensing) > MOST_NODES:
-        return (name, "D Assumption 3.2", None, f"not looked at beyond {MOST_NODES} sensors")
+    if len(scenario.sensing) > MAX_NODES:
+        return (name, "D Assumption 3.2", None, f"not looked at beyond {MAX_NODES} sensors")
     try:
         table = information_level(scenario)
     except TheoryError as error:
@@ -126,7 +126,7 @@ def _information(scenario: Scenario) -> Row:
     return (name, "D Assumption 3.2", bool(whole["level"] > 0.0), words)
 
 
-def _arrivals(scenario: Scenario) -> Row:
+def _arrivals(scenario: Scenario) -> AssumptionRow:
     channel = scenario.network.channel
     rates = [
         channel.loss.mean_delivery(link, scenario.measured(link))
@@ -134,8 +134,8 @@ def _arrivals(scenario: Scenario) -> Row:
     ]
     fixed = channel.delay.fixed
     in_time = fixed is not None and fixed < scenario.phase_length
-    if recorded_channel(channel):
-        return ("every message arrives", "D (8)", None, RECORDED)
+    if is_recorded(channel):
+        return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
     whole = in_time and all(rate == 1.0 for rate in rates)
     policy = getattr(scenario.filter.algorithm, "on_loss", "")
     words = f"a message may be lost or late; weights then change ({policy}): P stays consistent"

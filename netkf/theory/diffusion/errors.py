@@ -1,4 +1,4 @@
-"""The errors of the diffusion filter along the messages of a run."""
+"""Exact errors of the diffusion filter along the messages of a run."""
 
 from __future__ import annotations
 
@@ -7,25 +7,27 @@ from collections.abc import Sequence
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.rules import Estimates, Rule, Sent
-from netkf.theory.common.stacked_errors import Errors
-from netkf.theory.numerics.moves import intersected
+from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.theory.numerics.updates import intersect_covariances
 from netkf.trace.run import Run
 
 
-class Diffuses(Estimates):
-    """D (8), (9) with the weights of what arrived."""
+class DiffusionRule(EstimateExchangeRule):
+    """Covariance intersection D (8), (9) with the weights of the messages that arrived."""
 
-    def combined(
+    def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, list[FloatArray]]:
-        """The shares sum to 1."""
+        """Share the weight of lost messages as the filter does, so that weights sum to 1."""
         algorithm = self.scenario.filter.algorithm
         assert isinstance(algorithm, DiffusionFilter)
         own, heard = algorithm.share(self.scenario.own_weights[node], weights)
-        return intersected([own, *heard], roots)
+        return intersect_covariances([own, *heard], roots)
 
 
-def rule(scenario: Scenario, errors: Errors, run: Run, messages: Sequence[Sent]) -> Rule:
-    """The moves of this filter along the messages of a run."""
-    return Diffuses(scenario, errors)
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    return DiffusionRule(scenario, errors)

@@ -28,8 +28,8 @@ _STEP = 0.25
 _U = np.exp(np.arange(-40.0, 4.0, _STEP))
 _WEIGHTS = _STEP * _U * np.exp(-_U)
 NOTHING = 1e-12  # an eigenvalue that small, relative to the trace, is 0
-MOST_SEARCHED = 30  # numbers in a past that the search for the worst one can handle
-MOST_TRIES = 300
+MAX_SEARCHED = 30  # numbers in a past that the search for the worst one can handle
+MAX_TRIES = 300
 QUANTILE = 2.576
 ACCURACY = 1e-9
 """Relative error of the integral, with room to spare."""
@@ -154,9 +154,9 @@ def _least(
 
         x = np.concatenate([np.zeros(0), *(start[k] for k in moving)])
         found.append(level(x))
-        if 0 < len(x) <= MOST_SEARCHED and found[-1] > 0.0:
+        if 0 < len(x) <= MAX_SEARCHED and found[-1] > 0.0:
             search = scipy.optimize.minimize(
-                level, x, method="Nelder-Mead", bounds=bounds, options={"maxfev": MOST_TRIES}
+                level, x, method="Nelder-Mead", bounds=bounds, options={"maxfev": MAX_TRIES}
             )
             found.append(float(search.fun))
     return min(found)

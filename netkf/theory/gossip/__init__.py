@@ -1,1 +1,1 @@
-"""Theory of the gossip filter (G)."""
+"""Theory of the gossip filter (G): assumptions, mean matchings, detecting walks, exact errors."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import Row
+from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.gossip.matchings import (
     detecting_walk,
@@ -17,7 +17,7 @@ from netkf.theory.gossip.matchings import (
 MAX_SHOWN = 12
 
 
-def slot_rows(scenario: Scenario) -> list[Row]:
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """(assumption, source, holds, evidence) of each assumption."""
     return [
         *_matching(scenario),
@@ -28,7 +28,7 @@ def slot_rows(scenario: Scenario) -> list[Row]:
     ]
 
 
-def _matching(scenario: Scenario) -> list[Row]:
+def _matching(scenario: Scenario) -> list[AssumptionRow]:
     name = "the mean matching is irreducible and aperiodic"
     try:
         mean = _mean(scenario)
@@ -55,7 +55,7 @@ def _mean(scenario: Scenario) -> FloatArray:
         return mean_matching(scenario)
 
 
-def _walk(scenario: Scenario) -> list[Row]:
+def _walk(scenario: Scenario) -> list[AssumptionRow]:
     name = "some walk on the network detects the state (weak detectability)"
     try:
         walk = detecting_walk(scenario)
@@ -75,7 +75,7 @@ def _walk(scenario: Scenario) -> list[Row]:
     return [(name, "G D.1", True, f"the Gramian of the walk ({shown}) is invertible")]
 
 
-def _swaps(scenario: Scenario) -> list[Row]:
+def _swaps(scenario: Scenario) -> list[AssumptionRow]:
     channel = scenario.network.channel
     certain = type(channel.loss).__name__ == "NoLoss"
     holds = certain or channel.symmetric

@@ -1,4 +1,4 @@
-"""The errors of the gossip filter along the messages of a run."""
+"""Exact errors of the gossip filter along the messages of a run."""
 
 from __future__ import annotations
 
@@ -8,22 +8,24 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.rules import Estimates, Rule, Sent
-from netkf.theory.common.stacked_errors import Errors
+from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
+from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.trace.run import Run
 
 
-class Swaps(Estimates):
-    """G (10): what came last takes the place of the own pair."""
+class SwapRule(EstimateExchangeRule):
+    """The swap G (10): the last pair (xhat, P) to arrive replaces the node's own."""
 
-    def combined(
+    def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, list[FloatArray]]:
-        """One matrix is the identity."""
+        """Multiply the last error by the identity and all others by zero."""
         n, others = self.errors.n, len(roots) - 1
         return roots[-1], [np.zeros((n, n))] * others + [np.eye(n)]
 
 
-def rule(scenario: Scenario, errors: Errors, run: Run, messages: Sequence[Sent]) -> Rule:
-    """The moves of this filter along the messages of a run."""
-    return Swaps(scenario, errors)
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    return SwapRule(scenario, errors)

@@ -13,7 +13,7 @@ from netkf.network.matchings import Matching, RecordedSlots
 from netkf.scenario.scenario import Scenario
 
 LONGEST_WALK = 40
-MOST_PLACES = 20_000
+MAX_PLACES = 20_000
 
 
 def mean_matching(scenario: Scenario) -> FloatArray:
@@ -110,7 +110,7 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
         if len(space) == n:
             return walk
         key = (place, len(walk), np.round(space.T @ space, 8).tobytes())
-        if key in seen or len(seen) > MOST_PLACES or len(walk) > LONGEST_WALK:
+        if key in seen or len(seen) > MAX_PLACES or len(walk) > LONGEST_WALK:
             continue
         seen.add(key)
         for following in neighbours[place]:

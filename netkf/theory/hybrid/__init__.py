@@ -1,1 +1,1 @@
-"""Theory of the hybrid filter (H): the bound (12), its steady state and limits."""
+"""Theory of the hybrid filter (H): the bound H(12) over time, its steady state and its limits."""

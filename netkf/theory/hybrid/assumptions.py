@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from netkf.algorithms.hybrid import Hybrid
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import Row
+from netkf.theory.common.evidence import AssumptionRow
 
 
-def weight_rows(scenario: Scenario) -> list[Row]:
+def weight_rows(scenario: Scenario) -> list[AssumptionRow]:
     """(assumption, source, holds, evidence): Pi = I - epsilon L is doubly stochastic, H (5)."""
     algorithm = scenario.filter.algorithm
     assert isinstance(algorithm, Hybrid)

@@ -17,14 +17,14 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import Coupled, coupled
 from netkf.theory.hybrid.packed import Packed
 from netkf.theory.hybrid.taylor import StiffError, followed
-from netkf.theory.numerics.moves import Seen
+from netkf.theory.numerics.updates import Observation
 
 TOLERANCE = 1e-10
 DEFECT = 1e-7
 CHECKED_STEPS = 200
 EXPLICIT_EVALUATIONS = 20_000
 OVERFLOW = 1e150
-MOST_ROUNDS, SETTLED = 40, 1e-8
+MAX_ROUNDS, SETTLED = 40, 1e-8
 PARTS = (1, 40, 400)  # of a stretch that a step is at most one of, try after try
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
 
@@ -153,7 +153,7 @@ class _Pieces:
         jumped = self._first
         self._append(end, lambda _: first)
         last = np.inf
-        for _ in range(MOST_ROUNDS):
+        for _ in range(MAX_ROUNDS):
             before = np.array([self(t).reshape(-1) for t in places])
             self._first = jumped
             self._outputs[-1] = self._integrate(begin, end, f)
@@ -276,7 +276,7 @@ class _Jumps:
         return np.asarray(kept[:, None] * Y + weights @ sent)
 
 
-def _sampled(P: FloatArray, seen: Seen) -> FloatArray:
+def _sampled(P: FloatArray, seen: Observation) -> FloatArray:
     """``g(P)``, as ``(I - K H) P (I - K H)' + K R K'``."""
     K = np.linalg.solve(seen.H @ P @ seen.H.T + seen.R, seen.H @ P).T
     closed = np.eye(len(P)) - K @ seen.H

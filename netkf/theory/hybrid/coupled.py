@@ -23,10 +23,10 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observed import increments
+from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid.samples import (
     Jump,
-    Samples,
+    PoissonSamples,
     at_random,
     by_readings,
     clock_of,
@@ -48,7 +48,7 @@ class Coupled(NamedTuple):
     q: FloatArray
     delay: float
     start: FloatArray
-    samples: tuple[Samples, ...] = ()
+    samples: tuple[PoissonSamples, ...] = ()
     jumps: tuple[Jump, ...] = ()
 
     @property
@@ -121,7 +121,7 @@ def informations(scenario: Scenario) -> FloatArray:
     """(N, n, n): ``G_i`` of the increments as the filters believe it; a pooled filter's is the same
     at all nodes.
     """
-    seen = [one.H.T @ np.linalg.solve(one.R, one.H) for one in increments(scenario)]
+    seen = [one.H.T @ np.linalg.solve(one.R, one.H) for one in increment_observations(scenario)]
     if scenario.filter.algorithm.pooled:
         seen = seen * len(scenario.nodes)
     return np.stack(seen)

@@ -1,4 +1,4 @@
-"""The errors of the hybrid filter and of covariance intersection along the messages of a run."""
+"""Exact errors of the hybrid filter and of covariance intersection along the messages of a run."""
 
 from __future__ import annotations
 
@@ -6,25 +6,27 @@ from collections.abc import Sequence
 
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.rules import Estimates, Rule, Sent
-from netkf.theory.common.stacked_errors import Errors
-from netkf.theory.numerics.moves import convex, intersected
+from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.theory.numerics.updates import average_covariances, intersect_covariances
 from netkf.trace.run import Run
 
 
-class Resets(Estimates):
-    """H (7), (9), and D (8), (9) for covariance intersection."""
+class ResetRule(EstimateExchangeRule):
+    """The reset H (7), (9), or D (8), (9) for covariance intersection."""
 
-    def combined(
+    def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, list[FloatArray]]:
-        """The weight that is left is the node's own."""
+        """Give the node's own estimate the weight that the messages leave."""
         all_weights = [1.0 - sum(weights), *weights]
         if self.scenario.hosted.combination == "intersection":
-            return intersected(all_weights, roots)
-        return convex(all_weights, roots)
+            return intersect_covariances(all_weights, roots)
+        return average_covariances(all_weights, roots)
 
 
-def rule(scenario: Scenario, errors: Errors, run: Run, messages: Sequence[Sent]) -> Rule:
-    """The moves of this filter along the messages of a run."""
-    return Resets(scenario, errors)
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    return ResetRule(scenario, errors)

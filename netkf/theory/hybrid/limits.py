@@ -12,7 +12,7 @@ from netkf.scenario.registry import name_of, spoken
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import Coupled, informations, left_weights, promised
-from netkf.theory.hybrid.samples import Samples, by_readings, jumps, poisson_samples
+from netkf.theory.hybrid.samples import PoissonSamples, by_readings, jumps, poisson_samples
 from netkf.theory.hybrid.steady import steady_state
 from netkf.theory.intermittent.riccati import filtered_covariance
 from netkf.theory.numerics.matrices import algebraic_riccati, lyapunov
@@ -56,7 +56,7 @@ def _one(scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: Flo
     for group in poisson_samples(scenario):
         silent = scipy.sparse.csr_array((1, len(group.nodes)))
         nodes, rate = np.zeros(len(group.nodes), dtype=int), group.rate * w[group.nodes]
-        groups.append(Samples(nodes, group.H, group.R, rate, silent))
+        groups.append(PoissonSamples(nodes, group.H, group.R, rate, silent))
     start = np.asarray(scenario.start(scenario.nodes[0])[1])[None]
     nothing, eye = scipy.sparse.csr_array((1, 1)), np.eye(len(A))
     return Coupled(A, Q, G[None], nothing, eye, 0.0 * eye, 0.0, start, tuple(groups))

@@ -14,7 +14,7 @@ import scipy.sparse
 
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.coupled import Coupled
-from netkf.theory.hybrid.samples import Samples
+from netkf.theory.hybrid.samples import PoissonSamples
 
 NO_INFORMATION = 1e-15  # eigenvalues of G, its diagonal made 1, that are rounding
 
@@ -73,17 +73,17 @@ class Packed:
         return np.asarray(change)
 
     def _sample(
-        self, change: FloatArray, group: Samples, P: FloatArray, sent: FloatArray | None
+        self, change: FloatArray, group: PoissonSamples, P: FloatArray, sent: FloatArray | None
     ) -> None:
         """Add ``s (g(P) - P)``, and what arrives of estimates sent at samples."""
-        off = self.pack(group.told(P))
+        off = self.pack(group.sample_decrease(P))
         np.subtract.at(change, group.nodes, group.rate[:, None] * off)
         if not group.heard.nnz:
             return
         if sent is None:
             arriving = self.pack(P)[group.nodes] - off
         else:
-            after = self.pack(sent)[group.nodes] - self.pack(group.told(sent))
+            after = self.pack(sent)[group.nodes] - self.pack(group.sample_decrease(sent))
             arriving = self.predicted(after)
         change += group.heard @ arriving
 

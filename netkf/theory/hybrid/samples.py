@@ -20,10 +20,10 @@ from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import sample_path, sample_times, sampled_sensors
 from netkf.scenario.scenario import Placed, Scenario
-from netkf.theory.numerics.moves import Seen, together
+from netkf.theory.numerics.updates import Observation, stack_observations
 
 
-class Samples(NamedTuple):
+class PoissonSamples(NamedTuple):
     """S sensors of p rows each that sample by Poisson clocks.
 
     nodes (S,) places of their nodes; H (S, p, n), R (S, p, p); rate (S,), per second; heard (N, S)
@@ -42,7 +42,7 @@ class Samples(NamedTuple):
         K = np.swapaxes(np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)), 1, 2)
         return K, np.eye(P.shape[-1]) - K @ self.H
 
-    def told(self, P: FloatArray) -> FloatArray:
+    def sample_decrease(self, P: FloatArray) -> FloatArray:
         """(S, n, n): what a sample takes off P (N, n, n)."""
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         return np.asarray(C @ np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)))
@@ -52,12 +52,12 @@ class Samples(NamedTuple):
         K, _ = self.gains(P)
         return np.asarray(K @ self.R @ np.swapaxes(K, 1, 2))
 
-    def only(self, node: int) -> Samples:
+    def only(self, node: int) -> PoissonSamples:
         """Those of one node, as if it were alone."""
         mine = self.nodes == node
         count = int(mine.sum())
         silent = scipy.sparse.csr_array((1, count))
-        return Samples(
+        return PoissonSamples(
             np.zeros(count, dtype=int), self.H[mine], self.R[mine], self.rate[mine], silent
         )
 
@@ -68,7 +68,7 @@ class Jump(NamedTuple):
     """
 
     time: float
-    seen: dict[int, Seen]
+    seen: dict[int, Observation]
     sent: FloatArray | None
 
 
@@ -113,7 +113,7 @@ def deliveries(scenario: Scenario) -> dict[tuple[int, int], float]:
     }
 
 
-def poisson_samples(scenario: Scenario) -> tuple[Samples, ...]:
+def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
     """Of all sensors with Poisson clocks, grouped by their number of rows."""
     index, size = scenario.topology.index, len(scenario.nodes)
     weights = deliveries(scenario)
@@ -135,7 +135,7 @@ def poisson_samples(scenario: Scenario) -> tuple[Samples, ...]:
                 if j == sender:
                     heard[i, k] = rate * weight
         nodes, H_, R_, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
-        groups.append(Samples(nodes, H_, R_, rates, scipy.sparse.csr_array(heard)))
+        groups.append(PoissonSamples(nodes, H_, R_, rates, scipy.sparse.csr_array(heard)))
     return tuple(groups)
 
 
@@ -151,21 +151,21 @@ def jumps(scenario: Scenario) -> tuple[Jump, ...]:
         return ()
     streams, n = Streams(scenario.seed), scenario.plant.n
     times, index = sample_times(scenario, streams), scenario.topology.index
-    here: dict[float, dict[int, list[Seen]]] = {}
+    here: dict[float, dict[int, list[Observation]]] = {}
     for (node, ordinal), place in places.items():
         sensor = scenario.sensors[place.entry]
         path = sample_path(scenario, streams, node, place) if sensor.varying else None
         R = scenario.noise(place.entry, True)
         for k, time in enumerate(times[node, ordinal].tolist()):
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
-            here.setdefault(time, {}).setdefault(index[node], []).append(Seen(H, R, R))
+            here.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))
     everyone = range(len(scenario.nodes))
     found = []
     for time in sorted(here):
-        seen = {node: together(readings, n) for node, readings in here[time].items()}
+        seen = {node: stack_observations(readings, n) for node, readings in here[time].items()}
         sent = _sent(scenario, list(seen))
         if scenario.filter.algorithm.pooled:
-            whole = together(list(itertools.chain(*here[time].values())), n)
+            whole = stack_observations(list(itertools.chain(*here[time].values())), n)
             seen = dict.fromkeys(everyone, whole)
         found.append(Jump(time, seen, sent))
     return tuple(found)

@@ -14,7 +14,7 @@ ORDER = 28
 LAST_TERM = 1e-11  # of the series, relative to the largest entry of the matrix
 DEFECT = 1e-10  # of a step: its length times what the derivative misses the slope by, relative
 FLOOR = 1e-13  # times the scale of the problem: what no matrix need be more precise than
-SHORTER, MOST_TRIES = 0.7, 40
+SHORTER, MAX_TRIES = 0.7, 40
 
 
 class StiffError(Exception):
@@ -45,7 +45,7 @@ def followed(
         span = min(span, left)
         series = packed.series(Y, span, ORDER)
         step = min(_reach(series, np.abs(Y).max(axis=1) + FLOOR * scale), left / span)
-        for _ in range(MOST_TRIES):
+        for _ in range(MAX_TRIES):
             last = step * span >= left
             following = float(times[-1]) if last else now + step * span
             until = int(np.searchsorted(times, following, side="right"))

@@ -1,1 +1,1 @@
-"""Theory of intermittent observations (R): the random Riccati equation."""
+"""Theory of filters with intermittent observations (R): the random Riccati equation and its law."""

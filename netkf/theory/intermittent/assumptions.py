@@ -9,15 +9,19 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import RECORDED, Row, recorded_channel
+from netkf.theory.common.evidence import RECORDED_CHANNEL, AssumptionRow, is_recorded
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
-from netkf.theory.intermittent.riccati import contraction_radius, critical_probability, unseen
+from netkf.theory.intermittent.riccati import (
+    contraction_radius,
+    critical_probability,
+    undetectable_slot_mode,
+)
 
 MAX_SHOWN, MAX_HEARD = 12, 8
 OFTEN = "readings arrive often enough for a bounded mean (sufficient)"
 
 
-def slot_rows(scenario: Scenario) -> list[Row]:
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """(assumption, source, holds, evidence) of each assumption."""
     return [
         *slot_plant_rows(scenario),
@@ -38,14 +42,14 @@ def _sight(scenario: Scenario) -> dict[int, FloatArray]:
     }
 
 
-def _readings(scenario: Scenario) -> list[Row]:
+def _readings(scenario: Scenario) -> list[AssumptionRow]:
     F = scenario.slot_plant.F
     name = "(F, H) is detectable at every node"
     try:
         sight = _sight(scenario)
     except TheoryError as error:
         return [(name, "R Theorem 9", None, f"not decided: {error}")]
-    blind = [node for node, H in sight.items() if unseen(F, H) is not None]
+    blind = [node for node, H in sight.items() if undetectable_slot_mode(F, H) is not None]
     words = "its own readings and its neighbours' see every mode that does not decay"
     if blind:
         several, listed = "s" if len(blind) > 1 else "", ", ".join(map(str, blind[:MAX_SHOWN]))
@@ -53,22 +57,22 @@ def _readings(scenario: Scenario) -> list[Row]:
     return [(name, "R Theorem 9", not blind, words)]
 
 
-def _arrivals(scenario: Scenario) -> list[Row]:
+def _arrivals(scenario: Scenario) -> list[AssumptionRow]:
     loss = scenario.network.channel.loss
     rates = [
         loss.mean_delivery(link, scenario.measured(link)) for link in scenario.topology.directions
     ]
     known = [rate for rate in rates if np.isfinite(rate)]
     least = min(known, default=1.0)
-    rows: list[Row] = [
+    rows: list[AssumptionRow] = [
         (
             "arrivals are independent of each other and of the past, and not impossible",
             "R (12), Theorem 9",
             None
-            if recorded_channel(scenario.network.channel)
+            if is_recorded(scenario.network.channel)
             else loss.independent and len(known) == len(rates) and least > 0.0,
-            RECORDED
-            if recorded_channel(scenario.network.channel)
+            RECORDED_CHANNEL
+            if is_recorded(scenario.network.channel)
             else f"delivery from {least:g}"
             if loss.independent
             else "losses come in bursts",
@@ -81,12 +85,12 @@ def _arrivals(scenario: Scenario) -> list[Row]:
     return rows
 
 
-def _often_enough(scenario: Scenario) -> Row:
+def _often_enough(scenario: Scenario) -> AssumptionRow:
     F, sensing = scenario.slot_plant.F, set(scenario.sensing)
     worst: tuple[float, int, list[float]] | None = None
     for node, H in _sight(scenario).items():
         own, _ = scenario.observation(node)
-        if unseen(F, own) is None or unseen(F, H) is not None:
+        if undetectable_slot_mode(F, own) is None or undetectable_slot_mode(F, H) is not None:
             continue
         heard = [(i, j) for i, j in scenario.topology.directions if j == node and i in sensing]
         if len(heard) > MAX_HEARD:

@@ -1,75 +1,82 @@
-"""The errors of the filter with intermittent observations along the messages of a run."""
+"""Exact errors of the filter with intermittent observations along the messages of a run."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observed import Observed
-from netkf.theory.common.rules import Rule, Sent
-from netkf.theory.common.stacked_errors import Errors
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.trace.run import Run
 
 
-class Readings(Rule):
-    """R (15)-(18): messages are readings, and the noise of a reading is the same at all who use it.
+class ReadingExchangeRule(ErrorRule):
+    """Updates R (15)-(18) by the node's own readings and those that it receives.
 
-    A late reading is used as if it had come in time. All arrivals are known here beforehand, so a
-    node whose late readings come at T keeps, from the first of their times on, a version of its
-    estimate that uses all that will have arrived by T; at T it becomes the node's.
+    A reading has the same noise at all nodes that use it, and a late one is used as if it had come
+    in time. The replay knows all arrivals beforehand: from the time of a late reading on, the node
+    keeps a second version of its estimate that uses all readings which arrive by T, the time at
+    which that one arrives. At T the version replaces the node's estimate.
     """
 
-    def __init__(self, scenario: Scenario, errors: Errors, messages: Sequence[Sent]) -> None:
+    def __init__(
+        self, scenario: Scenario, errors: StackedErrors, messages: Sequence[SentMessage]
+    ) -> None:
         super().__init__(scenario, errors)
-        self._at: dict[tuple[int, float], list[Sent]] = {}
-        first: dict[tuple[int, float], float] = {}
+        self._sent: dict[tuple[int, float], list[SentMessage]] = {}  # by receiver, time of sending
+        first: dict[tuple[int, float], float] = {}  # earliest reading among those that arrive at T
         for m in messages:
-            self._at.setdefault((m.receiver, m.time), []).append(m)
+            self._sent.setdefault((m.receiver, m.time), []).append(m)
             if m.late:
                 key = (m.receiver, m.arrives)
                 first[key] = min(first.get(key, m.time), m.time)
-        self._first: dict[tuple[int, float], list[float]] = {}
+        self._branches: dict[tuple[int, float], list[float]] = {}
         for (receiver, arrives), time in sorted(first.items()):
-            self._first.setdefault((receiver, time), []).append(arrives)
+            self._branches.setdefault((receiver, time), []).append(arrives)
         self._versions: dict[int, list[float]] = {host: [] for host in range(errors.hosts)}
-        self._seen: Observed = {}
+        self._observations: HostObservations = {}
         self._columns: Mapping[int, slice] = {}
 
-    def sense(self, time: float, seen: Observed) -> None:
-        """Every version takes what it will have."""
-        self._seen, self._columns = seen, self.errors.readings(seen)
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Update each version of each estimate by the readings that it will have got."""
+        self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for host in range(self.errors.hosts):
             self._branch(host, time)
-            self._use(host, [host])
+            self._update(host, [host])
             for until in self._versions[host]:
-                heard = self._at.get((host, time), [])
-                senders = [m.sender for m in heard if m.arrives <= until]
-                self._use(("version", host, until), [host, *senders])
+                sent = self._sent.get((host, time), [])
+                senders = [m.sender for m in sent if m.arrives <= until]
+                self._update(("version", host, until), [host, *senders])
 
     def _branch(self, host: int, time: float) -> None:
+        """Start the versions for late readings of this instant."""
         live = self._versions[host]
-        for until in self._first.get((host, time), ()):
+        for until in self._branches.get((host, time), ()):
+            # The version that ends last before this one has all readings that this one has so far.
             before = [t for t in live if t < until]
             source = ("version", host, max(before)) if before else host
             self.errors.copy(source, ("version", host, until), host)
             live.append(until)
             live.sort()
 
-    def _use(self, name: Hashable, nodes: Sequence[int]) -> None:
+    def _update(self, name: Hashable, nodes: Sequence[int]) -> None:
         for node in nodes:
-            if node in self._seen:
-                self.errors.update(name, self._seen[node], self._columns[node])
+            if node in self._observations:
+                self.errors.update(name, self._observations[node], self._columns[node])
 
-    def arrive(self, time: float, messages: Sequence[Sent]) -> None:
-        """What comes in time is used as it comes."""
+    def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
+        """Use readings that come in time, or replace an estimate by its finished version."""
         for host in {m.receiver for m in messages}:
             if time in self._versions[host]:
                 self._versions[host].remove(time)
                 self.errors.replace(("version", host, time), host)
             else:
-                self._use(host, [m.sender for m in messages if m.receiver == host])
+                self._update(host, [m.sender for m in messages if m.receiver == host])
 
 
-def rule(scenario: Scenario, errors: Errors, run: Run, messages: Sequence[Sent]) -> Rule:
-    """The moves of this filter along the messages of a run."""
-    return Readings(scenario, errors, messages)
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    return ReadingExchangeRule(scenario, errors, messages)

@@ -20,13 +20,13 @@ from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.rng.streams import Streams
 from netkf.theory.numerics.matrices import RESIDUAL, as_covariance, as_numbers, as_square, as_whole
 
-DEEPEST, MOST_POLICIES = 22, 40
+DEEPEST, MAX_POLICIES = 22, 40
 COALESCED = 1e-9
 FIRST_PAST, LONGEST_PAST = 32, 100_000
 BLOCK = 20_000  # draws at once
 
 
-class System(NamedTuple):
+class SlotSystem(NamedTuple):
     """Checked F (n, n), Q (n, n), H (p, n), R (p, p)."""
 
     F: FloatArray
@@ -35,7 +35,7 @@ class System(NamedTuple):
     R: FloatArray
 
 
-def checked_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> System:
+def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> SlotSystem:
     """The matrices as checked arrays; raises TheoryError."""
     F_ = as_square("F", F)
     n = len(F_)
@@ -43,7 +43,7 @@ def checked_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Sy
     R_ = as_covariance("R", R, len(H_))
     if len(R_) and not np.linalg.eigvalsh(R_)[0] > 0.0:
         raise TheoryError("R must be positive definite")
-    return System(F_, as_covariance("Q", Q, n), H_, R_)
+    return SlotSystem(F_, as_covariance("Q", Q, n), H_, R_)
 
 
 def _observation(H: ArrayLike, n: int) -> FloatArray:
@@ -69,7 +69,7 @@ def riccati_step(
 
     Computed from square roots by an orthogonal triangularisation, without a subtraction.
     """
-    system = checked_system(F, Q, H, R)
+    system = check_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
     root, _ = update_root(_root(start), system.F, square_root(system.Q), system.H, _root(system.R))
     return symmetric(root @ root.T)
@@ -88,8 +88,8 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     Raises TheoryError, naming the mode, where (F, H) is not detectable, and where what was found
     does not solve the equation or does not stabilise the filter.
     """
-    F, Q, H, R = checked_system(F, Q, H, R)
-    hidden = unseen(F, H)
+    F, Q, H, R = check_system(F, Q, H, R)
+    hidden = undetectable_slot_mode(F, H)
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
     try:
@@ -120,7 +120,7 @@ def _gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatAr
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
 
 
-def unseen(F: FloatArray, H: FloatArray) -> complex | None:
+def undetectable_slot_mode(F: FloatArray, H: FloatArray) -> complex | None:
     """An eigenvalue of F on or outside the unit circle whose mode H does not see, or None."""
     size = max(float(np.linalg.norm(F, 2)), 1e-300)
     seen = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
@@ -166,7 +166,7 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> Critical:
     transition = as_square("F", F)
     n = len(transition)
     observation = _observation(H, n)
-    hidden = unseen(transition, observation)
+    hidden = undetectable_slot_mode(transition, observation)
     if hidden is not None:
         raise TheoryError(
             f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g} is never seen"
@@ -238,7 +238,7 @@ class _Contraction:
         """
         best = self._perron(chances, gains)[0]
         for excess in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8):
-            for _ in range(MOST_POLICIES):
+            for _ in range(MAX_POLICIES):
                 X = self._resolvent(chances, gains, best * (1.0 + excess) + 1e-300)
                 if X is None:
                     break
@@ -299,7 +299,7 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     outside 0 .. 22 and where P* does not exist.
     """
     depth = as_whole("depth", depth, 0, DEEPEST)
-    F, Q, H, R = checked_system(F, Q, H, R)
+    F, Q, H, R = check_system(F, Q, H, R)
     roots = _root(steady_covariance(F, Q, H, R))[None]
     root_Q, root_R = square_root(Q), _root(R)
     for _ in range(depth):
@@ -327,7 +327,7 @@ def invariant_samples(
     has forgotten its start would prefer draws with recent arrivals. Raises TheoryError where no
     invariant law exists or that does not happen. Much faster with the extra ``fast``.
     """
-    F, Q, H, R = checked_system(F, Q, H, R)
+    F, Q, H, R = check_system(F, Q, H, R)
     if as_numbers("delivery", delivery).size != 1 or not 0.0 < delivery <= 1.0:
         raise TheoryError(f"delivery must lie in (0, 1], got {delivery!r}")
     samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)

@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
-from netkf.theory.intermittent.riccati import checked_system, steady_covariance
+from netkf.theory.intermittent.riccati import check_system, steady_covariance
 
 NEGLIGIBLE = 1e-18
 DEPTH = 18
@@ -117,7 +117,7 @@ def scalar_law(
     Raises TheoryError where the system is not scalar, has no P*, or where the images of f_0 and
     f_1 meet, so that the recursion does not close.
     """
-    system = checked_system(*(np.atleast_2d(value) for value in (F, Q, H, R)))
+    system = check_system(*(np.atleast_2d(value) for value in (F, Q, H, R)))
     if len(system.F) != 1 or len(system.H) != 1:
         raise TheoryError("the exact law is for one state and one output")
     if not 0.0 < delivery < 1.0:

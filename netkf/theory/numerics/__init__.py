@@ -1,1 +1,1 @@
-"""Functions of plain matrices: checked inputs, algebraic equations, gaps and moves."""
+"""Numerics on plain matrices: checked inputs, algebraic equations, predictions, updates."""

@@ -87,7 +87,7 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
     Raises TheoryError, naming the reason, where there is none, or where the residual or the
     closed loop says that what was found is not one.
     """
-    missing = undetectable(A, G)
+    missing = undetectable_mode(A, G)
     if missing is not None:
         raise TheoryError(
             f"(A, H) is not detectable: the mode with eigenvalue {missing:.6g} is not seen"
@@ -123,12 +123,12 @@ def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     return symmetric(np.asarray(scipy.linalg.solve_continuous_lyapunov(A, -Q), dtype=np.float64))
 
 
-def undetectable(A: FloatArray, G: FloatArray) -> complex | None:
+def undetectable_mode(A: FloatArray, G: FloatArray) -> complex | None:
     """An eigenvalue of A with nonnegative real part whose mode G does not see, or None."""
     return _hidden(A, G, only_unstable=True)
 
 
-def unobservable(A: FloatArray, G: FloatArray) -> complex | None:
+def unobservable_mode(A: FloatArray, G: FloatArray) -> complex | None:
     """An eigenvalue of A whose mode G does not see (Popov, Belevitch, Hautus), or None."""
     return _hidden(A, G, only_unstable=False)
 

@@ -10,8 +10,8 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import Row, knowledge
-from netkf.theory.numerics.matrices import unobservable
+from netkf.theory.common.evidence import AssumptionRow, true_model_row
+from netkf.theory.numerics.matrices import unobservable_mode
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.certified_gamma import Moment, minimum_gamma
 from netkf.theory.push_sum.disconnection import disconnection_probability
@@ -22,7 +22,7 @@ from netkf.theory.push_sum.mean_square import mean_radius, radius
 HEAVY = 0.885
 
 
-def slot_rows(scenario: Scenario) -> list[Row]:
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """(assumption, source, holds, evidence) of each."""
     return [
         *_plant(scenario),
@@ -33,10 +33,10 @@ def slot_rows(scenario: Scenario) -> list[Row]:
     ]
 
 
-def _plant(scenario: Scenario) -> list[Row]:
+def _plant(scenario: Scenario) -> list[AssumptionRow]:
     F, Q = scenario.slot_belief
-    idle = unobservable(F.T, Q)
-    rows: list[Row] = [
+    idle = unobservable_mode(F.T, Q)
+    rows: list[AssumptionRow] = [
         (
             "(F, Q^1/2) is controllable",
             "P Assumption 2",
@@ -49,14 +49,14 @@ def _plant(scenario: Scenario) -> list[Row]:
     ]
     if not any(sensor.varying for sensor in scenario.sensors):
         rows.append(_sight(scenario))
-    return [*rows, knowledge(scenario, "P (7), (8)", "same F, Q and R")]
+    return [*rows, true_model_row(scenario, "P (7), (8)", "same F, Q and R")]
 
 
-def _sight(scenario: Scenario) -> Row:
+def _sight(scenario: Scenario) -> AssumptionRow:
     F, _ = scenario.slot_belief
     informations = [model.information for model in scenario.slot_models]
-    hidden = unobservable(F, np.sum(informations, axis=0))
-    alone = sum(unobservable(F, G) is None for G in informations)
+    hidden = unobservable_mode(F, np.sum(informations, axis=0))
+    alone = sum(unobservable_mode(F, G) is None for G in informations)
     words = f"every mode is seen; {alone} of {len(informations)} nodes see all alone"
     if hidden is not None:
         words = (
@@ -65,11 +65,11 @@ def _sight(scenario: Scenario) -> Row:
     return "(F, H) is observable, all sensors together", "P Assumption 2", hidden is None, words
 
 
-def _links(scenario: Scenario) -> list[Row]:
+def _links(scenario: Scenario) -> list[AssumptionRow]:
     topology, channel = scenario.topology, scenario.network.channel
     parts = len(topology.components)
     filter_ = push_sum_filter(scenario)
-    rows: list[Row] = [
+    rows: list[AssumptionRow] = [
         (
             "the graph is undirected and connected",
             "P Assumption 1",
@@ -113,7 +113,7 @@ def _links(scenario: Scenario) -> list[Row]:
     return [*rows, ("p_d < 1: the network is whole at times", "P Assumption 3", cut < 1.0, words)]
 
 
-def _gain(scenario: Scenario) -> list[Row]:
+def _gain(scenario: Scenario) -> list[AssumptionRow]:
     delta, bound = push_sum_filter(scenario).delta, consensus_gain_bound(scenario)
     local = f"nodes can tell from degrees that rho(L) <= {min(bound.local, bound.nodes)}"
     return [
@@ -132,7 +132,7 @@ def _gain(scenario: Scenario) -> list[Row]:
     ]
 
 
-def _stop(scenario: Scenario) -> Row:
+def _stop(scenario: Scenario) -> AssumptionRow:
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
         loss.mean_delivery(way, scenario.measured(way)) == 1.0
@@ -152,7 +152,7 @@ def _stop(scenario: Scenario) -> Row:
     return "no gain is frozen before its time", "P step 2.3", safe, words
 
 
-def _moments(scenario: Scenario) -> list[Row]:
+def _moments(scenario: Scenario) -> list[AssumptionRow]:
     return [
         _exact(
             ("the estimates become unbiased", "P (30), derived"),
@@ -168,7 +168,9 @@ def _moments(scenario: Scenario) -> list[Row]:
     ]
 
 
-def _exact(name: tuple[str, str], measure: Callable[[], float], heavy: bool = False) -> Row:
+def _exact(
+    name: tuple[str, str], measure: Callable[[], float], heavy: bool = False
+) -> AssumptionRow:
     try:
         found = measure()
     except TheoryError as error:
@@ -181,7 +183,7 @@ def _exact(name: tuple[str, str], measure: Callable[[], float], heavy: bool = Fa
     return *name, found < 1.0, words
 
 
-def _certified(scenario: Scenario, moment: Moment, source: str) -> Row:
+def _certified(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
     gamma = push_sum_filter(scenario).gamma
     name = f"gamma is certified for the {moment.replace('-', ' ')}"
     try:

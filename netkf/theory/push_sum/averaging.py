@@ -22,9 +22,9 @@ import scipy.sparse
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
 
-MOST_NODES, MOST_OUTCOMES = 60, 2**20
+MAX_NODES, MAX_OUTCOMES = 60, 2**20
 FEW_NODES = 16  # up to which the Kronecker square is cheap
-MOST_WORK = 1e12  # multiplications to enumerate
+MAX_WORK = 1e12  # multiplications to enumerate
 CHUNK = 8192  # outcomes at a time
 
 
@@ -131,7 +131,7 @@ class Averaging:
         N = self.nodes
         fates = self._fates
         count = math.prod(len(chance) for chance, _ in fates)
-        if N > MOST_NODES or count > MOST_OUTCOMES or count * (N**4 + N**3) > MOST_WORK:
+        if N > MAX_NODES or count > MAX_OUTCOMES or count * (N**4 + N**3) > MAX_WORK:
             raise TheoryError(
                 "the outcomes of links held over gamma > 1 steps are enumerated, and there are too "
                 f"many: 2^{math.log2(count):.0f} on {N} nodes; take a smaller graph or fresh links"

@@ -24,8 +24,8 @@ from netkf.theory.push_sum.limits import consensus_gain_bound
 from netkf.theory.push_sum.mean_square import mean_radius, radius
 
 Moment = Literal["mean", "mean-square"]
-MOST_STEPS = 10**7
-MOST_EXACT = 1000
+MAX_STEPS = 10**7
+MAX_EXACT = 1000
 
 
 class GammaConstants(NamedTuple):
@@ -121,9 +121,9 @@ def _first(certified: Callable[[int], bool], constants: GammaConstants) -> int:
     high = 1
     while not certified(high):
         high *= 2
-        if high > MOST_STEPS:
+        if high > MAX_STEPS:
             raise TheoryError(
-                f"no gamma up to {MOST_STEPS:,} is certified: lambda {constants.contraction:.6g}, "
+                f"no gamma up to {MAX_STEPS:,} is certified: lambda {constants.contraction:.6g}, "
                 f"theta {constants.mean:.6g} and {constants.mean_square:.6g} must lie below 1"
             )
     low = high // 2
@@ -158,7 +158,7 @@ def _rho(matrix: list[list[float]]) -> float:
 
 
 def exact_minimum_gamma(
-    scenario: Scenario, moment: Moment = "mean-square", most: int = MOST_EXACT
+    scenario: Scenario, moment: Moment = "mean-square", most: int = MAX_EXACT
 ) -> int:
     """The smallest gamma for which the exact radius of the moment's dynamics is below 1, whatever
     gamma the scenario has: ``push_sum_radius`` for "mean-square".

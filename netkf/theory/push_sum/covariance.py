@@ -14,7 +14,7 @@ from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.estimation_steps import estimation_steps
 from netkf.theory.push_sum.mean_square import BASIS, FEW, TINY, mapping, radius, written_out
 
-MOST_ROUNDS = 20
+MAX_ROUNDS = 20
 RESIDUAL = 1e-10
 
 
@@ -50,7 +50,7 @@ def _fixed_point(
 ) -> FloatArray:
     """X = T(X) + noise; its residual is small beside the variances of the row and the column."""
     T, X = mapping(law, closed), noise
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         rest = noise + T(X) - X
         deviations = np.sqrt(np.abs(np.diagonal(X)))
         allowed = np.outer(deviations, deviations) + 1e-6 * deviations.max(initial=0.0) ** 2

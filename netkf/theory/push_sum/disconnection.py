@@ -24,8 +24,8 @@ from netkf.network.graphs import Topology
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 
-MOST_PARTITIONS = 120_000
-MOST_ROOTS = 12
+MAX_PARTITIONS = 120_000
+MAX_ROOTS = 12
 SAMPLES = 200_000
 BATCH = 2_000_000  # link draws
 CONFIDENCE = 0.99
@@ -163,7 +163,7 @@ def _reaches_all(neighbours: list[dict[int, float]]) -> bool:
 def _order(neighbours: list[dict[int, float]]) -> list[int]:
     """All nodes, so that few are open at a time: greedy, from several first nodes."""
     nodes = range(len(neighbours))
-    fewest = sorted(nodes, key=lambda node: len(neighbours[node]))[:MOST_ROOTS]
+    fewest = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
     return min((_greedy(neighbours, root) for root in fewest), key=lambda found: found[0])[1]
 
 
@@ -209,7 +209,7 @@ def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
         states = {(*labels, len(labels)): p for labels, p in states.items()}
         for other in [x for x in open_ if x in neighbours[node]]:
             states = _joined(states, open_.index(other), neighbours[node][other])
-            if len(states) > MOST_PARTITIONS:
+            if len(states) > MAX_PARTITIONS:
                 return None
         keep = [x for x, other in enumerate(open_) if max(last[other], place[other]) > k]
         if k + 1 < len(order):

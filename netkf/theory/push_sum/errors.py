@@ -1,12 +1,12 @@
-"""The push-sum filter along the messages of a run: in slots P Fig. 1 with the corrected update of
-the mass, under clocks broadcast rounds by running sums.
+"""Exact errors of the push-sum filter along the messages of a run.
 
-Under clocks an estimate is a ratio of masses: a node of weight w among N holds the information
-``(w / N) (P^-1, P^-1 xhat)``. Every total (U, u) that was sent has an error ``u - U x``. Totals
-refer to now: as time passes ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times itself
-less ``U w``, s the factor with which old information fades. A node that gains (U, u) and then has
-the weight w goes to ``xhat + (N / w) P (u - U xhat)``, and its error to ``e - (N / w) P (U e + u -
-U x)``: errors are closed, whatever became of x itself.
+In slots P Fig. 1 with the corrected update of the mass; under clocks broadcast rounds with running
+sums. Under clocks an estimate is a ratio of masses: a node of weight w among N holds the
+information ``(w / N) (P^-1, P^-1 xhat)``. Every total (U, u) that was sent has an error ``u - U x``
+and refers to the present: over a gap ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times
+itself less ``U w``, where s < 1 is the factor by which old information fades. A node that gains
+(U, u), and then has the weight w, moves to ``xhat + (N / w) P (u - U xhat)``, and its error to
+``e - (N / w) P (U e + u - U x)``. The errors thus obey equations without x.
 """
 
 from __future__ import annotations
@@ -22,20 +22,23 @@ from netkf.algorithms.push_sum import PushSum
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observed import Observed
-from netkf.theory.common.rules import Rule, Sent
-from netkf.theory.common.stacked_errors import Errors
-from netkf.theory.numerics.moves import informed
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.theory.numerics.updates import add_information
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-Up = dict[tuple[int, int, int], FloatArray]
+ArrivalsByStep = dict[tuple[int, int, int], FloatArray]
+"""By slot, phase and step, (N, N): 1 where the message of node j reached node i in time."""
 
 
-def known_sums(scenario: Scenario, run: Run) -> None:
-    """Raise TheoryError where the errors in slots are not known: for frozen or asymptotic gains,
-    where the filters' F differs from the plant's, and at the horizon, since the exchanges of a slot
-    that begins there are not in the trace.
+def require_known_errors(scenario: Scenario, run: Run) -> None:
+    """Raise TheoryError if the errors in slots are not known here.
+
+    They are not for frozen or asymptotic gains, for filters whose F differs from the plant's, for
+    sensors whose H varies, and at the horizon: the trace lacks the exchanges of a slot that begins
+    there.
     """
     algorithm, plant = scenario.filter.algorithm, scenario.slot_plant
     assert isinstance(algorithm, PushSum)
@@ -47,38 +50,41 @@ def known_sums(scenario: Scenario, run: Run) -> None:
         raise TheoryError("the exact errors are known for sensors whose H is fixed")
     slots = np.round(run.times / plant.period).astype(int).tolist()
     if slots and plant.over(slots[-1], scenario.horizon):
-        words = "the exchanges of the slot at the horizon are not in the trace"
-        raise TheoryError(f"{words}: sample before it")
+        message = "the exchanges of the slot at the horizon are not in the trace: sample before it"
+        raise TheoryError(message)
 
 
-class Averages(Rule):
-    """Slots: masses exchanged once, estimates averaged in gamma steps."""
+class AveragingRule(ErrorRule):
+    """Rule in slots: masses are exchanged once, estimates averaged in gamma steps."""
 
-    def __init__(self, scenario: Scenario, errors: Errors, run: Run) -> None:
+    def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
         super().__init__(scenario, errors)
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, PushSum)
         self._gamma, self._delta = int(algorithm.gamma or 1), float(algorithm.delta or math.nan)
-        self._up = _arrived(scenario, run, self._gamma)
+        self._arrivals = _arrivals_by_step(scenario, run, self._gamma)
         self._N, n = len(scenario.nodes), errors.n
         self._nu = np.array([scenario.topology.degrees[node] + 1 for node in scenario.nodes])
         models = scenario.slot_models
         self._own = np.array([m.H.T @ np.linalg.solve(m.R, m.H) for m in models])
         own = self._own.reshape(self._N, n * n)
+        # Masses z = (w, n~, C~) of each node, P (3): only the leader starts with a weight.
         self._z = np.concatenate([np.zeros((self._N, 1)), np.ones((self._N, 1)), own], axis=1)
         self._z[scenario.topology.index[algorithm.leader], 0] = 1.0
 
-    def exchange(self, slot: int, phase: int, messages: Sequence[Sent]) -> None:
-        """P (3)-(5), and step 5."""
+    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
+        """Exchange the masses, P (3)-(5) (phase 0), or average the estimates, P step 5."""
         if phase == 0:
             received = self._received(slot, 0, 0)
             shares = self._z / self._nu[:, None]
-            kept = (self._nu - received.sum(axis=1))[:, None]
-            self._z = kept * shares + received @ shares
+            # A node keeps the share of each link over which nothing came: links fail both ways.
+            retained = (self._nu - received.sum(axis=1))[:, None]
+            self._z = retained * shares + received @ shares
             return
         mixing, hosts = np.eye(self._N), range(self._N)
         for step in range(self._gamma):
             received = self._received(slot, 1, step)
+            # z <- (I - L / delta) z with the Laplacian L of the links that are up in this step.
             laplacian = np.diag(received.sum(axis=1)) - received
             mixing = mixing - laplacian @ mixing / self._delta
         forms = self.errors.stack.forms(hosts)
@@ -86,37 +92,37 @@ class Averages(Rule):
         self.errors.stack.put_all(dict(zip(hosts, mixed, strict=True)))
 
     def _received(self, slot: int, phase: int, step: int) -> FloatArray:
-        return self._up.get((slot, phase, step), np.zeros((self._N, self._N)))
+        return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
 
-    def sense(self, time: float, seen: Observed) -> None:
-        """Step 4 with what the mass says of the network, P (6)-(8)."""
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Update the estimates, P step 4, with the G and N that the masses estimate, P (6)-(8)."""
         n, errors = self.errors.n, self.errors
-        heard = self._z[:, 0] > 0.0
+        heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only
         weight = np.where(heard, self._z[:, 0], 1.0)
         learned = self._z[:, 2:].reshape(self._N, n, n) / weight[:, None, None]
         G = np.where(heard[:, None, None], learned, self._own)
         number = np.where(heard, self._z[:, 1] / weight, 1.0)
-        columns = errors.readings(seen)
+        columns = errors.reading_noises(observations)
         for host in range(self._N):
-            root = informed(errors.roots[host], G[host])
-            if host not in seen:
+            root = add_information(errors.roots[host], G[host])
+            if host not in observations:
                 errors.roots[host] = root
                 continue
-            one = seen[host]
+            one = observations[host]
             K = number[host] * root @ root.T @ np.linalg.solve(one.R, one.H).T
-            errors.move(host, np.eye(n) - K @ one.H, root)
+            errors.multiply(host, np.eye(n) - K @ one.H, root)
             errors.stack.add(host, columns[host], -K @ one.root)
 
 
-def _arrived(scenario: Scenario, run: Run, gamma: int) -> Up:
-    """By slot, phase and step, (N, N): 1 where what j sent reached i in time."""
+def _arrivals_by_step(scenario: Scenario, run: Run, gamma: int) -> ArrivalsByStep:
+    """Return the messages of a run that arrived in time, by slot, phase and averaging step."""
     index, size, period = scenario.topology.index, len(scenario.nodes), scenario.slot_plant.period
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     sent, length = rows["t"] - rows["age"], scenario.phase_length
     slot = scenario.slot_plant.slots_of(sent)
     since = sent - slot * period - rows["phase"] * length
     step = np.where(rows["phase"] == 0, 0, np.round(since / (length / gamma))).astype(int)
-    up: Up = {}
+    up: ArrivalsByStep = {}
     columns = (slot, rows["phase"], step, rows["node"], rows["peer"])
     for t, phase, k, node, peer in zip(*(c.tolist() for c in columns), strict=True):
         matrix = up.setdefault((t, phase, k), np.zeros((size, size)))
@@ -125,19 +131,21 @@ def _arrived(scenario: Scenario, run: Run, gamma: int) -> Up:
 
 
 class Total(NamedTuple):
-    """An amount of mass: weight and information; its error is in the stack."""
+    """Weight and information matrix U (n, n) of a total; its error is a vector of the stack."""
 
     weight: float
     U: FloatArray
 
 
-class RunningTotals(Rule):
-    """Clocks: the weight of each node, the total it ever sent to each hearer, the last totals it
-    heard.
+class RunningTotalsRule(ErrorRule):
+    """Rule under clocks.
+
+    It tracks the weight of each node, the total that each has sent to every receiver so far, and
+    the last totals that each has received.
     """
 
     def __init__(
-        self, scenario: Scenario, errors: Errors, rounds: Mapping[float, Sequence[int]]
+        self, scenario: Scenario, errors: StackedErrors, rounds: Mapping[float, Sequence[int]]
     ) -> None:
         super().__init__(scenario, errors, rounds)
         if errors.follows:
@@ -158,30 +166,34 @@ class RunningTotals(Rule):
         self._totals[name] = total
         self.errors.stack.put(name, form)
 
-    def passed(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
-        """Totals come to refer to now; the plant's noise is in the inputs ``columns``."""
+    def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
+        """Predict all totals by ``gap`` seconds; the plant's noise is in the inputs ``columns``."""
         if gap <= 0.0 or columns is None or noise is None:
             return
         inverse = np.asarray(scipy.linalg.expm(-gap * self._A))
         fading = math.exp(-2.0 * self._rate * gap)
         for name, total in self._totals.items():
+            # U -> s F^-T U F^-1, and the error u - U x -> s F^-T (u - U x) - U w.
             U = fading * (inverse.T @ total.U @ inverse)
             self._totals[name] = Total(total.weight, U)
             if U.any():
                 self.errors.stack.put(name, fading * inverse.T @ self.errors.stack.form(name))
                 self.errors.stack.add(name, columns, -U @ noise)
 
-    def sense(self, time: float, seen: Observed) -> None:
-        """A sample counts N / w times; then nodes whose turn it is give their shares."""
-        columns, number = self.errors.readings(seen), self.errors.hosts
-        for host, one in seen.items():
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Update by samples, each N / w times, then add the shares of nodes that broadcast now."""
+        columns, number = self.errors.reading_noises(observations), self.errors.hosts
+        for host, one in observations.items():
             counted = one._replace(R=one.R * (self._weights[host] / number))
             self.errors.update(host, counted, columns[host])
         for host in self._rounds.get(time, ()):
-            self._offer(host)
+            self._add_share(host)
 
-    def _offer(self, host: int) -> None:
-        """The node's mass is ``(w / N) (P^-1, P^-1 xhat)``, with the error ``-(w / N) P^-1 e``."""
+    def _add_share(self, host: int) -> None:
+        """Add the node's share of its mass to the total that it sends to each receiver.
+
+        The mass is ``(w / N) (P^-1, P^-1 xhat)``, and its error ``-(w / N) P^-1 e``.
+        """
         count, name, stack = self._receivers[host], ("sent", host), self.errors.stack
         if count == 0:
             return
@@ -193,26 +205,27 @@ class RunningTotals(Rule):
         self._put(name, sent, stack.form(name) - U @ stack.form(host))
         self._weights[host] = weight - count * (sent.weight - before.weight)
 
-    def send(self, messages: Sequence[Sent]) -> None:
-        """What will arrive is kept: a total as it was when it was sent."""
+    def send(self, messages: Sequence[SentMessage]) -> None:
+        """Store the sender's total for each message, as it is when the message leaves."""
         for message in messages:
             name = ("sent", message.sender)
             self._put(message, self._totals[name], self.errors.stack.form(name))
 
-    def arrive(self, time: float, messages: Sequence[Sent]) -> None:
-        """A hearer gains what a total grew by; an older one brings nothing."""
+    def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
+        """Add to each receiver the growth of its senders' totals since the last that it got."""
         for host in sorted({message.receiver for message in messages}):
             mine = [m for m in messages if m.receiver == host]
-            self._gain(host, sorted(mine, key=lambda m: (m.sender, m.number)))
+            self._receive(host, sorted(mine, key=lambda m: (m.sender, m.number)))
         for message in messages:
             del self._totals[message]
         self.errors.stack.drop(messages)
 
-    def _gain(self, host: int, messages: Sequence[Sent]) -> None:
+    def _receive(self, host: int, messages: Sequence[SentMessage]) -> None:
         errors, n = self.errors, self.errors.n
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
         for message in messages:
             link, heard = (message.sender, host), ("heard", message.sender, host)
+            # An older total than the last one holds nothing new.
             if message.number <= self._number.get(link, -1):
                 continue
             self._number[link] = message.number
@@ -226,8 +239,9 @@ class RunningTotals(Rule):
             return
         after = self._weights[host] + weight
         share = errors.hosts / after
+        # Information adds up: (w+ / N) P+^-1 = (w / N) P^-1 + U.
         scaled = np.sqrt(after / self._weights[host]) * errors.roots[host]
-        root = informed(scaled, share * U)
+        root = add_information(scaled, share * U)
         gain = share * root @ root.T
         errors.stack.put(host, (np.eye(n) - gain @ U) @ errors.stack.form(host) - gain @ form)
         errors.roots[host] = root
@@ -235,7 +249,7 @@ class RunningTotals(Rule):
 
 
 def _rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
-    """The places of nodes that began a broadcast, by time."""
+    """Return the indices of the nodes that broadcast at each time (seconds)."""
     found: dict[float, list[int]] = {}
     rows = run.log[run.log["kind"] == CODES["transmit"]]
     for time, node in zip(rows["t"].tolist(), rows["node"].tolist(), strict=True):
@@ -243,11 +257,11 @@ def _rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
     return found
 
 
-def rule(scenario: Scenario, errors: Errors, run: Run, messages: Sequence[Sent]) -> Rule:
-    """The moves of this filter along the messages of a run; raises TheoryError where the errors in
-    slots are not known.
-    """
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter; raises TheoryError if the errors in slots are not known."""
     if not scenario.slotted:
-        return RunningTotals(scenario, errors, _rounds(scenario, run))
-    known_sums(scenario, run)
-    return Averages(scenario, errors, run)
+        return RunningTotalsRule(scenario, errors, _rounds(scenario, run))
+    require_known_errors(scenario, run)
+    return AveragingRule(scenario, errors, run)

@@ -16,8 +16,8 @@ from netkf.theory.push_sum.disconnection import disconnection_probability
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
 from netkf.theory.push_sum.mean_square import push_sum_radius
 
-MOST_STATES = 120  # of all nodes together; beyond it a search over gamma takes minutes
-MOST_STEPS = 20
+MAX_STATES = 120  # of all nodes together; beyond it a search over gamma takes minutes
+MAX_STEPS = 20
 
 
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
@@ -34,9 +34,9 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
 
     def exact_gamma() -> int:
-        if len(scenario.nodes) * scenario.plant.n > MOST_STATES:
+        if len(scenario.nodes) * scenario.plant.n > MAX_STATES:
             raise TheoryError("not looked for in a network of this size")
-        return exact_minimum_gamma(scenario, most=MOST_STEPS)
+        return exact_minimum_gamma(scenario, most=MAX_STEPS)
 
     def cut() -> list[float]:
         found = disconnection_probability(scenario)

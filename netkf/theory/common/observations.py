@@ -1,0 +1,99 @@
+"""Readings of the nodes of a scenario as H, the assumed R and a square root of the true R.
+
+Increments, and samples in slots or at times. The H of random and recorded regressors is that of the
+run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
+from netkf.scenario.sampling import (
+    increment_sensors,
+    sample_path,
+    sample_times,
+    sampled_sensors,
+)
+from netkf.scenario.scenario import Placed, Scenario
+from netkf.theory.numerics.updates import Observation, stack_observations
+from netkf.trace.run import Run
+
+HostObservations = dict[int, Observation]
+"""Observations by the index of the host that uses them."""
+
+
+def nodes_by_host(scenario: Scenario) -> list[tuple[int, ...]]:
+    """Return the nodes whose readings each filter uses: one filter uses all if they are pooled."""
+    if scenario.filter.algorithm.pooled:
+        return [scenario.nodes]
+    return [(node,) for node in scenario.nodes]
+
+
+def _observation(scenario: Scenario, sensor: Placed, H: FloatArray) -> Observation:
+    R, true = (scenario.noise(sensor.entry, believed) for believed in (True, False))
+    return Observation(H, R, np.asarray(np.linalg.cholesky(true), dtype=np.float64))
+
+
+def increment_observations(scenario: Scenario) -> list[Observation]:
+    """Return the continuous readings of each host; p is 0 for hosts without any."""
+    placed, n = increment_sensors(scenario), scenario.plant.n
+    found = []
+    for nodes in nodes_by_host(scenario):
+        sensors = [sensor for node in nodes for sensor in placed.get(node, ())]
+        readings = [_observation(scenario, s, scenario.sensors[s.entry].H) for s in sensors]
+        found.append(stack_observations(readings, n))
+    return found
+
+
+def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], HostObservations]:
+    """Return a function from a slot to its readings by host; call it with increasing slots."""
+    streams, n = Streams(run.seed, run.replica), scenario.plant.n
+    hosts = [
+        [
+            (sensor, scenario.slot_path(streams, node, sensor))
+            for node in nodes
+            for sensor in scenario.placed.get(node, ())
+        ]
+        for nodes in nodes_by_host(scenario)
+    ]
+
+    def observe(slot: int) -> HostObservations:
+        found = {}
+        for host, paths in enumerate(hosts):
+            if not paths:
+                continue
+            rows = [(sensor, path.matrix(slot)) for sensor, path in paths]
+            # A sensor without a reading in this slot has a matrix without rows.
+            readings = [_observation(scenario, sensor, H) for sensor, H in rows if len(H)]
+            found[host] = stack_observations(readings, n)
+        return found
+
+    return observe
+
+
+def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservations]:
+    """Return the samples of a run in continuous time, by time (seconds) and host.
+
+    Samples that one filter gets at one instant are one observation.
+    """
+    streams, n = Streams(run.seed, run.replica), scenario.plant.n
+    by_node = sampled_sensors(scenario)
+    times = sample_times(scenario, streams)
+    found: dict[float, dict[int, list[Observation]]] = {}
+    for host, nodes in enumerate(nodes_by_host(scenario)):
+        for node in nodes:
+            for place in by_node.get(node, ()):
+                sensor = scenario.sensors[place.entry]
+                path = sample_path(scenario, streams, node, place) if sensor.varying else None
+                for k, time in enumerate(times[node, place.ordinal].tolist()):
+                    H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
+                    at_time = found.setdefault(time, {})
+                    at_time.setdefault(host, []).append(_observation(scenario, place, H))
+    return {
+        time: {host: stack_observations(readings, n) for host, readings in at_time.items()}
+        for time, at_time in found.items()
+    }

@@ -1,0 +1,275 @@
+"""Propagation of the state, of errors and of covariances over a gap between events.
+
+Without increments all errors obey the same ``e+ = F e + D x + w``, with the F of the filters and D
+from its difference to the plant's; :class:`Predictor` computes such a :class:`Prediction` from a
+stochastic differential equation. With increments each error has a transition of its own, computed
+by :class:`ErrorFlow`. With ``[X; Y](s) = E(s) [I; P]`` and ``E(s) = exp(M s)``, M the Hamiltonian,
+``Phi(g, s) = X(g)^-T X(s)^T`` and ``Phi(g, s) L(s) = X(g)^-T Y(s)^T H' R^-1`` are entire functions
+of s, which eight Gauss-Legendre nodes integrate to machine precision over steps of |M| g <= 1/2.
+Covariances are passed as roots ``P = S S'``, since ``(I + P G)^-1`` loses all digits where the
+eigenvalues of P differ much: with ``G_g = Gamma' Gamma`` from the same nodes and ``[I; Gamma S] =
+Z U``, it is ``I - (S Z_1)(Z_2' Gamma)``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
+NODES, WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
+MAX_NORM, TERMS = 0.5, 22  # of |M| s in the series of exp(M s), whose rest is below 0.5^22 / 22!
+MAX_CACHED = 256  # predictions that are cached by their gap; periodic clocks have few gaps
+
+
+class Prediction(NamedTuple):
+    """One prediction of the state and of all errors, over k common inputs.
+
+    state       : (n, n) F of the plant
+    error       : (n, n) F of the filters
+    follow      : (n, n) factor of the state in the errors, the difference of the two
+    state_noise : (n, k) factor of the inputs in the state
+    error_noise : (n, k) factor of the inputs in the errors
+    root        : (n, r) with ``root root' = Q`` as the filters assume it
+    """
+
+    state: FloatArray
+    error: FloatArray
+    follow: FloatArray
+    state_noise: FloatArray
+    error_noise: FloatArray
+    root: FloatArray
+
+
+class ShortExponential:
+    """``exp(M s)`` by its Taylor series, for |M| s up to MAX_NORM; ``unit`` is the largest s."""
+
+    def __init__(self, M: FloatArray) -> None:
+        self.unit = MAX_NORM / max(float(np.abs(M).sum(axis=0).max(initial=0.0)), 1e-300)
+        terms = [np.eye(len(M))]
+        for k in range(1, TERMS):
+            terms.append(terms[-1] @ (M * self.unit) / k)
+        self._terms = np.array(terms)
+
+    def __call__(self, times: FloatArray) -> FloatArray:
+        """Return the exponentials (K, d, d) at K times, each at most ``unit``."""
+        powers = (np.asarray(times)[:, None] / self.unit) ** np.arange(TERMS)
+        return np.asarray(np.tensordot(powers, self._terms, 1))
+
+
+def triangular_root(parts: FloatArray) -> FloatArray:
+    """Return lower triangular S (..., n, n) with ``S S' = parts parts'``, parts (..., n, k)."""
+    n, k = parts.shape[-2:]
+    if k == 0:
+        return np.zeros((*parts.shape[:-1], n))
+    if k < n:
+        widths = [(0, 0)] * (parts.ndim - 1) + [(0, n - k)]
+        parts = np.pad(parts, widths)
+    # parts' = Z U, so parts parts' = U' U: U' is the root, with arbitrary signs of its columns.
+    return np.swapaxes(np.linalg.qr(np.swapaxes(parts, -1, -2), mode="r"), -1, -2)
+
+
+class Predictor:
+    """Predictions without increments: plant dx = A x dt + B dw, filters that assume A_f, B_f."""
+
+    def __init__(self, A: FloatArray, B: FloatArray, A_f: FloatArray, B_f: FloatArray) -> None:
+        n = len(A)
+        self._n = n
+        # State and error together, driven by the same noise: de = (A_f e + (A - A_f) x) dt + B dw.
+        self._truth = _LinearSDE(
+            np.block([[A, np.zeros((n, n))], [A - A_f, A_f]]), np.concatenate([B, B], axis=0)
+        )
+        same = np.array_equal(A, A_f) and np.array_equal(B, B_f)
+        self._belief = None if same else _LinearSDE(A_f, B_f)
+        self._known: dict[float, Prediction] = {}
+
+    def __call__(self, gap: float) -> Prediction:
+        """Return the prediction over ``gap`` seconds."""
+        found = self._known.get(gap)
+        if found is None:
+            n = self._n
+            F, noise = self._truth.discretise(gap)
+            root = noise[n:] if self._belief is None else self._belief.discretise(gap)[1]
+            found = Prediction(
+                F[:n, :n], F[n:, n:], F[n:, :n], noise[:n], noise[n:], triangular_root(root)
+            )
+            if len(self._known) >= MAX_CACHED:
+                self._known.clear()
+            self._known[gap] = found
+        return found
+
+
+class _LinearSDE:
+    """The equation dz = A z dt + B dw, discretised over any gap by doubling."""
+
+    def __init__(self, A: FloatArray, B: FloatArray) -> None:
+        self._exp, self._B = ShortExponential(A), B
+
+    def discretise(self, gap: float) -> tuple[FloatArray, FloatArray]:
+        """Return ``exp(A gap)`` (d, d) and a root (d, d) of the covariance that the noise adds."""
+        doublings = max(0, math.ceil(math.log2(max(gap / self._exp.unit, 1e-300))))
+        short = gap / 2.0**doublings
+        E = self._exp(np.append(short * (1.0 - NODES), short))
+        # The noise covariance is the integral of exp(A s) B B' exp(A s)': its root has a block for
+        # each node of the quadrature.
+        parts = np.sqrt(WEIGHTS * short)[:, None, None] * (E[:-1] @ self._B)
+        F, root = E[-1], parts.transpose(1, 0, 2).reshape(len(self._B), -1)
+        for _ in range(doublings):
+            root = np.concatenate([F @ root, root], axis=1)  # Q(2 s) = F Q(s) F' + Q(s)
+            if root.shape[1] > 2 * len(root):
+                root = triangular_root(root)
+            F = F @ F
+        return F, triangular_root(root)
+
+
+class FlowTransition(NamedTuple):
+    """Transition of K errors over a gap with continuous readings.
+
+    transition : (K, n, n) of each error
+    follow     : (K, n, n) factor of the state
+    response   : (K, n, k) factor of the plant's k inputs
+    own        : (K, n, q) factor of q noises of the filter's readings, q at most n
+    root       : (K, n, n) root of P at the end
+    """
+
+    transition: FloatArray
+    follow: FloatArray
+    response: FloatArray
+    own: FloatArray
+    root: FloatArray
+
+
+class ErrorFlow:
+    """Errors of filters with the same continuous readings H (p, n); p = 0 for filters without any.
+
+    ``R`` (p, p) is the noise covariance that the filters assume, ``noise`` (p, p) a root of the
+    true one; ``A``, ``B`` as they assume them, ``plant`` the true pair. Transitions are over at
+    most ``unit`` seconds.
+    """
+
+    def __init__(
+        self,
+        A: FloatArray,
+        B: FloatArray,
+        H: FloatArray,
+        R: FloatArray,
+        noise: FloatArray,
+        plant: tuple[FloatArray, FloatArray],
+    ) -> None:
+        n = len(A)
+        self._n, self._B, self._plant = n, B, plant
+        self._root_R = np.linalg.cholesky(R)
+        self._whitened = np.linalg.solve(self._root_R, H)
+        self._weight = np.linalg.solve(R, H).T
+        self._noise = self._weight @ noise
+        # The Hamiltonian of dP = A P + P A' + Q - P G P, scaled to balance its off-diagonal blocks.
+        G, Q = self._whitened.T @ self._whitened, B @ B.T
+        self._scale = _balancing_scale(A, Q, G)
+        M = np.block([[-A.T, G * self._scale], [Q / self._scale, A]])
+        self._exp = ShortExponential(M)
+        self._difference = plant[0] - A
+        self._state = ShortExponential(plant[0]) if self._difference.any() else None
+        self.unit = self._exp.unit
+        if self._state is not None:
+            self.unit = min(self.unit, self._state.unit)
+
+    def _blocks(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the transposes (K, n, n) of the four blocks of exp(M s), without the scale."""
+        n, c = self._n, self._scale
+        E = np.swapaxes(self._exp(times), 1, 2)
+        return E[:, :n, :n], E[:, n:, :n] / c, E[:, :n, n:] * c, E[:, n:, n:]
+
+    def transition(self, roots: FloatArray, gap: float) -> FlowTransition:
+        """Return the transition of K filters with ``roots`` (K, n, n) of P over ``gap`` seconds."""
+        times, w = NODES * gap, WEIGHTS * gap
+        T11, T12, T21, T22 = self._blocks(np.append(times, gap))
+        F = np.linalg.inv(T11[-1])
+        at = np.sqrt(w)[:, None, None]
+        # X(g)^T = (I + P G_g) T11(g), so X(g)^-T = T11^-1 J = F J with J = (I + P G_g)^-1.
+        J, C, SZ = self._update_gramian(roots, at * (self._whitened @ np.linalg.inv(T11[:-1])))
+        FJ, FC = F @ J, F @ C
+        phi = FJ[:, None] @ T11[:-1] + FC[:, None] @ T12[:-1]  # Phi(g, s) = X(g)^-T X(s)^T
+        response = phi @ self._plant[1]
+        follow = np.zeros_like(FJ)
+        if self._state is not None:
+            states = self._state(times)
+            weighted = w[:, None, None] * phi @ self._difference @ states
+            follow = weighted.sum(axis=1)
+            response = response + self._response_through_state(FJ, FC, gap)
+        # Phi(g, s) L(s) at each node, L the gain of the filter at that time.
+        gains = (FJ[:, None] @ T21[:-1] + FC[:, None] @ T22[:-1]) @ self._noise
+        own = _side_by_side(at * gains)
+        if own.shape[2] > self._n:
+            own = triangular_root(own)
+        root = self._root(F, F @ SZ, T11[:-1], T21[:-1], at)
+        return FlowTransition(FJ, follow, _side_by_side(at * response), own, root)
+
+    def _update_gramian(
+        self, roots: FloatArray, pieces: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return ``J = (I + P G)^-1``, ``J P`` and its root S Z_1, (K, n, n) each.
+
+        ``pieces`` (8, p, n) are the rows of Gamma, ``G = Gamma' Gamma``.
+        """
+        n, Gamma = self._n, pieces.reshape(-1, self._n)
+        eye = np.broadcast_to(np.eye(n), roots.shape)
+        if not len(Gamma):
+            return eye, roots @ np.swapaxes(roots, 1, 2), roots
+        Z, _ = np.linalg.qr(np.concatenate([eye, Gamma @ roots], axis=1))
+        SZ = roots @ Z[:, :n]  # Z_1 = U^-1 whatever the signs of U
+        J = eye - SZ @ (np.swapaxes(Z[:, n:], 1, 2) @ Gamma)
+        return J, SZ @ np.swapaxes(SZ, 1, 2), SZ
+
+    def _root(
+        self, F: FloatArray, moved: FloatArray, T11: FloatArray, T21: FloatArray, at: FloatArray
+    ) -> FloatArray:
+        """Return the root of P at the end: F S Z_1 beside a root of the solution from P = 0."""
+        fresh = [_side_by_side((at * (F @ T11 @ self._B))[None])[0]]
+        fresh.append(_side_by_side((at * (F @ T21 @ self._weight @ self._root_R))[None])[0])
+        zero = triangular_root(np.concatenate(fresh, axis=1))
+        both = np.concatenate([moved, np.broadcast_to(zero, moved.shape)], axis=2)
+        return triangular_root(both)
+
+    def _response_through_state(self, FJ: FloatArray, FC: FloatArray, gap: float) -> FloatArray:
+        """Return the response (K, 8, n, m) of errors to noise at each node through the state."""
+        assert self._state is not None
+        parts = []
+        for s in NODES * gap:  # noise at s moves the state from s on, and that the errors
+            places, w = s + NODES * (gap - s), WEIGHTS * (gap - s)
+            T11, T12, _, _ = self._blocks(places)
+            phi = FJ[:, None] @ T11 + FC[:, None] @ T12
+            states = self._state(places - s) @ self._plant[1]
+            parts.append((w[:, None, None] * phi @ self._difference @ states).sum(axis=1))
+        return np.stack(parts, axis=1)
+
+
+def propagate_state(
+    plant: tuple[FloatArray, FloatArray], gap: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the state's transition (n, n) and its response (n, 8 m) to the plant's inputs.
+
+    The inputs are those of :class:`ErrorFlow`: m at each of the 8 nodes of the gap (seconds).
+    """
+    A, B = plant
+    E = ShortExponential(A)(np.append((1.0 - NODES) * gap, gap))
+    at = np.sqrt(WEIGHTS * gap)[:, None, None]
+    return E[-1], _side_by_side((at * (E[:-1] @ B))[None])[0]
+
+
+def _side_by_side(parts: FloatArray) -> FloatArray:
+    """Reshape (K, s, n, m) to (K, n, s m): s matrices side by side."""
+    K, s, n, m = parts.shape
+    return np.ascontiguousarray(parts.transpose(0, 2, 1, 3)).reshape(K, n, s * m)
+
+
+def _balancing_scale(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
+    """Return the unit of covariances that makes the norm of the Hamiltonian about minimal."""
+    q, g = float(np.abs(Q).max(initial=0.0)), float(np.abs(G).max(initial=0.0))
+    if g == 0.0:
+        return q or 1.0
+    rate = max(float(np.abs(A).max(initial=0.0)), 1e-12)
+    return math.sqrt(q / g) if q > 0.0 else rate / g
