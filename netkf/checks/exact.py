@@ -19,7 +19,8 @@ from netkf.core.fields import Part
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.errors import diagonal_blocks, replayed_covariances
-from netkf.trace.run import BLUR, Run, blurred, errors
+from netkf.trace.nees import errors
+from netkf.trace.run import BLUR, Run, blurred
 
 MOST = 1000
 """Replicas whose exact covariances are computed; the others show their errors only."""

@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     if many and options.replica is not None:
         remedy = "leave out --runs or --replica"
         raise ScenarioError("--replica", "is for a single run", options.replica, remedy)
-    if many and options.workers != 1 and options.scheduler is None:
+    if many and (options.workers or 1) > 1:
         # Worker processes import netkf while this one reads the scenario.
         from netkf.ensembles.process_start import start_early
 

@@ -1,13 +1,8 @@
-"""Replicas in blocks: what a worker does, and the tree in which results meet.
-
-The result of all runs is that of the binary tree over the numbers of the replicas: node (level, k)
-holds replicas k 2^level up to (k + 1) 2^level. A block is a node of that tree and workers merge
-inside it with the same tree, so the bits do not depend on the size of the blocks, on who did
-which, or on the order in which they came back.
-"""
+"""Blocks of replicas: what a worker does."""
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 import sys
 from collections.abc import Callable
@@ -15,94 +10,54 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError
-from netkf.engines.compiled.lots import together
+from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.runs.failures import explain_failure
-from netkf.scenario.plugins import in_words
+from netkf.scenario.plugins import in_words, plugged_in
 from netkf.scenario.registry import forget_other
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]
-Merge = Callable[[Any, Any], Any]
+"""``task(scenario, seed, replica)`` of one replica."""
+
+BlockTask = Callable[[Scenario, int, range], Any]
+"""``task(scenario, seed, replicas)`` of neighbouring replicas, merged by the tree over them."""
 
 
-def tree(leaf: Callable[[int], Any], merge: Merge, first: int, stop: int, size: int) -> Any:
-    """Of the ``size`` = 2^level leaves from ``first`` on that lie before ``stop``."""
-    if size == 1:
-        return leaf(first)
-    half = size // 2
-    left = tree(leaf, merge, first, stop, half)
-    if first + half >= stop:
-        return left
-    return merge(left, tree(leaf, merge, first + half, stop, half))
-
-
-class Grove:
-    """Takes the results of blocks in any order and merges neighbours as soon as both are there, so
-    that about as many wait as the logarithm of all.
-    """
-
-    def __init__(self, merge: Merge) -> None:
-        self._merge = merge
-        self._waiting: dict[tuple[int, int], Any] = {}
-
-    def add(self, block: int, value: Any) -> None:
-        """The result of a block; every block comes once."""
-        level, k = 0, block
-        while (level, k ^ 1) in self._waiting:
-            other = self._waiting.pop((level, k ^ 1))
-            value = self._merge(other, value) if k & 1 else self._merge(value, other)
-            level, k = level + 1, k >> 1
-        self._waiting[level, k] = value
-
-    def result(self) -> Any:
-        """Of all blocks; those at the end that have no neighbour join from right to left."""
-        values = [value for _, value in sorted(self._waiting.items(), key=_first_block)]
-        whole = values.pop()
-        while values:
-            whole = self._merge(values.pop(), whole)
-        return whole
-
-
-def _first_block(item: tuple[tuple[int, int], Any]) -> int:
-    (level, k), _ = item
-    return k << level
-
-
-class Job(NamedTuple):
-    """A block as it travels: the pickled scenario with its digest and where its modules are, what
-    to do with each replica, and with which: the block of ``size`` that begins at ``start``, and
-    nothing from ``stop`` on, counted from replica ``first``.
-    """
+class PackedScenario(NamedTuple):
+    """A scenario as it travels: its pickle, the digest of that, and where its modules are."""
 
     digest: str
     payload: bytes
     modules: tuple[tuple[str, str], ...]
-    task: Task
-    merge: Merge
+
+
+class Job(NamedTuple):
+    """A block of work: ``task`` for ``size`` replicas from ``start`` on, none from ``stop`` on,
+    counted from replica ``first``. ``start`` is a multiple of ``size``, a power of two.
+    """
+
+    scenario: Scenario | PackedScenario
+    task: BlockTask
     seed: int
     first: int
     start: int
     stop: int
     size: int
 
+    @property
+    def replicas(self) -> range:
+        """Numbers of the replicas."""
+        last = min(self.start + self.size, self.stop)
+        return range(self.first + self.start, self.first + last)
+
 
 def work(job: Job) -> Any:
-    """Do a block in a worker."""
-    return block_result(unpacked(job), job)
-
-
-def block_result(scenario: Scenario, job: Job) -> Any:
-    """The merged result of a block; raises EngineError that names a plugged-in class."""
-    first, stop = job.first + job.start, job.first + min(job.start + job.size, job.stop)
+    """Do a block; raises EngineError that names a plugged-in class that fails."""
+    scenario = job.scenario
+    if isinstance(scenario, PackedScenario):
+        scenario = unpacked(scenario)
     try:
-        with together(scenario, job.seed, first, stop):
-            return tree(
-                lambda place: job.task(scenario, job.seed, job.first + place),
-                job.merge,
-                job.start,
-                job.stop,
-                job.size,
-            )
+        return job.task(scenario, job.seed, job.replicas)
     except Exception as error:
         reason = explain_failure(scenario, error)
         if reason is error:
@@ -110,27 +65,60 @@ def block_result(scenario: Scenario, job: Job) -> Any:
         raise reason from error
 
 
+def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replicas: range) -> Any:
+    """Do a task replica by replica, merging by the tree over them."""
+    tree = MergeTree(merge)
+    for k, replica in enumerate(replicas):
+        tree.add(k, task(scenario, seed, replica))
+    return tree.result()
+
+
+def packed(scenario: Scenario) -> PackedScenario:
+    """A scenario for other processes; raises EngineError where it cannot be pickled."""
+    try:
+        payload = pickle.dumps(scenario, protocol=pickle.HIGHEST_PROTOCOL)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        words = f"the scenario cannot be sent to workers ({in_words(error)})"
+        remedy = "classes and functions must be those of modules; or use workers=1"
+        raise EngineError(f"{words}; {remedy}") from None
+    digest = hashlib.sha256(payload).hexdigest()
+    return PackedScenario(digest, payload, tuple(sorted(_modules(scenario))))
+
+
+def _modules(scenario: Scenario) -> set[tuple[str, str]]:
+    """The module of each plugged-in class, with the folder that it can be imported from."""
+    found = set()
+    for part in plugged_in(scenario):
+        name = type(part).__module__
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file is not None and name != "__main__":
+            path = Path(file).resolve()
+            up = name.count(".") + (path.name == "__init__.py")
+            found.add((name, str(path.parents[up])))
+    return found
+
+
 KEPT = 4
 _scenarios: dict[str, Scenario] = {}
 
 
-def unpacked(job: Job) -> Scenario:
-    """The scenario of a job, with its caches kept from one block to the next."""
-    scenario = _scenarios.get(job.digest)
+def unpacked(travelling: PackedScenario) -> Scenario:
+    """The scenario that travelled, with its caches kept from one block to the next."""
+    scenario = _scenarios.get(travelling.digest)
     if scenario is None:
         while len(_scenarios) >= KEPT:
             _scenarios.pop(next(iter(_scenarios)), None)
-        scenario = _scenarios.setdefault(job.digest, _unpickled(job))
+        scenario = _scenarios.setdefault(travelling.digest, _unpickled(travelling))
     return scenario
 
 
-def _unpickled(job: Job) -> Scenario:
-    for name, folder in job.modules:
+def _unpickled(travelling: PackedScenario) -> Scenario:
+    for name, folder in travelling.modules:
         forget_other(name, Path(folder))
         if folder not in sys.path:
             sys.path.insert(0, folder)
     try:
-        scenario: Scenario = pickle.loads(job.payload)
+        scenario: Scenario = pickle.loads(travelling.payload)
     except (AttributeError, ImportError) as error:
         words = f"a class of the scenario cannot be imported by a worker ({in_words(error)})"
         remedy = "put it into a module that can be imported there, or use workers=1"

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from netkf.ensembles.moments import Moments
-from netkf.ensembles.statistics import Tally, Trace
+from netkf.ensembles.statistics import RunStatistics, Trace
 from netkf.runs.files import write_atomically
 
 PARTS = ("samples", "averages", "messages")
 
 
-class KeptBlocks:
-    """The tallies of blocks that are done. A file is written beside and renamed: it is there whole
-    or not at all.
+class BlockCheckpoints:
+    """Statistics of the blocks that are done, a file each. Files are written beside and renamed:
+    each is there whole or not at all.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -31,16 +31,16 @@ class KeptBlocks:
         files = self._folder.glob("*.npz") if self._folder.is_dir() else ()
         return sorted(int(file.stem) for file in files if zipfile.is_zipfile(file))
 
-    def save(self, number: int, tally: Tally) -> None:
+    def save(self, number: int, statistics: RunStatistics) -> None:
         """A block with the traces that its runs left."""
         self._folder.mkdir(exist_ok=True)
         with write_atomically(self._file(number)) as part, part.open("wb") as opened:
-            np.savez(opened, **_as_arrays(tally))
+            np.savez(opened, **_as_arrays(statistics))
 
-    def load(self, number: int) -> Tally:
+    def load(self, number: int) -> RunStatistics:
         """A block without its traces."""
         with np.load(self._file(number)) as arrays:
-            return _tally(arrays)
+            return _statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
         """Of all blocks, in the order of replicas."""
@@ -58,19 +58,19 @@ class KeptBlocks:
         return self._folder / f"{number:06d}.npz"
 
 
-def _as_arrays(tally: Tally) -> dict[str, Any]:
-    arrays: dict[str, Any] = {"totals": tally.totals}
-    moments = {name: getattr(tally, name) for name in PARTS}
-    moments |= {f"conserved_{name}": found for name, (found, _) in tally.conserved.items()}
+def _as_arrays(statistics: RunStatistics) -> dict[str, Any]:
+    arrays: dict[str, Any] = {"totals": statistics.totals}
+    moments = {name: getattr(statistics, name) for name in PARTS}
+    moments |= {f"conserved_{name}": found for name, (found, _) in statistics.conserved.items()}
     for name, found in moments.items():
         arrays |= {f"{name}_{field}": getattr(found, field) for field in Moments._fields}
-    for k, trace in enumerate(tally.traces):
+    for k, trace in enumerate(statistics.traces):
         arrays |= {f"trace_{k}_{field}": getattr(trace, field) for field in Trace._fields}
     words = {
-        "conserved": {name: drift for name, (_, drift) in tally.conserved.items()},
-        "rounding_from": tally.rounding_from,
-        "fingerprint": tally.fingerprint,
-        "traces": len(tally.traces),
+        "conserved": {name: drift for name, (_, drift) in statistics.conserved.items()},
+        "rounding_from": statistics.rounding_from,
+        "fingerprint": statistics.fingerprint,
+        "traces": len(statistics.traces),
     }
     return {**arrays, "words": np.array(json.dumps(words))}
 
@@ -80,12 +80,12 @@ def _words(arrays: Any) -> dict[str, Any]:
     return found
 
 
-def _tally(arrays: Any) -> Tally:
+def _statistics(arrays: Any) -> RunStatistics:
     def moments(name: str) -> Moments:
         return Moments(*(arrays[f"{name}_{field}"] for field in Moments._fields))
 
     words = _words(arrays)
-    return Tally(
+    return RunStatistics(
         moments("samples"),
         moments("averages"),
         moments("messages"),

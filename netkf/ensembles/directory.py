@@ -13,11 +13,11 @@ from typing import Any
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, integer
-from netkf.ensembles.checkpoints import KeptBlocks
+from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
-from netkf.ensembles.pools import make_pool, workers_for
-from netkf.ensembles.replicas import Progress, block_size, replicate
-from netkf.ensembles.statistics import Tally, merge, reduced_run
+from netkf.ensembles.pools import block_size, make_pool
+from netkf.ensembles.replicas import Progress, replicate_blocks
+from netkf.ensembles.statistics import RunStatistics, block_statistics, merge
 from netkf.ensembles.summary import summarise_ensemble
 from netkf.runs.failures import InterruptedRunError, explain_failure
 from netkf.runs.files import (
@@ -98,14 +98,13 @@ def runs_to_directory(
     engine_used = choose_engine(engine, scenario)
     chosen = engine_used.name
     check_sources(scenario)
-    workers = workers_for(scenario, runs, engine_used, workers, executor, scheduler)
-    pool = make_pool(scenario, runs, workers, executor, scheduler)
+    pool = make_pool(runs, workers, executor, scheduler)
     size = block_size(runs, pool.width)
     size = min(size, LARGEST_TRACED) if trace == "full" else size
     plan = _Plan(scenario_digest(scenario), runs, trace, size)
     directory, plan = _directory(scenario, out, resume, plan, chosen)
     manifest = Manifest(directory, scenario.name, scenario.seed, 0, chosen, runs)
-    blocks = KeptBlocks(directory)
+    blocks = BlockCheckpoints(directory)
     if resume and is_finished(directory):
         blocks.remove()
         return None
@@ -115,11 +114,11 @@ def runs_to_directory(
         if not (directory / "scenario.toml").exists():
             write_scenario(directory, scenario)
         traces = {"full": runs, "first": 1, "none": 0}[trace]
-        whole = replicate(
-            partial(reduced_run, engine=engine_used, traces=traces),
+        whole = replicate_blocks(
+            partial(block_statistics, engine=engine_used, traces=traces),
+            merge,
             scenario,
             runs,
-            merge=merge,
             pool=pool,
             progress=progress,
             block=plan.block,
@@ -149,10 +148,10 @@ def runs_to_directory(
 def _write(
     directory: Path,
     scenario: Scenario,
-    whole: Tally,
+    whole: RunStatistics,
     engine: str,
     trace: str,
-    blocks: KeptBlocks,
+    blocks: BlockCheckpoints,
 ) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
     """All files but the manifest."""
     ensemble = ensemble_of(scenario, whole, scenario.seed, engine)
@@ -172,7 +171,7 @@ def _write(
 class _Keeper:
     """Keeps blocks as they come, and the manifest up to date."""
 
-    def __init__(self, manifest: Manifest, blocks: KeptBlocks, plan: _Plan) -> None:
+    def __init__(self, manifest: Manifest, blocks: BlockCheckpoints, plan: _Plan) -> None:
         self._manifest, self._blocks, self._plan = manifest, blocks, plan
         self.before = blocks.numbers()
         self._done = sum(map(self._runs, self.before))
@@ -181,13 +180,13 @@ class _Keeper:
     def _runs(self, number: int) -> int:
         return min(self._plan.block, self._plan.runs - number * self._plan.block)
 
-    def received(self, number: int, tally: Tally) -> Tally:
+    def received(self, number: int, found: RunStatistics) -> RunStatistics:
         """Save a block; its traces stay on disk."""
-        self._blocks.save(number, tally)
+        self._blocks.save(number, found)
         self._done += self._runs(number)
         self.simulated += self._runs(number)
         self.note()
-        return tally._replace(traces=())
+        return found._replace(traces=())
 
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:
         """Say how the runs stand."""

@@ -11,9 +11,8 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer
-from netkf.ensembles.pools import workers_for
-from netkf.ensembles.replicas import Progress, replicate
-from netkf.ensembles.statistics import MESSAGES, Tally, merge, reduced_run
+from netkf.ensembles.replicas import Progress, replicate_blocks
+from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
@@ -101,13 +100,13 @@ def monte_carlo(
         raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)
     chosen = choose_engine(engine, scenario)
     seed, count = scenario.seed if seed is None else seed, integer(low=1)("runs", runs)
-    whole = replicate(
-        partial(reduced_run, engine=chosen),
+    whole = replicate_blocks(
+        partial(block_statistics, engine=chosen),
+        merge,
         scenario,
         count,
         seed,
-        merge=merge,
-        workers=workers_for(scenario, count, chosen, workers, executor, scheduler),
+        workers=workers,
         executor=executor,
         scheduler=scheduler,
         progress=progress,
@@ -115,40 +114,40 @@ def monte_carlo(
     return ensemble_of(scenario, whole, seed, chosen.name)
 
 
-def ensemble_of(scenario: Scenario, tally: Tally, seed: int, engine: str) -> Ensemble:
-    """What a tally of all runs says."""
-    n, samples = scenario.plant.n, tally.samples
-    with np.errstate(invalid="ignore"):
-        means = np.where(samples.size > 0.0, samples.mean, np.nan)
-    mean_P, mean_error, mean_nees = _unpacked(means, n)
-    se_P, se_error, se_nees = _unpacked(samples.standard_error(), n)
+def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str) -> Ensemble:
+    """The ensemble that the statistics of all runs describe."""
+    samples, shape = found.samples, (len(scenario.times), len(scenario.nodes), -1)
+    means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
+    n = scenario.plant.n
+    mean_P, mean_error, mean_nees = _unpacked(means.reshape(shape), n)
+    se_P, se_error, se_nees = _unpacked(samples.standard_error().reshape(shape), n)
     for errors in (mean_error, mean_nees, se_error, se_nees):
-        errors[scenario.times >= tally.rounding_from] = np.nan
-    totals = tally.messages.mean * tally.messages.size
+        errors[scenario.times >= found.rounding_from] = np.nan
+    totals = found.messages.mean[0] * found.messages.size
     return Ensemble(
         scenario.times,
         scenario.nodes,
-        samples.size[:, 0, 0].astype(np.int64),
+        samples.size.astype(np.int64),
         mean_P,
         se_P,
         mean_error,
         se_error,
         mean_nees,
         se_nees,
-        tally.averages.mean,
-        tally.averages.standard_error(),
+        found.averages.mean.reshape(-1, 3),
+        found.averages.standard_error().reshape(-1, 3),
         {
             name: round(total)
             for name, total in zip(MESSAGES, totals.tolist(), strict=True)
             if np.isfinite(total)
         },
-        int(tally.totals[1]),
-        int(tally.totals[0]),
+        int(found.totals[1]),
+        int(found.totals[0]),
         seed,
         engine,
-        tally.fingerprint,
+        found.fingerprint,
         scenario.plant.shown,
-        tally.rounding_from,
+        found.rounding_from,
     )
 
 

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from abc import ABC, abstractmethod
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import suppress
@@ -13,18 +14,25 @@ from typing import Any
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
-from netkf.engines.base import Engine
-from netkf.engines.compiled.engine import CompiledEngine
-from netkf.engines.compiled.lots import guessed_seconds
-from netkf.ensembles.blocks import Job, block_result, work
+from netkf.ensembles.blocks import Job, PackedScenario, packed, work
 from netkf.ensembles.process_start import context, main_hidden, one_blas_thread
+from netkf.linalg.compiling import seconds_spent
 from netkf.scenario.scenario import Scenario
 
 AHEAD = 1024
 """Most blocks that are handed out and not yet back."""
 
-STARTING = 0.6
-"""Seconds until processes of our own do something."""
+QUICK, LARGEST_HERE = 0.1, 1024
+"""Blocks done in this process grow to at most so many runs, while they take fewer seconds."""
+
+WARM, SAVING = 0.2, 2.0
+"""Worker processes are started where they save so many seconds, as the first blocks, which are done
+here, show after so many seconds. Starting them costs about as much.
+"""
+
+LARGEST_BLOCK = 64
+MOST_BLOCKS = 4096
+ROUNDS = 16
 
 PATIENCE = 10
 """Seconds to wait for a scheduler."""
@@ -42,6 +50,10 @@ class Pool(ABC):
     def submit(self, job: Job) -> Future[Any]:
         """Hand out a block."""
 
+    def next_size(self, left: int, runs: int) -> int:
+        """Runs of the next block, a power of two, where so many of all ``runs`` are left."""
+        return block_size(runs, self.width)
+
     def renew(self) -> bool:
         """Replace workers that died; False where that is not ours to do."""
         return False
@@ -51,39 +63,128 @@ class Pool(ABC):
 
 
 class Here(Pool):
-    """In this process, one block at a time, with the scenario and the caches that it has."""
+    """The present process, one block at a time, with the scenario and the caches that it has."""
 
     ahead = 1
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
+    def __init__(self) -> None:
+        self._size = 1
 
     def submit(self, job: Job) -> Future[Any]:
         """Done before it returns."""
         future: Future[Any] = Future()
+        began, compiled = time.perf_counter(), seconds_spent()
         try:
-            future.set_result(block_result(self._scenario, job))
+            future.set_result(work(job))
         except Exception as error:
             future.set_exception(error)
+        self._measured(job, time.perf_counter() - began - (seconds_spent() - compiled))
         return future
 
+    def next_size(self, left: int, runs: int) -> int:
+        """Twice as many as before while blocks are quick."""
+        return self._size
 
-class Given(Pool):
+    def _measured(self, job: Job, seconds: float) -> None:
+        """Take note of how long a block took, without what was compiled meanwhile."""
+        if seconds < QUICK and len(job.replicas) >= self._size:
+            self._size = min(2 * self._size, LARGEST_HERE)
+
+
+class Adaptive(Here):
+    """The present process, until the rest of the work is worth processes of our own, which do it.
+
+    In an ``open_ended`` pool, which serves one job after another, as much work is expected to come
+    as there was already.
+    """
+
+    def __init__(self, workers: int, open_ended: bool = False) -> None:
+        super().__init__()
+        self.width, self._open_ended = workers, open_ended
+        self._processes: Processes | None = None
+        self._scenario: object = None
+        self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
+
+    def submit(self, job: Job) -> Future[Any]:
+        """Done here, or handed to the processes once they are worth it."""
+        if job.scenario is not self._scenario:
+            self._scenario, self._size = job.scenario, 1
+            self._begun, self._seconds, self._runs = False, 0.0, 0
+        if self._processes is None and self._worth_processes(job):
+            self._processes = Processes(self.width)
+            self.ahead = AHEAD
+        if self._processes is not None:
+            return self._processes.submit(job)
+        return super().submit(job)
+
+    def next_size(self, left: int, runs: int) -> int:
+        """As suits where the next block is done."""
+        if self._processes is None:
+            return super().next_size(left, runs)
+        return block_size(left, self.width)
+
+    def _measured(self, job: Job, seconds: float) -> None:
+        super()._measured(job, seconds)
+        self._spent += seconds
+        if self._begun or seconds > 1.0:  # the first block fills caches
+            self._seconds += seconds
+            self._runs += len(job.replicas)
+        self._begun = True
+
+    def _worth_processes(self, job: Job) -> bool:
+        expected = 0.0
+        if self._seconds > WARM:
+            expected = self._seconds / self._runs * (job.stop - job.start)
+        if self._open_ended:
+            expected = max(expected, self._spent)
+        return expected * (1.0 - 1.0 / self.width) > SAVING
+
+    def renew(self) -> bool:
+        """New processes, three times."""
+        return self._processes is not None and self._processes.renew()
+
+    def close(self, at_once: bool) -> None:
+        """End the processes, if any were started."""
+        if self._processes is not None:
+            self._processes.close(at_once)
+
+
+class Elsewhere(Pool):
+    """A pool outside this process: scenarios are packed, each once."""
+
+    def __init__(self) -> None:
+        self._packed: tuple[object, PackedScenario] | None = None
+
+    def submit(self, job: Job) -> Future[Any]:
+        """Hand out a block with the packed scenario."""
+        if isinstance(job.scenario, Scenario):
+            if self._packed is None or self._packed[0] is not job.scenario:
+                self._packed = job.scenario, packed(job.scenario)
+            job = job._replace(scenario=self._packed[1])
+        return self._send(job)
+
+    @abstractmethod
+    def _send(self, job: Job) -> Future[Any]:
+        """Hand out a block that can travel."""
+
+
+class Given(Elsewhere):
     """An executor of the user's, which stays open."""
 
     def __init__(self, executor: Executor) -> None:
+        super().__init__()
         self._executor = executor
         self.width = getattr(executor, "_max_workers", None) or cores()
 
-    def submit(self, job: Job) -> Future[Any]:
-        """As the executor does it."""
+    def _send(self, job: Job) -> Future[Any]:
         return self._executor.submit(work, job)
 
 
-class Cluster(Pool):
+class Cluster(Elsewhere):
     """The workers of a Dask scheduler, which does the blocks of lost workers again."""
 
     def __init__(self, address: str) -> None:
+        super().__init__()
         try:
             import distributed
         except ImportError:
@@ -102,8 +203,7 @@ class Cluster(Pool):
         self._executor = self._client.get_executor(retries=3)
         self.width = max(1, sum(self._client.nthreads().values()))
 
-    def submit(self, job: Job) -> Future[Any]:
-        """As the scheduler places it."""
+    def _send(self, job: Job) -> Future[Any]:
         future: Future[Any] = self._executor.submit(work, job)
         return future
 
@@ -113,10 +213,11 @@ class Cluster(Pool):
         self._client.close()
 
 
-class Processes(Pool):
+class Processes(Elsewhere):
     """Worker processes of our own, each with one BLAS thread and without the user's script."""
 
     def __init__(self, workers: int) -> None:
+        super().__init__()
         self.width = workers
         self._renewed = 0
         self._open()
@@ -124,9 +225,10 @@ class Processes(Pool):
     def _open(self) -> None:
         self._executor = ProcessPoolExecutor(self.width, context(), initializer=_prepare)
 
-    def submit(self, job: Job) -> Future[Any]:
-        """Workers are started as they are needed."""
-        with one_blas_thread(), main_hidden(b"__main__" not in job.payload):
+    def _send(self, job: Job) -> Future[Any]:
+        # Workers are started as they are needed: by the first blocks.
+        assert isinstance(job.scenario, PackedScenario)
+        with one_blas_thread(), main_hidden(b"__main__" not in job.scenario.payload):
             return self._executor.submit(work, job)
 
     def renew(self) -> bool:
@@ -152,14 +254,25 @@ def cores() -> int:
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
+def block_size(runs: int, width: int) -> int:
+    """A power of two that leaves every worker several blocks, so that all end together."""
+    size = 1
+    while size < LARGEST_BLOCK and 2 * size * width * ROUNDS <= runs:
+        size *= 2
+    while size * MOST_BLOCKS < runs:
+        size *= 2
+    return size
+
+
 def make_pool(
-    scenario: Scenario,
     blocks: int,
     workers: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
+    open_ended: bool = False,
 ) -> Pool:
-    """The pool that was asked for; by default as many processes of our own as there are cores.
+    """The pool that was asked for; by default this process, and as many processes of our own as
+    there are cores once they are worth it. ``open_ended``: more jobs follow.
 
     Raises ScenarioError where two were asked for, or where one is of the wrong kind.
     """
@@ -179,26 +292,9 @@ def make_pool(
         return Cluster(scheduler)
     count = cores() if workers is None else integer(low=1)("workers", workers)
     count = min(count, blocks)
-    return Here(scenario) if count == 1 else Processes(count)
-
-
-def workers_for(
-    scenario: Scenario,
-    runs: int,
-    engine: Engine,
-    workers: int | None,
-    executor: Executor | None,
-    scheduler: str | None,
-) -> int | None:
-    """``workers``; 1 where nothing was asked for and all is done here before processes, once they
-    have started, would have done it.
-    """
-    if any(asked is not None for asked in (workers, executor, scheduler)):
-        return workers
-    if not isinstance(engine, CompiledEngine) or scenario.slotted:
-        return None
-    seconds = guessed_seconds(scenario, runs)
-    return 1 if seconds < STARTING + seconds / cores() else None
+    if count == 1:
+        return Here()
+    return Adaptive(count, open_ended) if workers is None else Processes(count)
 
 
 def _prepare() -> None:

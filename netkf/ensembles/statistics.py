@@ -1,23 +1,24 @@
-"""One run reduced to a tally, and tallies of neighbours merged into one."""
+"""Statistics of many runs: computed for batches of runs, merged by the tree over replicas."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from netkf.engines.base import Engine, silent
-from netkf.ensembles.moments import Moments, merge_moments, single
+from netkf.engines.base import Engine, recorded_batch, silent
+from netkf.ensembles.merge_tree import MergeTree, aligned_pieces
+from netkf.ensembles.moments import Moments, merge_moments, moments_of
+from netkf.ensembles.reduction import reduce_batch
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
-from netkf.runs.simulate import choose_engine, collect
-from netkf.runs.summary import averaged_samples
+from netkf.runs.simulate import collect
 from netkf.scenario.scenario import Scenario
+from netkf.trace.batch import RunBatch
 from netkf.trace.recorder import MemorySink, Recorder
-from netkf.trace.run import Run, errors
+from netkf.trace.schema import KINDS
 
 MESSAGES = ("sent", "delivered", "lost", "in_flight", "transmissions")
 
@@ -34,16 +35,16 @@ class Trace(NamedTuple):
     error: FloatArray
 
 
-class Tally(NamedTuple):
-    """Some runs, reduced.
+class RunStatistics(NamedTuple):
+    """Statistics of some runs of a scenario.
 
-    ``samples``: (T, N, 2 u + 1) upper triangles of P and of e e' with the error e, then NEES;
-    size (T, 1, 1). ``averages``: (N + 1, 3) of every run: mean square error, mean trace of P and
-    mean NEES over the samples after time 0, of the nodes and of all; size (1, 1). ``messages``:
-    (5,) as MESSAGES, transmissions nan in slots, size (1,). ``totals`` are events, diverged runs.
-    ``conserved``: of each sum its mean at the start and at the end, then the largest relative
-    drift. ``rounding_from`` is the first sample of any run at which rounding blurs the errors, inf
-    where none. ``fingerprint`` is that of replica 0. ``traces`` are those asked for, in order.
+    ``samples`` (T, N (2 u + 1)): of each node the upper triangles of P and of e e' with the error
+    e, then NEES. ``averages`` (1, (N + 1) 3): of every run the mean square error, mean trace of P
+    and mean NEES over the samples after time 0, of the nodes and of all. ``messages`` (1, 5) as
+    MESSAGES, transmissions nan in slots. ``totals`` are events and diverged runs. ``conserved``: of
+    each sum its mean at the start and at the end (1, 2), then the largest relative drift.
+    ``rounding_from`` is the first sample of any run at which rounding blurs the errors, inf where
+    none. ``fingerprint`` is that of replica 0. ``traces`` are those asked for, in order.
     """
 
     samples: Moments
@@ -57,19 +58,17 @@ class Tally(NamedTuple):
 
     @property
     def runs(self) -> int:
-        """How many runs are in it."""
-        return int(self.averages.size[0, 0])
+        """Number of runs."""
+        return int(self.averages.size[0])
 
 
-def merge(a: Tally, b: Tally) -> Tally:
-    """The runs of ``a`` followed by those of ``b``."""
+def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
+    """Statistics of the runs of ``a`` followed by those of ``b``."""
     conserved = {
-        name: (merge_moments(a.conserved[name][0], b.conserved[name][0]), max(drifts, key=abs))
-        for name, drifts in (
-            (name, (a.conserved[name][1], b.conserved[name][1])) for name in a.conserved
-        )
+        name: (merge_moments(sums, b.conserved[name][0]), max(drift, b.conserved[name][1], key=abs))
+        for name, (sums, drift) in a.conserved.items()
     }
-    return Tally(
+    return RunStatistics(
         merge_moments(a.samples, b.samples),
         merge_moments(a.averages, b.averages),
         merge_moments(a.messages, b.messages),
@@ -79,6 +78,37 @@ def merge(a: Tally, b: Tally) -> Tally:
         a.fingerprint,
         a.traces + b.traces,
     )
+
+
+def block_statistics(
+    scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int = 0
+) -> RunStatistics:
+    """Simulate a block of replicas and merge their statistics; the first ``traces`` replicas of the
+    ensemble keep everything too. Only their events and those of replica 0 have a fingerprint.
+    """
+    tree, done = MergeTree(merge), 0
+    for batch, fingerprint, kept in _batches(scenario, seed, replicas, engine, traces):
+        values = run_values(batch, scenario)
+        for level, k in aligned_pieces(done, done + len(batch)):
+            first = (k << level) - done
+            piece = merge_runs(values, slice(first, first + (1 << level)))
+            tree.add(k, piece._replace(fingerprint=fingerprint, traces=kept), level)
+        done += len(batch)
+    whole: RunStatistics = tree.result()
+    return whole
+
+
+def _batches(
+    scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
+) -> Iterator[tuple[RunBatch, str, tuple[Trace, ...]]]:
+    """Batches with the fingerprint and the traces of those that are a single recorded run."""
+    recorded = min(max(traces, 1), replicas.stop)  # replica 0 always has a fingerprint
+    for replica in range(replicas.start, recorded):
+        yield _recorded_run(scenario, seed, replica, engine, replica < traces)
+    rest = range(max(replicas.start, recorded), replicas.stop)
+    if rest:
+        for batch in engine.run_many(scenario, seed, rest):
+            yield batch, "", ()
 
 
 class _Samples(MemorySink):
@@ -93,74 +123,90 @@ class _Samples(MemorySink):
             super().events(rows)
 
 
-def reduced_run(
-    scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto", traces: int = 0
-) -> Tally:
-    """Simulate one replica and reduce it; the first ``traces`` replicas keep everything too. Only
-    theirs and replica 0's events have a fingerprint.
+def _recorded_run(
+    scenario: Scenario, seed: int, replica: int, engine: Engine, traced: bool
+) -> tuple[RunBatch, str, tuple[Trace, ...]]:
+    memory = _Samples(traced)
+    recorder = Recorder([memory])
+    status = engine.run(scenario, Streams(seed, replica), recorder, silent)
+    batch = recorded_batch(scenario, replica, memory, recorder, status)
+    if not traced:
+        return batch, recorder.fingerprint, ()
+    run = collect(scenario, memory, recorder, seed, replica, engine.name, status)
+    trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
+    return batch, run.fingerprint, (trace,)
+
+
+class RunValues(NamedTuple):
+    """Values of R runs that statistics are over.
+
+    ``samples`` (R, T, N, 2 u + 1) with ``size`` (R, T) 1 or 0; ``averages`` (R, N + 1, 3);
+    ``messages`` (R, 5); ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
     """
-    traced = replica < traces
-    memory, chosen = _Samples(traced), choose_engine(engine, scenario)
-    recorder = Recorder([memory], counted=not traced and replica > 0)
-    status = chosen.run(scenario, Streams(seed, replica), recorder, silent)
-    run = collect(scenario, memory, recorder, seed, replica, chosen.name, status)
-    return _tally(run, recorder, scenario, traced)
+
+    samples: FloatArray
+    size: FloatArray
+    averages: FloatArray
+    messages: FloatArray
+    events: np.ndarray
+    diverged: np.ndarray
+    rounding_from: FloatArray
+    sums: dict[str, FloatArray]
 
 
-def _tally(run: Run, recorder: Recorder, scenario: Scenario, traced: bool) -> Tally:
-    """A sample at which a node's estimate or covariance is broken is left out."""
-    diverged = run.status == "diverged"
-    kept = len(run.times) - 1 if diverged else len(run.times)
-    P, e = run.P[:kept], run.error[:kept]
-    sq_error, nees = errors(e, P)
-    trace = np.trace(P, axis1=2, axis2=3)
-    blurred = run.rounding_from
-    used = averaged_samples(run.times, blurred, diverged)
-    averages = np.stack(
-        [_mean(sq_error[used.errors]), _mean(trace[used.covariances]), _mean(nees[used.errors])],
-        axis=1,
-    )
-    return Tally(
-        single(*_padded(_columns(P, e, nees), len(scenario.times))),
-        single(np.vstack([averages, averages.mean(axis=0)]), np.ones((1, 1))),
-        single(count_messages(recorder.count, scenario.slotted), np.ones(1)),
-        np.array([recorder.total, int(diverged)]),
-        {
-            name: (single(np.array(sums), np.ones(1)), (sums[1] - sums[0]) / sums[0])
-            for name, sums in run.sums.items()
-        },
-        blurred,
-        run.fingerprint,
-        (Trace(run.replica, run.log, run.times, run.x, run.xhat, run.P, run.error),)
-        if traced
-        else (),
+def run_values(batch: RunBatch, scenario: Scenario) -> RunValues:
+    """Values of the runs of a batch, for every node where the filter is pooled."""
+    reduced, nodes = reduce_batch(batch), len(scenario.nodes)
+    samples, averages = reduced.samples, reduced.averages
+    if samples.shape[2] < nodes:
+        samples, averages = np.repeat(samples, nodes, axis=2), np.repeat(averages, nodes, axis=1)
+    return RunValues(
+        samples,
+        reduced.size,
+        np.concatenate([averages, _mean_of_nodes(averages)], axis=1),
+        count_messages(batch.counts, scenario.slotted),
+        batch.counts.sum(axis=1),
+        batch.diverged,
+        reduced.rounding_from,
+        dict(batch.sums),
     )
 
 
-@cache
-def _upper(n: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.triu_indices(n)
+def _mean_of_nodes(averages: FloatArray) -> FloatArray:
+    """(R, 1, 3) means over the nodes of (R, N, 3), node after node in every run."""
+    total = np.zeros((len(averages), 1, averages.shape[2]))
+    for k in range(averages.shape[1]):
+        total[:, 0] += averages[:, k]
+    return np.asarray(total / averages.shape[1])
 
 
-def _columns(P: FloatArray, e: FloatArray, nees: FloatArray) -> FloatArray:
-    i, j = _upper(e.shape[2])
-    with np.errstate(over="ignore"):
-        return np.concatenate([P[:, :, i, j], e[:, :, i] * e[:, :, j], nees[:, :, None]], axis=2)
+def merge_runs(values: RunValues, runs: slice) -> RunStatistics:
+    """Statistics of some of the runs, merged by the tree over them; overwrites their values."""
+    samples, averages, messages = values.samples[runs], values.averages[runs], values.messages[runs]
+    count, one = len(messages), np.ones((len(messages), 1))
+    conserved = {
+        name: (
+            moments_of(np.array(sums[runs, None]), one.copy()),
+            float(max((sums[runs, 1] - sums[runs, 0]) / sums[runs, 0], key=abs)),
+        )
+        for name, sums in values.sums.items()
+    }
+    return RunStatistics(
+        moments_of(samples.reshape(*samples.shape[:2], -1), values.size[runs]),
+        moments_of(averages.reshape(count, 1, -1), one.copy()),
+        moments_of(messages.reshape(count, 1, -1), one.copy()),
+        np.array([values.events[runs].sum(), values.diverged[runs].sum()]),
+        conserved,
+        float(values.rounding_from[runs].min()),
+        "",
+    )
 
 
-def _padded(values: FloatArray, length: int) -> tuple[FloatArray, FloatArray]:
-    """Zeros for samples that are missing at the end, and 1 or 0 (T, 1, 1) for those that exist."""
-    whole = np.zeros((length, *values.shape[1:]))
-    whole[: len(values)] = values
-    return whole, (np.arange(length) < len(values)).astype(float)[:, None, None]
-
-
-def count_messages(count: Callable[[str], int], slotted: bool) -> FloatArray:
-    """(5,) as MESSAGES, from the number of events of each kind."""
-    sent, delivered, lost = count("send"), count("deliver"), count("lost") + count("late")
-    transmissions = math.nan if slotted else float(count("transmit") or sent)
-    return np.array([sent, delivered, lost, sent - delivered - lost, transmissions])
-
-
-def _mean(values: FloatArray) -> FloatArray:
-    return values.mean(axis=0) if len(values) else np.full(values.shape[1:], np.nan)
+def count_messages(counts: np.ndarray, slotted: bool) -> FloatArray:
+    """(R, 5) as MESSAGES, from the events by kind (R, len(KINDS))."""
+    of = dict(zip(KINDS, counts.T.astype(np.float64), strict=True))
+    sent, delivered, lost = of["send"], of["deliver"], of["lost"] + of["late"]
+    # Without broadcasts every message is a transmission of its own.
+    single = np.where(of["transmit"] > 0.0, of["transmit"], sent)
+    transmissions = np.full(len(counts), math.nan) if slotted else single
+    return np.stack([sent, delivered, lost, sent - delivered - lost, transmissions], axis=1)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.ensembles.statistics import MESSAGES, Tally
+from netkf.ensembles.statistics import MESSAGES, RunStatistics
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.summary import CONFIDENCE, PromisedTraces, nees_bounds, summary_notes
 from netkf.scenario.scenario import Scenario
@@ -14,21 +14,22 @@ from netkf.scenario.usage import record_usage
 
 
 def summarise_ensemble(
-    scenario: Scenario, tally: Tally, promised: PromisedTraces
+    scenario: Scenario, found: RunStatistics, promised: PromisedTraces
 ) -> dict[str, Any]:
     """The keys of one run's summary. ``rms_error`` is the root of the mean square error of all
     runs; a key that ends in ``_se`` is a standard error.
     """
-    mean, error = tally.averages.mean, tally.averages.standard_error()
+    mean = found.averages.mean.reshape(-1, 3)
+    error = found.averages.standard_error().reshape(-1, 3)
     bound = _bounds(scenario, promised)
-    blurred = tally.rounding_from if np.isfinite(tally.rounding_from) else None
+    blurred = found.rounding_from if np.isfinite(found.rounding_from) else None
     rows = [_row(*values) for values in zip(mean, error, bound, strict=True)]
-    messages = tally.messages.mean.tolist()
-    messages_se = tally.messages.standard_error().tolist()
+    messages = found.messages.mean[0].tolist()
+    messages_se = found.messages.standard_error()[0].tolist()
     nodes = [{"node": node, **row} for node, row in zip(scenario.nodes, rows[:-1], strict=True)]
     summary: dict[str, Any] = {
-        "runs": tally.runs,
-        "diverged": int(tally.totals[1]),
+        "runs": found.runs,
+        "diverged": int(found.totals[1]),
         "nodes": nodes,
         "overall": rows[-1],
         "limit": promised.limit,
@@ -40,28 +41,29 @@ def summarise_ensemble(
         "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
     }
     if scenario.plant.shown:
-        summary["nees"] = _chi_square(scenario, tally)
-    if tally.conserved:
+        summary["nees"] = _chi_square(scenario, found)
+    if found.conserved:
         summary["conserved"] = {
-            name: {"exact": sums.mean[0], "total": sums.mean[1], "drift": drift}
-            for name, (sums, drift) in tally.conserved.items()
+            name: {"exact": sums.mean[0, 0], "total": sums.mean[0, 1], "drift": drift}
+            for name, (sums, drift) in found.conserved.items()
         }
-    records = {} if tally.totals[1] else record_usage(scenario, None)
+    records = {} if found.totals[1] else record_usage(scenario, None)
     if records:
         summary["records"] = records
     return summary
 
 
-def _chi_square(scenario: Scenario, tally: Tally) -> dict[str, float]:
+def _chi_square(scenario: Scenario, found: RunStatistics) -> dict[str, float]:
     """Bounds on the mean NEES of one sample over the runs that hold with ``confidence`` where P is
     exact, since the sum is chi-square; over n they bound the ANEES. ``inside``: the share of all
     samples after time 0 that every run has and that rounding does not blur.
     """
-    n, runs = scenario.plant.n, tally.runs
+    n, runs = scenario.plant.n, found.runs
     low, high = nees_bounds(n, runs)
-    clear = (scenario.times > 0.0) & (scenario.times < tally.rounding_from)
-    kept = clear & (tally.samples.size[:, 0, 0] == runs)
-    means = tally.samples.mean[kept, :, -1]
+    clear = (scenario.times > 0.0) & (scenario.times < found.rounding_from)
+    kept = clear & (found.samples.size == runs)
+    nees = found.samples.mean.reshape(len(kept), len(scenario.nodes), -1)[:, :, -1]
+    means = nees[kept]
     inside = float(((means >= low) & (means <= high)).mean()) if means.size else np.nan
     return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": inside}
 

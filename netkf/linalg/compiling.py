@@ -22,7 +22,7 @@ from typing import Any, TypeVar, overload
 
 from netkf.linalg.linking import linked_once
 
-ROOMS = ("core", "algorithms", "plants", "trace", "engines")
+ROOMS = ("linalg", "rng", "core", "algorithms", "plants", "trace", "engines")
 """Whose code and numbers compiled functions may hold."""
 
 MOST_STATES = 4

@@ -16,8 +16,9 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory import central_covariance, covariance_bound, limit_covariance
 from netkf.theory.hybrid.coupled import not_promised
 from netkf.theory.hybrid.steady import has_steady_state
+from netkf.trace.nees import errors
 from netkf.trace.recorder import Sink
-from netkf.trace.run import carried, errors, rounding_from
+from netkf.trace.run import carried, rounding_from
 from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95

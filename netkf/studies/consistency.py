@@ -29,7 +29,8 @@ from netkf.runs.simulate import choose_engine, simulate
 from netkf.runs.summary import NO_COVARIANCE
 from netkf.scenario.scenario import Scenario
 from netkf.theory import error_covariance
-from netkf.trace.run import Run, blurred, errors
+from netkf.trace.nees import errors
+from netkf.trace.run import Run, blurred
 
 if TYPE_CHECKING:
     import pandas as pd

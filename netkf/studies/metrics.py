@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,60 +12,68 @@ from netkf.algorithms.baselines import Central
 from netkf.algorithms.models import SlotModel
 from netkf.core.errors import TheoryError
 from netkf.engines.base import Engine
-from netkf.ensembles.statistics import count_messages, reduced_run
+from netkf.ensembles.statistics import RunValues, count_messages, run_values
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Filtering, Scenario
 from netkf.theory import covariance_bound, error_covariance, riccati_step
+from netkf.trace.schema import KINDS
 
 MOST_ERRORS = 24
 
 
-class Figures(NamedTuple):
+class RunMetrics(NamedTuple):
     """Of R runs: ``mean_square`` error and ``trace`` of P (R, N), averaged over the samples after
-    time 0; ``messages`` (R, 5) as MESSAGES; ``diverged`` (R,); ``rounding_from`` (R,): when it
+    time 0; ``messages`` (R, 5) as MESSAGES; ``diverged`` (R, 1); ``rounding_from`` (R, 1): when it
     begins to blur errors, which are averaged over the samples before, nan without one.
     """
 
     mean_square: FloatArray
     trace: FloatArray
     messages: FloatArray
-    diverged: FloatArray
+    diverged: np.ndarray
     rounding_from: FloatArray
 
 
-def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Figures:
-    """The figures of one replica, for ``replicate``."""
-    tally = reduced_run(scenario, seed, replica, engine)
-    averages = tally.averages.mean[:-1]
-    blurred = np.array([tally.rounding_from])
-    return Figures(averages[:, 0], averages[:, 1], tally.messages.mean, tally.totals[1:2], blurred)
+def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> RunMetrics:
+    """Simulate neighbouring replicas, for ``replicate_blocks``."""
+    batches = engine.run_many(scenario, seed, replicas)
+    return join_metrics(*(_batch_metrics(run_values(batch, scenario)) for batch in batches))
 
 
-def together(runs: Sequence[Figures]) -> Figures:
-    """The figures of several runs, stacked."""
-    return Figures(*(np.stack(values) for values in zip(*runs, strict=True)))
+def _batch_metrics(values: RunValues) -> RunMetrics:
+    return RunMetrics(
+        values.averages[:, :-1, 0],
+        values.averages[:, :-1, 1],
+        values.messages,
+        values.diverged[:, None],
+        values.rounding_from[:, None],
+    )
 
 
-def one_expected_run(
-    scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
-) -> Figures:
-    """As ``one_run``, with the expected square of the error given the events of the run: what luck
-    with noise adds is left out, and far fewer runs are enough.
+def join_metrics(*parts: RunMetrics) -> RunMetrics:
+    """The metrics of several batches, one after the other."""
+    return RunMetrics(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine) -> RunMetrics:
+    """Metrics of one replica with the expected square of the error given the events of the run,
+    which needs far fewer runs: no chance of the noise is in it.
     """
     run = simulate(scenario, seed, replica, engine)
     if run.status != "complete":
-        return one_run(scenario, seed, replica, engine)
+        return block_metrics(scenario, seed, range(replica, replica + 1), engine)
     square, trace = (
-        averaged(scenario, np.trace(matrices, axis1=2, axis2=3))
+        averaged(scenario, np.trace(matrices, axis1=2, axis2=3))[None]
         for matrices in (error_covariance(scenario, run), run.P)
     )
-    messages = count_messages(run.count, scenario.slotted)
-    return Figures(square, trace, messages, np.zeros(1, dtype=np.int64), np.full(1, np.inf))
+    counts = np.array([[run.count(kind) for kind in KINDS]])
+    messages = count_messages(counts, scenario.slotted)
+    return RunMetrics(square, trace, messages, np.zeros((1, 1)), np.full((1, 1), np.inf))
 
 
 def expected_errors_known(scenario: Scenario) -> bool:
-    """Whether ``one_expected_run`` can be done, and in about the time of a few runs."""
+    """Whether ``expected_metrics`` can be computed, and in about the time of a few runs."""
     small = len(scenario.nodes) * scenario.plant.n <= MOST_ERRORS
     if not (scenario.slotted and small and scenario.drawn):
         return False

@@ -8,19 +8,27 @@ from contextlib import contextmanager
 from typing import Any
 
 from netkf.ensembles.blocks import Job
-from netkf.ensembles.pools import Here, Pool, make_pool
-from netkf.scenario.scenario import Scenario
+from netkf.ensembles.pools import Pool, make_pool
 
 
 class _Kept(Pool):
     """A pool that stays open when a part of the work ends."""
 
     def __init__(self, pool: Pool) -> None:
-        self._pool, self.width, self.ahead = pool, pool.width, pool.ahead
+        self._pool, self.width = pool, pool.width
+
+    @property
+    def ahead(self) -> int:  # type: ignore[override]
+        """As many as the pool takes now."""
+        return self._pool.ahead
 
     def submit(self, job: Job) -> Future[Any]:
         """As the pool does it."""
         return self._pool.submit(job)
+
+    def next_size(self, left: int, runs: int) -> int:
+        """As the pool chooses."""
+        return self._pool.next_size(left, runs)
 
     def renew(self) -> bool:
         """As the pool does it."""
@@ -29,7 +37,6 @@ class _Kept(Pool):
 
 @contextmanager
 def shared_pool(
-    scenario: Scenario,
     runs: int,
     workers: int | None = None,
     executor: Executor | None = None,
@@ -38,10 +45,7 @@ def shared_pool(
     """Where to do the work, as keywords for ``replicate``, for several scenarios of ``runs`` runs
     each.
     """
-    pool = make_pool(scenario, runs, workers, executor, scheduler)
-    if isinstance(pool, Here):
-        yield {"workers": 1}
-        return
+    pool = make_pool(runs, workers, executor, scheduler, open_ended=True)
     done = False
     try:
         yield {"pool": _Kept(pool)}

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from netkf.ensembles.replicas import replicate
+from netkf.ensembles.replicas import replicate_blocks
 from netkf.scenario.scenario import Scenario
-from netkf.studies.metrics import Figures, central_trace, together
+from netkf.studies.metrics import central_trace, join_metrics
 from netkf.studies.targets import Target, by_simulation, by_theory
 
 if TYPE_CHECKING:
@@ -96,19 +96,22 @@ class Search:
         """Decide by simulation: twice as many runs until the interval is on one side."""
         scenario = self._scenario.replace({self._key: value})
         central = central_trace(scenario) if self._target.quantity == "within_central" else None
-        done: list[Figures] = []
+        done, found = 0, []
         while True:
-            batch = min(max(FIRST_BATCH, len(done)), runs - len(done))
-            done += replicate(task, scenario, batch, first=len(done), **handed)
-            interval = by_simulation(together(done), self._target, level, central)
+            batch = min(max(FIRST_BATCH, done), runs - done)
+            found.append(
+                replicate_blocks(task, join_metrics, scenario, batch, first=done, **handed)
+            )
+            done += batch
+            interval = by_simulation(join_metrics(*found), self._target, level, central)
             word = UNDECIDED
             if interval.high <= self._target.limit:
                 word = REACHED
             elif not interval.low <= self._target.limit:
                 word = MISSED
-            self._progress(f"{self._key} = {value:g}: {len(done)} runs, {word}")
-            if word != UNDECIDED or len(done) >= runs:
-                return Probe(value, *interval, len(done), word)
+            self._progress(f"{self._key} = {value:g}: {done} runs, {word}")
+            if word != UNDECIDED or done >= runs:
+                return Probe(value, *interval, done, word)
 
     def found(
         self,

@@ -9,9 +9,15 @@ from functools import partial
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import choice, integer, number
+from netkf.ensembles.blocks import BlockTask, each_replica
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
-from netkf.studies.metrics import expected_errors_known, one_expected_run, one_run
+from netkf.studies.metrics import (
+    block_metrics,
+    expected_errors_known,
+    expected_metrics,
+    join_metrics,
+)
 from netkf.studies.parameter_grid import whole_number
 from netkf.studies.pools import shared_pool
 from netkf.studies.search import DIGITS, FIRST_BATCH, MOST_PROBES, Search, Sizing
@@ -70,11 +76,14 @@ def size(
         search = Search(base, key, wanted, whole, "theory")
         words = by_theory(base.replace({key: low}), wanted)[1]
         return search.found(low, high, search.theory, 1.0, words)
-    with shared_pool(base, runs, workers, executor, scheduler) as handed:
+    with shared_pool(runs, workers, executor, scheduler) as handed:
         search = Search(base, key, wanted, whole, "simulation", progress)
         level = (1.0 - sure) / (MOST_PROBES["simulation"] * _looks(runs))
         exact = wanted.of_errors and expected_errors_known(base.replace({key: low}))
-        task = partial(one_expected_run if exact else one_run, engine=used)
+        task: BlockTask = partial(block_metrics, engine=used)
+        if exact:
+            one = partial(expected_metrics, engine=used)
+            task = partial(each_replica, one, join_metrics)
         decide = partial(search.simulation, task=task, runs=runs, level=level, handed=handed)
         words = f"{QUANTITIES[wanted.quantity]}, over the runs"
         if exact:

@@ -15,7 +15,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer
-from netkf.ensembles.replicas import replicate
+from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.failures import InterruptedRunError, explain_failures
 from netkf.runs.files import (
     check_sources,
@@ -30,13 +30,13 @@ from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
     Estimate,
-    Figures,
+    RunMetrics,
+    block_metrics,
     bound_traces,
     central_trace,
-    one_run,
+    join_metrics,
     overall,
     root,
-    together,
     worst,
 )
 from netkf.studies.parameter_grid import Cell, cells, shown
@@ -100,17 +100,17 @@ def _rows(
     pool: tuple[int | None, Executor | None, str | None],
     progress: Progress | None,
 ) -> Iterator[Row]:
-    with shared_pool(places[0].scenario, runs, *pool) as handed:
+    with shared_pool(runs, *pool) as handed:
         for k, place in enumerate(places):
             with explain_failures(place.scenario):
-                task = partial(one_run, engine=choose_engine(engine, place.scenario))
-                found = replicate(task, place.scenario, runs, **handed)
-            yield _row(place, together(found))
+                task = partial(block_metrics, engine=choose_engine(engine, place.scenario))
+                found = replicate_blocks(task, join_metrics, place.scenario, runs, **handed)
+            yield _row(place, found)
             if progress is not None:
                 progress(k + 1, len(places))
 
 
-def _row(place: Cell, found: Figures) -> Row:
+def _row(place: Cell, found: RunMetrics) -> Row:
     quantities: dict[str, Estimate] = {
         "worst_rms": root(worst(found.mean_square)),
         "mean_rms": root(overall(found.mean_square)),

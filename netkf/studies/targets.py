@@ -12,7 +12,7 @@ import scipy.special
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.studies.metrics import Figures, bound_traces, central_trace
+from netkf.studies.metrics import RunMetrics, bound_traces, central_trace
 from netkf.theory import assumptions
 
 QUANTITIES = {
@@ -101,7 +101,9 @@ def _errors_obey(scenario: Scenario) -> str:
     return "" if exact else "; P_i in turn bounds the covariance of the error, H (10)"
 
 
-def by_simulation(found: Figures, target: Target, level: float, central: float | None) -> Interval:
+def by_simulation(
+    found: RunMetrics, target: Target, level: float, central: float | None
+) -> Interval:
     """The quantity with an interval that misses with probability ``level``: Student's, at once for
     all nodes where it is about the worst; ``central`` is the trace to divide by.
     """

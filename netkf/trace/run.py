@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.core.errors import quote
 from netkf.linalg.arrays import FloatArray
+from netkf.trace.nees import errors
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 
 if TYPE_CHECKING:
@@ -100,22 +101,6 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
     run = np.full(len(rows), replica, dtype=np.int64)
     columns = {"run": run, "seq": np.arange(first, first + len(rows)), "kind": kinds}
     return {name: columns[name] if name in columns else rows[name] for name in EVENT_COLUMNS}
-
-
-def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared error and NEES ``e' P^-1 e``, (T, N) each, of errors (T, N, n) and P (T, N, n, n);
-    NEES is nan where P is singular or nan.
-    """
-    with np.errstate(all="ignore"):
-        try:
-            solved = np.linalg.solve(P, e[..., None])[..., 0]
-        except np.linalg.LinAlgError:
-            solved = np.full_like(e, np.nan)
-            regular = np.array(np.isfinite(P).all(axis=(2, 3)))
-            ranks = np.linalg.matrix_rank(P[regular], hermitian=True)
-            regular[regular] = np.asarray(ranks) == P.shape[-1]
-            solved[regular] = np.linalg.solve(P[regular], e[regular][:, :, None])[:, :, 0]
-        return (e * e).sum(axis=-1), (e * solved).sum(axis=-1)
 
 
 def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray) -> float:

@@ -1,5 +1,6 @@
 """Ensembles: the same bits wherever and however the runs are done, and the right moments."""
 
+import itertools
 import json
 import os
 import random
@@ -17,9 +18,9 @@ import netkf
 from netkf.cli.main import main
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.ensembles import pools
-from netkf.ensembles.blocks import Grove, tree
 from netkf.ensembles.directory import runs_to_directory
-from netkf.ensembles.moments import merge_moments, single
+from netkf.ensembles.merge_tree import MergeTree, aligned_pieces
+from netkf.ensembles.moments import merge_moments, moments_of
 from netkf.ensembles.replicas import replicate
 from tests.conftest import SCENARIOS
 
@@ -99,31 +100,61 @@ def test_a_million_values_lose_no_digits():
     """1e9 + k / 1024, where a sum of squares would have no digit left: the tree over 2^20 values
     that repeat after 2^10 has equal halves from there on.
     """
-    leaves = [single(np.array([1e9 + k / 1024]), np.ones(1)) for k in range(1024)]
-    found = tree(leaves.__getitem__, merge_moments, 0, 1024, 1024)
+    values = 1e9 + np.arange(1024).reshape(-1, 1, 1) / 1024
+    found = moments_of(values, np.ones((1024, 1)))
     for _ in range(10):
         found = merge_moments(found, found)
     assert found.size[0] == 2**20
-    assert found.mean[0] == 1e9 + 1023 / 2048
-    assert found.M2[0] == pytest.approx(2**20 * (1024**2 - 1) / 12 / 1024**2, rel=1e-13)
+    assert found.mean[0, 0] == 1e9 + 1023 / 2048
+    assert found.M2[0, 0] == pytest.approx(2**20 * (1024**2 - 1) / 12 / 1024**2, rel=1e-13)
+
+
+def joined(a, b):
+    """Words that show the shape of the tree."""
+    return f"({a}{b})"
+
+
+def tree_of(first, stop):
+    """The tree over replicas, replica after replica."""
+    tree = MergeTree(joined)
+    for k in range(first, stop):
+        tree.add(k, str(k))
+    return tree.result()
 
 
 @pytest.mark.parametrize("runs", [1, 2, 5, 13, 16])
-@pytest.mark.parametrize("size", [1, 2, 4, 8])
-def test_blocks_in_any_order_are_one_tree(runs, size):
-    """Words show the shape of the tree."""
-
-    def merge(a, b):
-        return f"({a}{b})"
-
-    whole = tree(str, merge, 0, runs, 16)
+@pytest.mark.parametrize("level", [0, 1, 2, 3])
+def test_blocks_in_any_order_are_one_tree(runs, level):
+    size = 1 << level
     for seed in range(3):
         blocks = [*range(-(-runs // size))]
         random.Random(seed).shuffle(blocks)
-        grove = Grove(merge)
-        for block in blocks:
-            grove.add(block, tree(str, merge, block * size, runs, size))
-        assert grove.result() == whole
+        tree = MergeTree(joined)
+        for k in blocks:
+            tree.add(k, tree_of(k * size, min((k + 1) * size, runs)), level)
+        assert tree.result() == tree_of(0, runs)
+
+
+@pytest.mark.parametrize("cuts", [[0, 13], [0, 1, 13], [0, 5, 6, 11, 13], [0, 3, 8, 13]])
+def test_pieces_of_any_batches_are_one_tree(cuts):
+    tree = MergeTree(joined)
+    for first, stop in itertools.pairwise(cuts):
+        for level, k in aligned_pieces(first, stop):
+            tree.add(k, tree_of(k << level, (k + 1) << level), level)
+    assert tree.result() == tree_of(0, 13)
+
+
+@pytest.mark.parametrize("count", [2, 3, 7, 8])
+def test_moments_of_many_are_those_merged_one_by_one(count):
+    """To the last bit, with values that some observations lack."""
+    random = np.random.default_rng(count)
+    size = (random.random((count, 2)) < 0.7).astype(float)
+    values = np.where(size[..., None] > 0.0, random.normal(size=(count, 2, 3)), 0.0)
+    tree = MergeTree(merge_moments)
+    for k in range(count):
+        tree.add(k, moments_of(values[k : k + 1].copy(), size[k : k + 1].copy()))
+    for one, other in zip(tree.result(), moments_of(values, size), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def replica_number(scenario, seed, replica):
@@ -350,11 +381,24 @@ def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
     short = ring.replace({"horizon": 2.0})
     here = netkf.monte_carlo(short, 20)
     assert here.runs.max() == 20
-    for asked in ({"workers": 2}, {"engine": SimpyEngine()}):
-        with pytest.raises(AssertionError, match="2 processes were started"):
-            netkf.monte_carlo(short, 20, **asked)
     with pytest.raises(AssertionError, match="2 processes were started"):
-        netkf.monte_carlo(ring.replace({"horizon": 1000.0}), 1000)
+        netkf.monte_carlo(short, 20, workers=2)
+    for name in ("WARM", "SAVING"):
+        monkeypatch.setattr(pools, name, 0.0)
+    with pytest.raises(AssertionError, match="2 processes were started"):
+        netkf.monte_carlo(short, 20)
+
+
+@pytest.mark.parametrize("done", [0, 1, 3])
+def test_bits_do_not_depend_on_when_processes_start(short, monkeypatch, done):
+    """After so many blocks in this process."""
+    alone, blocks = netkf.monte_carlo(short, 12, workers=1), []
+    monkeypatch.setattr(pools, "cores", lambda: 2)
+    monkeypatch.setattr(
+        pools.Adaptive, "_worth_processes", lambda *_: blocks.append(0) or len(blocks) > done
+    )
+    assert_same_bits(netkf.monte_carlo(short, 12), alone)
+    assert len(blocks) == done + 1
 
 
 def begin(out, *arguments):

@@ -1,0 +1,56 @@
+"""Squared errors and normalised squared errors (NEES) of estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.small import eliminate
+
+
+def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared error and NEES ``e' P^-1 e`` (...) of errors (..., n) and covariances (..., n, n);
+    NEES is nan where P is singular or nan.
+    """
+    n, shape = e.shape[-1], e.shape[:-1]
+    flat, nees = np.ascontiguousarray(e).reshape(-1, n), np.empty(shape)
+    with np.errstate(all="ignore"):
+        square = (e * e).sum(axis=-1)
+        matrices = np.ascontiguousarray(P).reshape(-1, n, n)
+        if not fill_nees(flat, matrices, nees.reshape(-1), np.empty((n, n)), np.empty((n, 1))):
+            nees.reshape(-1)[~_regular(matrices)] = np.nan
+    return np.asarray(square), nees
+
+
+@kernel
+def fill_nees(
+    e: FloatArray, P: FloatArray, out: FloatArray, factor: FloatArray, solved: FloatArray
+) -> bool:
+    """Write NEES (K,) of errors (K, n) and covariances (K, n, n), nan where P is exactly singular;
+    False where there is such a P. ``factor`` (n, n) and ``solved`` (n, 1) are scratch.
+    """
+    regular, n = True, e.shape[1]
+    for k in range(len(e)):
+        finite = True
+        for i in range(n):
+            solved[i, 0] = e[k, i]
+            finite = finite and np.isfinite(e[k, i])
+            for j in range(n):
+                factor[i, j] = P[k, i, j]
+                finite = finite and np.isfinite(P[k, i, j])
+        eliminate(factor, solved, n)  # solved = P^-1 e
+        out[k] = 0.0
+        for i in range(n):
+            out[k] += e[k, i] * solved[i, 0]
+        if finite and np.isnan(solved[0, 0]):
+            regular = False
+    return regular
+
+
+def _regular(P: FloatArray) -> np.ndarray:
+    """(K,) bool: matrices (K, n, n) that are finite and of full rank up to rounding."""
+    found = np.asarray(np.isfinite(P).all(axis=(1, 2)))
+    ranks = np.linalg.matrix_rank(P[found], hermitian=True)
+    found[found] = np.asarray(ranks) == P.shape[-1]
+    return found
