@@ -183,10 +183,11 @@ def test_no_frames_of_users_are_told_by_the_engine(plugged):
 
 def test_size_does_not_decide_by_rounding(plugged):
     late = plugged.replace({"probe": [0.0, 50.0, 60.0]})
-    from netkf.studies.metrics import one_run, together
+    from netkf.runs.simulate import choose_engine
+    from netkf.studies.metrics import block_metrics
     from netkf.studies.targets import by_simulation, parse_target
 
-    figures = together([one_run(late, 1, k) for k in range(3)])
+    figures = block_metrics(late, 1, range(3), choose_engine("auto", late))
     interval = by_simulation(figures, parse_target("mean_rms<=3"), 0.05, None)
     assert interval.low == -np.inf
     assert interval.high == np.inf
