@@ -7,8 +7,9 @@ tests/benchmarks/test_by_hand.py holds the statistics of both against each other
 
 Arrays are float64 or int64, ``random`` is a ``numpy.random.Generator``, ``size`` a tuple of n
 zeros: its length is known when the kernel is compiled, so that loops over states are unrolled (two
-to three times as fast, and all helpers inlined as much again). R runs, T probes, N nodes, L links, n states, p rows of a reading. Results:
-``x`` (R, T, n), ``xhat`` (R, T, N, n), ``P`` (R, T, N, n, n).
+to three times as fast, and inlining all helpers gains as much again). R runs, T probes, N nodes,
+L links, n states, p rows of a reading. Results: ``x`` (R, T, n), ``xhat`` (R, T, N, n), ``P``
+(R, T, N, n, n).
 """
 
 import numba
