@@ -34,8 +34,10 @@ from netkf.core.fields import (
     number,
     positive,
     probability,
-    setting,
     vector,
+)
+from netkf.core.fields import (
+    field as setting,
 )
 from netkf.network.channels import (
     Bernoulli,

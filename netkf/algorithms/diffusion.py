@@ -13,7 +13,7 @@ from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import choice, either, nested, setting, square
+from netkf.core.fields import choice, either, field, nested, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import compilable
 
@@ -53,10 +53,10 @@ class DiffusionFilter(Filter):
     Either way the weights sum to 1 and P stays consistent; a node that heard nothing predicts.
     """
 
-    weights: str | FloatArray = setting(
+    weights: str | FloatArray = field(
         either(choice(METROPOLIS), square, nested(1)), default=METROPOLIS
     )
-    on_loss: str = setting(choice("renormalise", "keep-own"), default="renormalise")
+    on_loss: str = field(choice("renormalise", "keep-own"), default="renormalise")
 
     paper: ClassVar[str] = "diffusion"
     combination: ClassVar[str] = "shares"

@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 
 CLOCKS = ("links", "directions", "nodes", "readings")
@@ -157,7 +157,7 @@ FORMER = {
 
 
 @dataclass(frozen=True, eq=False)
-class Filter(Part):
+class Filter(Component):
     """The contract of node algorithms: how readings and messages change a node's state.
 
     The base class is a Kalman filter on the node's own readings; a filter that talks defines at

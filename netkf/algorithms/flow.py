@@ -20,7 +20,7 @@ from netkf.algorithms.filter import Increments
 from netkf.algorithms.kernels.gains import gain_update
 from netkf.algorithms.kernels.riccati import riccati_step
 from netkf.algorithms.models import FlowModel, usable
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import in_place
 
@@ -44,7 +44,7 @@ class Payload(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FlowFilter(Part):
+class FlowFilter(Component):
     """The deprecated contract of filters in continuous time.
 
     The base class is the Kalman-Bucy filter of H (4a), (4b); filters differ mostly in ``absorb``.

@@ -11,7 +11,7 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.kernels.root_update import combine_roots
 from netkf.algorithms.registry import built_in
-from netkf.core.fields import number, setting
+from netkf.core.fields import field, number
 from netkf.linalg.arrays import FloatArray
 
 
@@ -24,7 +24,7 @@ class Hybrid(Filter):
     degree. A message that took its time is predicted to its arrival first.
     """
 
-    epsilon: float = setting(number(above=0.0, high=1.0))
+    epsilon: float = field(number(above=0.0, high=1.0))
 
     paper: ClassVar[str] = "hybrid"
     combination: ClassVar[str] = "convex"

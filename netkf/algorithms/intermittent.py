@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
-from netkf.core.fields import choice, positive, setting
+from netkf.core.fields import choice, field, positive
 from netkf.linalg.arrays import FloatArray
 
 SLACK = 1.0 + 1e-6
@@ -64,8 +64,8 @@ class Intermittent(Filter):
             longest time a message may take
     """
 
-    late: str = setting(choice("exact", "drop"), default="exact")
-    window: float | None = setting(positive, default=None)
+    late: str = field(choice("exact", "drop"), default="exact")
+    window: float | None = field(positive, default=None)
 
     paper: ClassVar[str] = "intermittent"
     combination: ClassVar[str] = "readings"

@@ -24,7 +24,7 @@ from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import boolean, choice, integer, number, positive, setting
+from netkf.core.fields import boolean, choice, field, integer, number, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import compilable
 from netkf.linalg.small import applied, even, product, solution
@@ -83,13 +83,13 @@ class PushSum(Filter):
                were up and its weight positive
     """
 
-    gamma: int = setting(integer(low=1, high=MOST_STEPS), default=None)
-    delta: float = setting(positive, default=None)
-    leader: int = setting(integer(low=0), default=0)
-    asymptotic: bool = setting(boolean, default=False)
-    links: str = setting(choice("fresh", "held"), default="fresh")
-    stop: str = setting(choice(*RULES), default="never")
-    tolerance: float = setting(number(low=0.0), default=1e-6)
+    gamma: int = field(integer(low=1, high=MOST_STEPS), default=None)
+    delta: float = field(positive, default=None)
+    leader: int = field(integer(low=0), default=0)
+    asymptotic: bool = field(boolean, default=False)
+    links: str = field(choice("fresh", "held"), default="fresh")
+    stop: str = field(choice(*RULES), default="never")
+    tolerance: float = field(number(low=0.0), default=1e-6)
 
     paper: ClassVar[str] = "push_sum"
     combination: ClassVar[str] = "sums"

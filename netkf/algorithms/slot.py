@@ -24,7 +24,7 @@ from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kernels.square_root import lower_triangular, predict_root, update_root
 from netkf.algorithms.models import SlotModel
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import compilable
 from netkf.linalg.small import applied, product, solution
@@ -72,7 +72,7 @@ class Role(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SlotFilter(Part):
+class SlotFilter(Component):
     """The contract of every filter in slots.
 
     ``programme`` lists the phases of a slot, "exchange" or "sense"; ``first_slot`` is the first in

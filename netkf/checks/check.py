@@ -215,7 +215,7 @@ def check(
     sure = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     paper_of(scenario)
-    if not scenario.drawn:
+    if not scenario.is_random:
         raise TheoryError(
             "the state or the readings are recorded: there is one run, and no law to check; "
             "netkf theory says what is assumed"

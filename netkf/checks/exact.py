@@ -15,7 +15,7 @@ from netkf.checks.evidence import Finding, Row, identity, left_out, rounded_away
 from netkf.checks.laws import NEES, chi_squared, worst
 from netkf.checks.statistics import mean_ratio, off_by
 from netkf.core.errors import TheoryError
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.errors import diagonal_blocks, replayed_covariances
@@ -122,7 +122,7 @@ def promised_filter(algorithm: Any) -> Any:
     )
 
 
-def _like(kind: type[Part], algorithm: Any) -> Part:
+def _like(kind: type[Component], algorithm: Any) -> Component:
     names = [field.name for field in dataclasses.fields(kind) if hasattr(algorithm, field.name)]
     return kind(**{name: getattr(algorithm, name) for name in names})
 

@@ -182,7 +182,7 @@ def delivered(scenario: Scenario, direction: tuple[int, int]) -> float:
     delay = channel.delay.fixed
     if delay is None:
         raise TheoryError("random delays make some readings late")
-    chance = channel.loss.mean_delivery(direction, scenario.measured(direction))
+    chance = channel.loss.mean_delivery(direction, scenario.table_probability(direction))
     return chance if delay <= scenario.phase_length else 0.0
 
 

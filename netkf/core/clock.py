@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 
 Entity = Any
@@ -24,7 +24,7 @@ FIRST_BLOCK, LONGEST_BLOCK = 8, 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class Clock(Part):
+class Clock(Component):
     """The contract of a clock: a stateless maker of increasing tick times, all above 0.
 
     The caller owns the generator of each entity, so that the ticks of an entity depend on nothing

@@ -1,8 +1,8 @@
 """Settings that check themselves: the parts of a scenario are frozen dataclasses of these.
 
-``setting(rule)`` declares a field; the rule converts what a file or a script gives and says in one
+``field(rule)`` declares a field; the rule converts what a file or a script gives and says in one
 line what is wrong with it. Files and Python meet the same rules because both go through
-``Part.__post_init__``.
+``Component.__post_init__``.
 """
 
 from __future__ import annotations
@@ -10,63 +10,78 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.linalg.arrays import FloatArray, frozen, is_semidefinite
+from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What a value must be, in words; how to convert it; what to do when it is not.
+    """A requirement on a value: its text, the conversion that enforces it, and the remedy.
 
-    ``convert`` returns the value to keep or raises ``TypeError``/``ValueError``; the message of a
-    ValueError, where there is one, replaces ``words``.
+    ``convert`` returns the value to store, or raises ``TypeError`` or ``ValueError``. ``remedy``
+    tells the user how to correct a value that breaks the rule.
     """
 
-    words: str
+    requirement: str
     convert: Callable[[Any], Any]
     remedy: str = ""
 
     def __call__(self, key: str, value: object) -> Any:
-        """The value to keep; raises ScenarioError at ``key``."""
+        """Return the converted value; raises ScenarioError at ``key`` if it breaks the rule."""
         try:
             return self.convert(value)
         except ScenarioError as error:
             raise error.under(key) from None
-        except (TypeError, ValueError, OverflowError) as error:
-            because = isinstance(error, _BecauseError)
-            words = str(error) if because else self.words
-            remedy = getattr(error, "remedy", "") or self.remedy
-            raise ScenarioError(key, words, value, remedy) from None
+        except _SpecificError as error:
+            remedy = error.remedy or self.remedy
+            raise ScenarioError(key, str(error), value, remedy) from None
+        except (TypeError, ValueError, OverflowError):
+            # These messages are Python's own; the requirement tells the user more.
+            raise ScenarioError(key, self.requirement, value, self.remedy) from None
 
 
-class _BecauseError(ValueError):
-    """A ValueError whose message is meant for the user; ``remedy`` may say better what to do."""
+class _SpecificError(ValueError):
+    """A broken requirement that is narrower than the rule's own; its ``remedy`` may be, too."""
 
-    def __init__(self, words: str, remedy: str = "") -> None:
-        super().__init__(words)
+    def __init__(self, requirement: str, remedy: str = "") -> None:
+        super().__init__(requirement)
         self.remedy = remedy
 
 
-def setting(rule: Rule, default: Any = MISSING) -> Any:
-    """A dataclass field whose values obey ``rule``; ``None`` as a default may stay None."""
+def field(rule: Rule, default: Any = MISSING) -> Any:
+    """Declare a dataclass field whose values obey ``rule``; a default of None is not checked."""
     return dataclasses.field(
         default=default, metadata={"rule": rule}, kw_only=default is not MISSING
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """Base of everything that a scenario is made of.
+class Component:
+    """Base class of everything that a scenario is made of: an immutable set of checked fields.
 
-    Parts are equal when they are of one class and their settings are.
+    Components are equal when they have the same class and equal fields.
     """
+
+    former_names: ClassVar[Mapping[str, str]] = {}
+    """The names that attributes of a contract had before, by their present names."""
+
+    def __init_subclass__(cls) -> None:
+        """Give every attribute that has a former name both names, whichever the class defines."""
+        super().__init_subclass__()
+        own = vars(cls)
+        for name, former in cls.former_names.items():
+            # Both names refer to one function, so super() reaches the base class under either.
+            if former in own and name not in own:
+                setattr(cls, name, own[former])
+            elif name in own:
+                setattr(cls, former, own[name])
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -78,18 +93,19 @@ class Part:
         if type(self) is not type(other):
             return NotImplemented
         return all(
-            _same(getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self)
+            _are_equal(getattr(self, f.name), getattr(other, f.name))
+            for f in dataclasses.fields(self)
         )
 
     def __hash__(self) -> int:
         return hash((type(self), len(dataclasses.fields(self))))
 
 
-def _same(one: Any, other: Any) -> bool:
+def _are_equal(one: Any, other: Any) -> bool:
     if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
         return one is not None and other is not None and np.array_equal(one, other)
     if isinstance(one, tuple) and isinstance(other, tuple):
-        return len(one) == len(other) and all(map(_same, one, other))
+        return len(one) == len(other) and all(map(_are_equal, one, other))
     return bool(one == other)
 
 
@@ -100,10 +116,10 @@ def number(
     below: float = math.inf,
     high: float = math.inf,
 ) -> Rule:
-    """A finite number inside the given bounds."""
+    """Return the rule for a finite number inside the given bounds."""
     bounds = [
-        f"{word} {bound:g}"
-        for word, bound in (
+        f"{relation} {bound:g}"
+        for relation, bound in (
             ("above", above),
             ("at least", low),
             ("below", below),
@@ -120,11 +136,11 @@ def number(
             raise ValueError
         return result
 
-    words = " and ".join(bounds)
+    inside = " and ".join(bounds)
     return Rule(
-        f"must be a finite number{' ' if words else ''}{words}",
+        f"must be a finite number{' ' if inside else ''}{inside}",
         convert,
-        f"give a number {words}" if words else "give a finite number",
+        f"give a number {inside}" if inside else "give a finite number",
     )
 
 
@@ -133,7 +149,7 @@ probability = number(low=0.0, high=1.0)
 
 
 def integer(low: int | None = None, high: int | None = None) -> Rule:
-    """A whole number, at least ``low`` and at most ``high`` where they are given."""
+    """Return the rule for an integer from ``low`` to ``high``; None leaves that side open."""
 
     def convert(value: Any) -> int:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
@@ -147,11 +163,11 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
     return Rule(f"must be an integer{bound}", convert, f"give an integer{bound}")
 
 
-LARGEST = 1e30
-"""Numbers of larger size, or variances below its inverse, overflow when they meet."""
+MAX_MAGNITUDE = 1e30
+"""Products of larger entries, or of inverses of smaller variances, could overflow."""
 
 
-def _is(kind: type) -> Callable[[Any], Any]:
+def _instance_of(kind: type) -> Callable[[Any], Any]:
     def convert(value: Any) -> Any:
         if not isinstance(value, kind) or value == "":
             raise TypeError
@@ -160,27 +176,27 @@ def _is(kind: type) -> Callable[[Any], Any]:
     return convert
 
 
-boolean = Rule("must be true or false", _is(bool), "write true or false without quotes")
+boolean = Rule("must be true or false", _instance_of(bool), "write true or false without quotes")
 
 
-def _line(value: Any) -> str:
+def _one_line(value: Any) -> str:
     if not isinstance(value, str) or not value.isprintable():
         raise TypeError
     return value
 
 
-def _line_or_more(value: Any) -> str:
-    if not _line(value):
+def _nonempty_line(value: Any) -> str:
+    if not _one_line(value):
         raise TypeError
     return str(value)
 
 
-line = Rule("must be one line of text", _line, 'write it as "text" without line breaks')
-text = Rule("must be one line of text that is not empty", _line_or_more, 'write it as "text"')
+line = Rule("must be one line of text", _one_line, 'write it as "text" without line breaks')
+text = Rule("must be one line of text that is not empty", _nonempty_line, 'write it as "text"')
 
 
 def instance(*kinds: type) -> Rule:
-    """An object of one of some classes (a part of a scenario)."""
+    """Return the rule for an object of one of the classes ``kinds``."""
 
     def convert(value: Any) -> Any:
         if not isinstance(value, kinds):
@@ -192,7 +208,7 @@ def instance(*kinds: type) -> Rule:
 
 
 def choice(*names: str) -> Rule:
-    """One of a few strings."""
+    """Return the rule for one of the given strings."""
 
     def convert(value: Any) -> str:
         if value not in names:
@@ -204,23 +220,24 @@ def choice(*names: str) -> Rule:
 
 
 def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
-    """What obeys the second rule where it looks like it, else the first."""
+    """Return a rule that applies ``second`` to values for which ``is_second``, else ``first``."""
 
     def convert(value: Any) -> Any:
         rule = second if is_second(value) else first
         try:
             return rule.convert(value)
-        except (_BecauseError, ScenarioError):
+        except (_SpecificError, ScenarioError):
             raise
         except (TypeError, ValueError, OverflowError):
-            raise _BecauseError(words) from None
+            # Either form would have been accepted, so the message names both.
+            raise _SpecificError(requirement) from None
 
-    words = f"{first.words}, or {second.words.removeprefix('must be ')}"
-    return Rule(words, convert, first.remedy)
+    requirement = f"{first.requirement}, or {second.requirement.removeprefix('must be ')}"
+    return Rule(requirement, convert, first.remedy)
 
 
 def nested(depth: int) -> Callable[[Any], bool]:
-    """Whether lists are nested that deep."""
+    """Return a test for lists or arrays that are nested at least ``depth`` deep."""
 
     def measure(value: Any) -> int:
         if isinstance(value, np.ndarray):
@@ -233,21 +250,23 @@ def nested(depth: int) -> Callable[[Any], bool]:
 
 
 def array(dimensions: int, kind: str) -> Rule:
-    """A finite real array with that many dimensions."""
+    """Return the rule for a finite real array with that many dimensions, called a ``kind``."""
 
     def convert(value: Any) -> FloatArray:
         if isinstance(value, (str, bytes)) or _has_bool(value):
             raise TypeError
-        result = frozen(value)
+        result = readonly_array(value)
         if result.ndim == 0:
             open_, close = "[" * dimensions, "]" * dimensions
-            raise _BecauseError(f"must be a {kind}", f"write {open_}{result.item():g}{close}")
+            raise _SpecificError(f"must be a {kind}", f"write {open_}{result.item():g}{close}")
         if result.ndim != dimensions or result.size == 0:
-            raise _BecauseError(f"must be a {kind}")
+            raise _SpecificError(f"must be a {kind}")
         if not np.isfinite(result).all():
-            raise _BecauseError(f"must be a {kind} with finite numbers")
-        if np.abs(result).max() > LARGEST:
-            raise _BecauseError(f"must be a {kind} with numbers of at most {LARGEST:g} in size")
+            raise _SpecificError(f"must be a {kind} with finite numbers")
+        if np.abs(result).max() > MAX_MAGNITUDE:
+            raise _SpecificError(
+                f"must be a {kind} with numbers of at most {MAX_MAGNITUDE:g} in size"
+            )
         return result
 
     remedy = "write rows of equal length, [[a, b], [c, d]]" if dimensions == 2 else "write [a, b]"
@@ -255,6 +274,7 @@ def array(dimensions: int, kind: str) -> Rule:
 
 
 def _has_bool(value: Any) -> bool:
+    # numpy would convert True to 1.0 and "1" to 1.0.
     if isinstance(value, (list, tuple)):
         return any(map(_has_bool, value))
     return isinstance(value, (bool, str))
@@ -267,7 +287,7 @@ matrix = array(2, "matrix")
 def _square(value: Any) -> FloatArray:
     result = matrix.convert(value)
     if result.shape[0] != result.shape[1]:
-        raise _BecauseError(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
+        raise _SpecificError(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
     return np.asarray(result)
 
 
@@ -277,7 +297,7 @@ square = Rule("must be a square matrix of finite numbers", _square, matrix.remed
 def _symmetric(value: Any) -> FloatArray:
     result = _square(value)
     if not np.allclose(result, result.T, rtol=1e-9, atol=1e-12 * np.abs(result).max()):
-        raise _BecauseError("must be a symmetric matrix")
+        raise _SpecificError("must be a symmetric matrix")
     return result
 
 
@@ -285,15 +305,15 @@ def _covariance(value: Any) -> FloatArray:
     result = _symmetric(value)
     if not is_semidefinite(result):
         least = np.linalg.eigvalsh(result)[0]
-        raise _BecauseError(f"must be positive semidefinite (least eigenvalue {least:.3g})")
+        raise _SpecificError(f"must be positive semidefinite (least eigenvalue {least:.3g})")
     return result
 
 
 def _definite(value: Any) -> FloatArray:
     result = _symmetric(value)
     values = np.linalg.eigvalsh(result)
-    if not values[0] > max(1e-14 * abs(values[-1]), 1.0 / LARGEST):
-        raise _BecauseError(f"must be positive definite (least eigenvalue {values[0]:.3g})")
+    if not values[0] > max(1e-14 * abs(values[-1]), 1.0 / MAX_MAGNITUDE):
+        raise _SpecificError(f"must be positive definite (least eigenvalue {values[0]:.3g})")
     return result
 
 
@@ -310,7 +330,10 @@ definite_covariance = Rule(
 
 
 def several(rule: Rule, what: str, least: int = 1) -> Rule:
-    """A list of values that each obey ``rule``; a mistake is shown with its place in the list."""
+    """Return the rule for a list of at least ``least`` values that each obey ``rule``.
+
+    An error names the index of the wrong value in the list.
+    """
 
     def convert(value: Any) -> tuple[Any, ...]:
         if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
@@ -324,7 +347,7 @@ def several(rule: Rule, what: str, least: int = 1) -> Rule:
 
 
 def row(*rules: Rule, what: str) -> Rule:
-    """A list of a fixed length whose entries obey one rule each."""
+    """Return the rule for a list of fixed length whose entries obey one rule each."""
 
     def convert(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (list, tuple, np.ndarray)) or len(value) != len(rules):
@@ -338,7 +361,7 @@ def row(*rules: Rule, what: str) -> Rule:
 
 @dataclass(frozen=True, repr=False)
 class SourceFile:
-    """A file that a scenario names: its path as written, and the folder that it is relative to."""
+    """A file that a scenario refers to: its path as written, relative to ``folder``."""
 
     name: str
     folder: Path
@@ -348,11 +371,11 @@ class SourceFile:
 
     @property
     def full(self) -> Path:
-        """Where the file is."""
+        """Path of the file, relative to the working directory or absolute."""
         return self.folder / self.name
 
 
-def _source(value: Any) -> SourceFile:
+def _source_file(value: Any) -> SourceFile:
     if isinstance(value, SourceFile):
         source = value
     elif isinstance(value, (str, Path)) and str(value):
@@ -361,20 +384,22 @@ def _source(value: Any) -> SourceFile:
             source = SourceFile(Path(value).name, Path(value).parent)
     else:
         raise TypeError
+    # A scenario can come from someone else: it must not read files outside its own folder.
     name = os.path.normpath(source.name)
     if not source.name or os.path.isabs(name) or name == ".." or name.startswith("../"):
-        raise _BecauseError("must stay inside the folder of the scenario file")
+        raise _SpecificError("must stay inside the folder of the scenario file")
     try:
         folder = source.folder.resolve()
+        # A link inside the folder may still lead out of it.
         if not source.full.resolve().is_relative_to(folder):
-            raise _BecauseError("must stay inside the folder of the scenario file")
+            raise _SpecificError("must stay inside the folder of the scenario file")
         if not source.full.is_file():
-            raise _BecauseError(f"no such file in {source.folder}")
+            raise _SpecificError(f"no such file in {source.folder}")
     except (OSError, RuntimeError) as error:  # a loop of links, a name that is too long
-        raise _BecauseError("must be the path of a file that can be read") from error
+        raise _SpecificError("must be the path of a file that can be read") from error
     return SourceFile(name, source.folder)
 
 
 source_file = Rule(
-    "must be the path of a file", _source, "give a path relative to the scenario file"
+    "must be the path of a file", _source_file, "give a path relative to the scenario file"
 )

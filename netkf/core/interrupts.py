@@ -14,7 +14,7 @@ _inside = False
 
 
 @contextmanager
-def undisturbed() -> Iterator[None]:
+def defer_signals() -> Iterator[None]:
     """Ctrl-C and the request to end wait until the block is left, and all blocks around it.
 
     In other threads than the main one nothing is changed: Python delivers signals to that one.

@@ -82,7 +82,7 @@ class Engine(ABC):
     def batch_of_one(self, scenario: Scenario, seed: int, replica: int) -> RunBatch:
         """Simulate one replica with ``run`` and count its events."""
         memory = MemorySink()
-        recorder = Recorder([memory], counted=True)
+        recorder = Recorder([memory], counts_only=True)
         status = self.run(scenario, Streams(seed, replica), recorder, silent)
         return recorded_batch(scenario, replica, memory, recorder, status)
 

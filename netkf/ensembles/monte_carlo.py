@@ -146,7 +146,7 @@ def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str
         seed,
         engine,
         found.fingerprint,
-        scenario.plant.shown,
+        scenario.plant.truth_known,
         found.rounding_from,
     )
 

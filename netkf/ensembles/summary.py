@@ -40,7 +40,7 @@ def summarise_ensemble(
         "messages": dict(zip(MESSAGES, messages, strict=True)),
         "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
     }
-    if scenario.plant.shown:
+    if scenario.plant.truth_known:
         summary["nees"] = _chi_square(scenario, found)
     if found.conserved:
         summary["conserved"] = {

@@ -17,14 +17,14 @@ __all__ = [
     "FloatArray",
     "IntArray",
     "block_diagonal",
-    "frozen",
+    "readonly_array",
     "is_semidefinite",
     "square_root",
     "symmetric",
 ]
 
 
-def frozen(value: ArrayLike) -> FloatArray:
+def readonly_array(value: ArrayLike) -> FloatArray:
     """A read-only float64 copy."""
     array = np.array(value, dtype=np.float64)
     array.flags.writeable = False

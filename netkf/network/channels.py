@@ -1,67 +1,85 @@
-"""Channels: whether a message is lost and, if not, how long it takes."""
+"""Channels: loss and delay models, and the sampling of both for one link."""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
-    Part,
+    Component,
     boolean,
+    field,
     instance,
     number,
     positive,
     probability,
-    setting,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
 
 
 @dataclass(frozen=True, eq=False)
-class Loss(Part):
+class Loss(Component):
     """The contract of a loss model.
 
     For each activation the engine draws one uniform number; a message is delivered when that is
-    below ``chance``. Both directions share the number when the channel is symmetric.
+    below its ``delivery_probability``. Both directions share the number when the channel is
+    symmetric.
     """
 
+    former_names: ClassVar[Mapping[str, str]] = {
+        "delivery_probability": "chance",
+        "next_state": "weather",
+        "deterministic": "certain",
+        "stateful": "changing",
+    }
+
     @abstractmethod
-    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
-        """Probability that message number ``message`` from link[0] reaches link[1];
-        ``measured`` is what the graph's table says of that direction (1 where it says nothing).
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
+        """Return the probability that message number ``message`` from link[0] reaches link[1].
+
+        ``bad`` is the state of the link. ``table_probability`` is the entry of the graph's table
+        for that direction, 1 without one.
         """
 
-    def weather(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Whether the link is in its bad state at the next activation (None: at the first)."""
+    def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
+        """Return True if the link is in its bad state at the next activation.
+
+        ``bad`` is its state at the last activation, None at the first.
+        """
         return False
 
     @property
-    def certain(self) -> bool:
-        """Whether every chance is 0 or 1 and nothing is drawn."""
+    def deterministic(self) -> bool:
+        """True if every delivery probability is 0 or 1, so that nothing is drawn."""
         return False
 
     @property
-    def changing(self) -> bool:
-        """Whether ``weather`` draws."""
+    def stateful(self) -> bool:
+        """True if ``next_state`` draws."""
         return False
 
-    def mean_delivery(self, link: Link, measured: float) -> float:
-        """Delivered fraction in the long run; nan where it is not known beforehand."""
-        return self.chance(link, 0, False, measured)
+    chance, weather, certain, changing = delivery_probability, next_state, deterministic, stateful
+
+    def mean_delivery(self, link: Link, table_probability: float) -> float:
+        """Return the delivered fraction in the long run; nan if it is unknown before a run."""
+        return self.delivery_probability(link, 0, False, table_probability)
 
     @property
     def independent(self) -> bool:
-        """Whether the fates of different activations are independent."""
+        """True if the outcomes of different activations are independent."""
         return True
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError where the settings do not fit the graph."""
+        """Raise ScenarioError if the fields do not fit the graph."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +87,14 @@ class NoLoss(Loss):
     """Every message arrives."""
 
     @property
-    def certain(self) -> bool:
+    def deterministic(self) -> bool:
         """True."""
         return True
 
-    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
-        """1."""
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
+        """Return 1."""
         return 1.0
 
 
@@ -82,10 +102,12 @@ class NoLoss(Loss):
 class Bernoulli(Loss):
     """A message arrives with probability ``delivery``."""
 
-    delivery: float = setting(probability)
+    delivery: float = field(probability)
 
-    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
-        """``delivery``."""
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
+        """Return ``delivery``."""
         return self.delivery
 
 
@@ -93,12 +115,14 @@ class Bernoulli(Loss):
 class PerLink(Loss):
     """A message arrives with the delivery probability that the graph's table gives its link."""
 
-    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
-        """``measured``."""
-        return measured
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
+        """Return ``table_probability``."""
+        return table_probability
 
     def check(self, topology: Topology) -> None:
-        """The graph has probabilities."""
+        """Raise ScenarioError unless the graph has a table of probabilities."""
         if topology.delivery is None:
             raise ScenarioError(
                 "kind",
@@ -110,18 +134,19 @@ class PerLink(Loss):
 
 @dataclass(frozen=True, eq=False)
 class GilbertElliott(Loss):
-    """A two-state chain, one step an activation.
+    """A two-state Markov chain that makes one step per activation.
 
-    Either ``to_bad``, ``to_good``, ``deliver_good`` (default 1) and ``deliver_bad`` (default 0),
-    or ``mean_loss`` and ``mean_burst`` (activations) for a chain that loses all in its bad state.
+    Give either ``to_bad``, ``to_good``, ``deliver_good`` (default 1) and ``deliver_bad`` (default
+    0), or ``mean_loss`` and ``mean_burst`` (activations) for a chain that loses every message in
+    its bad state.
     """
 
-    to_bad: float | None = setting(probability, default=None)
-    to_good: float | None = setting(number(above=0.0, high=1.0), default=None)
-    deliver_good: float | None = setting(probability, default=None)
-    deliver_bad: float | None = setting(probability, default=None)
-    mean_loss: float | None = setting(number(low=0.0, below=1.0), default=None)
-    mean_burst: float | None = setting(number(low=1.0), default=None)
+    to_bad: float | None = field(probability, default=None)
+    to_good: float | None = field(number(above=0.0, high=1.0), default=None)
+    deliver_good: float | None = field(probability, default=None)
+    deliver_bad: float | None = field(probability, default=None)
+    mean_loss: float | None = field(number(low=0.0, below=1.0), default=None)
+    mean_burst: float | None = field(number(low=1.0), default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,69 +186,78 @@ class GilbertElliott(Loss):
         return self.to_bad, self.to_good
 
     @property
-    def changing(self) -> bool:
+    def stateful(self) -> bool:
         """True."""
         return True
 
-    def weather(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """One step of the chain; the first state is stationary."""
+    def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
+        """Make one step of the chain; the first state is drawn from the stationary law."""
         to_bad, to_good = self._steps
         u = random.random()
         if bad is None:
             return bool(u < to_bad / (to_bad + to_good))
         return bool(u >= to_good if bad else u < to_bad)
 
-    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
-        """Delivery probability of the state."""
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
+        """Return the delivery probability of the state."""
         if bad:
             return 0.0 if self.deliver_bad is None else self.deliver_bad
         return 1.0 if self.deliver_good is None else self.deliver_good
 
-    def mean_delivery(self, link: Link, measured: float) -> float:
-        """Under the stationary law."""
+    def mean_delivery(self, link: Link, table_probability: float) -> float:
+        """Return the mean delivery probability under the stationary law."""
         to_bad, to_good = self._steps
         bad = to_bad / (to_bad + to_good)
-        return bad * self.chance(link, 0, True, 1.0) + (1.0 - bad) * self.chance(
-            link, 0, False, 1.0
-        )
+        return bad * self.delivery_probability(link, 0, True, 1.0) + (
+            1.0 - bad
+        ) * self.delivery_probability(link, 0, False, 1.0)
 
     @property
     def independent(self) -> bool:
-        """Only when the chain forgets its state in one step."""
+        """True only if the next state does not depend on the present one."""
+        # Then both rows of the transition matrix are equal.
         return sum(self._steps) == 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Delay(Part):
+class Delay(Component):
     """The contract of a delay model."""
+
+    former_names: ClassVar[Mapping[str, str]] = {"is_random": "drawn"}
 
     @abstractmethod
     def draw(self, random: np.random.Generator) -> float:
-        """Seconds, not negative; once per activation, and only if ``drawn``."""
+        """Draw a delay in seconds, not negative; called once per activation if ``is_random``."""
 
     @property
     def fixed(self) -> float | None:
-        """The delay where it is always the same, else None."""
+        """The delay in seconds if it is constant, else None."""
         return None
 
     @property
     def longest(self) -> float:
-        """The longest delay there can be, seconds; inf if there is no bound."""
+        """The largest possible delay in seconds; inf if there is no bound."""
         return math.inf if self.fixed is None else self.fixed
 
     @property
-    def drawn(self) -> bool:
-        """Whether ``draw`` is called."""
+    def is_random(self) -> bool:
+        """True if ``draw`` is called."""
         return self.fixed is None
 
+    drawn = is_random
+
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Seconds that message number ``message`` takes from link[0] to link[1], not negative; nan
-        if it is lost. ``drawn`` is what ``draw`` gave, or ``fixed``, or else 0.
+        """Return the seconds that message number ``message`` takes from link[0] to link[1].
+
+        The result is not negative, and nan if the message is lost. ``drawn`` is the result of
+        ``draw`` if delays are random, else ``fixed`` or 0.
         """
         return drawn
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError if the settings do not fit the graph."""
+        """Raise ScenarioError if the fields do not fit the graph."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,23 +265,23 @@ class NoDelay(Delay):
     """A message arrives when it is sent."""
 
     def draw(self, random: np.random.Generator) -> float:
-        """0."""
+        """Return 0."""
         return 0.0
 
     @property
     def fixed(self) -> float | None:
-        """0."""
+        """Return 0."""
         return 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class ConstantDelay(Delay):
-    """``seconds`` for every message."""
+    """A delay of ``seconds`` for every message."""
 
-    seconds: float = setting(number(low=0.0))
+    seconds: float = field(number(low=0.0))
 
     def draw(self, random: np.random.Generator) -> float:
-        """``seconds``."""
+        """Return ``seconds``."""
         return self.seconds
 
     @property
@@ -258,21 +292,21 @@ class ConstantDelay(Delay):
 
 @dataclass(frozen=True, eq=False)
 class ExponentialDelay(Delay):
-    """Exponential with the given ``mean`` in seconds."""
+    """Exponential delays with the given ``mean`` in seconds."""
 
-    mean: float = setting(positive)
+    mean: float = field(positive)
 
     def draw(self, random: np.random.Generator) -> float:
-        """One draw."""
+        """Draw a delay in seconds."""
         return self.mean * random.standard_exponential()
 
 
 @dataclass(frozen=True, eq=False)
 class UniformDelay(Delay):
-    """Uniform between ``low`` and ``high`` seconds."""
+    """Delays that are uniform between ``low`` and ``high`` seconds."""
 
-    low: float = setting(number(low=0.0))
-    high: float = setting(number(low=0.0))
+    low: float = field(number(low=0.0))
+    high: float = field(number(low=0.0))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -285,92 +319,105 @@ class UniformDelay(Delay):
         return self.high
 
     def draw(self, random: np.random.Generator) -> float:
-        """One draw."""
+        """Draw a delay in seconds."""
         return self.low + (self.high - self.low) * random.random()
 
 
 @dataclass(frozen=True, eq=False)
 class LognormalDelay(Delay):
-    """Lognormal with ``mean`` seconds; ``sigma`` is the standard deviation of its logarithm."""
+    """Lognormal delays of ``mean`` seconds; their logarithm has standard deviation ``sigma``."""
 
-    mean: float = setting(positive)
-    sigma: float = setting(number(low=0.0))
+    mean: float = field(positive)
+    sigma: float = field(number(low=0.0))
 
     def draw(self, random: np.random.Generator) -> float:
-        """One draw."""
+        """Draw a delay in seconds."""
         return self.mean * math.exp(self.sigma * (random.standard_normal() - 0.5 * self.sigma))
 
 
 @dataclass(frozen=True, eq=False)
-class Channel(Part):
-    """Loss and delay of every message.
+class Channel(Component):
+    """The loss and the delay model of all messages.
 
-    ``symmetric``: the two messages of one activation share one draw of each, so that with equal
-    probabilities both arrive or none; else each direction has its own. In a directed graph every
-    link is one direction and has its own.
+    If ``symmetric``, the two messages of one activation share one draw of each model, so that with
+    equal probabilities both arrive or none; otherwise each direction has draws of its own. A link
+    of a directed graph is a single direction.
     """
 
-    loss: Loss = setting(instance(Loss), default=NoLoss())
-    delay: Delay = setting(instance(Delay), default=NoDelay())
-    symmetric: bool = setting(boolean, default=True)
+    loss: Loss = field(instance(Loss), default=NoLoss())
+    delay: Delay = field(instance(Delay), default=NoDelay())
+    symmetric: bool = field(boolean, default=True)
 
 
-class Fates:
-    """What one link (symmetric) or one direction of it draws, activation after activation.
+class ChannelDraw(NamedTuple):
+    """The random numbers of one activation of a link or direction.
 
-    ``generator`` makes the streams "loss", "weather" and "delay" of that link or direction; those
-    that are not needed are not made.
+    ``uniform`` lies in [0, 1), ``bad`` is the state of the link and ``delay`` is in seconds.
+    """
+
+    uniform: float
+    bad: bool
+    delay: float
+
+
+class ChannelSampler:
+    """Draws the outcomes of one link (symmetric channel) or direction, activation by activation.
+
+    ``generator`` makes the streams "loss", "weather" and "delay" of that link or direction; it is
+    called only for the streams that the channel draws from.
     """
 
     def __init__(self, channel: Channel, generator: Callable[[str], np.random.Generator]) -> None:
         self._loss, self._delay = channel.loss, channel.delay
-        self._fixed = channel.delay.fixed or 0.0
+        self._fixed_delay = channel.delay.fixed or 0.0
         self._bad: bool | None = None
-        made = {purpose: generator(purpose) for purpose in needed(channel)}
-        self._luck, self._sky = made.get("loss"), made.get("weather")
-        self._post = made.get("delay")
+        streams = {purpose: generator(purpose) for purpose in stream_purposes(channel)}
+        self._loss_random = streams.get("loss")
+        self._state_random = streams.get("weather")
+        self._delay_random = streams.get("delay")
 
-    def draw(self) -> tuple[float, bool, float]:
-        """A uniform number, whether the link is in its bad state, and a delay in seconds (0 if
-        none is drawn).
-        """
-        luck, bad, delay = 0.0, False, self._fixed
-        if self._luck is not None:
-            luck = float(self._luck.random())
-        if self._sky is not None:
-            self._bad = bad = self._loss.weather(self._bad, self._sky)
-        if self._post is not None:
-            delay = self._delay.draw(self._post)
-        return luck, bad, delay
+    def draw(self) -> ChannelDraw:
+        """Return the draw of the next activation; its delay is 0 if there is none to draw."""
+        uniform, bad, delay = 0.0, False, self._fixed_delay
+        if self._loss_random is not None:
+            uniform = float(self._loss_random.random())
+        if self._state_random is not None:
+            self._bad = bad = self._loss.next_state(self._bad, self._state_random)
+        if self._delay_random is not None:
+            delay = self._delay.draw(self._delay_random)
+        return ChannelDraw(uniform, bad, delay)
 
     def draws(self, count: int) -> tuple[FloatArray, np.ndarray, FloatArray]:
-        """The next ``count`` draws at once, (count,) each; the same numbers."""
-        luck, bad = np.zeros(count), np.zeros(count, dtype=bool)
-        if self._luck is not None:
-            luck = self._luck.random(count)
-        if self._sky is not None:
+        """Return the next ``count`` uniform numbers, states and delays, (count,) each.
+
+        They equal the results of ``count`` calls of ``draw``.
+        """
+        uniform, bad = np.zeros(count), np.zeros(count, dtype=bool)
+        if self._loss_random is not None:
+            uniform = self._loss_random.random(count)
+        if self._state_random is not None:
             for k in range(count):
-                self._bad = bad[k] = self._loss.weather(self._bad, self._sky)
-        if self._post is None:
-            return luck, bad, np.full(count, self._fixed)
-        return luck, bad, delays(self._delay, self._post, count)
+                self._bad = bad[k] = self._loss.next_state(self._bad, self._state_random)
+        if self._delay_random is None:
+            return uniform, bad, np.full(count, self._fixed_delay)
+        return uniform, bad, draw_delays(self._delay, self._delay_random, count)
 
 
-def needed(channel: Channel) -> tuple[str, ...]:
-    """The purposes for which Fates asks for a stream."""
-    asked: list[str] = []
-    if not channel.loss.certain:
-        asked.append("loss")
-    if channel.loss.changing:
-        asked.append("weather")
-    if channel.delay.drawn:
-        asked.append("delay")
-    return tuple(asked)
+def stream_purposes(channel: Channel) -> tuple[str, ...]:
+    """Return the purposes of the random streams that a ChannelSampler of this channel asks for."""
+    purposes: list[str] = []
+    if not channel.loss.deterministic:
+        purposes.append("loss")
+    if channel.loss.stateful:
+        purposes.append("weather")
+    if channel.delay.is_random:
+        purposes.append("delay")
+    return tuple(purposes)
 
 
-def delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
-    """(count,) seconds, the same as that many calls of ``delay.draw``."""
-    # By exact type: a class derived from one of these may draw in its own way.
+def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
+    """Return (count,) delays in seconds, equal to the results of that many ``delay.draw`` calls."""
+    # By exact type: a subclass may override draw.
     if type(delay) is ExponentialDelay:
         return delay.mean * random.standard_exponential(count)
     if type(delay) is UniformDelay:
@@ -378,58 +425,72 @@ def delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
     return np.array([delay.draw(random) for _ in range(count)])
 
 
-def alike(loss: Loss) -> bool:
-    """Whether all messages of a link have one chance; by exact type, since a class derived from
-    one of these may have its own way.
-    """
+def identical_per_link(loss: Loss) -> bool:
+    """Return True if all messages of a directed link have the same delivery probability."""
+    # By exact type: a subclass may override delivery_probability.
     return type(loss) in (NoLoss, Bernoulli, PerLink)
 
 
-def chances(loss: Loss, link: Link, first: int, bad: np.ndarray, measured: float) -> FloatArray:
-    """(count,) ``loss.chance`` of the messages from number ``first`` on, ``bad`` (count,)."""
-    if alike(loss):
-        return np.full(len(bad), loss.chance(link, first, False, measured))
+def delivery_probabilities(
+    loss: Loss, link: Link, first: int, bad: np.ndarray, table_probability: float
+) -> FloatArray:
+    """Return (count,) delivery probabilities of messages ``first``, ``first + 1``, ... of a link.
+
+    ``bad`` (count,) holds the state of the link at each. Raises ScenarioError for a value outside
+    [0, 1].
+    """
+    if identical_per_link(loss):
+        return np.full(len(bad), loss.delivery_probability(link, first, False, table_probability))
     return np.array(
-        [checked_chance(loss, link, first + k, b, measured) for k, b in enumerate(bad.tolist())]
+        [
+            checked_delivery_probability(loss, link, first + k, b, table_probability)
+            for k, b in enumerate(bad.tolist())
+        ]
     )
 
 
-def checked_chance(loss: Loss, link: Link, message: int, bad: bool, measured: float) -> float:
-    """``loss.chance``; raises ScenarioError where it is no probability."""
-    chance = loss.chance(link, message, bad, measured)
-    if not 0.0 <= chance <= 1.0:
-        words = f"{type(loss).__name__}: the chance of message {message} on link {list(link)} must"
-        remedy = "mend chance of the class"
-        raise ScenarioError("network.channel.loss", f"{words} be in [0, 1]", chance, remedy)
-    return chance
+def checked_delivery_probability(
+    loss: Loss, link: Link, message: int, bad: bool, table_probability: float
+) -> float:
+    """Return ``loss.delivery_probability``; raises ScenarioError if it is outside [0, 1]."""
+    value = loss.delivery_probability(link, message, bad, table_probability)
+    if not 0.0 <= value <= 1.0:
+        rule = (
+            f"{type(loss).__name__}: the delivery probability of message {message} on link "
+            f"{list(link)} must be in [0, 1]"
+        )
+        remedy = "mend delivery_probability of the class"
+        raise ScenarioError("network.channel.loss", rule, value, remedy)
+    return value
 
 
-def by_message(delay: Delay) -> bool:
-    """Whether delays depend on the message, so that ``message_delay`` must be asked."""
+def delay_depends_on_message(delay: Delay) -> bool:
+    """Return True if the class overrides ``message_delay``."""
     return type(delay).message_delay is not Delay.message_delay
 
 
 def checked_delay(delay: Delay, link: Link, message: int, drawn: float) -> float:
-    """``delay.message_delay``; raises ScenarioError if it is negative."""
+    """Return ``delay.message_delay`` in seconds; raises ScenarioError if it is negative."""
     seconds = delay.message_delay(link, message, drawn)
     if seconds < 0.0:
-        words = f"{type(delay).__name__}: the delay of message {message} on link {list(link)} must"
+        rule = (
+            f"{type(delay).__name__}: the delay of message {message} on link {list(link)} must "
+            "not be negative"
+        )
         remedy = "mend message_delay of the class"
-        raise ScenarioError("network.channel.delay", f"{words} not be negative", seconds, remedy)
+        raise ScenarioError("network.channel.delay", rule, seconds, remedy)
     return seconds
 
 
-def outcome(
-    channel: Channel,
-    link: Link,
-    message: int,
-    draw: tuple[float, bool, float],
-    measured: float,
+def transit_time(
+    channel: Channel, link: Link, message: int, draw: ChannelDraw, table_probability: float
 ) -> float:
-    """Seconds after which message number ``message`` of a directed link arrives, nan if it is
-    lost; ``draw`` is that of Fates. Raises ScenarioError for chances and delays that are none.
+    """Return the seconds after which message number ``message`` of a directed link arrives.
+
+    The result is nan if the message is lost. Raises ScenarioError for a delivery probability
+    outside [0, 1] and for a negative delay.
     """
-    luck, bad, delay = draw
-    if luck >= checked_chance(channel.loss, link, message, bad, measured):
+    loss, bad = channel.loss, draw.bad
+    if draw.uniform >= checked_delivery_probability(loss, link, message, bad, table_probability):
         return math.nan
-    return checked_delay(channel.delay, link, message, delay)
+    return checked_delay(channel.delay, link, message, draw.delay)

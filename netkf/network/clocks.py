@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -18,11 +19,11 @@ from netkf.core.fields import (
     SourceFile,
     choice,
     either,
+    field,
     integer,
     number,
     positive,
     row,
-    setting,
     several,
     source_file,
 )
@@ -42,7 +43,7 @@ class LinkClock(Clock):
     broadcasts to every neighbour; an entity is (node,).
     """
 
-    at: str = setting(choice(*AT), default="links")
+    at: str = field(choice(*AT), default="links")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
         """Ids of everything that has a clock, in order."""
@@ -58,7 +59,7 @@ class LinkClock(Clock):
 class OnReadings(LinkClock):
     """A node transmits whenever it has taken a sample, after using it; no clock ticks."""
 
-    at: str = field(init=False, default="readings")
+    at: str = dataclasses.field(init=False, default="readings")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
         """None."""
@@ -94,7 +95,7 @@ def _one_rate(value: Any) -> tuple[float, ...]:
     return rates
 
 
-_entity_rate = Rule(_link_rate.words, _one_rate, _link_rate.remedy)
+_entity_rate = Rule(_link_rate.requirement, _one_rate, _link_rate.remedy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +104,8 @@ class Poisson(LinkClock):
     sets single links or directions over that default, ``[[i, rate], ...]`` single nodes.
     """
 
-    rate: float | None = setting(_rate, default=None)
-    rates: tuple[tuple[float, ...], ...] = setting(
+    rate: float | None = field(_rate, default=None)
+    rates: tuple[tuple[float, ...], ...] = field(
         several(_entity_rate, "triples [i, j, rate]", least=0), default=()
     )
 
@@ -115,7 +116,7 @@ class Poisson(LinkClock):
             if len(given) != length:
                 shown = [int(value) if value.is_integer() else value for value in map(float, given)]
                 remedy = f'{rule.remedy}, because at = "{self.at}"'
-                raise ScenarioError(f"rates[{k}]", rule.words, shown, remedy)
+                raise ScenarioError(f"rates[{k}]", rule.requirement, shown, remedy)
 
     @cached_property
     def _own(self) -> dict[Entity, float]:
@@ -190,13 +191,13 @@ class Renewal(LinkClock):
     weibull gaps of shape 1 are the Poisson clock.
     """
 
-    distribution: str = setting(choice(*PARAMETERS))
-    mean: float | None = setting(positive, default=None)
-    rate: float | None = setting(_rate, default=None)
-    scale: float | None = setting(positive, default=None)
-    shape: float | None = setting(number(low=0.1, high=1e6), default=None)
-    low: float | None = setting(number(low=0.0), default=None)
-    high: float | None = setting(positive, default=None)
+    distribution: str = field(choice(*PARAMETERS))
+    mean: float | None = field(positive, default=None)
+    rate: float | None = field(_rate, default=None)
+    scale: float | None = field(positive, default=None)
+    shape: float | None = field(number(low=0.1, high=1e6), default=None)
+    low: float | None = field(number(low=0.0), default=None)
+    high: float | None = field(positive, default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -276,11 +277,11 @@ class Periodic(LinkClock):
     ``phase`` is a time in [0, period) or "random", one draw a link; nothing ticks at time 0.
     """
 
-    period: float = setting(number(low=SHORTEST))
-    phase: float | str = setting(
+    period: float = field(number(low=SHORTEST))
+    phase: float | str = field(
         either(number(low=0.0), choice("random"), lambda value: isinstance(value, str)), default=0.0
     )
-    jitter: float = setting(number(low=0.0), default=0.0)
+    jitter: float = field(number(low=0.0), default=0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -319,7 +320,7 @@ class RecordedClock(LinkClock):
     ``t,node`` for nodes. An entity listed twice at one time ticks once.
     """
 
-    path: SourceFile = setting(source_file)
+    path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -14,15 +14,15 @@ import numpy as np
 from netkf.core.csv_files import read_columns, read_header, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
-    Part,
+    Component,
     SourceFile,
     boolean,
+    field,
     integer,
     number,
     positive,
     probability,
     row,
-    setting,
     several,
     source_file,
 )
@@ -140,7 +140,7 @@ def demand_nodes(source: SourceFile, nodes: Iterable[int], topology: Topology) -
 
 
 @dataclass(frozen=True, eq=False)
-class Graph(Part):
+class Graph(Component):
     """The contract of a graph kind; ``seed`` is the root seed for the random ones."""
 
     @abstractmethod
@@ -171,7 +171,7 @@ def _bounded(nodes: int, links: int) -> None:
 class Cycle(Graph):
     """``nodes`` in a ring."""
 
-    nodes: int = setting(integer(low=3, high=MOST_NODES))
+    nodes: int = field(integer(low=3, high=MOST_NODES))
 
     def build(self, seed: int) -> Topology:
         """Links (k, k + 1) and (0, nodes - 1)."""
@@ -182,7 +182,7 @@ class Cycle(Graph):
 class PathGraph(Graph):
     """``nodes`` in a row."""
 
-    nodes: int = setting(_count)
+    nodes: int = field(_count)
 
     def build(self, seed: int) -> Topology:
         """Links (k, k + 1)."""
@@ -193,7 +193,7 @@ class PathGraph(Graph):
 class Complete(Graph):
     """Every pair of ``nodes`` is linked."""
 
-    nodes: int = setting(_count)
+    nodes: int = field(_count)
 
     def build(self, seed: int) -> Topology:
         """All pairs."""
@@ -206,7 +206,7 @@ class Complete(Graph):
 class Star(Graph):
     """``nodes`` in all, node 0 in the middle."""
 
-    nodes: int = setting(_count)
+    nodes: int = field(_count)
 
     def build(self, seed: int) -> Topology:
         """Links (0, k)."""
@@ -217,8 +217,8 @@ class Star(Graph):
 class Grid(Graph):
     """``rows`` by ``columns``; node ids run along the rows."""
 
-    rows: int = setting(_count)
-    columns: int = setting(_count)
+    rows: int = field(_count)
+    columns: int = field(_count)
 
     def build(self, seed: int) -> Topology:
         """Links to the right and below; positions on the lattice."""
@@ -236,8 +236,8 @@ class RandomGraph(Graph):
     drawn again, with the next seed, until they are connected.
     """
 
-    seed: int | None = setting(integer(low=0), default=None)
-    connected: bool = setting(boolean, default=False)
+    seed: int | None = field(integer(low=0), default=None)
+    connected: bool = field(boolean, default=False)
 
     def _draw(
         self, seed: int, make: Callable[[np.random.RandomState], networkx.Graph[Any]]
@@ -263,8 +263,8 @@ class RandomGraph(Graph):
 class Regular(RandomGraph):
     """``nodes`` with ``degree`` random links each."""
 
-    nodes: int = setting(_count)
-    degree: int = setting(integer(low=0))
+    nodes: int = field(_count)
+    degree: int = field(integer(low=0))
 
     def build(self, seed: int) -> Topology:
         """networkx.random_regular_graph; above half the nodes, the complement of one."""
@@ -295,8 +295,8 @@ class Regular(RandomGraph):
 class ErdosRenyi(RandomGraph):
     """``nodes`` of which each pair is linked with probability ``p``."""
 
-    nodes: int = setting(_count)
-    p: float = setting(probability)
+    nodes: int = field(_count)
+    p: float = field(probability)
 
     def build(self, seed: int) -> Topology:
         """networkx.fast_gnp_random_graph."""
@@ -312,8 +312,8 @@ class ErdosRenyi(RandomGraph):
 class Geometric(RandomGraph):
     """``nodes`` at random places of the unit square, linked when closer than ``radius``."""
 
-    nodes: int = setting(_count)
-    radius: float = setting(positive)
+    nodes: int = field(_count)
+    radius: float = field(positive)
 
     def build(self, seed: int) -> Topology:
         """networkx.random_geometric_graph, with its positions."""
@@ -332,11 +332,11 @@ class Geometric(RandomGraph):
 class Edges(Graph):
     """Links written out; ``nodes = N`` names the nodes 0 .. N - 1, else the links do."""
 
-    edges: tuple[Link, ...] = setting(
+    edges: tuple[Link, ...] = field(
         several(row(_node, _node, what="a pair of node ids"), "pairs of node ids", least=0)
     )
-    nodes: int | None = setting(_count, default=None)
-    directed: bool = setting(boolean, default=False)
+    nodes: int | None = field(_count, default=None)
+    directed: bool = field(boolean, default=False)
 
     def build(self, seed: int) -> Topology:
         """The links as given."""
@@ -375,10 +375,10 @@ class CsvGraph(Graph):
     those others. ``positions`` is a table whose first three columns are node, x and y.
     """
 
-    path: SourceFile = setting(source_file)
-    minimum: float | None = setting(number(low=0.0, high=1.0), default=None)
-    directed: bool = setting(boolean, default=False)
-    positions: SourceFile | None = setting(source_file, default=None)
+    path: SourceFile = field(source_file)
+    minimum: float | None = field(number(low=0.0, high=1.0), default=None)
+    directed: bool = field(boolean, default=False)
+    positions: SourceFile | None = field(source_file, default=None)
 
     def build(self, seed: int) -> Topology:
         """The links of the table."""

@@ -16,12 +16,12 @@ import numpy as np
 from netkf.core.csv_files import read_columns, read_header, whole
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
-    Part,
+    Component,
     SourceFile,
     choice,
+    field,
     number,
     positive,
-    setting,
     source_file,
 )
 from netkf.linalg.arrays import FloatArray
@@ -31,7 +31,7 @@ MOST_EDGES = 20  # beyond it the recursions over sets of edges take too long
 
 
 @dataclass(frozen=True, eq=False)
-class SlotActivation(Part):
+class SlotActivation(Component):
     """Who exchanges in the slots of a slot filter.
 
     ``phase`` is the length of one exchange in seconds, shared evenly among its steps; the inbox of
@@ -39,7 +39,7 @@ class SlotActivation(Part):
     exchanges of a slot.
     """
 
-    phase: float | None = setting(positive, default=None)
+    phase: float | None = field(positive, default=None)
 
     @abstractmethod
     def check(self, topology: Topology) -> None:
@@ -60,9 +60,9 @@ class Matching(SlotActivation):
     independent     each link with probability ``p`` by itself; links that meet are all dropped
     """
 
-    protocol: str = setting(choice(*PROTOCOLS))
-    lazy: float | None = setting(number(low=0.0, below=1.0), default=None)
-    p: float | None = setting(number(above=0.0, high=1.0), default=None)
+    protocol: str = field(choice(*PROTOCOLS))
+    lazy: float | None = field(number(low=0.0, below=1.0), default=None)
+    p: float | None = field(number(above=0.0, high=1.0), default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -238,7 +238,7 @@ class RecordedSlots(SlotActivation):
     directions where the graph is undirected).
     """
 
-    path: SourceFile = setting(source_file)
+    path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
         super().__post_init__()

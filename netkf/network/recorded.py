@@ -12,7 +12,7 @@ import numpy as np
 
 from netkf.core.csv_files import read_columns, whole
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import SourceFile, choice, setting, source_file
+from netkf.core.fields import SourceFile, choice, field, source_file
 from netkf.network.channels import Delay, Loss
 from netkf.network.graphs import Link, Topology, demand_links
 
@@ -97,8 +97,8 @@ class RecordedLoss(Loss):
     directed link counted from 0). ``after`` says what becomes of a message that is not listed.
     """
 
-    path: SourceFile = setting(source_file)
-    after: str = setting(_after, default="deliver")
+    path: SourceFile = field(source_file)
+    after: str = field(_after, default="deliver")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -111,18 +111,20 @@ class RecordedLoss(Loss):
         return read_messages(self.path, "delivered", words, lambda value: value in (0.0, 1.0))
 
     @property
-    def certain(self) -> bool:
+    def deterministic(self) -> bool:
         """True."""
         return True
 
-    def chance(self, link: Link, message: int, bad: bool, measured: float) -> float:
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
         """0 or 1."""
         value = _at("network.channel.loss", self.table, link, message, self.after)
         if value is None:
             return 0.0 if self.after == "lose" else 1.0
         return value
 
-    def mean_delivery(self, link: Link, measured: float) -> float:
+    def mean_delivery(self, link: Link, table_probability: float) -> float:
         """Not known beforehand."""
         return math.nan
 
@@ -143,8 +145,8 @@ class RecordedDelay(Delay):
     delivered takes no time.
     """
 
-    path: SourceFile = setting(source_file)
-    after: str = setting(_after, default="deliver")
+    path: SourceFile = field(source_file)
+    after: str = field(_after, default="deliver")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,7 +163,7 @@ class RecordedDelay(Delay):
         return 0.0
 
     @property
-    def drawn(self) -> bool:
+    def is_random(self) -> bool:
         """False."""
         return False
 

@@ -9,9 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from netkf.core.fields import matrix, positive, setting, square
+from netkf.core.fields import field, matrix, positive, square
 from netkf.linalg.arrays import FloatArray, square_root
-from netkf.plants.laws import Laws
+from netkf.plants.laws import GridLaws
 from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
 from netkf.plants.transitions import Transitions, frame_period
@@ -28,9 +28,9 @@ class Diffusion(Plant):
     ``A`` (n, n), ``B`` (n, m); ``sensing_period`` is the step h of the sensors in seconds.
     """
 
-    A: FloatArray = setting(square)
-    B: FloatArray = setting(matrix)
-    sensing_period: float | None = setting(positive, default=None)
+    A: FloatArray = field(square)
+    B: FloatArray = field(matrix)
+    sensing_period: float | None = field(positive, default=None)
 
     @property
     def n(self) -> int:
@@ -43,10 +43,10 @@ class Diffusion(Plant):
         return np.asarray(self.B @ self.B.T)
 
     @cached_property
-    def laws(self) -> Laws:
+    def laws(self) -> GridLaws:
         """What all paths of this plant share."""
         assert self.sensing_period is not None
-        return Laws(self.A, self.B, self.sensing_period)
+        return GridLaws(self.A, self.B, self.sensing_period)
 
     @property
     def longest_period(self) -> float:

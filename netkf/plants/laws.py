@@ -9,8 +9,8 @@ from netkf.linalg.legendre import forward_coefficients
 from netkf.linalg.series import polynomial, with_reach
 from netkf.plants.recursion import Recursion
 
-MOST_SPLITS = 256  # kept laws of a state shown inside a step
-MOST_GRIDS = 256  # kept stretches of the sensing grid
+MAX_LAWS = 256  # kept laws of a state shown inside a step
+MAX_GRIDS = 256  # kept stretches of the sensing grid
 DEPENDENT = 1e-9  # share of a row that is not rounding
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
@@ -21,7 +21,7 @@ def grid_time(period: float, k: int) -> float:
     return float(round(k * period, 12))
 
 
-class Laws:
+class GridLaws:
     """What all paths of ``dx = A x dt + B dw`` on the grid of one ``period`` share; the laws of
     states shown inside a step are worked out as they are asked for.
     """
@@ -31,8 +31,8 @@ class Laws:
         self.A, self.B = A, B
         self.to_end, self.to_moments = _response_series(A, period)
         self.response = self.responses(period)
-        self.spread = _factor(self._noise(period))
-        self._splits: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
+        self.noise_factor = _factor(self._noise(period))
+        self._conditional_laws: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
         self._grids: dict[tuple[int, int], FloatArray] = {}
         self.steps = Recursion(self.response[0])
 
@@ -41,7 +41,7 @@ class Laws:
         known = self._grids.get((first, count))
         if known is None:
             known = np.array([grid_time(self.period, first + k) for k in range(count)])
-            if len(self._grids) < MOST_GRIDS:
+            if len(self._grids) < MAX_GRIDS:
                 self._grids[first, count] = known
         return known
 
@@ -73,16 +73,16 @@ class Laws:
             np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted]) @ entry
         )
 
-    def split(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
+    def conditional_law(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
         """Gain and root (3 n, 3 n) of the law of state and moments at ``left`` seconds given those
         of a whole step of ``length``.
         """
         key = round(length, 12), round(left, 12)
-        law = self._splits.get(key)
+        law = self._conditional_laws.get(key)
         if law is None:
-            if len(self._splits) >= MOST_SPLITS:
-                self._splits.clear()
-            law = self._splits[key] = self._conditional(*key)
+            if len(self._conditional_laws) >= MAX_LAWS:
+                self._conditional_laws.clear()
+            law = self._conditional_laws[key] = self._conditional(*key)
         return law
 
     def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.core.fields import covariance, positive, setting, square
+from netkf.core.fields import covariance, field, positive, square
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.plant import Plant
 from netkf.plants.recursion import Recursion
@@ -29,9 +29,9 @@ class LinearPlant(Plant):
     ``F`` (n, n), ``Q`` (n, n).
     """
 
-    F: FloatArray = setting(square)
-    Q: FloatArray = setting(covariance)
-    period: float = setting(positive)
+    F: FloatArray = field(square)
+    Q: FloatArray = field(covariance)
+    period: float = field(positive)
 
     @property
     def n(self) -> int:

@@ -21,7 +21,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import in_place
 from netkf.linalg.series import fill_polynomial, polynomial
 from netkf.linalg.small import added, applied
-from netkf.plants.laws import Laws, grid_time
+from netkf.plants.laws import GridLaws, grid_time
 from netkf.plants.transitions import Transitions
 
 BLOCK = 64  # steps drawn at once, or a multiple of it
@@ -86,7 +86,7 @@ class DiffusionPaths:
 
     def __init__(
         self,
-        laws: Laws,
+        laws: GridLaws,
         start: FloatArray,
         randoms: Sequence[np.random.Generator],
         cuts: Sequence[Cuts],
@@ -102,7 +102,7 @@ class DiffusionPaths:
         # Block by block, so that no path is rounded as its neighbours happen to be.
         size = blocks, BLOCK, 3 * n
         normals = np.stack([random.standard_normal(size) for random in self._randoms])
-        noise = (normals @ laws.spread.T).reshape(count * blocks, BLOCK, 3, n)
+        noise = (normals @ laws.noise_factor.T).reshape(count * blocks, BLOCK, 3, n)
         cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
         onwards = noise[:, :, 0].reshape(count, blocks, BLOCK, n)
         before, after = self._states(onwards)
@@ -200,7 +200,7 @@ class DiffusionPaths:
         n, laws = self.laws.n, self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
         left = float(times[0] - pieces.start[rows[0]])
-        gain, spread = laws.split(length, left)
+        gain, spread = laws.conditional_law(length, left)
         x, end = pieces.x_start[:, rows], pieces.x_end[:, rows]
         known = np.concatenate([end[:, :, None], pieces.moments[:, rows]], axis=2)
         residual = (known - _moved(laws.responses(length), x)).reshape(*x.shape[:2], 3 * n)
@@ -368,7 +368,7 @@ def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> 
             out[m, 3] += weight * (2.5 * square - 1.5) * z
 
 
-def seen(laws: Laws, step: Step, start: float, end: float) -> FloatArray:
+def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     """(2, n) moments of x over ``[start, end]`` inside a step."""
     n = len(step.x_start)
     if start == step.start and end == step.end:

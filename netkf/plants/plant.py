@@ -8,21 +8,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.fields import Part, covariance, setting, vector
+from netkf.core.fields import Component, covariance, field, vector
 from netkf.linalg.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Plant(Part):
+class Plant(Component):
     """x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n), both zero by default."""
 
-    drawn: ClassVar[bool] = True
+    is_random: ClassVar[bool] = True
     """Whether runs draw the state from the model; else the model is what the filters believe."""
-    shown: ClassVar[bool] = True
+    truth_known: ClassVar[bool] = True
     """Whether the state is known, so that there are errors to speak of."""
 
-    mean: FloatArray | None = setting(vector, default=None)
-    cov: FloatArray | None = setting(covariance, default=None)
+    mean: FloatArray | None = field(vector, default=None)
+    cov: FloatArray | None = field(covariance, default=None)
 
     @property
     @abstractmethod

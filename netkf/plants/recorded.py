@@ -19,13 +19,13 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
     definite_covariance,
+    field,
     integer,
     matrix,
-    setting,
     several,
     source_file,
 )
-from netkf.linalg.arrays import FloatArray, frozen
+from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.sampling import RecordedSamples
@@ -41,8 +41,8 @@ NOTHING = np.empty(0)
 class UnknownPlant(LinearPlant):
     """Nobody knows the state; ``F``, ``Q``, ``mean`` and ``cov`` are the filters' model of it."""
 
-    drawn: ClassVar[bool] = False
-    shown: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
+    truth_known: ClassVar[bool] = False
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """Nan."""
@@ -55,9 +55,9 @@ class RecordedPlant(LinearPlant):
     ``mean`` and ``cov`` are the filters' model of it.
     """
 
-    drawn: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
 
-    path: SourceFile = setting(source_file)
+    path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,8 +85,8 @@ class UnknownDiffusion(Diffusion):
     filters' model of it.
     """
 
-    drawn: ClassVar[bool] = False
-    shown: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
+    truth_known: ClassVar[bool] = False
 
     @property
     def recorded_truth(self) -> RecordedTruth:
@@ -103,9 +103,9 @@ class RecordedDiffusion(Diffusion):
     ``A``, ``B``, ``mean`` and ``cov`` are the filters' model of it.
     """
 
-    drawn: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
 
-    path: SourceFile = setting(source_file)  # type: ignore[assignment]
+    path: SourceFile = field(source_file)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -173,12 +173,12 @@ class RecordedSensor(Sensor):
     more or fewer components: what a row has beyond its own p must be empty, nan or 0.
     """
 
-    drawn: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
 
-    path: SourceFile = setting(source_file)
-    H: FloatArray = setting(matrix, default=None)
-    R: FloatArray = setting(definite_covariance)
-    nodes: tuple[int, ...] = setting(several(integer(), "node ids"), default=None)
+    path: SourceFile = field(source_file)
+    H: FloatArray = field(matrix, default=None)
+    R: FloatArray = field(definite_covariance)
+    nodes: tuple[int, ...] = field(several(integer(), "node ids"), default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -189,7 +189,7 @@ class RecordedSensor(Sensor):
             raise ScenarioError("path", f"{self.path.name} has no rows", None, "add some")
         if self.varying and any(self._rows.values()):
             row = next(rows[0][1] for rows in self._rows.values() if rows)
-            object.__setattr__(self, "H", frozen(row[None, 1:]))
+            object.__setattr__(self, "H", readonly_array(row[None, 1:]))
         H: FloatArray | None = self.H
         if H is None:
             remedy = "add H = ..., or columns phi0, ... to the table"

@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from netkf.core.fields import covariance, definite_covariance, matrix, setting, square, vector
-from netkf.linalg.arrays import FloatArray, frozen, square_root
+from netkf.core.fields import covariance, definite_covariance, field, matrix, square, vector
+from netkf.linalg.arrays import FloatArray, readonly_array, square_root
 from netkf.plants.linear import LinearPath, SlotReadings
 from netkf.plants.recursion import Recursion
 from netkf.plants.sensors import Sensor
@@ -28,12 +28,12 @@ class RegressorSensor(Sensor):
     ``xi_cov`` (q, q), ``R`` (1, 1).
     """
 
-    A: FloatArray = setting(square)
-    B: FloatArray = setting(matrix)
-    C: FloatArray = setting(matrix)
-    start: FloatArray = setting(vector)
-    xi_cov: FloatArray = setting(covariance)
-    R: FloatArray = setting(definite_covariance)
+    A: FloatArray = field(square)
+    B: FloatArray = field(matrix)
+    C: FloatArray = field(matrix)
+    start: FloatArray = field(vector)
+    xi_cov: FloatArray = field(covariance)
+    R: FloatArray = field(definite_covariance)
 
     @property
     def varying(self) -> bool:
@@ -43,7 +43,7 @@ class RegressorSensor(Sensor):
     @property
     def H(self) -> FloatArray:
         """(1, n): the row of slot 0."""
-        return frozen((self.C @ self.start)[None])
+        return readonly_array((self.C @ self.start)[None])
 
     @cached_property
     def steps(self) -> Recursion:

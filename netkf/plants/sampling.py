@@ -12,7 +12,7 @@ import numpy as np
 from netkf.core.clock import Clock, Entity
 from netkf.core.csv_files import read_columns, whole
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import Rule, SourceFile, setting, source_file
+from netkf.core.fields import Rule, SourceFile, field, source_file
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import SlotReadings
 
@@ -72,7 +72,7 @@ class RecordedSampling(Clock):
     time are one sample.
     """
 
-    path: SourceFile = setting(source_file)
+    path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -19,11 +19,11 @@ import numpy as np
 
 from netkf.core.clock import Clock, all_ticks
 from netkf.core.fields import (
-    Part,
+    Component,
     definite_covariance,
+    field,
     integer,
     matrix,
-    setting,
     several,
 )
 from netkf.linalg.arrays import FloatArray
@@ -35,13 +35,13 @@ from netkf.plants.sampling import DrawnSamples, Samples, sampling
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor(Part):
+class Sensor(Component):
     """The contract: each of ``nodes`` has such a sensor, with noise of its own."""
 
-    drawn: ClassVar[bool] = True
+    is_random: ClassVar[bool] = True
     """Whether runs draw the readings from H and R; else those are what the filters believe."""
 
-    nodes: tuple[int, ...] = setting(several(integer(), "node ids"))
+    nodes: tuple[int, ...] = field(several(integer(), "node ids"))
 
     @property
     def varying(self) -> bool:
@@ -83,9 +83,9 @@ class LinearSensor(Sensor):
     ``H`` (p, n), ``R`` (p, p).
     """
 
-    H: FloatArray = setting(matrix)
-    R: FloatArray = setting(definite_covariance)
-    sampling: Clock | None = setting(sampling, default=None)
+    H: FloatArray = field(matrix)
+    R: FloatArray = field(definite_covariance)
+    sampling: Clock | None = field(sampling, default=None)
 
     def sample_times(
         self,

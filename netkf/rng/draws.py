@@ -19,7 +19,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import demanded, in_place
-from netkf.rng.streams import Streams, Together
+from netkf.rng.streams import ReplicaStreams, Streams
 
 _U = np.uint64
 CHEAP = _U(0xDA942042E4DD58B5)
@@ -133,15 +133,15 @@ def fill_exponentials(
             place += 1
 
 
-class Draws:
+class StreamBatch:
     """The streams of one purpose of many entities, in order, run by run: their ``states`` (K, 4),
     which drawing changes; needs numba.
     """
 
     def __init__(
-        self, streams: Streams | Together, purpose: str, entities: Sequence[tuple[int, ...]]
+        self, streams: Streams | ReplicaStreams, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> None:
-        words = streams.words(purpose, entities)
+        words = streams.seed_words(purpose, entities)
         self.states = np.empty(words.shape, dtype=np.uint64)
         demanded(seed_states)(words, self.states)
 

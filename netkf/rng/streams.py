@@ -37,19 +37,19 @@ class Streams:
         return np.random.SeedSequence(entropy=self.seed, spawn_key=key)
 
     @property
-    def each(self) -> tuple[Streams, ...]:
-        """As of several runs, see ``Together``."""
+    def per_replica(self) -> tuple[Streams, ...]:
+        """As of several runs, see ``ReplicaStreams``."""
         return (self,)
 
-    def words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+    def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
         """(K, 4) words of 64 bits that seed the generators of K entities."""
-        return Together(self.seed, self.replica, 1).words(purpose, entities)
+        return ReplicaStreams(self.seed, self.replica, 1).seed_words(purpose, entities)
 
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
         """``generator`` of each of them, in order; see ``seeded``."""
-        return Together(self.seed, self.replica, 1).generators(purpose, entities)
+        return ReplicaStreams(self.seed, self.replica, 1).generators(purpose, entities)
 
     def seeded(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
         """The same streams, with the seeds of these purposes and entities made all at once: numpy
@@ -58,7 +58,7 @@ class Streams:
         made: dict[tuple[str, tuple[int, ...]], _Words] = {}
         if entities and _small(entities):
             for purpose in purposes:
-                words = self.words(purpose, entities)
+                words = self.seed_words(purpose, entities)
                 made |= {(purpose, e): _Words(w) for e, w in zip(entities, words, strict=True)}
         return _Seeded(self.seed, self.replica, made)
 
@@ -73,7 +73,7 @@ class _Seeded(Streams):
 
 
 @dataclass(frozen=True)
-class Together:
+class ReplicaStreams:
     """The sources of ``count`` runs of one seed, the first of which is ``replica``; what they draw
     is what each would draw for itself.
     """
@@ -83,18 +83,18 @@ class Together:
     count: int
 
     @property
-    def each(self) -> tuple[Streams, ...]:
+    def per_replica(self) -> tuple[Streams, ...]:
         """The source of each run."""
         return tuple(Streams(self.seed, self.replica + k) for k in range(self.count))
 
-    def words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+    def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
         """(count K, 4) words of 64 bits that seed the generators of K entities, run by run."""
         if not entities:
             return np.empty((0, 4), dtype=np.uint64)
         replicas = range(self.replica, self.replica + self.count)
         few = self.count * len(entities) < FEW
         if few or replicas[-1] >= WORD or not _small(entities):
-            some = [s._sequence(purpose, *entity) for s in self.each for entity in entities]
+            some = [s._sequence(purpose, *entity) for s in self.per_replica for entity in entities]
             return np.array([sequence.generate_state(4, np.uint64) for sequence in some])
         keys = np.empty((self.count, len(entities), 2 + len(entities[0])), dtype=np.uint32)
         keys[:, :, 0] = np.array(replicas, dtype=np.uint32)[:, None]
@@ -105,7 +105,7 @@ class Together:
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
         """The generators that these words seed."""
-        made: list[Any] = [_Words(words) for words in self.words(purpose, entities)]
+        made: list[Any] = [_Words(words) for words in self.seed_words(purpose, entities)]
         return [np.random.Generator(np.random.PCG64DXSM(words)) for words in made]
 
 

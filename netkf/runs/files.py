@@ -170,11 +170,11 @@ def missing_modules(scenario: Scenario) -> list[str]:
 class ParquetSink(Sink):
     """Streams events and states to Parquet, one row group per block, so that memory is bounded."""
 
-    anywhere: ClassVar[bool] = True
+    thread_safe: ClassVar[bool] = True
 
     def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
         self._nodes, self._replica, self._first = scenario.nodes, replica, 0
-        self._shown = scenario.plant.shown
+        self._shown = scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None
         self._states = _Table(directory / "states.parquet", STATE_ENCODING) if events else None
         self._samples: list[tuple[FloatArray, ...]] = []
@@ -222,7 +222,7 @@ class TraceTables:
     """Writes events.parquet and states.parquet of several runs, one run after the other."""
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
-        self._nodes, self._shown = scenario.nodes, scenario.plant.shown
+        self._nodes, self._shown = scenario.nodes, scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
         self._states = _Table(directory / "states.parquet", STATE_ENCODING)
         self._gathered: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])

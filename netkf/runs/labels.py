@@ -53,6 +53,6 @@ def mismatch_words(scenario: Scenario) -> str:
     """What P and its bound are worth where the filters believe another model; empty where not."""
     if scenario.filters_know_the_truth:
         return ""
-    if not scenario.drawn:
+    if not scenario.is_random:
         return "whether P fits the errors depends on the model: the state or readings are recorded"
     return "the filters' model differs from the truth: P and its bound need not bound the errors"

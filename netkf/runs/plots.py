@@ -35,14 +35,14 @@ def run_picture(scenario: Scenario, completed: CompletedRun) -> None:
     NEES, and the network with the activity of its links.
     """
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        rows = 3 if scenario.plant.shown else 2
+        rows = 3 if scenario.plant.truth_known else 2
         figure = Figure(figsize=(11.0, 1.0 + 2.7 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(rows, 2, width_ratios=[1.15, 1.0])
-        draw_above = _draw_errors if scenario.plant.shown else _draw_estimates
+        draw_above = _draw_errors if scenario.plant.truth_known else _draw_estimates
         draw_above(figure.add_subplot(grid[0, 0]), scenario, completed)
         _draw_covariances(figure.add_subplot(grid[1, 0]), scenario, completed)
-        if scenario.plant.shown:
+        if scenario.plant.truth_known:
             samples = completed.samples
             axes = figure.add_subplot(grid[2, 0])
             draw_nees(axes, np.array(samples.times), samples.nees, scenario)
@@ -185,7 +185,7 @@ def _draw_network(figure: Figure, axes: Any, scenario: Scenario, completed: Comp
     """Draw nodes coloured by their error (trace of P without ground truth), and links."""
     positions = scenario.topology.positions or _layout(scenario)
     _draw_links(axes, scenario, positions, completed.samples.delivered)
-    key = "rms_error" if scenario.plant.shown else "mean_trace"
+    key = "rms_error" if scenario.plant.truth_known else "mean_trace"
     shades = {row["node"]: row[key] for row in completed.summary["nodes"]}
     dots = _draw_nodes(axes, scenario, positions, shades)
     if len(scenario.nodes) <= MAX_LABELLED_NODES:
@@ -198,7 +198,7 @@ def _draw_network(figure: Figure, axes: Any, scenario: Scenario, completed: Comp
     axes.axis("off")
     axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))
     axes.set_title(_network_title(completed.summary["messages"]), fontsize=9)
-    label = "RMS error" if scenario.plant.shown else "mean trace P"
+    label = "RMS error" if scenario.plant.truth_known else "mean trace P"
     figure.colorbar(dots, ax=axes, shrink=0.5, label=label, pad=0.01)
 
 

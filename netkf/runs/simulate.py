@@ -101,7 +101,7 @@ def collect(
         status=status,
         fingerprint=recorder.fingerprint,
         sums=recorder.sums,
-        shown=scenario.plant.shown,
+        truth_known=scenario.plant.truth_known,
         exact_errors=recorder.exact_errors,
         stats=recorder.stats,
     )

@@ -36,7 +36,7 @@ class SummarySink(Sink):
     diverged         : nodes whose estimate or covariance was not usable at the last sample
     """
 
-    anywhere: ClassVar[bool] = True
+    thread_safe: ClassVar[bool] = True
 
     def __init__(self) -> None:
         self.times: list[float] = []
@@ -237,7 +237,7 @@ def summary_notes(
 ) -> list[str]:
     """Return notes on the averages of a run or of an ensemble, one sentence each."""
     notes = [] if covariance_given else [NO_COVARIANCE]
-    if rounding_from is not None and scenario.plant.shown:
+    if rounding_from is not None and scenario.plant.truth_known:
         notes.append(
             f"from {rounding_from:g} s on the state is so large that rounding blurs the errors: "
             "they and NEES are averaged over the samples before; shorten the horizon"

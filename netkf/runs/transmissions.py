@@ -77,7 +77,7 @@ class Transmissions:
 class SentPerLink(Sink):
     """Counts the messages that were sent over each directed link, lost ones included."""
 
-    anywhere: ClassVar[bool] = True
+    thread_safe: ClassVar[bool] = True
 
     def __init__(self) -> None:
         self.sent: Counter[Link] = Counter()

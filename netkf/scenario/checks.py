@@ -9,7 +9,7 @@ import numpy as np
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
@@ -341,7 +341,7 @@ def _slots(scenario: Scenario) -> None:
         )
 
 
-def _told(activation: Part) -> str:
+def _told(activation: Component) -> str:
     """The kind of an activation in a sentence."""
     name = spoken(activation, "activation")
     if not isinstance(activation, RecordedSlots):

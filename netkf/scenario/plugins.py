@@ -7,14 +7,14 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 
 
-def plugged_in(part: Any) -> list[Part]:
+def plugged_in(part: Any) -> list[Component]:
     """The parts of a scenario whose classes are not netkf's own."""
     if isinstance(part, tuple):
         return [found for item in part for found in plugged_in(item)]
-    if not isinstance(part, Part):
+    if not isinstance(part, Component):
         return []
     inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
     own = [] if is_ours(type(part)) else [part]
@@ -26,7 +26,7 @@ def is_ours(cls: type) -> bool:
     return cls.__module__.partition(".")[0] == "netkf"
 
 
-def module_files(scenario: Part) -> dict[str, Path | None]:
+def module_files(scenario: Component) -> dict[str, Path | None]:
     """The modules that a scenario's classes come from: the file where it is one file beside the
     scenario, else None.
     """

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.errors import ScenarioError, nearest
-from netkf.core.fields import Part, SourceFile, integer, source_file
+from netkf.core.fields import Component, SourceFile, integer, source_file
 from netkf.network.channels import Channel
 from netkf.scenario.plugins import blame, in_words, is_ours
 from netkf.scenario.registry import SLOTTED, find
@@ -74,7 +74,7 @@ def source_files(part: Any) -> list[SourceFile]:
         return [part]
     if isinstance(part, tuple):
         return [source for item in part for source in source_files(item)]
-    if isinstance(part, Part):
+    if isinstance(part, Component):
         values = [getattr(part, field.name) for field in dataclasses.fields(part)]
         return [source for value in values for source in source_files(value)]
     return []

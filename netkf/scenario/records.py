@@ -24,7 +24,7 @@ def check_records(scenario: Scenario) -> None:
         key = f"sensors[{k}]"
         if isinstance(sensor, RecordedSensor):
             _readings(scenario, key, sensor)
-        elif not scenario.plant.shown:
+        elif not scenario.plant.truth_known:
             raise ScenarioError(
                 f"{key}.kind",
                 "must be recorded where the plant's state is unknown",
@@ -100,7 +100,7 @@ def used_states(scenario: Scenario) -> tuple[str, int, int] | None:
 def _used_rows(scenario: Scenario, plant: RecordedDiffusion) -> int:
     """Rows at probe times, and at the sample times of sensors that are drawn, in replica 0."""
     times = [scenario.times]
-    if any(sensor.drawn for sensor in scenario.sensors):
+    if any(sensor.is_random for sensor in scenario.sensors):
         times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))
     asked, rows = np.unique(np.concatenate(times)), plant.table[0]
     near = np.searchsorted(asked, rows - TOLERANCE)
@@ -111,7 +111,7 @@ def _used_rows(scenario: Scenario, plant: RecordedDiffusion) -> int:
 
 def _wanted(scenario: Scenario) -> set[int]:
     """The slots in which a run needs the state."""
-    drawn = any(sensor.drawn for sensor in scenario.sensors)
+    drawn = any(sensor.is_random for sensor in scenario.sensors)
     return {*scenario.slots, *(sensed_slots(scenario) if drawn else ())}
 
 

@@ -12,7 +12,7 @@ from netkf.algorithms.registry import built_in_filters
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, nearest, quote
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.network import channels, clocks, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -28,7 +28,7 @@ from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 
-FAMILIES: dict[str, type[Part]] = {
+FAMILIES: dict[str, type[Component]] = {
     "plant": Plant,
     "continuous plant": Plant,
     "sensor": Sensor,
@@ -43,10 +43,10 @@ FAMILIES: dict[str, type[Part]] = {
 }
 """The contract that the classes of each family keep."""
 
-FORMER: dict[str, tuple[type[Part], ...]] = {"filter": (FlowFilter, SlotFilter)}
+FORMER: dict[str, tuple[type[Component], ...]] = {"filter": (FlowFilter, SlotFilter)}
 """Contracts that classes of users may still keep (algorithms.adapters)."""
 
-KINDS: dict[str, dict[str, type[Part]]] = {
+KINDS: dict[str, dict[str, type[Component]]] = {
     "plant": {
         "diffusion": Diffusion,
         "linear": LinearPlant,
@@ -127,7 +127,7 @@ def time_words(slotted: bool) -> str:
     return f"belongs to plants {needs}, and this plant is {has}"
 
 
-def find(family: str, kind: object, folder: Path) -> type[Part]:
+def find(family: str, kind: object, folder: Path) -> type[Component]:
     """The class of ``kind``: a name of the table, or ``"package.module:Class"``, looked up beside
     the scenario file and in the current folder too.
     """
@@ -148,7 +148,7 @@ def find(family: str, kind: object, folder: Path) -> type[Part]:
     )
 
 
-def _imported(family: str, kind: str, folder: Path) -> type[Part]:
+def _imported(family: str, kind: str, folder: Path) -> type[Component]:
     module_name, _, class_name = kind.partition(":")
     places = [place for place in (str(folder), str(Path.cwd())) if place not in sys.path]
     sys.path[:0] = places
@@ -196,7 +196,7 @@ def _is_abstract(attribute: object) -> bool:
     return bool(getattr(attribute, "__isabstractmethod__", False))
 
 
-def name_of(family: str, part: Part) -> str:
+def name_of(family: str, part: Component) -> str:
     """The ``kind`` that :func:`find` would turn into the class of ``part``."""
     others = (KINDS.get(f"{time} {family}", {}) for time in ("slot", "continuous"))
     for table in (KINDS[family], *others):
@@ -206,7 +206,7 @@ def name_of(family: str, part: Part) -> str:
     return f"{type(part).__module__}:{type(part).__qualname__}"
 
 
-def spoken(part: Part, family: str = "filter") -> str:
+def spoken(part: Component, family: str = "filter") -> str:
     """The kind of a part in a sentence: its name, or that of a user's class."""
     name = name_of(family, part)
     return type(part).__name__.lower() if ":" in name else name

@@ -105,7 +105,7 @@ def uses_grid(scenario: Scenario) -> bool:
     """Whether the truth in continuous time is drawn on a sensing grid: where sensors give
     increments, or there are no sensors at all.
     """
-    drawn = not scenario.slotted and scenario.plant.drawn
+    drawn = not scenario.slotted and scenario.plant.is_random
     return drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
@@ -113,7 +113,7 @@ def exact_errors(scenario: Scenario) -> bool:
     """Whether errors are simulated in frames, see plants.truth: the plant is unstable, its state
     and all readings are drawn, the filters have its A (in slots F) and commute with a shift.
     """
-    if not scenario.drawn or not commutes(scenario.hosted):
+    if not scenario.is_random or not commutes(scenario.hosted):
         return False
     plant = scenario.plant
     if isinstance(plant, LinearPlant):
@@ -157,7 +157,7 @@ def demand_states(scenario: Scenario, times: dict[tuple[int, int], FloatArray]) 
     try:
         plant.demand(scenario.times, "the probe")
         for node, place in _placed(scenario):
-            if scenario.sensors[place.entry].drawn:
+            if scenario.sensors[place.entry].is_random:
                 plant.demand(times[node, place.ordinal], f"a sample of node {node}")
     except ScenarioError as error:
         raise error.under("plant") from None
@@ -171,7 +171,7 @@ def check_sampling(scenario: Scenario) -> None:
         key = f"sensors[{k}]"
         if isinstance(sensor, LinearSensor) and sensor.sampling is not None:
             _check_clock(scenario, key, sensor)
-        if not scenario.slotted and not scenario.plant.drawn and not samples(sensor):
+        if not scenario.slotted and not scenario.plant.is_random and not samples(sensor):
             raise ScenarioError(
                 f"{key}.sampling",
                 "must be a clock, since increments of a recorded state are unknown",

@@ -19,18 +19,18 @@ from netkf.algorithms.models import FlowModel, SlotModel
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import TheoryError
 from netkf.core.fields import (
-    Part,
+    Component,
     array,
     covariance,
     definite_covariance,
     either,
+    field,
     instance,
     integer,
     line,
     matrix,
     nested,
     positive,
-    setting,
     several,
     square,
     text,
@@ -53,51 +53,51 @@ from netkf.scenario import sampling
 
 
 @dataclass(frozen=True, eq=False)
-class Network(Part):
+class Network(Component):
     """Who can talk to whom, when, and what becomes of a message."""
 
-    graph: Graph = setting(instance(Graph))
-    activation: LinkClock | SlotActivation | None = setting(
+    graph: Graph = field(instance(Graph))
+    activation: LinkClock | SlotActivation | None = field(
         instance(LinkClock, SlotActivation), default=None
     )
-    channel: Channel = setting(instance(Channel), default=Channel())
+    channel: Channel = field(instance(Channel), default=Channel())
 
 
 @dataclass(frozen=True, eq=False)
-class Belief(Part):
+class Belief(Component):
     """What the filters believe where it differs from the truth.
 
     ``A`` (n, n) and ``B`` (n, m) of a diffusion, ``F`` and ``Q`` (n, n) of a linear plant, ``R`` of
     the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry.
     """
 
-    A: FloatArray | None = setting(square, default=None)
-    B: FloatArray | None = setting(matrix, default=None)
-    F: FloatArray | None = setting(square, default=None)
-    Q: FloatArray | None = setting(covariance, default=None)
-    R: FloatArray | tuple[FloatArray, ...] | None = setting(
+    A: FloatArray | None = field(square, default=None)
+    B: FloatArray | None = field(matrix, default=None)
+    F: FloatArray | None = field(square, default=None)
+    Q: FloatArray | None = field(covariance, default=None)
+    R: FloatArray | tuple[FloatArray, ...] | None = field(
         either(definite_covariance, several(definite_covariance, "covariance matrices"), nested(3)),
         default=None,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Filtering(Part):
+class Filtering(Component):
     """The filter of every node: its ``algorithm``, its start and what it believes.
 
     ``mean`` (n,) and ``cov`` (n, n) are one for all nodes or a tuple with one per node in the
     order of node ids; both default to the plant's.
     """
 
-    algorithm: AnyFilter = setting(instance(Filter, FlowFilter, SlotFilter))
-    mean: FloatArray | tuple[FloatArray, ...] | None = setting(
+    algorithm: AnyFilter = field(instance(Filter, FlowFilter, SlotFilter))
+    mean: FloatArray | tuple[FloatArray, ...] | None = field(
         either(vector, several(vector, "vectors, one per node"), nested(2)), default=None
     )
-    cov: FloatArray | tuple[FloatArray, ...] | None = setting(
+    cov: FloatArray | tuple[FloatArray, ...] | None = field(
         either(covariance, several(covariance, "covariance matrices, one per node"), nested(3)),
         default=None,
     )
-    model: Belief = setting(instance(Belief), default=Belief())
+    model: Belief = field(instance(Belief), default=Belief())
 
 
 class Placed(NamedTuple):
@@ -108,7 +108,7 @@ class Placed(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Scenario(Part):
+class Scenario(Component):
     """What is simulated. Every value is checked on construction, alone and against the others;
     ScenarioError says what is wrong in one line.
 
@@ -116,17 +116,17 @@ class Scenario(Part):
     samples or a tuple of increasing times.
     """
 
-    name: str = setting(text)
-    horizon: float = setting(positive)
-    plant: Plant = setting(instance(Plant))
-    sensors: tuple[LinearSensor | RegressorSensor | RecordedSensor, ...] = setting(
+    name: str = field(text)
+    horizon: float = field(positive)
+    plant: Plant = field(instance(Plant))
+    sensors: tuple[LinearSensor | RegressorSensor | RecordedSensor, ...] = field(
         several(instance(Sensor), "sensors", least=0)
     )
-    network: Network = setting(instance(Network))
-    filter: Filtering = setting(instance(Filtering))
-    probe: float | FloatArray = setting(either(positive, array(1, "list of times"), nested(1)))
-    claim: str = setting(line, default="")
-    seed: int = setting(integer(low=0), default=0)
+    network: Network = field(instance(Network))
+    filter: Filtering = field(instance(Filtering))
+    probe: float | FloatArray = field(either(positive, array(1, "list of times"), nested(1)))
+    claim: str = field(line, default="")
+    seed: int = field(integer(low=0), default=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -404,15 +404,15 @@ class Scenario(Part):
         return A, np.asarray(B @ B.T)
 
     @property
-    def drawn(self) -> bool:
+    def is_random(self) -> bool:
         """Whether runs draw the state and all readings; else nobody knows their law."""
-        return self.plant.drawn and all(sensor.drawn for sensor in self.sensors)
+        return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
 
     @property
     def filters_know_the_truth(self) -> bool:
         """Whether the filters have the plant's matrices and the sensors' R."""
         plant = self.plant
-        if not self.drawn:
+        if not self.is_random:
             return False
         if isinstance(plant, LinearPlant):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
@@ -475,7 +475,7 @@ class Scenario(Part):
             own[receiver] -= self.weight(receiver, sender)
         return {node: max(value, 0.0) for node, value in own.items()}
 
-    def measured(self, link: Link) -> float:
+    def table_probability(self, link: Link) -> float:
         """The delivery probability of a direction in the graph's table, 1 where it has none."""
         delivery = self.topology.delivery
         return 1.0 if delivery is None else delivery.get(link, 0.0)
@@ -488,7 +488,8 @@ class Scenario(Part):
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
             return {}
         return {
-            link: self._send_rate(clock, link) * loss.mean_delivery(link, self.measured(link))
+            link: self._send_rate(clock, link)
+            * loss.mean_delivery(link, self.table_probability(link))
             for link in self.topology.directions
         }
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.fields import Part, SourceFile
+from netkf.core.fields import Component, SourceFile
 from netkf.network.graphs import RandomGraph
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
@@ -79,11 +79,11 @@ def _filtering(filtering: Filtering, defaults: bool) -> dict[str, Any]:
     return {**table, "model": model} if model else table
 
 
-def _kind(family: str, part: Part, defaults: bool) -> dict[str, Any]:
+def _kind(family: str, part: Component, defaults: bool) -> dict[str, Any]:
     return {"kind": name_of(family, part), **_fields(part, defaults)}
 
 
-def _fields(part: Part, defaults: bool) -> dict[str, Any]:
+def _fields(part: Component, defaults: bool) -> dict[str, Any]:
     table: dict[str, Any] = {}
     for field in (field for field in dataclasses.fields(part) if field.init):
         value = getattr(part, field.name)

@@ -240,7 +240,7 @@ def consistency(
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "consistency takes a netkf.Scenario", scenario, LOAD)
-    if not scenario.drawn:
+    if not scenario.is_random:
         words = "states or readings are recorded, so the law of the errors is unknown"
         raise ScenarioError("plant", words, None, "simulate the plant and all readings")
     count = integer(low=FEWEST)("runs", runs)

@@ -75,7 +75,7 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
 def expected_errors_known(scenario: Scenario) -> bool:
     """Whether ``expected_metrics`` can be computed, and in about the time of a few runs."""
     small = len(scenario.nodes) * scenario.plant.n <= MOST_ERRORS
-    if not (scenario.slotted and small and scenario.drawn):
+    if not (scenario.slotted and small and scenario.is_random):
         return False
     try:
         error_covariance(scenario, simulate(scenario))
@@ -151,7 +151,7 @@ def central_trace(scenario: Scenario) -> float:
 
 
 def _fixed_rows(scenario: Scenario) -> None:
-    if not scenario.drawn:
+    if not scenario.is_random:
         raise TheoryError("the readings are recorded: nobody knows their law")
     for node in scenario.sensing:
         scenario.observation(node)  # raises where H is random

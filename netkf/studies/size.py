@@ -63,7 +63,7 @@ def size(
         choice(*DIGITS)("--by", by)
     wanted, sure = parse_target(target), number(above=0.0, below=1.0)("--confidence", confidence)
     integer(low=FIRST_BATCH)("--runs", runs)
-    if wanted.of_errors and not scenario.plant.shown:
+    if wanted.of_errors and not scenario.plant.truth_known:
         remedy = "ask for mean_trace or worst_trace"
         raise ScenarioError(
             "--target", "is about errors, and there is no ground truth", target, remedy

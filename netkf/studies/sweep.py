@@ -128,7 +128,7 @@ def _row(place: Cell, found: RunMetrics) -> Row:
     diverged = int(found.diverged.sum())
     status = f"{diverged} diverged" if diverged else "complete"
     blurred = float(found.rounding_from.min())
-    if np.isfinite(blurred) and place.scenario.plant.shown:
+    if np.isfinite(blurred) and place.scenario.plant.truth_known:
         status += f"; rounding blurs errors from {blurred:g} s on, they are left out"
     row["status"] = status
     return row

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import Channel, Delay, Fates, Loss
+from netkf.network.channels import Channel, ChannelSampler, Delay, Loss
 from netkf.network.graphs import Link
 from netkf.rng.streams import Streams
 from netkf.testing.generators import Told, spoken
@@ -24,11 +24,11 @@ LINKS = ((0, 1), (1, 0))
 def check_channel(channel: Any, /, **settings: Any) -> None:
     """Check a Channel, a Loss or a Delay, or a class of these with its ``settings``.
 
-    Chances are numbers from 0 to 1 (0 or 1 where ``certain``) and need no randomness; ``weather``
-    and ``draw`` use nothing but the generator they are given, the same draws at each activation,
-    and none where ``changing`` is False or the delay is ``fixed``; ``mean_delivery`` agrees with a
-    simulation of 50,000 activations, and so does ``independent``; delays are not negative and,
-    where ``fixed``, as it says. Raises AssertionError with one line.
+    Delivery probabilities are numbers from 0 to 1 (0 or 1 where ``deterministic``) and need no
+    randomness; ``next_state`` and ``draw`` use only the generator they are given, make the same
+    draws at each activation, and none where ``stateful`` is False or the delay is ``fixed``;
+    ``mean_delivery`` and ``independent`` agree with a simulation of 50,000 activations; delays are
+    not negative and equal ``fixed`` if it is not None. Raises AssertionError with one line.
     """
     part = made(channel, (Channel, Loss, Delay), settings)
     if isinstance(part, Channel):
@@ -40,50 +40,50 @@ def check_channel(channel: Any, /, **settings: Any) -> None:
     if isinstance(part, Delay):
         _delays(watched)
         return
-    for link, measured in ((LINKS[0], 1.0), (LINKS[1], 0.6)):
-        _chances(watched, link, measured)
+    for link, table_probability in ((LINKS[0], 1.0), (LINKS[1], 0.6)):
+        _chances(watched, link, table_probability)
     _weather(watched)
-    for link, measured in ((LINKS[0], 1.0), (LINKS[1], 0.6)):
-        _fractions(watched, link, measured)
+    for link, table_probability in ((LINKS[0], 1.0), (LINKS[1], 0.6)):
+        _fractions(watched, link, table_probability)
 
 
-def _chances(watched: Watched, link: Link, measured: float) -> None:
-    part, where = watched.part, f"{watched.name}.chance"
+def _chances(watched: Watched, link: Link, table_probability: float) -> None:
+    part, where = watched.part, f"{watched.name}.{watched.spoken('delivery_probability')}"
     for bad in (False, True):
         for message in (0, 1, 2, 1000):
-            chance = watched.call("chance", link, message, bad, measured)
+            chance = watched.call("delivery_probability", link, message, bad, table_probability)
             number = isinstance(chance, (int, float, np.floating)) and 0.0 <= chance <= 1.0
             demand(number, where, f"must be a number from 0 to 1 for message {message}", chance)
-            sure = not part.certain or chance in (0.0, 1.0)
+            sure = not part.deterministic or chance in (0.0, 1.0)
             demand(
                 sure,
                 where,
-                "must be 0 or 1 where the loss is certain",
+                "must be 0 or 1 where the loss is deterministic",
                 chance,
-                "let certain be False",
+                "let deterministic be False",
             )
-    mean = watched.call("mean_delivery", link, measured)
+    mean = watched.call("mean_delivery", link, table_probability)
     known = math.isnan(mean) or 0.0 <= mean <= 1.0
     demand(known, f"{watched.name}.mean_delivery", "must be a number from 0 to 1, or nan", mean)
 
 
 def _weather(watched: Watched) -> None:
-    part, where = watched.part, f"{watched.name}.weather"
+    part, where = watched.part, f"{watched.name}.{watched.spoken('next_state')}"
     seen: dict[bool, list[Any]] = {}
     for twin in range(2):
         random, bad, history = Told(5), None, []
         for k in range(DRAWS):
-            bad = watched.call("weather", bad, random, repeatable=False)
+            bad = watched.call("next_state", bad, random, repeatable=False)
             demand(bad is True or bad is False, where, "must be True or False", bad)
             calls = random.taken()
             history.append((bad, calls))
-            if not part.changing:
+            if not part.stateful:
                 demand(
                     not calls,
                     where,
-                    "must draw nothing where changing is False",
+                    "must draw nothing where stateful is False",
                     spoken(calls),
-                    "let changing be True",
+                    "let stateful be True",
                 )
             elif calls != history[0][1]:
                 fail(
@@ -101,12 +101,12 @@ def _weather(watched: Watched) -> None:
     )
 
 
-def _fractions(watched: Watched, link: Link, measured: float) -> None:
+def _fractions(watched: Watched, link: Link, table_probability: float) -> None:
     part = watched.part
-    stated = part.mean_delivery(link, measured)
+    stated = part.mean_delivery(link, table_probability)
     if math.isnan(stated) and not part.independent:
         return
-    arrived = _simulated(part, link, measured)
+    arrived = _simulated(part, link, table_probability)
     fractions = arrived.mean(axis=1)
     found, error = float(fractions.mean()), float(fractions.std()) / math.sqrt(CHAINS)
     few = FEW / (arrived.size if part.independent else CHAINS)
@@ -128,21 +128,23 @@ def _independent(watched: Watched, arrived: FloatArray, mean: float) -> None:
     demand(
         not related,
         f"{watched.name}.independent",
-        "must be False where fates of neighbouring activations are related",
+        "must be False where outcomes of neighbouring activations are related",
         f"a covariance of {value:.3g} +- {error:.2g}",
         "return False: theory relies on it",
     )
 
 
-def _simulated(part: Loss, link: Link, measured: float) -> FloatArray:
+def _simulated(part: Loss, link: Link, table_probability: float) -> FloatArray:
     """(chains, length) of 0 and 1: what the engine would have delivered."""
     arrived = np.zeros((CHAINS, LENGTH))
     before = global_randomness()
     for chain in range(CHAINS):
-        fates = Fates(Channel(loss=part), Streams(7, chain).generator)
+        sampler = ChannelSampler(Channel(loss=part), Streams(7, chain).generator)
         for message in range(LENGTH):
-            luck, bad, _ = fates.draw()
-            arrived[chain, message] = luck < part.chance(link, message, bad, measured)
+            uniform, bad, _ = sampler.draw()
+            arrived[chain, message] = uniform < part.delivery_probability(
+                link, message, bad, table_probability
+            )
     demand(global_randomness() == before, type(part).__name__, "must not use global generators")
     return arrived
 

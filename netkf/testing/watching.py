@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from netkf.core.errors import NetkfError, quote
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.scenario.plugins import in_words
 
 Leaves = dict[str, Any]
@@ -31,7 +31,7 @@ def demand(holds: object, where: str, rule: str, got: object = None, remedy: str
         fail(where, rule, got, remedy)
 
 
-def made(part: Any, contracts: tuple[type[Part], ...], settings: Mapping[str, Any]) -> Any:
+def made(part: Any, contracts: tuple[type[Component], ...], settings: Mapping[str, Any]) -> Any:
     """An object of a user's class: ``part`` itself, or the class made with ``settings``."""
     cls = part if isinstance(part, type) else type(part)
     name = cls.__name__
@@ -130,8 +130,14 @@ class Watched:
         self._kept: list[tuple[str, Any, Leaves]] = []
 
     def spoken(self, method: str) -> str:
-        """What the user's class calls the method."""
-        return self._former.get(method, method)
+        """Return the name by which the user's class defines a method or property."""
+        if method in self._former:
+            return self._former[method]
+        found = _static(type(self._owner), method)
+        defined = getattr(getattr(found, "fget", found), "__name__", method)
+        # Under a former name of the contract, see Component.former_names.
+        former = getattr(self._owner, "former_names", {}).get(method)
+        return former if defined == former else method
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """The result of a method; ``repeatable`` where it draws nothing."""

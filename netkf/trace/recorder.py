@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.interrupts import undisturbed
+from netkf.core.interrupts import defer_signals
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.schema import CODES, EVENT, KINDS
 
@@ -29,10 +29,10 @@ NAN = math.nan
 
 class Sink(ABC):
     """Where a recorder's blocks go; from another thread too, one call at a time, where that is
-    ``anywhere``.
+    ``thread_safe``.
     """
 
-    anywhere: ClassVar[bool] = False
+    thread_safe: ClassVar[bool] = False
     exact_errors: bool = False
     """Whether errors keep their digits however large the state is; the recorder sets it."""
 
@@ -52,7 +52,7 @@ class Sink(ABC):
 class MemorySink(Sink):
     """Keeps everything."""
 
-    anywhere: ClassVar[bool] = True
+    thread_safe: ClassVar[bool] = True
 
     def __init__(self) -> None:
         self.blocks: list[np.ndarray] = []
@@ -78,8 +78,8 @@ class Recorder:
     ``counted`` events are only counted, and the sinks see samples alone.
     """
 
-    def __init__(self, sinks: Sequence[Sink], counted: bool = False) -> None:
-        self._sinks, self.counted = tuple(sinks), counted
+    def __init__(self, sinks: Sequence[Sink], counts_only: bool = False) -> None:
+        self._sinks, self.counts_only = tuple(sinks), counts_only
         self._rows: list[tuple[float, int, int, int, int, int, float]] = []
         self._hash = hashlib.sha256()
         self._counts = np.zeros(len(KINDS), dtype=np.int64)
@@ -125,7 +125,7 @@ class Recorder:
         """Pass the gathered events on; all that came is counted and kept then, and nothing goes on
         in another thread.
         """
-        with undisturbed():
+        with defer_signals():
             try:
                 self._flush_gathered()
                 self._wait()
@@ -137,7 +137,7 @@ class Recorder:
     def _flush_gathered(self) -> None:
         if not self._rows:
             return
-        if self.counted:
+        if self.counts_only:
             kinds = np.fromiter(map(itemgetter(1), self._rows), dtype=np.uint8)
             self._rows.clear()
             self._count(kinds)
@@ -148,14 +148,14 @@ class Recorder:
 
     def extend(self, rows: np.ndarray) -> None:
         """Record a block of EVENT rows, which nobody writes to from now on."""
-        with undisturbed():  # what is counted is also kept
+        with defer_signals():  # what is counted is also kept
             self._flush_gathered()
             if not len(rows):
                 return
-            if self.counted:
+            if self.counts_only:
                 self._count(rows["kind"])
                 return
-            if len(rows) >= LONG and all(sink.anywhere for sink in self._sinks):
+            if len(rows) >= LONG and all(sink.thread_safe for sink in self._sinks):
                 self._wait()  # one block at most waits for its turn
                 if self._thread is None:
                     self._thread = ThreadPoolExecutor(1, "netkf-recorder")
@@ -195,7 +195,7 @@ class Recorder:
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
         """Record some samples, which nobody writes to from now on."""
-        with undisturbed():  # what one sink has seen all have
+        with defer_signals():  # what one sink has seen all have
             self._do(self._show, t, x, xhat, P, error)
 
     def _show(self, *sample: FloatArray) -> None:
@@ -221,4 +221,4 @@ class Recorder:
         """SHA-256 of the flushed events, independent of blocks and machines; empty where they were
         only counted.
         """
-        return "" if self.counted else self._hash.hexdigest()
+        return "" if self.counts_only else self._hash.hexdigest()

@@ -32,9 +32,9 @@ class Run:
     (trace.schema.EVENT). ``error`` is x - xhat; with ``exact_errors`` it has digits even where x
     and xhat are so large that their difference has lost them, else digits are lost from
     ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds what
-    exchanges should conserve, summed over all nodes: at the start and at the last sample. Where the
-    truth is not ``shown``, x is nan and tables have no columns of errors. ``stats`` holds what the
-    engine counted of its own work.
+    exchanges should conserve, summed over all nodes: at the start and at the last sample. Unless
+    ``truth_known``, x is nan and tables have no columns of errors. ``stats`` holds the counts that
+    the engine keeps of its own work.
     """
 
     times: FloatArray
@@ -50,7 +50,7 @@ class Run:
     status: str
     fingerprint: str
     sums: dict[str, tuple[float, float]] = field(default_factory=dict)
-    shown: bool = True
+    truth_known: bool = True
     exact_errors: bool = False
     stats: dict[str, int] = field(default_factory=dict)
 
@@ -61,6 +61,11 @@ class Run:
             f"nodes, {self.x.shape[-1]} states, {len(self.log):,} events, seed {self.seed}, "
             f"replica {self.replica}>"
         )
+
+    @property
+    def shown(self) -> bool:
+        """Former name of ``truth_known``."""
+        return self.truth_known
 
     @cached_property
     def events(self) -> pd.DataFrame:
@@ -75,7 +80,7 @@ class Run:
         import pandas as pd
 
         samples = (self.times, self.nodes, self.x, self.xhat, self.P, self.error)
-        return pd.DataFrame(state_table(self.replica, *samples, self.shown))
+        return pd.DataFrame(state_table(self.replica, *samples, self.truth_known))
 
     @cached_property
     def rounding(self) -> FloatArray:
@@ -151,9 +156,9 @@ def state_table(
     xhat: FloatArray,
     P: FloatArray,
     error: FloatArray,
-    shown: bool = True,
+    truth_known: bool = True,
 ) -> dict[str, Any]:
-    """Samples as named columns, a row a time and node; errors only where the truth is shown."""
+    """Samples as named columns, a row a time and node; errors only where the truth is known."""
     count, n = len(nodes), x.shape[1]
     rows = len(times) * count
     upper = np.triu_indices(n)
@@ -169,7 +174,7 @@ def state_table(
         nees.reshape(rows),
     ]
     table = dict(zip(state_columns(n), values, strict=True))
-    if not shown:
+    if not truth_known:
         del table["sq_error"], table["nees"]
     return table
 

@@ -17,7 +17,7 @@ from netkf.engines.compiled import lots
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.linalg import compiling, small
-from netkf.network.channels import Bernoulli, Fates
+from netkf.network.channels import Bernoulli, ChannelSampler
 from netkf.network.clocks import Poisson
 from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
@@ -422,10 +422,10 @@ class Cautious(Hybrid):
 
 
 class Halved(Bernoulli):
-    """A user's loss: half of what it says."""
+    """A user's loss, with the method under its former name: half of what it says."""
 
     def chance(self, link, message, bad, measured):
-        return 0.5 * self.delivery
+        return 0.5 * super().chance(link, message, bad, measured)
 
 
 def test_a_filter_of_ones_own_is_refused_by_name_and_auto_takes_the_other(ring):
@@ -447,7 +447,7 @@ def test_a_loss_of_ones_own_runs_in_both(ring):
 class Certain(Bernoulli):
     """A user's loss that is no probability."""
 
-    def chance(self, link, message, bad, measured):
+    def delivery_probability(self, link, message, bad, table_probability):
         return np.nan if message > 3 else 1.0
 
 
@@ -463,7 +463,9 @@ class Stuck(Poisson):
 def test_parts_of_ones_own_that_break_the_rules_are_refused_by_name(ring, engine):
     channel = dataclasses.replace(ring.network.channel, loss=Certain(delivery=0.8))
     lossy = dataclasses.replace(ring.network, channel=channel)
-    words = r"Certain: the chance of message 4 on link .* must be in \[0, 1\]; got nan"
+    words = (
+        r"Certain: the delivery probability of message 4 on link .* must be in \[0, 1\]; got nan"
+    )
     with pytest.raises(ScenarioError, match=words):
         netkf.simulate(dataclasses.replace(ring, network=lossy), engine=engine)
     stuck = dataclasses.replace(ring.network, activation=Stuck(rate=2.0))
@@ -542,7 +544,7 @@ def test_fates_drawn_at_once_are_those_drawn_one_by_one():
                 {"network.channel": {"loss": loss, "delay": delay}}
             )
             one, other = (
-                Fates(scenario.network.channel, lambda p: Streams(1).generator(p, 0, 1))
+                ChannelSampler(scenario.network.channel, lambda p: Streams(1).generator(p, 0, 1))
                 for _ in range(2)
             )
             singles = [one.draw() for _ in range(100)]
@@ -633,7 +635,7 @@ def test_a_lot_with_a_run_that_diverges(build):
 def test_a_block_of_rows_is_recorded_like_one_row_after_the_other():
     rows = [(0.5 * k, k % 3, k, -1, -1, -1, np.nan) for k in range(10)]
     one, other = (Recorder([MemorySink()]) for _ in range(2))
-    counting = Recorder([MemorySink()], counted=True)
+    counting = Recorder([MemorySink()], counts_only=True)
     for row in rows:
         one.append(row)
     one.flush()

@@ -8,7 +8,7 @@ import pytest
 from netkf.engines.compiled import poisson
 from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson, schedule
 from netkf.engines.compiled.schedule import Schedule, whole_schedules
-from netkf.rng.streams import Streams, Together
+from netkf.rng.streams import ReplicaStreams, Streams
 
 CHANNELS = {
     "shared": {"symmetric": True, "loss": {"kind": "bernoulli", "delivery": 0.7}},
@@ -70,8 +70,8 @@ def test_room_grows_where_there_are_more_ticks_than_expected(busy):
 
 def test_several_runs_are_what_each_is_alone(busy):
     case = busy(CHANNELS["shared"])
-    together = PoissonSchedules(case, Together(3, 5, 3)).whole()
-    for window, plain in zip(together, whole_schedules(case, Together(3, 5, 3)), strict=True):
+    together = PoissonSchedules(case, ReplicaStreams(3, 5, 3)).whole()
+    for window, plain in zip(together, whole_schedules(case, ReplicaStreams(3, 5, 3)), strict=True):
         for one, other in zip(ticks_of(window), ticks_of(plain), strict=True):
             np.testing.assert_array_equal(one, other)
 

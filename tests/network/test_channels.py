@@ -11,19 +11,22 @@ from netkf.trace.schema import CODES
 import netkf  # isort: skip
 
 
-def fates(count, **settings):
+def sampled_outcomes(count, **settings):
     channel = channels.Channel(**settings)
-    drawer = channels.Fates(channel, lambda purpose: Streams(1).generator(purpose, 0, 1))
-    draws = [drawer.draw() for _ in range(count)]
-    arrived = [u < channel.loss.chance((0, 1), k, bad, 1.0) for k, (u, bad, _) in enumerate(draws)]
+    sampler = channels.ChannelSampler(channel, lambda purpose: Streams(1).generator(purpose, 0, 1))
+    draws = [sampler.draw() for _ in range(count)]
+    arrived = [
+        u < channel.loss.delivery_probability((0, 1), k, bad, 1.0)
+        for k, (u, bad, _) in enumerate(draws)
+    ]
     return np.array(arrived), np.array([delay for _, _, delay in draws])
 
 
 def test_bernoulli():
-    arrived, _ = fates(20000, loss=channels.Bernoulli(0.7))
+    arrived, _ = sampled_outcomes(20000, loss=channels.Bernoulli(0.7))
     assert scipy.stats.binomtest(int(arrived.sum()), arrived.size, 0.7).pvalue > 1e-4
-    assert fates(50)[0].all()
-    assert not fates(50, loss=channels.Bernoulli(0.0))[0].any()
+    assert sampled_outcomes(50)[0].all()
+    assert not sampled_outcomes(50, loss=channels.Bernoulli(0.0))[0].any()
 
 
 @pytest.mark.parametrize(
@@ -34,7 +37,7 @@ def test_bernoulli():
     ],
 )
 def test_gilbert_elliott_has_its_mean_loss_and_burst(loss):
-    arrived, _ = fates(100_000, loss=loss)
+    arrived, _ = sampled_outcomes(100_000, loss=loss)
     lost = ~arrived
     starts = lost & np.concatenate([[True], arrived[:-1]])
     assert lost.sum() / starts.sum() == pytest.approx(5.0, rel=0.05)
@@ -45,7 +48,7 @@ def test_gilbert_elliott_has_its_mean_loss_and_burst(loss):
 
 def test_gilbert_elliott_with_two_kinds_of_luck():
     loss = channels.GilbertElliott(to_bad=0.1, to_good=0.3, deliver_good=0.9, deliver_bad=0.4)
-    arrived, _ = fates(100_000, loss=loss)
+    arrived, _ = sampled_outcomes(100_000, loss=loss)
     expected = 0.75 * 0.9 + 0.25 * 0.4
     assert loss.mean_delivery((0, 1), 1.0) == pytest.approx(expected)
     assert arrived.mean() == pytest.approx(expected, abs=0.01)
@@ -60,7 +63,7 @@ def test_gilbert_elliott_with_two_kinds_of_luck():
     ],
 )
 def test_delays_have_their_law(delay, law):
-    _, seconds = fates(4000, delay=delay)
+    _, seconds = sampled_outcomes(4000, delay=delay)
     assert scipy.stats.kstest(seconds, law.cdf).pvalue > 1e-4
     assert scipy.stats.kstest(1.2 * seconds, law.cdf).pvalue < 1e-4
     assert delay.fixed is None

@@ -8,17 +8,18 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.network.channels import (
     Channel,
+    ChannelDraw,
+    ChannelSampler,
     ExponentialDelay,
-    Fates,
     NoDelay,
     UniformDelay,
-    by_message,
-    outcome,
+    delay_depends_on_message,
+    transit_time,
 )
 from netkf.network.recorded import MessageUse, RecordedDelay, RecordedLoss
 
 WAY, BACK = (0, 1), (1, 0)
-FINE = (0.0, False, 0.0)
+FINE = ChannelDraw(0.0, False, 0.0)
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def record(tmp_path):
 
 
 def chances(loss, count, link=WAY):
-    return [loss.chance(link, k, False, 1.0) for k in range(count)]
+    return [loss.delivery_probability(link, k, False, 1.0) for k in range(count)]
 
 
 def seconds(delay, count, link=WAY):
@@ -67,9 +68,9 @@ def test_delays_after_the_record(record):
 def test_a_message_beyond_the_record_may_be_refused(record, cls, key):
     part = record(cls, ["0,1,0,1"], after="refuse")
     channel = Channel(**{key: part})
-    assert outcome(channel, WAY, 0, FINE, 1.0) == (1.0 if key == "delay" else 0.0)
+    assert transit_time(channel, WAY, 0, FINE, 1.0) == (1.0 if key == "delay" else 0.0)
     with pytest.raises(ScenarioError) as caught:
-        outcome(channel, WAY, 1, FINE, 1.0)
+        transit_time(channel, WAY, 1, FINE, 1.0)
     line = str(caught.value)
     assert line.startswith(f"network.channel.{key}.path: record.csv must list every message")
     assert "message 1 from node 0 to node 1" in line
@@ -86,19 +87,23 @@ def test_what_is_used_of_a_record(record, cls):
 def test_nothing_is_drawn_for_recorded_delays(record):
     asked = []
     channel = Channel(delay=record(RecordedDelay, ["0,1,0,0.5"]))
-    fates = Fates(channel, asked.append)
-    assert fates.draw() == FINE
-    assert [column.tolist() for column in fates.draws(2)] == [[0.0, 0.0], [False, False], [0.0] * 2]
+    sampler = ChannelSampler(channel, asked.append)
+    assert sampler.draw() == FINE
+    assert [column.tolist() for column in sampler.draws(2)] == [
+        [0.0, 0.0],
+        [False, False],
+        [0.0] * 2,
+    ]
     assert asked == []
     assert channel.delay.fixed is None
-    assert not channel.delay.drawn
-    assert by_message(channel.delay)
-    assert not by_message(NoDelay())
+    assert not channel.delay.is_random
+    assert delay_depends_on_message(channel.delay)
+    assert not delay_depends_on_message(NoDelay())
     assert channel.delay.longest == 0.5
     assert UniformDelay(0.1, 0.4).longest == 0.4
     assert ExponentialDelay(1.0).longest == math.inf
     assert NoDelay().longest == 0.0
-    assert ExponentialDelay(1.0).drawn
+    assert ExponentialDelay(1.0).is_random
 
 
 def test_negative_delays_are_refused(record):
@@ -107,4 +112,4 @@ def test_negative_delays_are_refused(record):
             return -1.0
 
     with pytest.raises(ScenarioError, match=r"Early: the delay of message 3 .* not be negative"):
-        outcome(Channel(delay=Early()), WAY, 3, FINE, 1.0)
+        transit_time(Channel(delay=Early()), WAY, 3, FINE, 1.0)

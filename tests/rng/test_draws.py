@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from netkf.rng.draws import Draws
-from netkf.rng.streams import Streams, Together
+from netkf.rng.draws import StreamBatch
+from netkf.rng.streams import ReplicaStreams, Streams
 
 LINKS = [(k, k + 1) for k in range(200)] + [(2**40, 3)]
 
 
-@pytest.mark.parametrize("streams", [Streams(3, 1), Together(2**70, 5, 3)])
+@pytest.mark.parametrize("streams", [Streams(3, 1), ReplicaStreams(2**70, 5, 3)])
 def test_exponentials_and_units_are_those_of_numpy(streams):
     """A million of each, among them those from every layer and from the tail of the ziggurat."""
-    draws = Draws(streams, "clock", LINKS)
-    generators = [one.generator("clock", *link) for one in streams.each for link in LINKS]
+    draws = StreamBatch(streams, "clock", LINKS)
+    generators = [one.generator("clock", *link) for one in streams.per_replica for link in LINKS]
     random = np.random.default_rng(0)
     for turn in range(4):
         which = np.flatnonzero(random.random(len(generators)) < 0.7)

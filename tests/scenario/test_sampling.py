@@ -150,7 +150,7 @@ def test_network_and_probes_do_not_move_the_truth_at_samples(make):
 def test_recorded_states_and_readings_over_a_diffusion(make):
     plant = {"kind": "recorded", "path": "x.csv"}
     scenario = make([RECORDED, {**SAMPLED, "sampling": {"kind": "periodic", "period": 0.5}}], plant)
-    assert not scenario.drawn
+    assert not scenario.is_random
     assert scenario.sensing == (0, 1, 2)
     truth = sampling.continuous_truth(scenario, Streams(4))
     assert isinstance(truth, RecordedTruth)
@@ -170,7 +170,7 @@ def test_unknown_states_are_nan(make):
     assert local.shape == (41, 2)
     assert np.isnan(local).all()
     assert np.isnan(absolute).all()
-    assert not scenario.plant.shown
+    assert not scenario.plant.truth_known
     assert as_table(scenario)["plant"]["kind"] == "unknown"
 
 

@@ -21,9 +21,9 @@ def says(table, words, **settings):
     return keep
 
 
-@says(CHANNELS, "TooSure.chance: must be a number from 0 to 1 for message 0; got 1.2")
+@says(CHANNELS, "TooSure.delivery_probability: must be a number from 0 to 1 for message 0; got 1.2")
 class TooSure(Loss):
-    def chance(self, link, message, bad, measured):
+    def delivery_probability(self, link, message, bad, table_probability):
         return 1.2
 
 
@@ -43,27 +43,34 @@ class Bursty(GilbertElliott):
         return True
 
 
-@says(CHANNELS, "HalfSure.chance: must be 0 or 1 where the loss is certain", delivery=0.5)
+@says(
+    CHANNELS,
+    "HalfSure.delivery_probability: must be 0 or 1 where the loss is deterministic",
+    delivery=0.5,
+)
 class HalfSure(Bernoulli):
     @property
-    def certain(self):
+    def deterministic(self):
         return True
 
 
-@says(CHANNELS, "Fickle.weather: must draw nothing where changing is False", delivery=0.5)
+@says(CHANNELS, "Fickle.weather: must draw nothing where stateful is False", delivery=0.5)
 class Fickle(Bernoulli):
     def weather(self, bad, random):
         return random.random() < 0.5
 
 
 @says(
-    CHANNELS, "Lazy.weather: must draw the same at each activation", mean_loss=0.2, mean_burst=5.0
+    CHANNELS,
+    "Lazy.next_state: must draw the same at each activation",
+    mean_loss=0.2,
+    mean_burst=5.0,
 )
 class Lazy(GilbertElliott):
-    def weather(self, bad, random):
-        return (
-            bool(random.random() < 0.3) if not bad else super().weather(random.random() < 2, random)
-        )
+    def next_state(self, bad, random):
+        if not bad:
+            return bool(random.random() < 0.3)
+        return super().next_state(random.random() < 2, random)
 
 
 @says(CHANNELS, "OwnLuck.chance: must give the same for the same arguments")

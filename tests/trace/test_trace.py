@@ -118,7 +118,7 @@ def test_long_blocks_are_kept_by_one_other_thread_in_their_order():
 
 
 def test_sinks_that_may_not_be_called_from_anywhere_are_called_from_here(monkeypatch):
-    monkeypatch.setattr(Watched, "anywhere", False)
+    monkeypatch.setattr(Watched, "thread_safe", False)
     sink = Watched()
     record = recorder.Recorder([sink, MemorySink()])
     for number in range(3):

@@ -16,7 +16,7 @@ from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time
 from netkf.plants.paths import BLOCK
 from netkf.plants.sensors import step_noise
-from netkf.rng.streams import Streams, Together
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Placed, Scenario
 
 LEAST_CUTS, MOST_CUTS = 64, 256  # normals that a sensor has ready
@@ -56,7 +56,7 @@ class Paths:
     def __init__(
         self,
         scenario: Scenario,
-        streams: Streams | Together,
+        streams: Streams | ReplicaStreams,
         blocks: int,
         sampled: FloatArray = NO_TIMES,
     ) -> None:
@@ -138,7 +138,7 @@ class Noise:
     def __init__(
         self,
         scenario: Scenario,
-        streams: Streams | Together,
+        streams: Streams | ReplicaStreams,
         steps: int,
         cuts: int,
     ) -> None:
@@ -148,7 +148,7 @@ class Noise:
         self._noise = streams.generators("noise", keys)
         self._cuts = streams.generators("cut", keys)
         self._period, self._steps = (scenario.truth.sensing_period or 1.0) if placed else 1.0, steps
-        n, count, runs = scenario.plant.n, len(sensors), len(streams.each)
+        n, count, runs = scenario.plant.n, len(sensors), len(streams.per_replica)
         self._rows = [len(sensor.R) for sensor in sensors]
         most = max(self._rows, default=0)
         H, root = np.zeros((count, most, n)), np.zeros((count, most, most))

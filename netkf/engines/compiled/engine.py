@@ -9,7 +9,7 @@ import numpy as np
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
-from netkf.core.fields import Part
+from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.event_loop import event_loop
 from netkf.engines.compiled.flow import FlowRun
@@ -51,7 +51,7 @@ class CompiledEngine(Engine):
     def refusal(self, scenario: Scenario) -> str | None:
         """Why this engine cannot run the scenario, with the remedy; None where it can."""
         remedy = 'use engine="simpy", or "auto", which chooses'
-        parts: list[tuple[str, Part]] = [("plant", scenario.plant)]
+        parts: list[tuple[str, Component]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
         for family, part in parts:

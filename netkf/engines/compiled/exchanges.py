@@ -20,7 +20,7 @@ from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
 from netkf.engines.compiled.masses import stopping
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import Fates, checked_chance, checked_delay
+from netkf.network.channels import ChannelSampler, checked_delay, checked_delivery_probability
 from netkf.network.graphs import Link
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.transitions import frame_slots
@@ -68,9 +68,9 @@ class Way:
 
     def __init__(self, scenario: Scenario, streams: Streams, link: Link, entity: int) -> None:
         self.link, self.entity, self.messages = link, entity, 0
-        self.measured = scenario.measured(link)
+        self.table_probability = scenario.table_probability(link)
         self.weight = scenario.weight(link[1], link[0])
-        self._fates = Fates(scenario.network.channel, partial(_stream, streams, link))
+        self._fates = ChannelSampler(scenario.network.channel, partial(_stream, streams, link))
 
     def fates(self) -> Iterator[tuple[float, bool, float]]:
         """The fates of its activations, one after the other."""
@@ -259,8 +259,10 @@ class Exchanges(Programme):
         (sender, receiver), number = way.link, way.messages
         way.messages = number + 1
         self._note((now, SEND, sender, receiver, number, phase, NAN))
-        link, measured = way.link, way.measured
-        if fate is None or fate[0] >= checked_chance(self._loss, link, number, fate[1], measured):
+        link, measured = way.link, way.table_probability
+        if fate is None or fate[0] >= checked_delivery_probability(
+            self._loss, link, number, fate[1], measured
+        ):
             self._note((now, LOST, sender, receiver, number, phase, NAN))
             return
         delay = checked_delay(self._scenario.network.channel.delay, link, number, fate[2])

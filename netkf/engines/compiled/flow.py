@@ -14,7 +14,7 @@ import numpy as np
 from netkf.algorithms.intermittent import SLACK, Intermittent
 from netkf.algorithms.models import FlowModel
 from netkf.algorithms.push_sum import PushSum
-from netkf.core.interrupts import undisturbed
+from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.draws import Noise, Paths, no_path, sizes
 from netkf.engines.compiled.event_loop import (
@@ -251,7 +251,7 @@ class FlowRun:
                     return "diverged"
                 self._give(wanted)
         finally:
-            with undisturbed():
+            with defer_signals():
                 try:
                     self._pass_rows_on(int(self._run["row"]))
                 finally:
@@ -301,7 +301,7 @@ class FlowRun:
         rows, recorder = self._state.rows, self._recorder
         self._run["row"] = 0
         recorder.extend(rows[:used])
-        if not recorder.counted:  # they are the recorder's now
+        if not recorder.counts_only:  # they are the recorder's now
             self._state = self._state._replace(rows=np.empty(len(rows), dtype=EVENT))
 
     def _hand_samples_on(self) -> bool:

@@ -23,7 +23,7 @@ from netkf.engines.compiled.state import Instants
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
-from netkf.rng.streams import Streams, Together
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
 
@@ -113,7 +113,7 @@ class Lots:
 
     def _draw(self, replica: int) -> None:
         count = min(self._size, self._stop - replica)
-        streams = Together(self._seed, replica, count)
+        streams = ReplicaStreams(self._seed, replica, count)
         scenario = self._scenario
         windows = schedules(scenario, streams)
         blocks = blocks_to_the_end(scenario)

@@ -28,40 +28,48 @@ from netkf.engines.compiled.exchanges import (
 )
 from netkf.engines.compiled.masses import stopping
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import alike
+from netkf.network.channels import identical_per_link
 from netkf.network.graphs import Link
 from netkf.network.matchings import Broadcast, Matching
-from netkf.rng.draws import Draws
-from netkf.rng.streams import Streams, Together
+from netkf.rng.draws import StreamBatch
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
 from netkf.trace.schema import EVENT
 
 
 def way_chances(scenario: Scenario, ways: Sequence[Sequence[Link]]) -> FloatArray:
-    """(ways, L): the one chance that all messages of a direction have, where losses are alike."""
+    """(ways, L): the delivery probability of all messages of each direction of each link."""
     loss = scenario.network.channel.loss
     return np.array(
-        [[loss.chance(way, 0, False, scenario.measured(way)) for way in some] for some in ways]
+        [
+            [
+                loss.delivery_probability(way, 0, False, scenario.table_probability(way))
+                for way in some
+            ]
+            for some in ways
+        ]
     )
 
 
 def way_luck(
-    scenario: Scenario, streams: Streams | Together, ways: Sequence[Sequence[Link]]
-) -> list[Draws]:
+    scenario: Scenario, streams: Streams | ReplicaStreams, ways: Sequence[Sequence[Link]]
+) -> list[StreamBatch]:
     """What decides about them: of both ways together where they share their fate, and nothing where
     nothing is left to decide.
     """
     channel = scenario.network.channel
     drawn = ways[:1] if channel.symmetric else ways
-    return [] if channel.loss.certain else [Draws(streams, "loss", some) for some in drawn]
+    return (
+        [] if channel.loss.deterministic else [StreamBatch(streams, "loss", some) for some in drawn]
+    )
 
 
 def is_plain(scenario: Scenario) -> bool:
     """Whether the slots of a scenario can be made so."""
     network = scenario.network
     return (
-        alike(network.channel.loss)
+        identical_per_link(network.channel.loss)
         and network.channel.delay.fixed == 0.0
         and isinstance(network.activation, Matching | Broadcast)
         and stopping(scenario) is None

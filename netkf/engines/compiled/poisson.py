@@ -24,8 +24,8 @@ from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Poisson
-from netkf.rng.draws import Draws, Ziggurat, next_exponential, next_unit, ziggurat
-from netkf.rng.streams import Streams, Together
+from netkf.rng.draws import StreamBatch, Ziggurat, next_exponential, next_unit, ziggurat
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 TICKS, TICKS_A_LINK, MOST_TICKS = 1 << 15, 4, 1 << 20
@@ -136,15 +136,15 @@ class PoissonSchedules:
     """The ticks of some runs of such a scenario, a window at a time."""
 
     def __init__(
-        self, scenario: Scenario, streams: Streams | Together, senders: Senders | None = None
+        self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders | None = None
     ) -> None:
-        clock, runs = scenario.network.activation, len(streams.each)
+        clock, runs = scenario.network.activation, len(streams.per_replica)
         senders = senders_of(scenario) if senders is None else senders
         assert isinstance(clock, LinkClock)
-        ticks, count = Draws(streams, "clock", senders.entities), len(senders.entities) * runs
+        ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs
         luck: np.ndarray = np.empty((0, 4), dtype=np.uint64)
-        if not scenario.network.channel.loss.certain:
-            luck = Draws(streams, "loss", senders.sources).states
+        if not scenario.network.channel.loss.deterministic:
+            luck = StreamBatch(streams, "loss", senders.sources).states
         rates = np.array([clock.mean_rate(entity) for entity in senders.entities])
         self._drawing = Drawing(
             coming=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),
@@ -211,7 +211,7 @@ def _room(ticks: int, sends: int) -> Found:
     return Found(np.empty(ticks), entity, at, np.empty(sends))
 
 
-def schedules(scenario: Scenario, streams: Together) -> list[Window]:
+def schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
     """All ticks of each of several runs, as one window."""
     if is_poisson(scenario):
         return PoissonSchedules(scenario, streams).whole()

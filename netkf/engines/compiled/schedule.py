@@ -19,17 +19,17 @@ from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import (
     Channel,
-    Fates,
-    alike,
-    by_message,
-    chances,
+    ChannelSampler,
     checked_delay,
-    needed,
+    delay_depends_on_message,
+    delivery_probabilities,
+    identical_per_link,
+    stream_purposes,
 )
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.network.graphs import Link
-from netkf.rng.draws import Draws
-from netkf.rng.streams import Streams, Together
+from netkf.rng.draws import StreamBatch
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 FIRST_BLOCK, LONGEST_BLOCK = 8, 1024
@@ -79,23 +79,29 @@ class Clocks:
     last ones known, infinite after the horizon, and ``drawn`` (E,) how many were drawn.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams | Together, senders: Senders) -> None:
-        clock, runs, entities = scenario.network.activation, len(streams.each), senders.entities
+    def __init__(
+        self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
+    ) -> None:
+        clock, runs, entities = (
+            scenario.network.activation,
+            len(streams.per_replica),
+            senders.entities,
+        )
         assert isinstance(clock, LinkClock) or not entities
         self._clock, self._entities, self._horizon = clock, entities * runs, scenario.horizon
         count = len(self._entities)
         self.last, self.drawn = np.zeros(count), np.zeros(count, dtype=np.int64)
-        self._alike = type(clock) is Poisson
+        self._all_poisson = type(clock) is Poisson
         self._rates = self._origins = np.empty(0)
-        if isinstance(clock, LinkClock) and self._alike:
-            self._draws = Draws(streams, "clock", entities)
+        if isinstance(clock, LinkClock) and self._all_poisson:
+            self._draws = StreamBatch(streams, "clock", entities)
             self._rates = np.tile([clock.mean_rate(entity) for entity in entities], runs)
         elif isinstance(clock, LinkClock):
             self._random = streams.generators("clock", entities)
             self._origins = np.array(
                 [
                     clock.origin(entity, partial(one.generator, "phase", *entity))
-                    for one in streams.each
+                    for one in streams.per_replica
                     for entity in entities
                 ]
             )
@@ -105,7 +111,7 @@ class Clocks:
         after the other, and how many each has. The horizon is half open; later ticks, and there may
         be many, are not kept.
         """
-        if self._alike:
+        if self._all_poisson:
             times, asked = self._exponential(places, counts), counts
         else:
             drawn = [self._ticks(k, count) for k, count in zip(places, counts, strict=True)]
@@ -138,37 +144,44 @@ class Clocks:
 def plain(channel: Channel) -> bool:
     """Whether each directed link has one chance and all messages one delay."""
     delay = channel.delay
-    fixed = delay.fixed is not None and not delay.drawn and not by_message(delay)
-    return fixed and alike(channel.loss)
+    fixed = delay.fixed is not None and not delay.is_random and not delay_depends_on_message(delay)
+    return fixed and identical_per_link(channel.loss)
 
 
 def delivery_chances(scenario: Scenario, ways: tuple[Link, ...]) -> FloatArray:
-    """(W,) the one chance that all messages of a directed link have, where losses are alike."""
+    """(W,) delivery probability of all messages of each directed link."""
     loss = scenario.network.channel.loss
-    return np.array([loss.chance(way, 0, False, scenario.measured(way)) for way in ways])
+    return np.array(
+        [loss.delivery_probability(way, 0, False, scenario.table_probability(way)) for way in ways]
+    )
 
 
 class Outcomes:
     """What becomes of all messages, run by run, activation after activation of each entity."""
 
-    def __init__(self, scenario: Scenario, streams: Streams | Together, senders: Senders) -> None:
+    def __init__(
+        self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
+    ) -> None:
         self._channel = channel = scenario.network.channel
-        runs = len(streams.each)
+        runs = len(streams.per_replica)
         self._senders, self._ways = senders, len(senders.ways)
         self._first, self._hearing = senders.first, senders.hearing
         self._count, self._sources = len(senders.entities), len(senders.sources)
-        self._measured = np.array([scenario.measured(way) for way in senders.ways])
-        self._alike, self._plain = alike(channel.loss), plain(channel)
-        if self._alike:
+        self._measured = np.array([scenario.table_probability(way) for way in senders.ways])
+        self._identical, self._plain = identical_per_link(channel.loss), plain(channel)
+        if self._identical:
             self._chances = delivery_chances(scenario, senders.ways)
         if not self._plain:
             self._fates = [
-                Fates(channel, partial(_stream, made, source))
-                for made in (one.seeded(needed(channel), senders.sources) for one in streams.each)
+                ChannelSampler(channel, partial(_stream, made, source))
+                for made in (
+                    one.seeded(stream_purposes(channel), senders.sources)
+                    for one in streams.per_replica
+                )
                 for source in senders.sources
             ]
-        elif not channel.loss.certain:
-            self._luck = Draws(streams, "loss", senders.sources)
+        elif not channel.loss.deterministic:
+            self._luck = StreamBatch(streams, "loss", senders.sources)
         self.sizes = np.tile(np.diff(senders.first), runs)
 
     def of(self, places: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
@@ -200,7 +213,7 @@ class Outcomes:
             columns = zip(*parts, strict=True)
             return tuple(np.concatenate([np.empty(0), *column]) for column in columns)
         delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
-        certain = self._channel.loss.certain
+        certain = self._channel.loss.deterministic
         luck = np.zeros(total) if certain else self._luck.units(sources, counts)
         return luck, np.zeros(total, dtype=bool), delay
 
@@ -214,12 +227,12 @@ class Outcomes:
         delay: np.ndarray,
     ) -> FloatArray:
         """(K,) seconds or LOST."""
-        if self._alike:
+        if self._identical:
             chance = np.repeat(self._chances[ways], counts)
         else:
             chance = self._chance(ways, counts, first, bad)
         lost = luck >= chance
-        if by_message(self._channel.delay):
+        if delay_depends_on_message(self._channel.delay):
             delay = self._by_message(ways, counts, first, lost, delay)
         return np.where(lost, LOST, delay)
 
@@ -230,7 +243,7 @@ class Outcomes:
         for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
             part = slice(done, done + count)
             way, measured = self._senders.ways[w], float(self._measured[w])
-            out[part] = chances(loss, way, number, bad[part].astype(bool), measured)
+            out[part] = delivery_probabilities(loss, way, number, bad[part].astype(bool), measured)
             done += count
         return out
 
@@ -257,8 +270,10 @@ class EntityDraws:
     does not talk. Entities of several runs follow one another, run by run.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams | Together, senders: Senders) -> None:
-        self.count = len(senders.entities) * len(streams.each)
+    def __init__(
+        self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
+    ) -> None:
+        self.count = len(senders.entities) * len(streams.per_replica)
         self._clocks = Clocks(scenario, streams, senders)
         self._outcomes = Outcomes(scenario, streams, senders)
         self.sizes = self._outcomes.sizes
@@ -356,9 +371,9 @@ class ReadingsSchedule:
         return ticks.chosen(back, sizes).window(end, sizes)
 
 
-def whole_schedules(scenario: Scenario, streams: Together) -> list[Window]:
+def whole_schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
     """All ticks of each of several runs, as one window."""
-    senders, runs = senders_of(scenario), len(streams.each)
+    senders, runs = senders_of(scenario), len(streams.per_replica)
     draws = EntityDraws(scenario, streams, senders)
     if not draws.count:
         return [NO_TICKS.window(math.inf, draws.sizes)] * runs

@@ -117,11 +117,11 @@ def _directions(
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
         i, j = link
-        way = transmitter.directed(link, entity, nodes[j], transmitter.fates(link))
+        way = transmitter.directed(link, entity, nodes[j], transmitter.sampler(link))
 
         def activate(now: float) -> None:
             recorder.append((now, TICK, i, j, -1, -1, NAN))
-            outcome = way.fates.draw()
+            outcome = way.sampler.draw()
             transmitter.send(way, nodes[i].emit(now, (j,)), outcome)
 
         return activate
@@ -138,14 +138,14 @@ def broadcasts(
     """For each node, one transmission to all that can hear it; each hearer has its own outcome."""
     ways: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
     for k, (i, j) in enumerate(scenario.topology.directions):
-        ways[i].append(transmitter.directed((i, j), k, nodes[j], transmitter.fates((i, j))))
+        ways[i].append(transmitter.directed((i, j), k, nodes[j], transmitter.sampler((i, j))))
 
     def activation(node: int) -> Activation:
         hearers, sent = tuple(way.link[1] for way in ways[node]), 0
 
         def transmit(now: float) -> None:
             nonlocal sent
-            outcomes = [way.fates.draw() for way in ways[node]]
+            outcomes = [way.sampler.draw() for way in ways[node]]
             payload = nodes[node].emit(now, hearers)
             if payload is None:
                 return

@@ -14,7 +14,7 @@ from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import Fates, checked_chance, checked_delay
+from netkf.network.channels import ChannelDraw, ChannelSampler, transit_time
 from netkf.network.graphs import Link
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -23,11 +23,8 @@ from netkf.trace.schema import CODES
 
 SEND, DELIVER, LOST, LATE = (CODES[kind] for kind in ("send", "deliver", "lost", "late"))
 
-Outcome = tuple[float, bool, float]
-"""A uniform draw, whether the link is in its bad state, and a delay in seconds."""
-
-DOWN: Outcome = (math.inf, False, 0.0)
-"""The outcome of a message on a link that is down."""
+LINK_DOWN = ChannelDraw(math.inf, False, 0.0)
+"""The draw for a link that is down: no uniform number is below a delivery probability."""
 
 
 class Receiver(Protocol):
@@ -44,10 +41,15 @@ class DirectedLink:
     """One direction of a link: who receives, what decides the outcome, how many messages so far."""
 
     def __init__(
-        self, scenario: Scenario, link: Link, entity: int, receiver: Receiver, fates: Fates
+        self,
+        scenario: Scenario,
+        link: Link,
+        entity: int,
+        receiver: Receiver,
+        sampler: ChannelSampler,
     ) -> None:
-        self.link, self.entity, self.fates, self.receiver = link, entity, fates, receiver
-        self.measured = scenario.measured(link)
+        self.link, self.entity, self.sampler, self.receiver = link, entity, sampler, receiver
+        self.table_probability = scenario.table_probability(link)
         self.weight = scenario.weight(link[1], link[0])
         self.messages = 0
 
@@ -64,19 +66,21 @@ class Transmitter:
         self._horizon, self._until = scenario.horizon, scenario.ends
         self._flying: dict[tuple[Link, int], Envelope] = {}
 
-    def fates(self, link: Link) -> Fates:
+    def sampler(self, link: Link) -> ChannelSampler:
         """The outcomes of a link (symmetric channel) or of one direction of it."""
-        return Fates(self._channel, partial(stream, self._streams, link))
+        return ChannelSampler(self._channel, partial(stream, self._streams, link))
 
-    def directed(self, link: Link, entity: int, receiver: Receiver, fates: Fates) -> DirectedLink:
+    def directed(
+        self, link: Link, entity: int, receiver: Receiver, sampler: ChannelSampler
+    ) -> DirectedLink:
         """One direction."""
-        return DirectedLink(self._scenario, link, entity, receiver, fates)
+        return DirectedLink(self._scenario, link, entity, receiver, sampler)
 
     def send(
         self,
         way: DirectedLink,
         payload: Any,
-        outcome: Outcome,
+        outcome: ChannelDraw,
         phase: int = -1,
         exchange: int = -1,
     ) -> None:
@@ -87,11 +91,8 @@ class Transmitter:
         way.messages = number + 1
         append = self._recorder.append
         append((now, SEND, sender, receiver, number, phase, NAN))
-        draw, bad, drawn = outcome
-        loss = self._channel.loss
-        lost = draw >= checked_chance(loss, way.link, number, bad, way.measured)
-        delay = drawn if lost else checked_delay(self._channel.delay, way.link, number, drawn)
-        if lost or math.isnan(delay):
+        delay = transit_time(self._channel, way.link, number, outcome, way.table_probability)
+        if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
         envelope = Envelope(sender, number, way.weight, payload, now, exchange)
@@ -139,11 +140,11 @@ class LinkExchange:
     ) -> None:
         i, j = link
         self._transmitter, self._shared = transmitter, scenario.network.channel.symmetric
-        self._outcomes: list[Outcome] = []
-        forth = transmitter.fates((i, j))
+        self._outcomes: list[ChannelDraw] = []
+        forth = transmitter.sampler((i, j))
         self._ways = [transmitter.directed((i, j), 2 * entity, receivers[j], forth)]
         if not scenario.topology.directed:
-            back = forth if self._shared else transmitter.fates((j, i))
+            back = forth if self._shared else transmitter.sampler((j, i))
             self._ways.append(transmitter.directed((j, i), 2 * entity + 1, receivers[i], back))
 
     def exchange(
@@ -161,13 +162,13 @@ class LinkExchange:
         """
         if fresh or not self._outcomes:
             first, *others = self._ways
-            drawn = first.fates.draw()
+            drawn = first.sampler.draw()
             self._outcomes = [
                 drawn,
-                *(drawn if self._shared else way.fates.draw() for way in others),
+                *(drawn if self._shared else way.sampler.draw() for way in others),
             ]
         for way, payload, outcome in zip(self._ways, payloads, self._outcomes, strict=False):
-            self._transmitter.send(way, payload, outcome if up else DOWN, phase, exchange)
+            self._transmitter.send(way, payload, outcome if up else LINK_DOWN, phase, exchange)
 
 
 def stream(streams: Streams, ends: tuple[int, ...], purpose: str) -> np.random.Generator:

@@ -27,7 +27,7 @@ def true_model_row(scenario: Scenario, source: str, matrices: str) -> Assumption
 
     The verdict is None for recorded states or readings, which have no known model.
     """
-    if not scenario.drawn:
+    if not scenario.is_random:
         return TRUE_MODEL, source, None, UNKNOWN_LAW
     same = scenario.filters_know_the_truth
     return TRUE_MODEL, source, same, matrices if same else "filter.model differs from the truth"
@@ -38,6 +38,6 @@ def judge_plant(scenario: Scenario, holds: bool, evidence: str) -> tuple[bool | 
 
     Where the state is recorded these matrices are an assumption, and the verdict is None.
     """
-    if scenario.plant.drawn:
+    if scenario.plant.is_random:
         return holds, evidence
     return None, f"assumed, not known: {evidence}"

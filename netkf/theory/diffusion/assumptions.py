@@ -84,9 +84,9 @@ def _plant(scenario: Scenario) -> list[AssumptionRow]:
         (
             "the parameter is a random walk: F = I",
             "D (2)",
-            walks if scenario.plant.drawn else None,
+            walks if scenario.plant.is_random else None,
             UNKNOWN_LAW
-            if not scenario.plant.drawn
+            if not scenario.plant.is_random
             else "increments and noises are Gaussian and independent, so bounded in every L_p, as "
             "D (29) asks"
             if walks
@@ -99,7 +99,7 @@ def _plant(scenario: Scenario) -> list[AssumptionRow]:
             f"least eigenvalue of Q {least:.3g}; they are the true ones"
             if same
             else f"least eigenvalue of Q {least:.3g}; {UNKNOWN_LAW}"
-            if not scenario.drawn
+            if not scenario.is_random
             else f"least eigenvalue of Q {least:.3g}; they differ from the true ones, as D allows: "
             "stable all the same, but P need not be the errors' covariance",
         ),
@@ -129,7 +129,7 @@ def _information(scenario: Scenario) -> AssumptionRow:
 def _arrivals(scenario: Scenario) -> AssumptionRow:
     channel = scenario.network.channel
     rates = [
-        channel.loss.mean_delivery(link, scenario.measured(link))
+        channel.loss.mean_delivery(link, scenario.table_probability(link))
         for link in scenario.topology.directions
     ]
     fixed = channel.delay.fixed

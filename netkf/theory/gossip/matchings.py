@@ -50,7 +50,9 @@ def effective_matching(scenario: Scenario) -> FloatArray:
         raise TheoryError("messages may be late")
     mean, index = mean_matching(scenario), scenario.topology.index
     for i, j in scenario.topology.links:
-        forth, back = (loss.mean_delivery(d, scenario.measured(d)) for d in ((i, j), (j, i)))
+        forth, back = (
+            loss.mean_delivery(d, scenario.table_probability(d)) for d in ((i, j), (j, i))
+        )
         if forth != back or not (channel.symmetric or forth == 1.0):
             raise TheoryError("a swap may become a copy")
         a, b = index[i], index[j]

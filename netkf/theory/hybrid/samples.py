@@ -107,7 +107,7 @@ def deliveries(scenario: Scenario) -> dict[tuple[int, int], float]:
         return {}
     index, loss = scenario.topology.index, scenario.network.channel.loss
     return {
-        (index[j], index[i]): loss.mean_delivery((i, j), scenario.measured((i, j)))
+        (index[j], index[i]): loss.mean_delivery((i, j), scenario.table_probability((i, j)))
         * scenario.weight(j, i)
         for i, j in scenario.topology.directions
     }

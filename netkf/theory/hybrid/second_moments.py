@@ -78,8 +78,8 @@ class _Equation:
         clock, channel = scenario.network.activation, scenario.network.channel
         assert isinstance(clock, Poisson)
         rate, loss = clock.mean_rate((i, j)), channel.loss
-        to_j = loss.mean_delivery((i, j), scenario.measured((i, j)))
-        to_i = loss.mean_delivery((j, i), scenario.measured((j, i)))
+        to_j = loss.mean_delivery((i, j), scenario.table_probability((i, j)))
+        to_i = loss.mean_delivery((j, i), scenario.table_probability((j, i)))
         both = min(to_i, to_j) if channel.symmetric else to_i * to_j
         at_i, at_j = scenario.weight(i, j), scenario.weight(j, i)
         for x, y, chance, weight in ((a, b, to_i, at_i), (b, a, to_j, at_j)):

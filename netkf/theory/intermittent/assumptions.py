@@ -60,7 +60,8 @@ def _readings(scenario: Scenario) -> list[AssumptionRow]:
 def _arrivals(scenario: Scenario) -> list[AssumptionRow]:
     loss = scenario.network.channel.loss
     rates = [
-        loss.mean_delivery(link, scenario.measured(link)) for link in scenario.topology.directions
+        loss.mean_delivery(link, scenario.table_probability(link))
+        for link in scenario.topology.directions
     ]
     known = [rate for rate in rates if np.isfinite(rate)]
     least = min(known, default=1.0)
@@ -114,7 +115,7 @@ def _often_enough(scenario: Scenario) -> AssumptionRow:
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:
     loss = scenario.network.channel.loss
-    return [loss.mean_delivery(link, scenario.measured(link)) for link in heard]
+    return [loss.mean_delivery(link, scenario.table_probability(link)) for link in heard]
 
 
 def _arriving(

@@ -135,7 +135,7 @@ def _gain(scenario: Scenario) -> list[AssumptionRow]:
 def _stop(scenario: Scenario) -> AssumptionRow:
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
-        loss.mean_delivery(way, scenario.measured(way)) == 1.0
+        loss.mean_delivery(way, scenario.table_probability(way)) == 1.0
         for i, j in scenario.topology.links
         for way in ((i, j), (j, i))
     )

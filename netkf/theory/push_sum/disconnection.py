@@ -141,7 +141,8 @@ def _of_channel(scenario: Scenario) -> dict[Edge, float]:
     channel, chances = scenario.network.channel, {}
     for i, j in scenario.topology.links:
         one, other = (
-            channel.loss.mean_delivery(way, scenario.measured(way)) for way in ((i, j), (j, i))
+            channel.loss.mean_delivery(way, scenario.table_probability(way))
+            for way in ((i, j), (j, i))
         )
         if math.isnan(one + other):
             raise TheoryError("the channel is a record, not a law: give delivery")
