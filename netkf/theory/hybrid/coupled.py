@@ -10,11 +10,12 @@ P_j is then the one from d seconds ago; without delay ``T = I``, ``q = 0``.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
+import scipy.sparse.linalg
 
 from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
 from netkf.algorithms.registry import overridden
@@ -174,8 +175,12 @@ def balanced(scenario: Scenario) -> bool | None:
     """
     if not np.isfinite(list(scenario.effective_rates().values())).all():
         return None
-    c = coupling(scenario).toarray()
-    return bool(np.allclose(c, c.T, rtol=1e-12))
+    return _symmetric(coupling(scenario))
+
+
+def _symmetric(c: scipy.sparse.csr_array) -> bool:
+    apart, size = abs(c - c.T), abs(c.T)
+    return bool((apart - RATE_TOLERANCE * size).max() <= SAME_RATE)
 
 
 def left_weights(scenario: Scenario) -> FloatArray:
@@ -189,20 +194,49 @@ def left_weights(scenario: Scenario) -> FloatArray:
         return np.ones(1)
     if not algorithm.talks:
         raise TheoryError(f"the {spoken(algorithm)} filter does not talk, links mean nothing to it")
-    c = coupling(scenario).toarray()
-    size = len(c)
-    laplacian = np.diag(c.sum(axis=1)) - c
     if balanced(scenario) is None:
         raise TheoryError("how often messages arrive is not known beforehand (a recorded table?)")
-    if math.isclose(float(np.abs(c).max()), 0.0):
+    c = coupling(scenario)
+    if not c.nnz:
         raise TheoryError("no message ever arrives")
-    laplacian /= np.abs(laplacian).max()
-    system = np.concatenate([laplacian.T, np.ones((1, size))])
-    target = np.concatenate([np.zeros(size), [1.0]])
-    w, _, rank, _ = np.linalg.lstsq(system, target, rcond=None)
-    if rank < size or not np.abs(system @ w - target).max() < RESIDUAL_WEIGHTS:
+    heard = _heard_by_all(c)
+    if heard is None:
         raise TheoryError("the messages that arrive do not join all nodes")
-    return np.asarray(np.maximum(w, 0.0) / np.maximum(w, 0.0).sum())
+    w = np.zeros(c.shape[0])
+    w[heard] = _stationary(scipy.sparse.csr_array(c[heard][:, heard]))
+    return w
 
 
+def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
+    """Places of the nodes whose messages reach all others, sooner or later and over others; None
+    where no node's do.
+
+    They are the one strongly connected part that hears nobody outside; with two such parts the
+    coupling has two left null vectors.
+    """
+    count, part = scipy.sparse.csgraph.connected_components(c, connection="strong")
+    hears, heard = c.nonzero()
+    outside = part[hears] != part[heard]
+    closed = np.setdiff1d(np.arange(count), part[hears[outside]])
+    return np.flatnonzero(part == closed[0]) if len(closed) == 1 else None
+
+
+def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
+    """(M,) w with ``w (D - C) = 0`` and sum 1 for strongly connected nodes, D the row sums of C."""
+    size = c.shape[0]
+    if size == 1 or _symmetric(c):
+        return np.full(size, 1.0 / size)
+    leaving = np.asarray(c.sum(axis=1)).reshape(-1)
+    transposed = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - c).T
+    # The weight of the first node is set to 1, the others follow from their own equations.
+    rest = scipy.sparse.csc_array(scipy.sparse.csr_array(transposed)[1:])
+    w = np.ones(size)
+    w[1:] = scipy.sparse.linalg.spsolve(rest[:, 1:], -rest[:, [0]].toarray().reshape(-1))
+    w = np.maximum(w, 0.0) / np.maximum(w, 0.0).sum()
+    if not np.abs(transposed @ w).max() <= RESIDUAL_WEIGHTS * leaving.max():
+        raise TheoryError("the messages that arrive do not join all nodes")
+    return np.asarray(w)
+
+
+RATE_TOLERANCE, SAME_RATE = 1e-12, 1e-8  # of rates that are equal: relative, absolute
 RESIDUAL_WEIGHTS = 1e-9

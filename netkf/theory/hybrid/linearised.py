@@ -1,8 +1,9 @@
 """Linear equations of H(12) made linear: ``op_P(X) = -right`` for all nodes together.
 
-Few unknowns are eliminated. Elimination fills in where a network has no small cuts (1000 nodes of a
-random graph would take minutes), so many unknowns are found by GMRES, each node's own block
-inverted beforehand; what does not converge is eliminated after all.
+Few unknowns are eliminated, and many where the network has small cuts (rings, rows, narrow grids).
+Elsewhere elimination fills in (1000 nodes of a random graph would take minutes), so many unknowns
+are found by GMRES, each node's own block inverted beforehand; what does not converge is eliminated
+after all if that is possible at all.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ def solved(packed: Packed, P: FloatArray, right: FloatArray) -> FloatArray:
     singular.
     """
     linear = packed.linear(P)
+    few = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
     with np.errstate(all="ignore"):
-        X = None if right.size <= FEW_UNKNOWNS else _iterated(linear, right)
+        X = None if few else _iterated(linear, right)
         return _eliminated(linear, right) if X is None else X
 
 

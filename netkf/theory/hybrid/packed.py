@@ -7,16 +7,20 @@ small matrix for A P + P A' that is the same at all nodes, and P G P where there
 
 from __future__ import annotations
 
+import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
 
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.coupled import Coupled
 from netkf.theory.hybrid.samples import PoissonSamples
 
 NO_INFORMATION = 1e-15  # eigenvalues of G, its diagonal made 1, that are rounding
+ELIMINATION_WORK = 3e9  # multiplications up to which elimination is taken
 
 
 class Packed:
@@ -33,11 +37,10 @@ class Packed:
         self._basis = np.zeros((self.m, n, n))
         self._basis[np.arange(self.m), self._i, self._j] = 1.0
         self._basis[np.arange(self.m), self._j, self._i] = 1.0
-        drift = equations.A @ self._basis
-        self._own = self.pack(drift + np.swapaxes(drift, 1, 2))
+        self._set_drift(equations.A, equations.Q)
         self._predicted = self.pack(equations.T @ self._basis @ equations.T.T)
         self.start = self.pack(equations.start)
-        self._Q, self._q = self.pack(equations.Q), self.pack(equations.q)
+        self._q = self.pack(equations.q)
         flows = [equations.coupling, *(s.heard for s in equations.samples)]
         self.leaving = np.asarray(sum(flow.sum(axis=1) for flow in flows)).reshape(-1)
         leave = scipy.sparse.diags_array(self.leaving)
@@ -45,6 +48,37 @@ class Packed:
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
         self._C = _factors(equations.G[self._sensed])
         self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
+
+    def shifted(self, A: FloatArray, Q: FloatArray) -> Packed:
+        """The equations of the same network with another drift A and noise Q (n, n) or (N, n, n);
+        what depends on the network alone is shared.
+        """
+        other = copy.copy(self)
+        other.equations = self.equations._replace(A=A, Q=Q)
+        other._set_drift(A, Q)
+        return other
+
+    def _set_drift(self, A: FloatArray, Q: FloatArray) -> None:
+        drift = A @ self._basis
+        self._own = self.pack(drift + np.swapaxes(drift, 1, 2))
+        self._Q = self.pack(Q)
+
+    @cached_property
+    def eliminates_cheaply(self) -> bool:
+        """Whether elimination fills in little, because the network has small cuts everywhere."""
+        coupling = scipy.sparse.csr_array(self.equations.coupling)
+        order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling)
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order))
+        i, j = coupling.nonzero()
+        width = int(np.abs(place[i] - place[j]).max(initial=0)) + 1
+        return len(order) * self.m * (width * self.m) ** 2 <= ELIMINATION_WORK
+
+    @cached_property
+    def arriving_matrix(self) -> scipy.sparse.csr_array:
+        """(N m, N m): what arrives at the ticks of clocks, as one sparse matrix."""
+        matrix = scipy.sparse.kron(self.equations.coupling, self._predicted.T, "csr")
+        return scipy.sparse.csr_array(matrix)
 
     def pack(self, P: FloatArray) -> FloatArray:
         """(..., n, n) to (..., m)."""
@@ -134,7 +168,7 @@ class Packed:
             np.add.at(blocks, group.nodes, group.rate[:, None, None] * (maps - np.eye(self.m)))
             if group.heard.nnz:
                 heard.append((group.heard, group.nodes, maps @ self._predicted))
-        return Linear(np.asarray(blocks), heard)
+        return Linear(np.asarray(blocks), heard, self)
 
     def driven(self, P: FloatArray) -> FloatArray:
         """(N, m): what H(12) made linear at P adds whatever P is: Q, the noises of readings, and
@@ -151,17 +185,20 @@ class Packed:
 
 class Linear(NamedTuple):
     """``blocks`` (N, m, m): what becomes of each row by itself, ``X_i B_i``; ``heard``: rates (N,
-    S) of what arrives from nodes (S,), each row times a map (S, m, m) or one map (1, m, m).
+    S) of what arrives from nodes (S,), each row times a map (S, m, m) or one map (1, m, m);
+    ``packed``: the equations.
     """
 
     blocks: FloatArray
     heard: list[tuple[scipy.sparse.csr_array, np.ndarray, FloatArray]]
+    packed: Packed
 
     def arriving(self, X: FloatArray) -> FloatArray:
         """(N, m): what arrives at each node of rows X (N, m)."""
         total = np.zeros_like(X)
         for rates, nodes, maps in self.heard:
-            total += rates @ (X[nodes][:, None] @ maps)[:, 0]
+            each = X[nodes]
+            total += rates @ (each @ maps[0] if len(maps) == 1 else (each[:, None] @ maps)[:, 0])
         return total
 
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
@@ -172,8 +209,8 @@ class Linear(NamedTuple):
         parts = (turned, np.arange(size), np.arange(size + 1))
         whole = scipy.sparse.csr_array(scipy.sparse.bsr_array(parts, shape=shape))
         for rates, nodes, maps in self.heard if arriving else ():
-            if len(maps) == 1 and len(nodes) == size:
-                whole = whole + scipy.sparse.kron(rates, maps[0].T, "csr")
+            if rates is self.packed.equations.coupling:
+                whole = whole + self.packed.arriving_matrix
                 continue
             entries = scipy.sparse.coo_array(rates)
             turned = np.swapaxes(maps, 1, 2)[entries.col] * entries.data[:, None, None]
