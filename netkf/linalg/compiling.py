@@ -163,6 +163,8 @@ def announce(function: Callable[..., Any]) -> None:
 def _introduce() -> None:
     from numba import extending
 
+    from netkf.linalg import struct_types  # noqa: F401 - registers structs
+
     for function, loops in _marked:
         if function not in _known:
             _known.add(function)

@@ -161,6 +161,12 @@ class Recorder:
                     self._thread = ThreadPoolExecutor(1, "netkf-recorder")
             self._do(self._pass_on, rows)
 
+    def add_counts(self, counts: np.ndarray) -> None:
+        """Count events by kind (len(KINDS),), where they are only counted."""
+        assert self.counts_only, "events are recorded"
+        self._flush_gathered()
+        self._counts += counts
+
     def _do(self, something: Callable[..., None], *arguments: Any) -> None:
         """At once, or in its turn where there is a thread for it."""
         if self._thread is None:

@@ -8,8 +8,8 @@ import pytest
 from netkf.algorithms.kernels.gains import gain_table, gain_update
 from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
 from netkf.algorithms.kernels.root_flow import (
-    flow_room,
     flow_root,
+    flow_scratch,
     flow_table,
     gain_update_root,
     information_rate,
@@ -197,13 +197,13 @@ def test_models_side_by_side_are_what_they_are_alone():
         for q, p in models
     ]
     stack = stack_tables(tables)
-    room = flow_room(stack)
+    scratch = flow_scratch(stack)
     roots = np.stack([wide_root(random, 3, 5.0, 10.0) for _ in tables])
     means = random.normal(size=(len(tables), 3))
     for gap in (0.01, 0.4, 7.0):
         for m, table in enumerate(tables):
             alone = flow_root(table, roots[m], means[m], gap)
-            move_root(stack, m, roots, means, m, gap, room)
+            move_root(stack, m, roots, means, m, gap, scratch)
             assert np.array_equal(np.tril(roots[m]), np.tril(alone[0]))
             assert np.array_equal(means[m], alone[1])
             P = np.tril(roots[m]) @ np.tril(roots[m]).T

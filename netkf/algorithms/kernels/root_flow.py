@@ -11,14 +11,18 @@ root of a computed G. ``dG/dg = F(s)' H' R^-1 H F(s)``, hence with the coefficie
 
     Gamma = sqrt(g) [c_0; c_1 / sqrt(3); c_2 / sqrt(5); ...],   c_j of order g^j.
 
-c_j is a power series in g, and as many of them are used as P and g need.
+c_j is a power series in g, and as many of them are used as P and g need. Where the size of P and
+G says that this rounding cannot matter, which is nearly always, a gap takes one step instead: with
+``I + S' G_g S = V V'`` and V upper triangular, S V^-T is triangular and a root of
+``P (I + G_g P)^-1``. Q_g, F and G_g are power series around the middle of the ``cell`` of length
+unit that the gap lies in.
 
 API. :func:`flow_table` tabulates one model, :func:`stack_tables` puts the tables of several
 models side by side (a table is a stack of one), and m says which of a stack is meant. Kernels
 work in place on place ``k`` of root (K, n, n) (lower triangular, nothing above the diagonal is
-read or written) and x (K, n), with room from :func:`flow_room`:
+read or written) and x (K, n), with room from :func:`flow_scratch`:
 
-    move_root(table, m, root, x, k, gap, room)            any gap > 0
+    move_root(table, m, root, x, k, gap, scratch)            any gap > 0
     information_rate(table, m, root, k) -> trace(P G)     1/s, see flow.stretch
     gain_root(moments, series, root, x, k, gap, values)   readings of a gap, see gains.py
 
@@ -29,18 +33,22 @@ and for Python, one node at a time, ``flow_root(table, root, x, gap)`` and
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.kernels.gains import GainTable
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
 from netkf.algorithms.kernels.root_update import rotate_out
-from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.series import fill_polynomial, with_reach
+from netkf.linalg.structs import Struct, struct_at
 
+CELLS, CELL_BYTES = 16, 1 << 17  # of one model at most
+NARROW = 64.0  # trace(P) trace(G) of a gap up to which rounding of G is harmless
 TERMS = 27  # of the power series: enough for |M| unit <= UNIT, odd
 UNIT = 0.25
 BLOCKS = 13  # Legendre coefficients at most: what is left is below 1e-40 of the first
@@ -51,12 +59,13 @@ PIVOT = 2.0**-48  # least pivot of Q_g, relative to its diagonal
 WIDE = np.longdouble
 
 
-class FlowTable(NamedTuple):
+class FlowTable(Struct):
     """All that depends on M models and not on P or the gap, side by side.
 
     unit   : (M,) gap that the series cover, seconds
-    sizes  : (M, 4) rows q of a block of Gamma, number of blocks (0: nothing is observed), whether
-             there is noise, number of levels
+    sizes  : (M, 5) rows q of a block of Gamma, number of blocks (0: nothing is observed), whether
+             there is noise, number of levels, and that of the first one longer than all cells
+    size   : (M,) trace of G, 1/s
     reach  : (M, terms) up to which gap the terms so far are enough, see linalg/series
     series : (M, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g) and,
              where something is observed, F
@@ -68,7 +77,8 @@ class FlowTable(NamedTuple):
     """
 
     unit: FloatArray
-    sizes: np.ndarray
+    sizes: IntArray
+    size: FloatArray
     reach: FloatArray
     series: FloatArray
     gamma: FloatArray
@@ -77,8 +87,8 @@ class FlowTable(NamedTuple):
     seen: FloatArray
 
 
-class FlowRoom(NamedTuple):
-    """Room to work in: values of the series, ``wide`` (n, n), ``T`` (n, n), rows (q, n), an
+class FlowScratch(Struct):
+    """Scratch arrays: values of the series, ``wide`` (n, n), ``T`` (n, n), rows (q, n), an
     observation (1, n), its gain (1, n).
     """
 
@@ -90,16 +100,16 @@ class FlowRoom(NamedTuple):
     gain: FloatArray
 
 
-def flow_room(table: FlowTable) -> FlowRoom:
+def flow_scratch(table: FlowTable) -> FlowScratch:
     """Room for all models of a table."""
     n, q = table.levels.shape[-1], table.seen.shape[1]
-    return FlowRoom(
-        np.zeros(table.series.shape[2]),
-        np.zeros((n, n)),
-        np.zeros((n, n)),
-        np.zeros(max(q, 1) * n),
-        np.zeros((1, n)),
-        np.zeros((1, n)),
+    return FlowScratch(
+        values=np.zeros(table.series.shape[3]),
+        wide=np.zeros((n, n)),
+        T=np.zeros((n, n)),
+        rows=np.zeros(max(q, 1) * n),
+        observed=np.zeros((1, n)),
+        gain=np.zeros((1, n)),
     )
 
 
@@ -121,26 +131,38 @@ def flow_table(
     if len(seen):
         norm = max(norm, float(np.abs(M).sum(axis=0).max()))
     unit = 2.0 ** np.floor(np.log2(min(UNIT / max(norm, 1e-300), longest)))
-    E, F, grown = transition_series(A, Q, seen)
-    lower = np.tril_indices(n)
-    parts = [grown[:, lower[0], lower[1]], E.reshape(TERMS, -1)]
-    if len(seen):
-        parts.append(F.reshape(TERMS, -1))
-    series = with_reach(np.concatenate(parts, axis=1).astype(np.float64), unit)
-    blocks, bound = information_blocks(seen, F, unit)
+    E, F, grown, G = transition_series(A, Q, seen, np.zeros(1))
+    blocks, bound = information_blocks(seen, F[0], unit)
     # The reach comes first: a table that is padded to a common width still has it there.
     gamma = [np.roll(with_reach(block.astype(np.float64), unit), 1, axis=1) for block in blocks]
-    levels = doubled(E, F, grown, blocks, scale, unit, max(1, int(longest / unit).bit_length()))
-    sizes = (len(seen), len(blocks), int(bool(np.any(Q))), len(levels))
+    count = max(1, int(longest / unit).bit_length())
+    levels = doubled(E[0], F[0], grown[0], blocks, scale, unit, count)
+    width = n * (n + 1) // 2 * (1 + (len(seen) > 0)) + n * n * (1 + (len(seen) > 0))
+    most = min(CELLS, CELL_BYTES // (8 * TERMS * width), 2 ** (len(levels) - 1))
+    octaves = max(0, most.bit_length() - 1)
+    if octaves:
+        middles = unit * (np.arange(2**octaves) + 0.5)
+        middles[0] = 0.0
+        E, F, grown, G = transition_series(A, Q, seen, middles)
+    rows, columns = np.tril_indices(n)
+    parts = [grown[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
+    if len(seen):
+        parts += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
+    cells = np.concatenate(parts, axis=2).astype(np.float64)
+    series = np.stack(
+        [with_reach(cell, unit if k == 0 else 0.5 * unit) for k, cell in enumerate(cells)]
+    )
+    sizes = (len(seen), len(blocks), int(bool(np.any(Q))), len(levels), octaves)
     return FlowTable(
         unit=np.array([unit]),
         sizes=np.array([sizes], dtype=np.int64),
-        reach=series[None, :, -1].copy(),
-        series=series[None, :, :-1].copy(),
+        size=np.array([float((seen * seen).sum())]),
+        reach=series[None, :, :, -1].copy(),
+        series=series[None, :, :, :-1].copy(),
         gamma=np.array(gamma).reshape(1, len(gamma), TERMS, len(seen) * n + 1),
         bound=bound[None],
         levels=levels[None],
-        seen=seen[None],
+        seen=seen[None].copy(),
     )
 
 
@@ -154,29 +176,72 @@ def whitened(H: FloatArray, R: FloatArray) -> FloatArray:
 
 
 def transition_series(
-    A: FloatArray, Q: FloatArray, seen: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(TERMS, n, n) each: coefficients of exp(A g), F and Q_g, in extended precision.
+    A: FloatArray, Q: FloatArray, seen: FloatArray, middles: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Taylor coefficients of exp(A g), F, Q_g and G_g around gaps ``middles`` (C,), in extended
+    precision: (C, TERMS, n, n) each.
 
-    ``dF = (A - Q_g G) F`` and ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` from I and 0 on.
+    ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``.
     """
-    n = len(A)
+    n, count = len(A), len(middles)
     A, Q, seen = A.astype(WIDE), Q.astype(WIDE), seen.astype(WIDE)
-    E = exponential_series(A, TERMS)
-    F, grown = np.zeros_like(E), np.zeros_like(E)
-    drain = np.zeros_like(E)  # Q_g G
-    F[0] = np.eye(n)
+    E, F, grown, G, drain = (wide_zeros(count, TERMS, n, n) for _ in range(5))
+    rows = wide_zeros(count, TERMS, len(seen), n)
+    E[:, 0], F[:, 0], grown[:, 0], G[:, 0] = transitions_at(A, Q, seen, middles)
     for k in range(TERMS - 1):
-        moved = A @ grown[k]
-        change = moved + moved.T + (Q if k == 0 else 0.0)
-        grown[k + 1] = symmetric(change - _convolved(drain, grown, k)) / (k + 1)
-        F[k + 1] = (A @ F[k] - _convolved(drain, F, k)) / (k + 1)
-        drain[k + 1] = (grown[k + 1] @ seen.T) @ seen
-    return E, F, grown
+        drain[:, k] = (grown[:, k] @ seen.T) @ seen  # Q_g G
+        rows[:, k] = seen @ F[:, k]
+        moved = A @ grown[:, k]
+        change = moved + np.swapaxes(moved, 1, 2) + (Q if k == 0 else 0.0)
+        grown[:, k + 1] = symmetric(change - _convolved(drain, grown, k)) / (k + 1)
+        F[:, k + 1] = (A @ F[:, k] - _convolved(drain, F, k)) / (k + 1)
+        G[:, k + 1] = _convolved(np.swapaxes(rows, 2, 3), rows, k) / (k + 1)
+        E[:, k + 1] = A @ E[:, k] / (k + 1)
+    return E, F, grown, G
 
 
 def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
-    return np.asarray((a[: k + 1] @ b[k::-1]).sum(axis=0))
+    return np.asarray((a[:, : k + 1] @ b[:, k::-1]).sum(axis=1))
+
+
+def transitions_at(
+    A: FloatArray, Q: FloatArray, seen: FloatArray, middles: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """exp(A g), F, Q_g and G_g (C, n, n) at g = 0 and 3/2, 5/2, ... of a unit, from the flow of
+    the Hamiltonian.
+    """
+    n, count = len(A), len(middles)
+    E, F, grown, G = wide_zeros(4, count, n, n)
+    E[0] = F[0] = np.eye(n)
+    if count == 1:
+        return E, F, grown, G
+    M, scale = hamiltonian(A, Q, seen.T @ seen)
+    powers = (middles[1] / WIDE(3.0)) ** np.arange(TERMS)
+    half, step = (
+        np.tensordot(powers, exponential_series(matrix.astype(WIDE), TERMS), 1) for matrix in (M, A)
+    )
+    moved, E[1:] = half, step
+    for k in range(1, count):
+        moved = half @ half @ moved
+        E[k] = step @ step @ (E[k - 1] if k > 1 else step)
+        inverse = wide_inverse(moved[:n, :n])
+        F[k] = inverse.T
+        G[k] = inverse @ moved[:n, n:] / scale
+        grown[k] = moved[n:, :n] @ inverse * scale
+    return E, F, symmetric(grown), symmetric(G)
+
+
+def wide_zeros(*shape: int) -> Any:
+    """Zeros in extended precision."""
+    return np.zeros(shape, dtype=WIDE)
+
+
+def wide_inverse(matrix: FloatArray) -> FloatArray:
+    """The inverse in extended precision, by Newton's iteration from double."""
+    inverse = np.linalg.inv(matrix.astype(np.float64)).astype(WIDE)
+    for _ in range(2):
+        inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
+    return np.asarray(inverse)
 
 
 def information_blocks(
@@ -295,7 +360,9 @@ def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
             row += len(part)
         return out
 
-    return FlowTable(*(padded(list(parts), 0.0) for parts in zip(*tables, strict=True)))
+    names = FlowTable.struct_fields
+    parts: Any = {n: padded([getattr(table, n) for table in tables], 0.0) for n in names}
+    return FlowTable(**parts)
 
 
 # Kernels.
@@ -309,21 +376,55 @@ def move_root(
     x: FloatArray,
     k: int,
     gap: float,
-    room: FlowRoom,
+    scratch: FlowScratch,
 ) -> None:
     """Move place ``k`` over ``gap`` seconds by model ``m``."""
-    whole = int(gap / table.unit[m])
-    rest = gap - whole * table.unit[m]
-    level, levels = 0, table.sizes[m, 3]
+    octaves = table.sizes[m, 4]
+    if gap >= table.unit[m] * (1 << octaves):
+        gap = move_levels(table, m, octaves, root, x, k, gap, scratch)
+    if not gap > 0.0:
+        return
+    if table.sizes[m, 1] == 0 or table.size[m] * gap * root_size(root, k) < NARROW:
+        move_narrow(table, m, root, x, k, gap, scratch)
+        return
+    gap = move_levels(table, m, 0, root, x, k, gap, scratch)
+    if gap > 0.0:
+        move_wide(table, m, root, x, k, gap, scratch)
+
+
+@kernel
+def root_size(root: FloatArray, k: int) -> float:
+    """``trace(P)``."""
+    total = 0.0
+    for i in range(root.shape[1]):
+        for j in range(i + 1):
+            total += root[k, i, j] * root[k, i, j]
+    return total
+
+
+@kernel
+def move_levels(
+    table: FlowTable,
+    m: int,
+    level: int,
+    root: FloatArray,
+    x: FloatArray,
+    k: int,
+    gap: float,
+    scratch: FlowScratch,
+) -> float:
+    """Move over the multiple of ``unit 2^level`` seconds in a gap; returns the seconds left."""
+    length, levels = table.unit[m] * (1 << level), table.sizes[m, 3]
+    whole = int(gap / length)
+    rest: float = gap - whole * length
     while whole > 0:
         if whole & 1 or level == levels - 1:
-            move_level(table, m, level, root, x, k, room)
+            move_level(table, m, level, root, x, k, scratch)
             whole -= 1
         if level < levels - 1:
             whole >>= 1
             level += 1
-    if rest > 0.0:
-        move_part_of_unit(table, m, root, x, k, rest, room)
+    return rest
 
 
 @kernel
@@ -334,10 +435,10 @@ def move_level(
     root: FloatArray,
     x: FloatArray,
     k: int,
-    room: FlowRoom,
+    scratch: FlowScratch,
 ) -> None:
     """``move_root`` over ``unit 2^level`` seconds."""
-    n, levels, T, observed = x.shape[1], table.levels, room.T, room.observed
+    n, levels, T, observed = x.shape[1], table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
         for r in range(n):
             for j in range(n):
@@ -345,77 +446,148 @@ def move_level(
                 for i in range(max(r, j), n):
                     total += levels[m, level, 2, r, i] * root[k, i, j]
                 observed[0, j] = total
-            rotate_out(root, k, observed, 0, room.gain, 1.0)
+            rotate_out(root, k, observed, 0, scratch.gain, 1.0)
     for i in range(n):
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
-    values, flow = room.values, 0 if table.sizes[m, 1] == 0 else 1
+    values, flow = scratch.values, 0 if table.sizes[m, 1] == 0 else 1
     for i in range(n):
         for j in range(n):
             values[i * n + j] = levels[m, level, flow, i, j]
-    transform(root, k, values, 0, room.wide, T, table.sizes[m, 2] > 0)
+    transform(root, k, values, 0, scratch.wide, T, table.sizes[m, 2] > 0)
     for i in range(n):
         total = 0.0
         for j in range(n):
             total += levels[m, level, 0, i, j] * x[k, j]
-        room.gain[0, i] = total
+        scratch.gain[0, i] = total
     for i in range(n):
-        x[k, i] = room.gain[0, i]
+        x[k, i] = scratch.gain[0, i]
 
 
 @kernel
-def move_part_of_unit(
+def move_wide(
     table: FlowTable,
     m: int,
     root: FloatArray,
     x: FloatArray,
     k: int,
     gap: float,
-    room: FlowRoom,
+    scratch: FlowScratch,
 ) -> None:
-    """``move_root`` over less than a unit."""
-    n, values, T = x.shape[1], room.values, room.T
-    lower = n * (n + 1) // 2
-    begin = lower
-    if table.sizes[m, 1] > 0:
-        use_readings(table, m, root, k, gap, room)
-        begin = lower + n * n
-    fill_series(values, table.series, table.reach, m, begin + n * n, gap)
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += values[lower + i * n + j] * x[k, j]
-        room.gain[0, i] = total
-    for i in range(n):
-        x[k, i] = room.gain[0, i]
-    noisy = table.sizes[m, 2] > 0
-    if noisy:
-        take_root(T, values)
-    transform(root, k, values, begin, room.wide, T, noisy)
+    """``move_root`` over less than a unit for any P, however wide."""
+    use_readings(table, m, root, k, gap, scratch)
+    n = x.shape[1]
+    fill_cell(scratch.values, table, m, 0, n * (n + 1) // 2 + 2 * n * n, gap)
+    move_by_series(table, m, root, x, k, scratch)
 
 
 @kernel
-def fill_series(
-    out: FloatArray, series: FloatArray, reach: FloatArray, m: int, size: int, gap: float
+def move_narrow(
+    table: FlowTable,
+    m: int,
+    root: FloatArray,
+    x: FloatArray,
+    k: int,
+    gap: float,
+    scratch: FlowScratch,
 ) -> None:
-    """Write the first ``size`` entries of the sum of model ``m``, see linalg/series."""
+    """``move_root`` over a gap inside a cell, where nothing is observed or P is not too wide."""
+    unit, n, values = table.unit[m], x.shape[1], scratch.values
+    cell = int(gap / unit)
+    since = gap if cell == 0 else gap - (cell + 0.5) * unit
+    lower = n * (n + 1) // 2
+    if table.sizes[m, 1] == 0:
+        fill_cell(values, table, m, cell, lower + n * n, since)
+    else:
+        fill_cell(values, table, m, cell, 2 * (lower + n * n), since)
+        shrink_root(root, k, values, lower + 2 * n * n, scratch.wide)
+    move_by_series(table, m, root, x, k, scratch)
+
+
+@kernel
+def move_by_series(
+    table: FlowTable, m: int, root: FloatArray, x: FloatArray, k: int, scratch: FlowScratch
+) -> None:
+    """``x = exp(A g) x`` and ``P = Q_g + F P F'``, with what is in ``values``."""
+    n, values, T = x.shape[1], scratch.values, scratch.T
+    begin = n * (n + 1) // 2
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += values[begin + i * n + j] * x[k, j]
+        scratch.gain[0, i] = total
+    for i in range(n):
+        x[k, i] = scratch.gain[0, i]
+    noisy = table.sizes[m, 2] > 0
+    if noisy:
+        take_root(T, values)
+    if table.sizes[m, 1] > 0:
+        begin += n * n
+    transform(root, k, values, begin, scratch.wide, T, noisy)
+
+
+@kernel
+def fill_cell(
+    out: FloatArray, table: FlowTable, m: int, cell: int, size: int, since: float
+) -> None:
+    """Write the first ``size`` values of the series of a cell, ``since`` seconds from its middle,
+    see linalg/series.
+    """
+    series, reach, distance = table.series, table.reach, abs(since)
     for j in range(size):
-        out[j] = series[m, 0, j]
+        out[j] = series[m, cell, 0, j]
     k, even = 0, 1.0
-    while gap > reach[m, k]:
-        odd = even * gap
-        even = odd * gap
+    while distance > reach[m, cell, k]:
+        odd = even * since
+        even = odd * since
         for j in range(size):
-            out[j] += odd * series[m, k + 1, j] + even * series[m, k + 2, j]
+            out[j] += odd * series[m, cell, k + 1, j] + even * series[m, cell, k + 2, j]
         k += 2
 
 
 @kernel
+def shrink_root(root: FloatArray, k: int, G: FloatArray, begin: int, V: FloatArray) -> None:
+    """Make place ``k`` the root of ``P (I + G P)^-1``; G is packed by rows of its lower triangle,
+    from ``begin`` on.
+    """
+    n = root.shape[1]
+    # V = I + S' G S by columns: G S first, whose column j is not needed by the ones before.
+    for j in range(n):
+        for i in range(n):
+            total = 0.0
+            for r in range(j, n):
+                g = i * (i + 1) // 2 + r if r <= i else r * (r + 1) // 2 + i
+                total += G[begin + g] * root[k, r, j]
+            V[i, j] = total
+        for i in range(j + 1):
+            total = 1.0 if i == j else 0.0
+            for r in range(i, n):
+                total += root[k, r, i] * V[r, j]
+            V[i, j] = total
+    # V V' from the last column on, V upper triangular.
+    for j in range(n - 1, -1, -1):
+        pivot = 1.0 / math.sqrt(V[j, j])
+        V[j, j] = pivot
+        for i in range(j):
+            V[i, j] *= pivot
+        for i in range(j):
+            for r in range(i + 1):
+                V[r, i] -= V[r, j] * V[i, j]
+    # S V^-T by rows.
+    for i in range(n):
+        for j in range(i, -1, -1):
+            total = root[k, i, j]
+            for r in range(j + 1, i + 1):
+                total -= root[k, i, r] * V[j, r]
+            root[k, i, j] = total * V[j, j]
+
+
+@kernel
 def use_readings(
-    table: FlowTable, m: int, root: FloatArray, k: int, gap: float, room: FlowRoom
+    table: FlowTable, m: int, root: FloatArray, k: int, gap: float, scratch: FlowScratch
 ) -> None:
     """Use the information Gamma' Gamma of a gap of less than a unit."""
-    n, q, rows, observed = root.shape[1], table.sizes[m, 0], room.rows, room.observed
+    n, q, rows, observed = root.shape[1], table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
     size = 0.0
     for i in range(n):
@@ -441,7 +613,7 @@ def use_readings(
                 for i in range(j, n):
                     total += rows[r * n + i] * root[k, i, j]
                 observed[0, j] = factor * total
-            rotate_out(root, k, observed, 0, room.gain, 1.0)
+            rotate_out(root, k, observed, 0, scratch.gain, 1.0)
         factor *= gap
 
 
@@ -571,30 +743,27 @@ def gain_root(
 
 @kernel
 def move_alone(
-    unit: FloatArray,
-    sizes: np.ndarray,
-    reach: FloatArray,
-    series: FloatArray,
-    gamma: FloatArray,
-    bound: FloatArray,
-    levels: FloatArray,
-    seen: FloatArray,
-    values: FloatArray,
-    work: FloatArray,
-    root: FloatArray,
-    x: FloatArray,
-    gap: float,
+    table: IntArray, scratch: IntArray, root: FloatArray, x: FloatArray, gap: float
 ) -> None:
-    """``move_root`` of one node and a table of one model, ``work`` (2 n + 2, n): numba takes plain
-    arrays from Python ten times faster than it takes named ones.
-    """
-    n = x.shape[1]
-    rows = values[series.shape[2] :]
-    parts = work[:n], work[n : 2 * n], work[2 * n : 2 * n + 1], work[2 * n + 1 : 2 * n + 2]
-    table = FlowTable(unit, sizes, reach, series, gamma, bound, levels, seen)
-    move_root(
-        table, 0, root, x, 0, gap, FlowRoom(values, parts[0], parts[1], rows, parts[2], parts[3])
-    )
+    """``move_root`` of one node by a table of one model, given the memory of the structs."""
+    move_root(struct_at(table, FlowTable), 0, root, x, 0, gap, struct_at(scratch, FlowScratch))
+
+
+class _Scratches(threading.local):
+    """Of each thread, by the sizes that they depend on."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[int, ...], FlowScratch] = {}
+
+    def of(self, table: FlowTable) -> FlowScratch:
+        """Scratch arrays for a table."""
+        sizes = table.series.shape[3], *table.seen.shape[1:]
+        if sizes not in self.known:
+            self.known[sizes] = flow_scratch(table)
+        return self.known[sizes]
+
+
+_scratches = _Scratches()
 
 
 def flow_root(
@@ -604,8 +773,7 @@ def flow_root(
     n = len(x)
     roots, means = root.reshape(1, n, n).copy(), x.reshape(1, n).copy()
     if gap > 0.0:
-        values = np.empty(table.series.shape[2] + table.seen.shape[1] * n)
-        move_alone(*table, values, np.empty((2 * n + 2, n)), roots, means, gap)
+        move_alone(table.memory, _scratches.of(table).memory, roots, means, gap)
     return roots[0], means[0]
 
 

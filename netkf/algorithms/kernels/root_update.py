@@ -5,8 +5,8 @@ here inverts a covariance or subtracts one from another: samples are used by Giv
 columns, which keep columns of very different sizes apart (a first covariance of 1e12 beside a
 sensor of 1e-9), and combinations are one orthogonal elimination.
 
-Kernels work in place on place ``k`` of stacks, root (K, n, n) and x (K, n), and take their room
-from :func:`update_room`; wrappers for Python take one node and return new arrays:
+Kernels work in place on place ``k`` of stacks, root (K, n, n) and x (K, n), and take their scratch
+from :func:`update_scratch`; wrappers for Python take one node and return new arrays:
 
 =================================  ============================================================
 ``sample_root``                    kernel: use one sample ``y = H x + v`` (p rows)
@@ -24,13 +24,13 @@ from :func:`update_room`; wrappers for Python take one node and return new array
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.kernels.square_root import lower_triangular
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Struct
 
 SINGULAR = 2.0**-25
 """Least pivot of a root that counts in an intersection, relative to the length of its row: the
@@ -40,8 +40,8 @@ NEGLIGIBLE = 1e-40  # of the square of a pivot: what cannot move it, nor the row
 TINY = 1e-200
 
 
-class UpdateRoom(NamedTuple):
-    """Room to work in: C (p, p), HS (p, n) and gains (p, n) of a sample, with p >= 1 its largest
+class UpdateScratch(Struct):
+    """Scratch arrays: C (p, p), HS (p, n) and gains (p, n) of a sample, with p >= 1 its largest
     number of rows; ``wide`` (n, n), ``whitened`` (n, n + 1) and ``total`` (n, n + 1) of
     combinations.
     """
@@ -54,11 +54,14 @@ class UpdateRoom(NamedTuple):
     total: FloatArray
 
 
-def update_room(n: int, p: int) -> UpdateRoom:
+def update_scratch(n: int, p: int) -> UpdateScratch:
     """Room for states of n entries and samples of at most p rows."""
     p = max(p, 1)
-    shapes = ((p, p), (p, n), (p, n), (n, n), (n, n + 1), (n, n + 1))
-    return UpdateRoom(*(np.zeros(shape) for shape in shapes))
+    shapes = {
+        **{"C": (p, p), "HS": (p, n), "gains": (p, n), "wide": (n, n)},
+        **{"whitened": (n, n + 1), "total": (n, n + 1)},
+    }
+    return UpdateScratch(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
 
 def lower_root(root: FloatArray) -> FloatArray:
@@ -104,7 +107,7 @@ def sample_root(
     y: FloatArray,
     H: FloatArray,
     root_R: FloatArray,
-    room: UpdateRoom,
+    scratch: UpdateScratch,
 ) -> None:
     """Use the sample ``y = H x + v``: y (p,), H (p, n), ``root_R`` (p, p) lower triangular
     and regular.
@@ -114,7 +117,7 @@ def sample_root(
     """
     # [root_R, H S; 0, S] is made lower triangular, [C, 0; gains', S+], row by row of H.
     p, n = len(y), x.shape[1]
-    C, HS, gains = room.C, room.HS, room.gains
+    C, HS, gains = scratch.C, scratch.HS, scratch.gains
     for r in range(p):
         for m in range(r + 1):
             C[r, m] = root_R[r, m]
@@ -169,7 +172,7 @@ def update_with_sample(
     """Root (n, n), x (n,) and normalised innovation (p,) once the sample y (p,) is used."""
     n = len(x)
     roots, means, innovation = root.reshape(1, n, n).copy(), x.reshape(1, n).copy(), y.copy()
-    sample_root(roots, means, 0, innovation, H, root_R, update_room(n, len(y)))
+    sample_root(roots, means, 0, innovation, H, root_R, update_scratch(n, len(y)))
     return roots[0], means[0], innovation
 
 
@@ -195,10 +198,10 @@ def add_root(
     other: FloatArray,
     other_x: FloatArray,
     m: int,
-    room: UpdateRoom,
+    scratch: UpdateScratch,
 ) -> None:
     """Add ``weight`` >= 0 times P and x of place ``m`` of ``other`` (M, n, n), ``other_x``."""
-    n, size, wide = x.shape[1], math.sqrt(weight), room.wide
+    n, size, wide = x.shape[1], math.sqrt(weight), scratch.wide
     for i in range(n):
         x[k, i] += weight * other_x[m, i]
         for j in range(i + 1):
@@ -241,10 +244,10 @@ def combine_roots(
     (k, n) and roots (k, n, n).
     """
     x, root = means[:1].copy(), roots[:1].copy()
-    room = update_room(means.shape[1], 1)
+    scratch = update_scratch(means.shape[1], 1)
     scale_root(root, x, 0, float(weights[0]))
     for m in range(1, len(weights)):
-        add_root(root, x, 0, float(weights[m]), roots, means, m, room)
+        add_root(root, x, 0, float(weights[m]), roots, means, m, scratch)
     return x[0], root[0]
 
 
@@ -252,9 +255,9 @@ def combine_roots(
 
 
 @kernel
-def begin_intersection(room: UpdateRoom) -> None:
+def begin_intersection(scratch: UpdateScratch) -> None:
     """Forget what was intersected before."""
-    total = room.total
+    total = scratch.total
     for i in range(total.shape[0]):
         for j in range(total.shape[1]):
             total[i, j] = 0.0
@@ -268,12 +271,12 @@ def add_to_intersection(
     k: int,
     centre: FloatArray,
     m: int,
-    room: UpdateRoom,
+    scratch: UpdateScratch,
 ) -> None:
     """Add ``weight`` times the information of place ``k``; means count from ``centre[m]``, which
     must be the same for all terms of one intersection.
     """
-    whitened, total, n = room.whitened, room.total, x.shape[1]
+    whitened, total, n = scratch.whitened, scratch.total, x.shape[1]
     if weight <= 0.0:
         return
     invert_root(whitened, root, k, math.sqrt(weight))
@@ -332,10 +335,10 @@ def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> Non
 
 @kernel
 def end_intersection(
-    root: FloatArray, x: FloatArray, k: int, centre: FloatArray, m: int, room: UpdateRoom
+    root: FloatArray, x: FloatArray, k: int, centre: FloatArray, m: int, scratch: UpdateScratch
 ) -> None:
     """Write the intersection into place ``k``; nan where nothing was added."""
-    total, whitened, n = room.total, room.whitened, x.shape[1]
+    total, whitened, n = scratch.total, scratch.whitened, x.shape[1]
     for i in range(n):
         for j in range(i + 1):
             value = 1.0 if j == i else 0.0
@@ -359,8 +362,8 @@ def intersect_roots(
     (k, n, n).
     """
     x, root = means[:1].copy(), np.zeros_like(roots[:1])
-    room = update_room(means.shape[1], 1)
+    scratch = update_scratch(means.shape[1], 1)
     for m in range(len(weights)):
-        add_to_intersection(float(weights[m]), roots, means, m, means, 0, room)
-    end_intersection(root, x, 0, means, 0, room)
+        add_to_intersection(float(weights[m]), roots, means, m, means, 0, scratch)
+    end_intersection(root, x, 0, means, 0, scratch)
     return x[0], root[0]

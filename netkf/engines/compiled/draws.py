@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.engines.compiled.increments import PathBlock
-from netkf.engines.compiled.state import Sensing
+from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time

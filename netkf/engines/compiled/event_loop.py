@@ -1,11 +1,10 @@
 """The event loop: what happens in one run, event after event, compiled.
 
-``event_loop`` finds the next event and calls its handler; the order is (time, rank, entity) as
-``engines.base`` says. It stops and says why where Python has something to do: draw more, pass rows
-on, show samples, move the origin. All state is in arrays, so that it goes on where it stopped.
-
-A handler first brings to the present whoever takes part. That may stop half way for more draws; it
-is done again then, and changes nothing that was done before.
+``event_loop`` finds the next event, predicts the nodes that take part in it, and calls its handler;
+the order is (time, rank, entity) as ``engines.base`` says. It stops and says why where Python has
+something to do: draw more, pass rows on, show samples, move the origin. All state is in one struct,
+so that it goes on where it stopped: a prediction that needs more draws is repeated, and changes
+nothing that was done before.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from netkf.algorithms.kernels.root_update import (
     end_intersection,
     scale_root,
 )
-from netkf.engines.compiled.increments import PathBlock, predict_with_increments
+from netkf.engines.compiled.increments import predict_with_increments
 from netkf.engines.compiled.late_readings import (
     History,
     copy_state,
@@ -31,13 +30,7 @@ from netkf.engines.compiled.late_readings import (
     use_reading,
 )
 from netkf.engines.compiled.message_queue import pop, push, put, release, sort_places, take
-from netkf.engines.compiled.running_totals import (
-    Totals,
-    add_reading,
-    hear,
-    offer_round,
-)
-from netkf.engines.compiled.schedule import Window
+from netkf.engines.compiled.running_totals import Totals, add_reading, hear, offer_round
 from netkf.engines.compiled.state import (
     AFTER_READINGS,
     CONVEX,
@@ -60,58 +53,84 @@ SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT = (
 (GO_ON, WANT_TICKS, WANT_STEPS, WANT_CUTS, WANT_MESSAGES, WANT_ROWS, WANT_SHOWN, WANT_REBASE,
  WANT_PAST, DONE) = range(10)  # fmt: skip
 """Why the loop stopped: it needs the next window of ticks, the next steps of the path, normals for
-cuts, a larger pool of messages, room for rows, for samples; the origin moves; a longer history.
+cuts, a larger pool of messages, space for rows, for samples; the origin moves; a longer history.
 """
+ON_REBASE, ON_SENSE, ON_SAMPLE, ON_TICK, ON_DELIVER, ON_ABSORB, ON_PROBE = range(7)
+"""Events, in the order in which those of one instant happen."""
 NEVER = math.inf
 
 
 @kernel
-def event_loop(  # noqa: PLR0912 - a branch for each kind of event
-    state: Simulation,
-    window: Window,
-    path: PathBlock,
-    totals: Totals | None,
-    history: History | None,
-) -> int:
-    """Go on until something is wanted; see the words above."""
-    run = state.run[0]
+def event_loop(state: Simulation, totals: Totals | None, history: History | None) -> int:
+    """Simulate until something is wanted; returns what, see the words above."""
     while True:
-        if run.row + run.most_rows > len(state.rows):
-            return WANT_ROWS
-        if run.free_count < run.most_messages:
-            return WANT_MESSAGES
-        rebase = next_of(state.frames, run.frame_at)
-        sense = next_of(path.grid, run.grid_at)
-        sample = next_of(state.instants.t, run.instant_at)
-        tick = next_of(window.t, run.tick_at)
-        probe = next_of(state.probes, run.probe_at)
-        deliver = state.pool[state.heap[0]].arrival if run.flying > 0 else NEVER
-        absorb = run.mail_time if run.waiting > 0 else NEVER
-        now = min(rebase, sense, sample, tick, deliver, absorb, probe)
-        if now >= window.end and window.end < NEVER:
-            return WANT_TICKS
-        if now > path.end and path.end < run.horizon:
-            return WANT_STEPS
-        if now == NEVER:
-            return DONE
-        while path.stop[run.piece] < now:
-            run.piece += 1
-        if rebase == now:
-            wanted = on_rebase(state, path, now)
-        elif sense == now:
-            wanted = on_sense(state, path, now)
-        elif sample == now:
-            wanted = on_sample(state, path, totals, history, now)
-        elif tick == now:
-            wanted = on_tick(state, window, path, totals, now)
-        elif deliver == now:
-            wanted = on_deliver(state, now)
-        elif absorb == now:
-            wanted = on_absorb(state, path, totals, history, now)
-        else:
-            wanted = on_probe(state, path, totals, now)
+        event, now = next_event(state)
+        wanted = wanted_first(state, history, event, now)
         if wanted != GO_ON:
             return wanted
+        while state.path.stop[state.piece] < now:
+            state.piece += 1
+        for k in range(count_participants(state, event)):
+            if not predict(state, participant(state, event, k), now):
+                return WANT_CUTS
+        if event == ON_TICK:
+            on_tick(state, totals, now)
+        elif event == ON_ABSORB:
+            on_absorb(state, totals, history, now)
+        elif event == ON_SENSE:
+            on_sense(state, now)
+        elif event == ON_SAMPLE:
+            on_sample(state, totals, history, now)
+        elif event == ON_DELIVER:
+            on_deliver(state, now)
+        elif event == ON_REBASE:
+            return WANT_REBASE
+        elif not on_probe(state, totals):
+            return WANT_SHOWN
+
+
+@kernel
+def wanted_first(state: Simulation, history: History | None, event: int, now: float) -> int:
+    """What an event needs before it can happen, or GO_ON."""
+    wanted = GO_ON
+    if state.traced and state.row + state.most_rows > len(state.rows):
+        wanted = WANT_ROWS
+    elif state.free_count < state.most_messages:
+        wanted = WANT_MESSAGES
+    elif now >= state.ticks.end and state.ticks.end < NEVER:
+        wanted = WANT_TICKS
+    elif now > state.path.end and state.path.end < state.horizon:
+        wanted = WANT_STEPS
+    elif now == NEVER:
+        wanted = DONE
+    elif history is not None and history.free[1] < readings_at_once(state, event):
+        wanted = WANT_PAST
+    return wanted
+
+
+@kernel
+def next_event(state: Simulation) -> tuple[int, float]:
+    """What happens next, and when; the earlier in the list, the earlier at one instant."""
+    event, now = ON_REBASE, next_of(state.frames, state.frame_at)
+    sense = next_of(state.path.grid, state.grid_at)
+    if sense < now:
+        event, now = ON_SENSE, sense
+    sample = next_of(state.instants.t, state.instant_at)
+    if sample < now:
+        event, now = ON_SAMPLE, sample
+    tick = next_of(state.ticks.t, state.tick_at)
+    if tick < now:
+        event, now = ON_TICK, tick
+    deliver = state.pool[state.heap[0]].arrival if state.flying > 0 else NEVER
+    if deliver < now:
+        event, now = ON_DELIVER, deliver
+    absorb = state.mail_time if state.receivers > 0 else NEVER
+    if absorb < now:
+        event, now = ON_ABSORB, absorb
+    probe = next_of(state.probes, state.probe_at)
+    if probe < now:
+        event, now = ON_PROBE, probe
+    return event, now
 
 
 @kernel
@@ -121,87 +140,104 @@ def next_of(times: FloatArray, k: int) -> float:
 
 
 @kernel
-def note(
-    run: np.ndarray,
-    rows: np.ndarray,
-    t: float,
-    kind: int,
-    node: int,
-    peer: int,
-    message: int,
-    age: float,
-) -> None:
-    """Write one row of the trace."""
-    row = rows[run[0].row]
-    row.t, row.kind, row.node, row.peer = t, kind, node, peer
-    row.message, row.phase, row.age = message, -1, age
-    run[0].row += 1
+def count_participants(state: Simulation, event: int) -> int:
+    """How many nodes must be at the time of the event before it happens."""
+    count = 1
+    if event in (ON_REBASE, ON_PROBE):
+        count = len(state.nodes)
+    elif event == ON_DELIVER:
+        count = 0
+    elif event == ON_TICK and state.at == LINKS:
+        count = 2  # both ends of a link decide what they send before either hears the other
+    return count
 
 
 @kernel
-def predict(state: Simulation, path: PathBlock, h: int, time: float) -> bool:
-    """Bring node ``h`` to ``time``; False where it needs more normals for cuts first."""
+def participant(state: Simulation, event: int, k: int) -> int:
+    """The k-th of them."""
+    if event == ON_TICK:
+        entity = state.entities[state.ticks.entity[state.tick_at]]
+        return int(entity.sender if k == 0 else entity.other)
+    if event == ON_ABSORB:
+        if state.absorbing == 0:
+            sort_places(state.waiting, state.receivers)
+        return int(state.waiting[state.absorbing])
+    if event == ON_SENSE:
+        return int(state.sensing.host[state.wake_at])
+    if event == ON_SAMPLE:
+        return int(state.instants.host[state.instant_at])
+    return k
+
+
+@kernel
+def readings_at_once(state: Simulation, event: int) -> int:
+    """How many readings an event uses at most."""
+    if event == ON_SAMPLE:
+        return 1
+    count = 0
+    if event == ON_ABSORB:
+        m = state.nodes[participant(state, event, 0)].inbox
+        while m != -1:
+            count, m = count + 1, state.pool[m].next
+    return count
+
+
+@kernel
+def note(state: Simulation, t: float, kind: int, node: int, peer: int, message: int) -> None:
+    """Record an event without an age."""
+    note_age(state, t, kind, node, peer, message, np.nan)
+
+
+@kernel
+def note_age(
+    state: Simulation, t: float, kind: int, node: int, peer: int, message: int, age: float
+) -> None:
+    """Write one row of the trace, or only count it."""
+    if not state.traced:
+        state.counts[kind] += 1
+        return
+    row = state.rows[state.row]
+    row.t, row.kind, row.node, row.peer = t, kind, node, peer
+    row.message, row.phase, row.age = message, -1, age
+    state.row += 1
+
+
+@kernel
+def predict(state: Simulation, h: int, time: float) -> bool:
+    """Predict node ``h`` to ``time``; False where it needs more normals for cuts first."""
     node = state.nodes[h]
     if not node.now < time:
         return True
     if node.sensors > node.sensor:
-        return predict_with_increments(state, path, h, time)
+        return predict_with_increments(state, h, time)
     gap = time - node.now
-    move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_room)
+    move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
     node.now = time
     return True
 
 
 @kernel
-def predict_all(state: Simulation, path: PathBlock, time: float) -> bool:
-    """Bring all nodes to ``time``."""
-    for h in range(len(state.nodes)):  # noqa: SIM110 - compiled functions know no generators
-        if not predict(state, path, h, time):
-            return False
-    return True
-
-
-@kernel
-def on_rebase(state: Simulation, path: PathBlock, now: float) -> int:
-    """The origin of the coordinates moves: Python does that."""
-    return WANT_REBASE if predict_all(state, path, now) else WANT_CUTS
-
-
-@kernel
-def on_sense(state: Simulation, path: PathBlock, now: float) -> int:
-    """A node uses its increments up to a point of the sensing grid."""
-    run, sensing = state.run[0], state.sensing
-    if not predict(state, path, sensing.host[run.wake_at], now):
-        return WANT_CUTS
-    note(state.run, state.rows, now, SENSE, sensing.node[run.wake_at], -1, -1, np.nan)
-    run.wake_at += 1
-    if run.wake_at == len(sensing.host):
-        run.wake_at = 0
-        run.grid_at += 1
-    return GO_ON
+def on_sense(state: Simulation, now: float) -> None:
+    """A node has used its increments up to a point of the sensing grid."""
+    sensing = state.sensing
+    note(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
+    state.wake_at += 1
+    if state.wake_at == len(sensing.host):
+        state.wake_at = 0
+        state.grid_at += 1
 
 
 @kernel
 def on_sample(
-    state: Simulation,
-    path: PathBlock,
-    totals: Totals | None,
-    history: History | None,
-    now: float,
-) -> int:
+    state: Simulation, totals: Totals | None, history: History | None, now: float
+) -> None:
     """A node uses all its samples of an instant."""
-    run, given = state.run[0], state.instants
-    instant = run.instant_at
-    h = given.host[instant]
-    if history is not None and history.free[1] < 1:
-        return WANT_PAST
-    if not predict(state, path, h, now):
-        return WANT_CUTS
-    sensed = -1
+    given, instant = state.instants, state.instant_at
+    h, sensed = given.host[instant], -1
     for s in range(given.first[instant], given.first[instant + 1]):
         if given.node[s] != sensed:  # of a pooled filter several nodes, in order
             sensed = given.node[s]
-            note(state.run, state.rows, now, SENSE, sensed, -1, -1, np.nan)
+            note(state, now, SENSE, sensed, -1, -1)
     if totals is not None:
         add_reading(state, totals, h, instant)
     elif history is not None:
@@ -209,125 +245,98 @@ def on_sample(
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
     state.nodes[h].reading = instant
-    run.instant_at += 1
-    return GO_ON
+    state.instant_at += 1
 
 
 @kernel
-def on_tick(
-    state: Simulation, window: Window, path: PathBlock, totals: Totals | None, now: float
-) -> int:
+def on_tick(state: Simulation, totals: Totals | None, now: float) -> None:
     """A clock ticks, or a node has used a sample: who transmits sends to each receiver."""
-    run, nodes = state.run[0], state.nodes
-    entity = state.entities[window.entity[run.tick_at]]
+    ticks, nodes, k = state.ticks, state.nodes, state.tick_at
+    entity = state.entities[ticks.entity[k]]
     i, j = entity.sender, entity.other
-    if not predict(state, path, i, now):
-        return WANT_CUTS
-    # Both ends of a link decide what they send before either hears the other.
-    if run.at == LINKS and not predict(state, path, j, now):
-        return WANT_CUTS
-    if run.at != AFTER_READINGS:
-        note(
-            state.run, state.rows, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1, np.nan
-        )
-    sends = True
-    if totals is not None:
-        sends = offer_round(state, totals, i, now)
-    if run.at >= NODES and sends:
-        note(state.run, state.rows, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent, np.nan)
+    if state.at != AFTER_READINGS:
+        note(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
+    state.tick_at += 1
+    if totals is not None and not offer_round(state, totals, i, now):
+        return
+    if state.at >= NODES:
+        note(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
-    first = window.at[run.tick_at] - entity.first
-    if sends:
-        for k in range(entity.first, entity.after):
-            send(state, totals, state.hearing[k], window.delay[first + k], now)
-    run.tick_at += 1
-    return GO_ON
+    first = ticks.at[k] - entity.first
+    for m in range(entity.first, entity.after):
+        send(state, totals, state.hearing[m], ticks.delay[first + m], now)
 
 
 @kernel
 def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: float) -> None:
     """Send one message on a directed link; ``delay`` is LOST or nan where it is lost."""
-    run, way, pool = state.run[0], state.ways[w], state.pool
+    way, pool = state.ways[w], state.pool
     number, h = way.messages, way.sender
     way.messages += 1
     one, other = state.nodes[h].id, state.nodes[way.receiver].id
-    note(state.run, state.rows, now, SEND, one, other, number, np.nan)
+    note(state, now, SEND, one, other, number)
     if not delay >= 0.0:
-        note(state.run, state.rows, now, LOST, one, other, number, np.nan)
+        note(state, now, LOST, one, other, number)
         return
-    if delay > 0.0 and not now + delay < run.horizon:
+    if delay > 0.0 and not now + delay < state.horizon:
         return
-    m = take(state.run, pool)
+    m = take(state)
     message = pool[m]
     message.way, message.number, message.sent = w, number, now
     if totals is not None:
         message.tag = totals.rounds[h] - 1
         for k in range(totals.sent.shape[1]):
             totals.offered[m, k] = totals.sent[h, k]
-    elif run.kind == READINGS:
+    elif state.kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
         copy_state(state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     if delay == 0.0:
         arrive(state, m, now)
         return
-    message.arrival, message.order = now + delay, run.order
-    run.order += 1
-    push(pool, state.heap, run.flying, m)
-    run.flying += 1
+    message.arrival, message.order = now + delay, state.order
+    state.order += 1
+    push(pool, state.heap, state.flying, m)
+    state.flying += 1
 
 
 @kernel
-def on_deliver(state: Simulation, now: float) -> int:
+def on_deliver(state: Simulation, now: float) -> None:
     """The next message arrives."""
-    run = state.run[0]
-    m = pop(state.pool, state.heap, run.flying)
-    run.flying -= 1
+    m = pop(state.pool, state.heap, state.flying)
+    state.flying -= 1
     arrive(state, m, now)
-    return GO_ON
 
 
 @kernel
 def arrive(state: Simulation, m: int, now: float) -> None:
-    """A message is put into the inbox of its receiver, unless it is too late."""
-    run, message = state.run[0], state.pool[m]
+    """Put a message into the inbox of its receiver, unless it is too late."""
+    message = state.pool[m]
     way = state.ways[message.way]
     one, other = state.nodes[way.sender].id, state.nodes[way.receiver].id
     age = now - message.sent
-    if not age <= run.age_limit:
-        note(state.run, state.rows, now, LATE, other, one, message.number, age)
-        release(state.run, state.pool, m)
+    if not age <= state.age_limit:
+        note_age(state, now, LATE, other, one, message.number, age)
+        release(state, m)
         return
-    note(state.run, state.rows, now, DELIVER, other, one, message.number, age)
+    note_age(state, now, DELIVER, other, one, message.number, age)
     if state.nodes[way.receiver].inbox == -1:
-        state.waiting[run.waiting] = way.receiver
-        run.waiting += 1
-        run.mail_time = now
-    newest_only = run.kind != READINGS
-    put(state.run, state.nodes, state.ways, state.pool, way.receiver, m, newest_only)
+        state.waiting[state.receivers] = way.receiver
+        state.receivers += 1
+        state.mail_time = now
+    put(state, way.receiver, m)
 
 
 @kernel
 def on_absorb(
-    state: Simulation,
-    path: PathBlock,
-    totals: Totals | None,
-    history: History | None,
-    now: float,
-) -> int:
+    state: Simulation, totals: Totals | None, history: History | None, now: float
+) -> None:
     """A node uses all that arrived at this instant, in the order of senders."""
-    run, pool = state.run[0], state.pool
-    if run.absorbing == 0:
-        sort_places(state.waiting, run.waiting)
-    h = state.waiting[run.absorbing]
-    node = state.nodes[h]
-    count, oldest, m = 0, 0.0, node.inbox
+    pool, h = state.pool, state.waiting[state.absorbing]
+    node, oldest = state.nodes[h], 0.0
+    m = node.inbox
     while m != -1:
-        count, oldest, m = count + 1, max(oldest, now - pool[m].sent), pool[m].next
-    if history is not None and history.free[1] < count:
-        return WANT_PAST
-    if not predict(state, path, h, now):
-        return WANT_CUTS
+        oldest, m = max(oldest, now - pool[m].sent), pool[m].next
     if totals is not None:
         hear(state, totals, h, now)
     elif history is not None:
@@ -337,14 +346,13 @@ def on_absorb(
     m = node.inbox
     while m != -1:
         following = pool[m].next
-        release(state.run, pool, m)
+        release(state, m)
         m = following
     node.inbox = -1
-    note(state.run, state.rows, now, ABSORB, node.id, -1, -1, oldest)
-    run.absorbing += 1
-    if run.absorbing == run.waiting:
-        run.absorbing = run.waiting = 0
-    return GO_ON
+    note_age(state, now, ABSORB, node.id, -1, -1, oldest)
+    state.absorbing += 1
+    if state.absorbing == state.receivers:
+        state.absorbing = state.receivers = 0
 
 
 @kernel
@@ -363,25 +371,25 @@ def use_mail(state: Simulation, history: History, h: int, now: float) -> None:
 @kernel
 def combine(state: Simulation, h: int, now: float) -> None:
     """Estimates of other nodes, predicted to now without readings where they took time."""
-    run, pool, ways, model = state.run[0], state.pool, state.ways, len(state.table.unit) - 1
+    pool, ways, model = state.pool, state.ways, len(state.table.unit) - 1
     m, heard = state.nodes[h].inbox, 0.0
     while m != -1:
         age = now - pool[m].sent
-        if age > 0.0 and (run.kind != SWAP or pool[m].next == -1):
-            move_root(state.table, model, state.pool_root, state.pool_x, m, age, state.flow_room)
+        if age > 0.0 and (state.kind != SWAP or pool[m].next == -1):
+            move_root(state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch)
         heard += ways[pool[m].way].weight
         m = pool[m].next
-    if run.kind == CONVEX:
+    if state.kind == CONVEX:
         combine_convex(state, h, max(0.0, 1.0 - heard))
-    elif run.kind == INTERSECTION:
+    elif state.kind == INTERSECTION:
         intersect(state, h, max(0.0, 1.0 - heard), 1.0)
-    elif run.kind == SHARES:
+    elif state.kind == SHARES:
         own, total = state.nodes[h].own, state.nodes[h].own + heard
-        if run.keep_own == 1 or total == 0.0:
+        if state.keep_own == 1 or total == 0.0:
             own, total = max(0.0, 1.0 - heard), 1.0
         if own / total != 1.0:
             intersect(state, h, own / total, total)
-    elif run.kind == SWAP:
+    elif state.kind == SWAP:
         last = state.nodes[h].last
         copy_state(state.xhat, state.root, h, state.pool_x, state.pool_root, last)
 
@@ -394,47 +402,49 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
     m = state.nodes[h].inbox
     while m != -1:
         weight = ways[pool[m].way].weight
-        add_root(root, xhat, h, weight, state.pool_root, state.pool_x, m, state.update_room)
+        add_root(root, xhat, h, weight, state.pool_root, state.pool_x, m, state.update_scratch)
         m = pool[m].next
 
 
 @kernel
 def intersect(state: Simulation, h: int, own: float, total: float) -> None:
     """D (8) and (9), with weights over their ``total``."""
-    xhat, root, room, pool, ways = state.xhat, state.root, state.update_room, state.pool, state.ways
-    begin_intersection(room)
-    add_to_intersection(own, root, xhat, h, xhat, h, room)
+    xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
+    scratch = state.update_scratch
+    begin_intersection(scratch)
+    add_to_intersection(own, root, xhat, h, xhat, h, scratch)
     m = state.nodes[h].inbox
     while m != -1:
         weight = ways[pool[m].way].weight / total
-        add_to_intersection(weight, state.pool_root, state.pool_x, m, xhat, h, room)
+        add_to_intersection(weight, state.pool_root, state.pool_x, m, xhat, h, scratch)
         m = pool[m].next
-    end_intersection(root, xhat, h, xhat, h, room)
+    end_intersection(root, xhat, h, xhat, h, scratch)
 
 
 @kernel
-def on_probe(state: Simulation, path: PathBlock, totals: Totals | None, now: float) -> int:
-    """All nodes are shown."""
-    if not predict_all(state, path, now):
-        return WANT_CUTS
-    run, shown, root, n = state.run[0], state.shown, state.root, state.xhat.shape[1]
-    taken = run.shown
+def on_probe(state: Simulation, totals: Totals | None) -> bool:
+    """Keep a sample of all nodes: estimates and covariances ``P = S S'``. False once there is no
+    space for another one.
+    """
+    shown, root, n, k = state.shown, state.root, state.xhat.shape[1], state.samples
     for h in range(len(state.nodes)):
         for i in range(n):
-            shown.xhat[taken, h, i] = state.xhat[h, i]
+            shown.xhat[k, h, i] = state.xhat[h, i]
             for j in range(i + 1):
                 total = 0.0
                 for r in range(j + 1):
                     total += root[h, i, r] * root[h, j, r]
-                shown.P[taken, h, i, j] = shown.P[taken, h, j, i] = total
+                shown.P[k, h, i, j] = shown.P[k, h, j, i] = total
     if totals is not None:
         count = len(state.nodes)
         for h in range(count):
-            shown.terms[taken, h] = totals.weight[h]
-            shown.terms[taken, count + h] = totals.sent[h, 0]
+            shown.terms[k, h] = totals.weight[h]
+            shown.terms[k, count + h] = totals.sent[h, 0]
         for w in range(len(state.ways)):
-            shown.terms[taken, 2 * count + w] = totals.heard[w, 0]
-    shown.rows[taken], shown.piece[taken] = run.row, run.piece
-    run.probe_at += 1
-    run.shown += 1
-    return WANT_SHOWN if run.shown == len(shown.rows) else GO_ON
+            shown.terms[k, 2 * count + w] = totals.heard[w, 0]
+    for kind in range(len(state.counts)):
+        shown.counts[k, kind] = state.counts[kind]
+    shown.rows[k], shown.piece[k] = state.row, state.piece
+    state.probe_at += 1
+    state.samples += 1
+    return state.samples < len(shown.rows)

@@ -28,8 +28,7 @@ from netkf.engines.compiled.event_loop import (
     WANT_TICKS,
     event_loop,
 )
-from netkf.engines.compiled.increments import PathBlock
-from netkf.engines.compiled.late_readings import History, empty_history, with_more_past
+from netkf.engines.compiled.late_readings import History, add_past, empty_history
 from netkf.engines.compiled.origins import move_origin
 from netkf.engines.compiled.poisson import schedule
 from netkf.engines.compiled.running_totals import Totals, empty_totals
@@ -40,17 +39,18 @@ from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
     CLOCKS,
     KINDS,
-    RUN,
     SUMS,
     Instants,
+    PathBlock,
     Sensing,
     Shown,
     Simulation,
+    Ticks,
+    add_messages,
     empty_pool,
     entity_records,
     filters_at_start,
-    rooms,
-    with_more_messages,
+    scratch_arrays,
 )
 from netkf.engines.compiled.truth import KnownStates, PathStates, States
 from netkf.linalg.arrays import FloatArray
@@ -59,11 +59,17 @@ from netkf.rng.streams import Streams
 from netkf.scenario.sampling import all_sample_times, uses_grid
 from netkf.scenario.scenario import Scenario
 from netkf.trace import recorder as recording
+from netkf.trace import schema
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import EVENT
 
 FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 1024, 4096, 256
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
+AT_START = (
+    *("frame_at", "piece", "grid_at", "wake_at", "instant_at", "tick_at", "probe_at", "row"),
+    *("free", "flying", "order", "receivers", "absorbing", "samples"),
+)
+"""Numbers of a Simulation that are 0 when a run begins."""
 
 
 class Windows(Protocol):
@@ -166,20 +172,20 @@ class Workspace:
             xhat=np.zeros((room, size, n)),
             P=np.zeros((room, size, n, n)),
             rows=np.zeros(room, dtype=np.int64),
+            counts=np.zeros((room, len(schema.KINDS)), dtype=np.int64),
             piece=np.zeros(room, dtype=np.int64),
             terms=np.zeros((room, terms)),
         )
 
-    def begin(self, draws: Draws) -> Simulation:
+    def begin(self, draws: Draws, traced: bool) -> Simulation:
         """The state of a run at time 0."""
         start, instants = self._start, draws.instants
         entities, ways = self._records
         ways["messages"] = 0
         pool = self._pool[0]
         pool["next"] = np.arange(1, len(pool) + 1)
-        room, flow, update = rooms(start.table, start.gains, instants)
+        scratch, flow, update = scratch_arrays(start.table, start.gains, instants)
         return Simulation(
-            run=self._run(instants),
             nodes=start.nodes.copy(),
             xhat=start.xhat.copy(),
             root=start.root.copy(),
@@ -195,28 +201,39 @@ class Workspace:
             waiting=self._waiting,
             instants=instants,
             sensing=draws.sensing,
+            path=draws.path(),
+            ticks=Ticks(**draws.window()._asdict()),
             frames=draws.states.frame_times,
             probes=self._probes,
             shown=self._shown,
             rows=self._rows,
-            room=room,
-            flow_room=flow,
-            update_room=update,
+            counts=np.zeros(len(schema.KINDS), dtype=np.int64),
+            scratch=scratch,
+            flow_scratch=flow,
+            update_scratch=update,
+            traced=traced,
+            **self._numbers(instants),
+            **dict.fromkeys(AT_START, 0),
         )
 
-    def _run(self, instants: Instants) -> np.ndarray:
-        algorithm, run = self._scenario.hosted, np.zeros(1, dtype=RUN)
-        now, most = run[0], int(np.diff(self._senders.first).max(initial=0))
-        now["kind"] = KINDS[type(algorithm).__name__]
-        now["at"] = CLOCKS.index(self._senders.at)
-        now["keep_own"] = getattr(algorithm, "on_loss", "") == "keep-own"
-        now["most_messages"], now["free_count"] = most, len(self._pool[0])
-        now["most_rows"] = 2 + 2 * most + int(np.diff(instants.first).max(initial=0))
-        now["horizon"], now["age_limit"] = self._scenario.horizon, math.inf
+    def _numbers(self, instants: Instants) -> dict[str, Any]:
+        algorithm = self._scenario.hosted
+        most = int(np.diff(self._senders.first).max(initial=0))
+        age_limit = math.inf
         if isinstance(algorithm, Intermittent):
             window = math.inf if algorithm.window is None else algorithm.window
-            now["age_limit"] = 0.0 if algorithm.late == "drop" else window
-        return run
+            age_limit = 0.0 if algorithm.late == "drop" else window
+        return {
+            "kind": KINDS[type(algorithm).__name__],
+            "at": CLOCKS.index(self._senders.at),
+            "keep_own": getattr(algorithm, "on_loss", "") == "keep-own",
+            "most_messages": most,
+            "free_count": len(self._pool[0]),
+            "most_rows": 2 + 2 * most + int(np.diff(instants.first).max(initial=0)),
+            "horizon": self._scenario.horizon,
+            "age_limit": age_limit,
+            "mail_time": 0.0,
+        }
 
 
 class FlowRun:
@@ -232,91 +249,90 @@ class FlowRun:
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         recorder.exact_errors = scenario.exact_errors
-        self._draws, self._state = draws, workspace.begin(draws)
-        self._run: Any = self._state.run[0]
-        self._totals, self._history = (
-            _totals(scenario, self._state),
-            _history(scenario, self._state),
-        )
-        self._window, self._path = draws.window(), draws.path()
+        self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
+        self._totals = _totals(scenario, self._state)
+        self._history = _history(scenario, self._state)
 
     def to_the_end(self) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
         try:
             wanted = WANT_ROWS
             while wanted != DONE:
-                some = self._state, self._window, self._path, self._totals, self._history
-                wanted = int(event_loop(*some))
+                wanted = int(event_loop(self._state, self._totals, self._history))
                 if not self._hand_samples_on():
                     return "diverged"
                 self._give(wanted)
         finally:
             with defer_signals():
                 try:
-                    self._pass_rows_on(int(self._run["row"]))
+                    self._pass_rows_on(self._state.row, self._state.counts)
                 finally:
                     self._recorder.flush()
         return "complete"
 
     def _give(self, wanted: int) -> None:
-        run = self._run
+        state = self._state
         if wanted == WANT_TICKS:
-            self._window, run["tick_at"] = self._draws.window(), 0
+            state.ticks, state.tick_at = Ticks(**self._draws.window()._asdict()), 0
         elif wanted == WANT_STEPS:
-            self._path = self._draws.path()
-            run["piece"] = run["grid_at"] = 0
+            state.path = self._draws.path()
+            state.piece = state.grid_at = 0
         elif wanted == WANT_CUTS:
             self._draws.more_cuts()
         elif wanted == WANT_MESSAGES:
             self._more_messages()
         elif wanted == WANT_ROWS:
-            self._pass_rows_on(int(run["row"]))
+            self._pass_rows_on(state.row, state.counts)
             self._make_rows()
         elif wanted == WANT_PAST and self._history is not None:
-            self._history = with_more_past(self._history, len(self._state.nodes))
+            add_past(self._history, len(state.nodes))
         elif wanted == WANT_REBASE:
             self._rebase()
 
     def _rebase(self) -> None:
-        k = int(self._run["frame_at"])
-        offset = -self._draws.states.offset(k, self._path, int(self._run["piece"]))
-        if self._history is not None and self._history.free[1] < len(self._state.nodes):
-            self._history = with_more_past(self._history, len(self._state.nodes))
-        move_origin(self._scenario, self._state, self._totals, self._history, k, offset)
-        self._run["frame_at"] = k + 1
+        state, k = self._state, self._state.frame_at
+        offset = -self._draws.states.offset(k, state.path, state.piece)
+        if self._history is not None and self._history.free[1] < len(state.nodes):
+            add_past(self._history, len(state.nodes))
+        move_origin(self._scenario, state, self._totals, self._history, k, offset)
+        state.frame_at = k + 1
 
     def _more_messages(self) -> None:
-        self._state = with_more_messages(self._state, int(self._run["most_messages"]))
+        add_messages(self._state, self._state.most_messages)
         if self._totals is not None:
             grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
             grown[: len(self._totals.offered)] = self._totals.offered
-            self._totals = self._totals._replace(offered=grown)
+            self._totals.offered = grown
 
     def _make_rows(self) -> None:
-        least = max(recording.BLOCK, 2 * int(self._run["most_rows"]))
+        least = max(recording.BLOCK, 2 * self._state.most_rows)
         if len(self._state.rows) < least:
-            self._state = self._state._replace(rows=np.empty(least, dtype=EVENT))
+            self._state.rows = np.empty(least, dtype=EVENT)
 
-    def _pass_rows_on(self, used: int) -> None:
-        rows, recorder = self._state.rows, self._recorder
-        self._run["row"] = 0
+    def _pass_rows_on(self, used: int, counts: np.ndarray) -> None:
+        state, recorder = self._state, self._recorder
+        if not state.traced:
+            recorder.add_counts(counts)
+            state.counts[:] = 0
+            return
+        rows = state.rows
+        state.row = 0
         recorder.extend(rows[:used])
-        if not recorder.counts_only:  # they are the recorder's now
-            self._state = self._state._replace(rows=np.empty(len(rows), dtype=EVENT))
+        state.rows = np.empty(len(rows), dtype=EVENT)  # the others are the recorder's now
 
     def _hand_samples_on(self) -> bool:
         """Record the samples that are there; False where one of them is no longer finite."""
-        run, shown = self._run, self._state.shown
-        count, run["shown"] = int(run["shown"]), 0
+        state, shown = self._state, self._state.shown
+        count, state.samples = state.samples, 0
         if not count:
             return True
-        times = self._state.probes[run["probe_at"] - count : run["probe_at"]].copy()
-        local, x = self._draws.states.shown(times, self._path, shown.piece[:count])
+        times = state.probes[state.probe_at - count : state.probe_at].copy()
+        local, x = self._draws.states.shown(times, state.path, shown.piece[:count])
         lost = [count - 1]
 
         def pass_rows_on(k: int) -> None:
             lost[0] = k
-            self._pass_rows_on(int(shown.rows[k]))
+            self._pass_rows_on(int(shown.rows[k]), shown.counts[k])
 
         fine = recorded(
             self._scenario,

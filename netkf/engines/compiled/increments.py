@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-
 from netkf.algorithms.flow import stretch_end
 from netkf.algorithms.kernels.root_flow import gain_root, information_rate, move_root
 from netkf.algorithms.models import usable
@@ -16,29 +12,6 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.small import fill_square
 from netkf.plants.paths import fill_seen
 from netkf.plants.sensors import divide, fill_reading
-
-
-class PathBlock(NamedTuple):
-    """Some steps of the sensing grid, the last of which ends at ``end``.
-
-    K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both (K, n),
-    moments (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid``
-    holds the times at which sensors wake; ``to_end`` and ``to_moments`` are those of the plant's
-    laws. Where nothing senses increments there is one piece without an end.
-    """
-
-    end: float
-    start: FloatArray
-    stop: FloatArray
-    x_start: FloatArray
-    x_stop: FloatArray
-    moments: FloatArray
-    cubic: FloatArray
-    step: np.ndarray
-    last: FloatArray
-    grid: FloatArray
-    to_end: FloatArray
-    to_moments: FloatArray
 
 
 @kernel
@@ -54,7 +27,7 @@ def read_increments(
 ) -> None:
     """Moments (2 p,) of the readings of sensors from ``first`` on, as many as fill ``out``, where x
     has the moments ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1:
-    all of it). ``early`` (2, most p) is room to work in.
+    all of it). ``early`` (2, most p) is a scratch array.
     """
     rows, rest, used, H, root = sensing.rows, sensing.rest, sensing.used, sensing.H, sensing.root
     s, row = first, 0
@@ -73,37 +46,47 @@ def read_increments(
 
 
 @kernel
-def fill_moments_of_piece(
-    state: Simulation, path: PathBlock, piece: int, now: float, end: float
-) -> None:
-    """Write the moments of x over [now, end], inside one piece, into ``room.seen``."""
-    start, stop, room = path.start[piece], path.stop[piece], state.room
+def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float) -> None:
+    """Write the moments of x over [now, end], inside one piece, into ``scratch.state_moments``."""
+    path, scratch = state.path, state.scratch
+    start, stop = path.start[piece], path.stop[piece]
     if now == start and end == stop:
-        fill_square(room.seen, path.moments[piece])
+        fill_square(scratch.state_moments, path.moments[piece])
         return
-    n = room.seen.shape[1]
-    rooms = room.values[: 2 * n * n], room.of_x, room.from_noise
-    laws, x, cubic = (path.to_end, path.to_moments), path.x_start, path.cubic
-    fill_seen(room.seen, *laws, now - start, end - now, stop - start, x, cubic, piece, *rooms)
+    n = scratch.state_moments.shape[1]
+    fill_seen(
+        scratch.state_moments,
+        path.to_end,
+        path.to_moments,
+        now - start,
+        end - now,
+        stop - start,
+        path.x_start,
+        path.cubic,
+        piece,
+        scratch.values[: 2 * n * n],
+        scratch.x,
+        scratch.from_noise,
+    )
 
 
 @kernel
-def fill_moments(state: Simulation, path: PathBlock, now: float, end: float) -> None:
-    """Write the moments of x over [now, end], inside one step, into ``room.seen``; samples of other
-    nodes may cut it.
+def fill_moments(state: Simulation, now: float, end: float) -> None:
+    """Write the moments of x over [now, end], inside one step that samples of other nodes may cut,
+    into ``scratch.state_moments``.
     """
-    k = state.run[0].piece
+    path, k = state.path, state.piece
     while k > 0 and path.stop[k - 1] >= end:
         k -= 1
     if now >= path.start[k]:
-        fill_moments_of_piece(state, path, k, now, end)
+        fill_moments_of_piece(state, k, now, end)
         return
-    seen, total, gap = state.room.seen, state.room.total, end - now
+    seen, total, gap = state.scratch.state_moments, state.scratch.total, end - now
     for i in range(seen.shape[1]):
         total[0, i] = total[1, i] = 0.0
     while True:
         first, last = max(now, path.start[k]), min(end, path.stop[k])
-        fill_moments_of_piece(state, path, k, first, last)
+        fill_moments_of_piece(state, k, first, last)
         # P_1 of the whole interval on this part of it.
         middle, share = ((first - now) - (end - last)) / gap, (last - first) / gap
         for i in range(seen.shape[1]):
@@ -116,16 +99,17 @@ def fill_moments(state: Simulation, path: PathBlock, now: float, end: float) -> 
 
 
 @kernel
-def predict_with_increments(state: Simulation, path: PathBlock, h: int, time: float) -> bool:
+def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
     """Bring node ``h`` to ``time``; False where it needs more normals for cuts first, and then goes
     on where it stopped.
     """
-    node, piece, room, sensing = state.nodes[h], state.run[0].piece, state.room, state.sensing
+    node, path, piece = state.nodes[h], state.path, state.piece
+    scratch, sensing = state.scratch, state.sensing
     k, xhat, root, table = node.model, state.xhat, state.root, state.table
     shape, begin = state.gains.shape, state.gains.first[k]
     terms, width, last = shape[k, 1], shape[k, 2], path.last[piece]
     gains = state.gains.series[begin : begin + terms * width].reshape(terms, width)
-    readings, values = room.moments[: shape[k, 0]], room.values[: width - 1]
+    readings, values = scratch.moments[: shape[k, 0]], scratch.values[: width - 1]
     while node.now < time:
         now, end = node.now, time
         stretch = usable(information_rate(table, k, root, h))
@@ -138,12 +122,19 @@ def predict_with_increments(state: Simulation, path: PathBlock, h: int, time: fl
                 if sensing.used[s] == sensing.normals.shape[1]:
                     return False
         node.least *= LONGER
-        move_root(table, k, root, xhat, h, end - now, state.flow_room)
-        fill_moments(state, path, now, end)
+        move_root(table, k, root, xhat, h, end - now, state.flow_scratch)
+        fill_moments(state, now, end)
         share = (end - now) / (last - now) if end < last else -1.0
         step = path.step[piece]
         read_increments(
-            readings, sensing, node.sensor, room.seen, step, share, last - now, room.early
+            readings,
+            sensing,
+            node.sensor,
+            scratch.state_moments,
+            step,
+            share,
+            last - now,
+            scratch.early,
         )
         gain_root(readings, gains, root, xhat, h, end - now, values)
         node.now = end

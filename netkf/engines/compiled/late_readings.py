@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from netkf.algorithms.intermittent import SAME
@@ -12,18 +10,19 @@ from netkf.algorithms.kernels.root_update import sample_root
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Struct
 
 PAST = np.dtype(
     [("instant", np.int64), ("frame", np.int64), ("before", np.int64), ("time", np.float64)]
 )
 
 
-class History(NamedTuple):
+class History(Struct):
     """What nodes keep so that late readings can be used: a pool ``past`` (P,) of things that
     happened, each with the instant of the reading that was used or the number of the frame that
     began (else -1), and the state right after it, ``x`` (P, n), ``root`` (P, n, n). ``newest`` (N,)
     of each node; ``free`` (2,) the first free one and how many are; ``offsets`` (F, n) of frames;
-    ``lag`` (1,) seconds for which they are kept.
+    they are kept for ``lag`` seconds.
     """
 
     past: np.ndarray
@@ -32,7 +31,7 @@ class History(NamedTuple):
     newest: np.ndarray
     free: np.ndarray
     offsets: FloatArray
-    lag: FloatArray
+    lag: float
 
 
 def empty_history(state: Simulation, lag: float, capacity: int) -> History:
@@ -47,22 +46,22 @@ def empty_history(state: Simulation, lag: float, capacity: int) -> History:
     x[:count], root[:count] = state.xhat, state.root
     free = np.array([count, capacity - count], dtype=np.int64)
     offsets = np.zeros((len(state.frames), n))
-    return History(past, x, root, np.arange(count), free, offsets, np.array([lag]))
+    return History(
+        past=past, x=x, root=root, newest=np.arange(count), free=free, offsets=offsets, lag=lag
+    )
 
 
-def with_more_past(history: History, least: int) -> History:
-    """Room for as much again, or ``least`` more."""
+def add_past(history: History, least: int) -> None:
+    """Double the capacity of a history, or add ``least``."""
     old = len(history.past)
     more = max(old, least)
     past = np.zeros(more, dtype=PAST)
     past["before"] = np.arange(old + 1, old + more + 1)
     past["before"][-1], history.free[0] = history.free[0], old
     history.free[1] += more
-    return history._replace(
-        past=np.concatenate([history.past, past]),
-        x=np.concatenate([history.x, np.zeros((more, *history.x.shape[1:]))]),
-        root=np.concatenate([history.root, np.zeros((more, *history.root.shape[1:]))]),
-    )
+    history.past = np.concatenate([history.past, past])
+    history.x = np.concatenate([history.x, np.zeros((more, *history.x.shape[1:]))])
+    history.root = np.concatenate([history.root, np.zeros((more, *history.root.shape[1:]))])
 
 
 @kernel
@@ -72,21 +71,21 @@ def use_instant(
     """Update place ``k`` with all samples of an instant together, in the order of sensors; R counts
     ``scale``^2 times.
     """
-    given, room, n, row = state.instants, state.room, x.shape[1], 0
+    given, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
     for s in range(given.first[instant], given.first[instant + 1]):
         sensor, matrix = given.sensor[s], given.matrix[s]
         p = given.rows[sensor]
         for i in range(p):
-            room.y[row + i] = given.y[s, i]
+            scratch.y[row + i] = given.y[s, i]
             for j in range(n):
-                room.H[row + i, j] = given.H[matrix, i, j]
+                scratch.H[row + i, j] = given.H[matrix, i, j]
             for j in range(row):
-                room.root_R[row + i, j] = 0.0
+                scratch.root_R[row + i, j] = 0.0
             for j in range(i + 1):
-                room.root_R[row + i, row + j] = scale * given.root[sensor, i, j]
+                scratch.root_R[row + i, row + j] = scale * given.root[sensor, i, j]
         row += p
     if row > 0:
-        sample_root(root, x, k, room.y[:row], room.H, room.root_R, state.update_room)
+        sample_root(root, x, k, scratch.y[:row], scratch.H, scratch.root_R, state.update_scratch)
 
 
 @kernel
@@ -146,7 +145,7 @@ def forget(history: History, h: int, since: float) -> None:
 def use_reading(state: Simulation, history: History, h: int, instant: int) -> None:
     """Use a reading of now."""
     use_instant(state, instant, state.root, state.xhat, h, 1.0)
-    lag, time = history.lag[0], state.instants.t[instant]
+    lag, time = history.lag, state.instants.t[instant]
     if lag <= 0.0:
         return
     if time // lag > history.past[history.newest[h]].time // lag:  # now and then
@@ -170,7 +169,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
         copy_state(x, root, k, x, root, before)
         if past[k].time > past[before].time:
             gap = past[k].time - past[before].time
-            move_root(state.table, model, root, x, k, gap, state.flow_room)
+            move_root(state.table, model, root, x, k, gap, state.flow_scratch)
         if past[k].instant >= 0:
             use_instant(state, past[k].instant, root, x, k, 1.0)
         if past[k].frame >= 0:
@@ -184,5 +183,5 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
     copy_state(state.xhat, state.root, h, x, root, k)
     if now > past[k].time:
         gap = now - past[k].time
-        move_root(state.table, model, state.root, state.xhat, h, gap, state.flow_room)
-    forget(history, h, now - history.lag[0])
+        move_root(state.table, model, state.root, state.xhat, h, gap, state.flow_scratch)
+    forget(history, h, now - history.lag)

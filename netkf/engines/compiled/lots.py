@@ -15,11 +15,10 @@ from functools import cached_property
 
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
 from netkf.engines.compiled.flow import Draws, Source, Workspace
-from netkf.engines.compiled.increments import PathBlock
 from netkf.engines.compiled.poisson import schedules
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.state import Instants
+from netkf.engines.compiled.state import Instants, PathBlock
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.engines.compiled.state import READINGS, Simulation
 from netkf.linalg.compiling import kernel
 
 
@@ -45,35 +46,28 @@ def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
 
 
 @kernel
-def take(run: np.ndarray, pool: np.ndarray) -> int:
-    """A free message."""
-    message = run[0].free
-    run[0].free = pool[message].next
-    run[0].free_count -= 1
-    return int(message)
+def take(state: Simulation) -> int:
+    """Take a free message from the pool."""
+    message = state.free
+    state.free = state.pool[message].next
+    state.free_count -= 1
+    return message
 
 
 @kernel
-def release(run: np.ndarray, pool: np.ndarray, message: int) -> None:
-    """It is free again."""
-    pool[message].next = run[0].free
-    run[0].free = message
-    run[0].free_count += 1
+def release(state: Simulation, message: int) -> None:
+    """Give a message back to the pool."""
+    state.pool[message].next = state.free
+    state.free = message
+    state.free_count += 1
 
 
 @kernel
-def put(
-    run: np.ndarray,
-    nodes: np.ndarray,
-    ways: np.ndarray,
-    pool: np.ndarray,
-    h: int,
-    message: int,
-    newest_only: bool,
-) -> None:
+def put(state: Simulation, h: int, message: int) -> None:
     """Put a message into the inbox of node ``h``, in the order of senders; of several of one sender
-    the newest counts, or all in the order of arrival.
+    the newest counts, or all readings in the order of arrival.
     """
+    nodes, ways, pool, newest_only = state.nodes, state.ways, state.pool, state.kind != READINGS
     node, peer = nodes[h], ways[pool[message].way].sender
     before, here = -1, node.inbox
     if here != -1 and ways[pool[node.last].way].sender < peer:  # mostly they come in order
@@ -85,10 +79,10 @@ def put(
         before, here = here, pool[here].next
     if here != -1 and ways[pool[here].way].sender == peer:
         if pool[message].sent < pool[here].sent:
-            release(run, pool, message)
+            release(state, message)
             return
         gone, here = here, pool[here].next
-        release(run, pool, gone)
+        release(state, gone)
     pool[message].next = here
     if before == -1:
         node.inbox = message

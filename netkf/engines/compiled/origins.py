@@ -24,13 +24,13 @@ def move_origin(
     state.xhat[:] += offset
     if totals is not None:
         _move_totals(scenario, state, totals, now, offset)
-    if history is not None and history.lag[0] > 0.0:
+    if history is not None and history.lag > 0.0:
         history.offsets[k] = offset
         for h in range(len(state.nodes)):
             remember(state, history, h, now, -1, k)
-    if totals is not None or state.run[0]["kind"] == READINGS:
+    if totals is not None or state.kind == READINGS:
         return
-    for m in state.heap[: state.run[0]["flying"]]:
+    for m in state.heap[: state.flying]:
         state.pool_x[m] += scenario.moved_back(offset, now - state.pool["sent"][m])
 
 
@@ -41,7 +41,7 @@ def _move_totals(
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
             _shift(values[k], scenario.moved_back(offset, now - time))
-    for m in state.heap[: state.run[0]["flying"]]:
+    for m in state.heap[: state.flying]:
         _shift(totals.offered[m], scenario.moved_back(offset, now - state.pool["sent"][m]))
 
 

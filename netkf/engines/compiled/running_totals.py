@@ -6,7 +6,6 @@ Totals move with the plant. Here each keeps the time it refers to, and is moved 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,34 +13,35 @@ from netkf.algorithms.kernels.root_flow import transform
 from netkf.algorithms.running_sums import MIN_ACCURACY
 from netkf.engines.compiled.late_readings import use_instant
 from netkf.engines.compiled.state import Simulation
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Struct
 
 TERMS = 18  # of the exponential, for a norm of at most 1/2
 SWEEPS, SMALL = 30, 1e-32  # of Jacobi's method; squares of what is left, relative
 
 
-class Totals(NamedTuple):
+class Totals(Struct):
     """Of N nodes: ``weight`` (N,), the total ``sent`` (N, m), m = 1 + n n + n, to each receiver,
     the time ``sent_at`` (N,) that it refers to, ``rounds`` and ``receivers`` (N,). Of W directed
     links: the total ``heard`` last (W, m), its ``number`` (W,) (-1: none) and ``heard_at`` (W,).
-    Of messages: the totals ``offered`` (C, m). ``A`` (n, n) and ``forgetting`` (1,) of the plant;
-    room for what is ``gained`` (m,), and for matrices (4, n, n).
+    Of messages: the totals ``offered`` (C, m). ``A`` (n, n) and ``forgetting`` of the plant;
+    scratch arrays for what is ``gained`` (m,), and for matrices (4, n, n).
     """
 
     weight: FloatArray
     sent: FloatArray
     sent_at: FloatArray
-    rounds: np.ndarray
-    receivers: np.ndarray
+    rounds: IntArray
+    receivers: IntArray
     heard: FloatArray
-    number: np.ndarray
+    number: IntArray
     heard_at: FloatArray
     offered: FloatArray
     A: FloatArray
-    forgetting: FloatArray
+    forgetting: float
     gained: FloatArray
-    room: FloatArray
+    scratch: FloatArray
 
 
 def empty_totals(
@@ -61,9 +61,9 @@ def empty_totals(
         heard_at=np.zeros(ways),
         offered=np.zeros((len(state.pool), m)),
         A=np.array(A, dtype=np.float64),
-        forgetting=np.array([forgetting]),
+        forgetting=forgetting,
         gained=np.zeros(m),
-        room=np.zeros((4, n, n)),
+        scratch=np.zeros((4, n, n)),
     )
 
 
@@ -81,8 +81,8 @@ def multiply(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 @kernel
 def fill_inverse(totals: Totals, gap: float) -> None:
-    """Write ``e^{-A gap}`` into ``room[0]``: the power series of a part of the gap, squared."""
-    A, out, term, moved = totals.A, totals.room[0], totals.room[1], totals.room[2]
+    """Write ``e^{-A gap}`` into ``scratch[0]``: the power series of a part of the gap, squared."""
+    A, out, term, moved = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
     n, norm = len(A), 0.0
     for i in range(n):
         row = 0.0
@@ -112,8 +112,8 @@ def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
     if not gap > 0.0:
         return
     fill_inverse(totals, gap)
-    inverse, half, moved = totals.room[0], totals.room[1], totals.room[2]
-    n, fading = len(inverse), math.exp(-2.0 * totals.forgetting[0] * gap)
+    inverse, half, moved = totals.scratch[0], totals.scratch[1], totals.scratch[2]
+    n, fading = len(inverse), math.exp(-2.0 * totals.forgetting * gap)
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -143,7 +143,7 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
     move_total(totals, totals.sent, h, now - totals.sent_at[h])
     totals.sent_at[h] = now
     totals.rounds[h] += 1
-    inverse, U, sent = totals.room[0], totals.room[1], totals.sent
+    inverse, U, sent = totals.scratch[0], totals.scratch[1], totals.sent
     # The node gives up exactly what its total grows by, for each receiver, or nothing.
     before, share = sent[h, 0], weight / (receivers + 1)
     grown = (before + share) - before
@@ -218,7 +218,7 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
     what was gained ``share`` times, and it cannot be less than nothing.
     """
     root, gained, n = state.root, totals.gained, state.xhat.shape[1]
-    inner, half, vectors = totals.room[0], totals.room[1], totals.room[2]
+    inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
     for i in range(n):
         for j in range(i + 1):
             root[h, i, j] *= size
@@ -236,13 +236,13 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
             inner[i, j] = 0.5 * share * total + (1.0 if i == j else 0.0)
     diagonalise(inner, vectors)
     shrink_root(state, h, inner, vectors)
-    move_by_gain(state, h, gained, share, totals.room[3, 0])
+    move_by_gain(state, h, gained, share, totals.scratch[3, 0])
 
 
 @kernel
 def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
     """The triangular root of ``S V D^-1 V' S'``: D is the diagonal of ``values``, at least 1."""
-    root, F, n = state.root, state.flow_room.values, state.xhat.shape[1]
+    root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -252,14 +252,14 @@ def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArr
     for i in range(n):
         for j in range(i + 1):
             root[h, i, j] = 1.0 if i == j else 0.0
-    transform(root, h, F, 0, state.flow_room.wide, state.flow_room.T, False)
+    transform(root, h, F, 0, state.flow_scratch.wide, state.flow_scratch.T, False)
 
 
 @kernel
 def move_by_gain(
     state: Simulation, h: int, gained: FloatArray, share: float, news: FloatArray
 ) -> None:
-    """``xhat += P share (u - U xhat)``; ``news`` (n,) is room to work in."""
+    """``xhat += P share (u - U xhat)``; ``news`` (n,) is a scratch array."""
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
     for i in range(n):
         total = gained[1 + n * n + i]

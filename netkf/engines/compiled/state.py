@@ -11,11 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.gains import GainTable
-from netkf.algorithms.kernels.root_flow import FlowRoom, FlowTable, flow_room, stack_tables
-from netkf.algorithms.kernels.root_update import UpdateRoom, update_room
+from netkf.algorithms.kernels.root_flow import (
+    FlowScratch,
+    FlowTable,
+    flow_scratch,
+    stack_tables,
+)
+from netkf.algorithms.kernels.root_update import UpdateScratch, update_scratch
 from netkf.algorithms.models import FlowModel, first_root
 from netkf.engines.compiled.senders import Senders
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.structs import Struct
 from netkf.scenario.scenario import Scenario
 
 
@@ -23,20 +29,6 @@ def _record(integers: str, floats: str = "") -> np.dtype:
     fields = [(name, np.int64) for name in integers.split()]
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
 
-
-RUN = _record(
-    "kind at keep_own frame_at piece grid_at wake_at instant_at tick_at probe_at "
-    "row most_rows most_messages free free_count flying order waiting absorbing shown",
-    "horizon age_limit mail_time",
-)
-"""Where a run stands. ``kind`` and ``at``: see KINDS and CLOCKS; ``..._at``: the next one of
-frames, points of the sensing grid, nodes that wake there, instants of samples, ticks and probes;
-the ``piece`` of the path; the next ``row``, and how many one event may need (``most_rows``); the
-first ``free`` message and how many are (``free_count``, ``most_messages``); messages on the heap
-(``flying``) and how many were put there (``order``); nodes with mail (``waiting``), of which so
-many are done (``absorbing``) at ``mail_time``; samples not handed on yet (``shown``); messages
-older than ``age_limit`` seconds are late.
-"""
 
 NODE = _record("model id sensor sensors inbox last sent reading", "now least own")
 """One filter: its model, the id in the trace (-1: pooled), its increment sensors from ``sensor`` up
@@ -75,55 +67,55 @@ LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")
 
 
-class Gains(NamedTuple):
+class Gains(Struct):
     """The gain tables of M models, flat: of model m from ``first[m]`` on; ``shape`` (M, 3) = rows
     2 p of moments, terms and width.
     """
 
     series: FloatArray
-    first: np.ndarray
-    shape: np.ndarray
+    first: IntArray
+    shape: IntArray
 
 
-class Room(NamedTuple):
-    """Room to work in: moments (2 p,) and noise ``early`` (2, p) for the most increments p of any
-    node, moments ``seen`` and their ``total`` (2, n) of x, ``values`` of the longest series,
-    ``of_x`` (n,), ``from_noise`` (2, 4); a sample of most rows q: ``y`` (q,), ``H`` (q, n),
+class Scratch(Struct):
+    """Scratch arrays: moments (2 p,) and noise ``early`` (2, p) for the most increments p of any
+    node, moments of x (``state_moments``) and their ``total`` (2, n), ``values`` of the longest
+    series, ``x`` (n,), ``from_noise`` (2, 4); a sample of at most q rows: ``y`` (q,), ``H`` (q, n),
     ``root_R`` (q, q).
     """
 
     moments: FloatArray
     early: FloatArray
-    seen: FloatArray
+    state_moments: FloatArray
     total: FloatArray
     values: FloatArray
-    of_x: FloatArray
+    x: FloatArray
     from_noise: FloatArray
     y: FloatArray
     H: FloatArray
     root_R: FloatArray
 
 
-class Sensing(NamedTuple):
+class Sensing(Struct):
     """S increment sensors: rows p (S,), H (S, p, n), root of R (S, p, p), the rest of the present
     step's noise (S, 2, p) and which step that is (S,); noise of the steps (S, steps, 2, p) and
     normals for cuts (S, count, 2, p), of which ``used`` (S,) are gone. ``host`` and ``node`` (K,)
     say who wakes at a grid point, in their order.
     """
 
-    rows: np.ndarray
+    rows: IntArray
     H: FloatArray
     root: FloatArray
     rest: FloatArray
-    step: np.ndarray
+    step: IntArray
     noise: FloatArray
     normals: FloatArray
-    used: np.ndarray
-    host: np.ndarray
-    node: np.ndarray
+    used: IntArray
+    host: IntArray
+    node: IntArray
 
 
-class Instants(NamedTuple):
+class Instants(Struct):
     """K instants at which a node has samples, in order: ``t`` (K,), ``host`` (K,), its samples from
     ``first[k]`` up to ``first[k + 1]``. Of each of S samples: the ``node`` that took it, ``y``
     (S, p), the places ``sensor`` and ``matrix`` (S,) of its noise and its H. Those are ``rows``
@@ -131,59 +123,131 @@ class Instants(NamedTuple):
     """
 
     t: FloatArray
-    host: np.ndarray
-    first: np.ndarray
-    node: np.ndarray
+    host: IntArray
+    first: IntArray
+    node: IntArray
     y: FloatArray
-    sensor: np.ndarray
-    matrix: np.ndarray
-    rows: np.ndarray
+    sensor: IntArray
+    matrix: IntArray
+    rows: IntArray
     root: FloatArray
     H: FloatArray
 
 
-class Shown(NamedTuple):
-    """Room for B samples of all N nodes: xhat (B, N, n), P (B, N, n, n), how many ``rows`` (B,)
-    came before, in which ``piece`` (B,) of the path each is, and ``terms`` (B, T) of sums that are
-    conserved. They are handed on many at a time, since a call of the loop costs more than a sample.
+class PathBlock(Struct):
+    """Some steps of the sensing grid, the last of which ends at ``end``.
+
+    K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both (K, n),
+    moments (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid``
+    holds the times at which sensors wake; ``to_end`` and ``to_moments`` are those of the plant's
+    laws. Where nothing senses increments there is one piece without an end.
+    """
+
+    end: float
+    start: FloatArray
+    stop: FloatArray
+    x_start: FloatArray
+    x_stop: FloatArray
+    moments: FloatArray
+    cubic: FloatArray
+    step: IntArray
+    last: FloatArray
+    grid: FloatArray
+    to_end: FloatArray
+    to_moments: FloatArray
+
+
+class Ticks(Struct):
+    """A ``schedule.Window`` of ticks."""
+
+    end: float
+    t: FloatArray
+    entity: IntArray
+    at: IntArray
+    delay: FloatArray
+
+
+class Shown(Struct):
+    """Space for B samples of all N nodes: xhat (B, N, n), P (B, N, n, n), how many ``rows`` (B,) or
+    events by kind (B, len(KINDS)) came before, in which ``piece`` (B,) of the path each is, and
+    ``terms`` (B, T) of sums that are conserved. They are handed on many at a time, since a call of
+    the loop costs more than a sample.
     """
 
     xhat: FloatArray
     P: FloatArray
-    rows: np.ndarray
-    piece: np.ndarray
+    rows: IntArray
+    counts: IntArray
+    piece: IntArray
     terms: FloatArray
 
 
-class Simulation(NamedTuple):
-    """A run, but for what comes in windows. Filters: ``nodes`` (N,), xhat (N, n), root (N, n, n),
-    the ``table`` of their models and, last, of prediction alone. Messages: ``pool`` (C,), what
-    they carry (C, n), (C, n, n), the ``heap`` of arrivals (C,), ``waiting`` (N,) nodes with mail.
+class Simulation(Struct):
+    """A run, and where it stands.
+
+    Filters: ``nodes`` (N,), xhat (N, n), root (N, n, n), the ``table`` of their models and, last,
+    of prediction alone. Messages: ``pool`` (C,), what they carry (C, n), (C, n, n), the ``heap`` of
+    arrivals (C,), ``waiting`` (N,) nodes with mail. Times of ``frames`` (F,) and ``probes`` (T,).
+    The trace: ``rows``, or only ``counts`` (len(KINDS),) of events where it is not ``traced``.
+
+    ``kind`` and ``at``: see KINDS and CLOCKS; ``..._at``: the next frame, point of the sensing
+    grid, node that wakes there, instant of samples, tick and probe; the ``piece`` of the path; the
+    next ``row``, and how many one event may need (``most_rows``); the first ``free`` message and
+    how many are (``free_count``, ``most_messages``); messages on the heap (``flying``) and how many
+    were put there (``order``); nodes with mail (``receivers``), of which so many are done
+    (``absorbing``) at ``mail_time``; samples not handed on yet (``samples``); messages older than
+    ``age_limit`` seconds are late.
     """
 
-    run: np.ndarray
     nodes: np.ndarray
     xhat: FloatArray
     root: FloatArray
     table: FlowTable
     gains: Gains
     entities: np.ndarray
-    hearing: np.ndarray
+    hearing: IntArray
     ways: np.ndarray
     pool: np.ndarray
     pool_x: FloatArray
     pool_root: FloatArray
-    heap: np.ndarray
-    waiting: np.ndarray
+    heap: IntArray
+    waiting: IntArray
     instants: Instants
     sensing: Sensing
+    path: PathBlock
+    ticks: Ticks
     frames: FloatArray
     probes: FloatArray
     shown: Shown
     rows: np.ndarray
-    room: Room
-    flow_room: FlowRoom
-    update_room: UpdateRoom
+    counts: IntArray
+    scratch: Scratch
+    flow_scratch: FlowScratch
+    update_scratch: UpdateScratch
+    kind: int
+    at: int
+    keep_own: int
+    traced: int
+    frame_at: int
+    piece: int
+    grid_at: int
+    wake_at: int
+    instant_at: int
+    tick_at: int
+    probe_at: int
+    row: int
+    most_rows: int
+    most_messages: int
+    free: int
+    free_count: int
+    flying: int
+    order: int
+    receivers: int
+    absorbing: int
+    samples: int
+    horizon: float
+    age_limit: float
+    mail_time: float
 
 
 class Filters(NamedTuple):
@@ -247,25 +311,27 @@ def entity_records(scenario: Scenario, senders: Senders) -> tuple[np.ndarray, np
     return entities, ways
 
 
-def rooms(table: FlowTable, gains: Gains, instants: Instants) -> tuple[Room, FlowRoom, UpdateRoom]:
-    """Room for all that is computed."""
+def scratch_arrays(
+    table: FlowTable, gains: Gains, instants: Instants
+) -> tuple[Scratch, FlowScratch, UpdateScratch]:
+    """Scratch arrays for all that is computed."""
     n, (most, _, width) = table.levels.shape[3], gains.shape.max(axis=0)
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
     totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
     q = max(1, int(np.diff(totals).max(initial=0)))
-    room = Room(
+    scratch = Scratch(
         moments=np.zeros(most),
         early=np.zeros((2, most // 2)),
-        seen=np.zeros((2, n)),
+        state_moments=np.zeros((2, n)),
         total=np.zeros((2, n)),
         values=np.zeros(max(width, 2 * n * n)),
-        of_x=np.zeros(n),
+        x=np.zeros(n),
         from_noise=np.zeros((2, 4)),
         y=np.zeros(q),
         H=np.zeros((q, n)),
         root_R=np.zeros((q, q)),
     )
-    return room, flow_room(table), update_room(n, q)
+    return scratch, flow_scratch(table), update_scratch(n, q)
 
 
 def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
@@ -275,16 +341,13 @@ def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArra
     return pool, np.zeros((capacity, n)), np.zeros((capacity, n, n)), np.zeros(capacity, np.int64)
 
 
-def with_more_messages(state: Simulation, least: int) -> Simulation:
-    """The pool at least doubled, by ``least`` messages or more."""
+def add_messages(state: Simulation, least: int) -> None:
+    """At least double the pool of messages, by ``least`` or more."""
     old, n = len(state.pool), state.xhat.shape[1]
     more = max(old, least)
     fresh = empty_pool(more, n)
     fresh[0]["next"] = np.arange(old + 1, old + more + 1)
-    run = state.run[0]
-    fresh[0]["next"][-1], run["free"] = run["free"], old
-    run["free_count"] += more
-    before = (state.pool, state.pool_x, state.pool_root, state.heap)
-    grown = [np.concatenate(pair) for pair in zip(before, fresh, strict=True)]
-    pool, pool_x, pool_root, heap = grown
-    return state._replace(pool=pool, pool_x=pool_x, pool_root=pool_root, heap=heap)
+    fresh[0]["next"][-1], state.free = state.free, old
+    state.free_count += more
+    for name, part in zip(("pool", "pool_x", "pool_root", "heap"), fresh, strict=True):
+        setattr(state, name, np.concatenate([getattr(state, name), part]))

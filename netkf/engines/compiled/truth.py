@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.engines.compiled.increments import PathBlock
+from netkf.engines.compiled.state import PathBlock
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams

@@ -1,0 +1,175 @@
+"""How numba sees a :class:`netkf.linalg.structs.Struct`: an address, and loads and stores from it.
+
+Imported before the first kernel is compiled; only public names of ``numba.extending`` and the
+layout of numba's own array structure (tests/linalg/test_structs.py).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.imputils import lower_constant
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import (
+    NativeValue,
+    infer_getattr,
+    intrinsic,
+    lower_getattr_generic,
+    lower_setattr_generic,
+    models,
+    overload,
+    register_model,
+    typeof_impl,
+    unbox,
+)
+from numba.np.numpy_support import from_dtype
+
+from netkf.linalg.structs import WORD, Struct, StructClass, struct_at
+
+I64 = ir.IntType(64)
+
+
+class StructType(types.Type):
+    """A derived class of Struct: the offset in bytes and the numba type of each field."""
+
+    def __init__(self, name: str, fields: tuple[tuple[str, int, Any], ...]) -> None:
+        self.fields = fields
+        super().__init__(name)
+
+    @property
+    def key(self) -> Any:
+        """What makes two types equal."""
+        return self.name, self.fields
+
+    def field(self, name: str) -> tuple[int, Any]:
+        """Offset and type of a field."""
+        return next((offset, kind) for known, offset, kind in self.fields if known == name)
+
+
+register_model(StructType)(models.OpaqueModel)
+_known: dict[type[Struct], StructType] = {}
+
+
+@typeof_impl.register(Struct)
+def type_of(value: Struct, _: Any) -> StructType:
+    """The type of a struct."""
+    return struct_type(type(value))
+
+
+def struct_type(cls: type[Struct]) -> StructType:
+    """The type of a derived class that has instances."""
+    if cls not in _known:
+        fields = tuple(
+            (name, WORD * cls.struct_offsets[name], _field_type(cls.struct_kinds[name]))
+            for name in cls.struct_fields
+        )
+        _known[cls] = StructType(cls.__name__, fields)
+    return _known[cls]
+
+
+def _field_type(kind: Any) -> Any:
+    if isinstance(kind, tuple):
+        return types.Array(from_dtype(kind[0]), kind[1], "C")
+    if issubclass(kind, Struct):
+        return struct_type(kind)
+    return from_dtype(np.dtype(kind))
+
+
+@unbox(StructType)
+def unbox_struct(_: StructType, value: Any, c: Any) -> Any:
+    """The address of a struct."""
+    number = c.pyapi.object_getattr_string(value, "address")
+    address = c.pyapi.long_as_voidptr(number)
+    c.pyapi.decref(number)
+    return NativeValue(address, is_error=c.pyapi.c_api_error())
+
+
+@infer_getattr
+class Fields(AttributeTemplate):
+    """The types of fields."""
+
+    key = StructType
+
+    def generic_resolve(self, struct: StructType, name: str) -> Any:
+        """The type of a field, or None."""
+        return next((kind for known, _, kind in struct.fields if known == name), None)
+
+
+def _place(builder: Any, address: Any, offset: int, kind: Any) -> Any:
+    place = builder.gep(address, [ir.Constant(I64, offset)])
+    return builder.bitcast(place, ir.PointerType(kind))
+
+
+@lower_getattr_generic(StructType)
+def load_field(context: Any, builder: Any, struct: StructType, address: Any, name: str) -> Any:
+    """A number, an address, or an array without an owner."""
+    offset, kind = struct.field(name)
+    if not isinstance(kind, types.Array):
+        return builder.load(_place(builder, address, offset, context.get_value_type(kind)))
+    itemsize = context.get_abi_sizeof(context.get_data_type(kind.dtype))
+    array = context.make_array(kind)(context, builder)
+    data = builder.load(_place(builder, address, offset, array.data.type))
+    first = _place(builder, address, offset + WORD, I64)
+    shape = [builder.load(builder.gep(first, [ir.Constant(I64, k)])) for k in range(kind.ndim)]
+    strides = [ir.Constant(I64, itemsize)]
+    for size in reversed(shape[1:]):
+        strides.insert(0, builder.mul(strides[0], size))
+    items = shape[0]
+    for size in shape[1:]:
+        items = builder.mul(items, size)
+    array.data, array.nitems, array.itemsize = data, items, ir.Constant(I64, itemsize)
+    array.shape = cgutils.pack_array(builder, shape, I64)
+    array.strides = cgutils.pack_array(builder, strides, I64)
+    array.meminfo = ir.Constant(array.meminfo.type, None)
+    array.parent = ir.Constant(array.parent.type, None)
+    return array._getvalue()
+
+
+@lower_setattr_generic(StructType)
+def store_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
+    """A number; arrays are put into place by Python."""
+    struct, (address, value) = sig.args[0], args
+    offset, kind = struct.field(name)
+    number = context.cast(builder, value, sig.args[1], kind)
+    builder.store(number, _place(builder, address, offset, number.type))
+
+
+class ClassType(types.Type):
+    """A derived class itself, which kernels name."""
+
+    def __init__(self, struct: StructType) -> None:
+        self.struct = struct
+        super().__init__(f"class({struct.name})")
+
+
+register_model(ClassType)(models.OpaqueModel)
+
+
+@typeof_impl.register(StructClass)
+def type_of_class(value: type[Struct], _: Any) -> ClassType:
+    """The type of a class that has instances."""
+    return ClassType(struct_type(value))
+
+
+@lower_constant(ClassType)
+def nothing(context: Any, *_: Any) -> Any:
+    """A class has no value in compiled code."""
+    return context.get_dummy_value()
+
+
+@intrinsic
+def _at(_: Any, memory: Any, cls: ClassType) -> Any:
+    def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        array = context.make_array(sig.args[0])(context, builder, args[0])
+        return builder.bitcast(array.data, cgutils.voidptr_t)
+
+    return cls.struct(memory, cls), take_address
+
+
+@overload(struct_at, inline="always")
+def _struct_at(memory, cls):  # noqa: ANN001, ANN202, ARG001
+    return lambda memory, cls: _at(memory, cls)  # noqa: PLW0108 - of the same parameter names
