@@ -1,4 +1,4 @@
-"""What the papers promise, computed: functions on scenarios and on plain matrices."""
+"""Results of the papers, computed for scenarios and for plain matrices."""
 
 from netkf.theory.assumptions import assumptions
 from netkf.theory.common.errors import error_covariance
@@ -61,6 +61,7 @@ __all__ = [
     "true_limit_covariance",
 ]
 
+# Every function whose first parameter is a scenario refuses anything else with one error message.
 globals().update(require_scenario({name: globals()[name] for name in __all__}))
 
 

@@ -1,4 +1,4 @@
-"""The assumptions of the theorems about a scenario, checked one by one with evidence."""
+"""The table of assumptions: those of the theorems, checked on a scenario with evidence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_
 from netkf.theory.common.papers import paper_function
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.hybrid.coupled import balanced
-from netkf.theory.hybrid.samples import at_random, by_readings, clock_of
+from netkf.theory.hybrid.samples import (
+    randomly_sampled_sensors,
+    sampling_clock,
+    transmits_at_samples,
+)
 from netkf.theory.numerics.matrices import unobservable_mode
 
 if TYPE_CHECKING:
@@ -25,8 +29,10 @@ COLUMNS = ["assumption", "source", "holds", "evidence"]
 
 
 def assumptions(scenario: Scenario) -> pd.DataFrame:
-    """A table with a row for each assumption: assumption, source, holds, evidence; ``holds`` is
-    None where it is not known.
+    """Return a table with a row for each assumption: assumption, source, holds, evidence.
+
+    ``holds`` is None where it is not known. The paper of the scenario's filter decides which
+    assumptions there are (``netkf.theory.<paper>.assumptions``).
     """
     import pandas as pd
 
@@ -43,22 +49,24 @@ def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    rows = _plant(scenario)
+    """Return the rows of H for a scenario in continuous time."""
+    rows = _plant_rows(scenario)
     if scenario.filter.algorithm.talks:
-        rows = [*_graph(scenario), *rows, *_clocks(scenario), *_channel(scenario)]
+        network = [*_link_clock_rows(scenario), *_channel_rows(scenario)]
+        rows = [*_graph_rows(scenario), *rows, *network]
     return [*rows, *start_rows(scenario, "H (9), (10)")]
 
 
-def _graph(scenario: Scenario) -> list[AssumptionRow]:
+def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
     topology = scenario.topology
-    parts = len(topology.components)
+    components = len(topology.components)
     rows: list[AssumptionRow] = [
         (
             "the graph is undirected and connected",
             "H II-B a",
-            parts == 1 and not topology.directed,
-            f"{len(topology.nodes)} nodes, {len(topology.links)} links, {parts} part"
-            + ("" if parts == 1 else "s")
+            components == 1 and not topology.directed,
+            f"{len(topology.nodes)} nodes, {len(topology.links)} links, {components} part"
+            + ("" if components == 1 else "s")
             + (", directed" if topology.directed else ""),
         )
     ]
@@ -66,58 +74,64 @@ def _graph(scenario: Scenario) -> list[AssumptionRow]:
     return [*rows, *weights(scenario)] if weights is not None else rows
 
 
-def _plant(scenario: Scenario) -> list[AssumptionRow]:
+def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
     plant = scenario.truth
-    lost = unobservable_mode(plant.A.T, plant.Q)
-    information = np.zeros((plant.n, plant.n))
-    fixed = not any(sensor.varying for sensor in scenario.sensors)
-    for node in scenario.sensing if fixed else ():
-        information += _own_information(scenario, node)
-    hidden = unobservable_mode(plant.A, information)
-    alone = [
-        node
-        for node in scenario.nodes
-        if fixed and unobservable_mode(plant.A, _own_information(scenario, node)) is None
-    ]
-    seen = (
-        f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
-        if hidden is None
-        else f"the mode with eigenvalue {hidden:.6g} is not seen"
-    )
+    # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
+    idle = unobservable_mode(plant.A.T, plant.Q)
     driven = (
         "every mode is driven by the noise"
-        if lost is None
-        else f"the mode with eigenvalue {lost:.6g} is not driven"
+        if idle is None
+        else f"the mode with eigenvalue {idle:.6g} is not driven"
     )
-    observable = judge_plant(scenario, hidden is None, seen)
     return [
-        ("(A, B) is controllable", "H II-A", *judge_plant(scenario, lost is None, driven)),
+        ("(A, B) is controllable", "H II-A", *judge_plant(scenario, idle is None, driven)),
         (
             "(A, H) is observable, all sensors together",
             "H II-A",
-            *(observable if fixed else (None, "H differs from reading to reading")),
+            *_judge_observability(scenario),
         ),
         true_model_row(scenario, "H (4)", "same A, B and R"),
-        *_sampling(scenario),
+        *_sampling_rows(scenario),
     ]
 
 
-def _sampling(scenario: Scenario) -> list[AssumptionRow]:
-    """Of sensors that sample: whether their times are Poisson processes, or known beforehand."""
+def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
+    """Return verdict and evidence on (A, H) with the sensors of all nodes."""
+    if any(sensor.varying for sensor in scenario.sensors):
+        return None, "H differs from reading to reading"
+    A, n = scenario.truth.A, scenario.plant.n
+    information = np.zeros((n, n))
+    for node in scenario.sensing:
+        information += _node_information(scenario, node)
+    hidden = unobservable_mode(A, information)
+    if hidden is not None:
+        evidence = f"the mode with eigenvalue {hidden:.6g} is not seen"
+        return judge_plant(scenario, False, evidence)
+    alone = [
+        node
+        for node in scenario.nodes
+        if unobservable_mode(A, _node_information(scenario, node)) is None
+    ]
+    evidence = f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
+    return judge_plant(scenario, True, evidence)
+
+
+def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return a row on the times of sampled sensors, which must be Poisson or known beforehand."""
     if not sampled_sensors(scenario):
         return []
     name = "sensors sample by Poisson clocks or at known times"
     source = "derived, docs/poisson_samples.md"
-    for node, place in at_random(scenario):
-        clock = clock_of(scenario.sensors[place.entry])
+    for node, place in randomly_sampled_sensors(scenario):
+        clock = sampling_clock(scenario.sensors[place.entry])
         if clock is not None and not clock.memoryless:
-            words = f"node {node} samples by another random clock: the bound is not promised"
-            return [(name, source, False, words)]
+            evidence = f"node {node} samples by another random clock: the bound is not promised"
+            return [(name, source, False, evidence)]
     return [(name, source, True, "the bound on the mean of P then has them")]
 
 
-def _own_information(scenario: Scenario, node: int) -> np.ndarray:
-    """Of all sensors, of those that sample too: of one sample."""
+def _node_information(scenario: Scenario, node: int) -> np.ndarray:
+    """Return ``sum H' R^-1 H`` (n, n) over a node's sensors; a sampled one counts by one sample."""
     information = np.zeros((scenario.plant.n, scenario.plant.n))
     for place in scenario.placed.get(node, ()):
         H, R = scenario.sensors[place.entry].H, scenario.noise(place.entry, believed=False)
@@ -125,12 +139,12 @@ def _own_information(scenario: Scenario, node: int) -> np.ndarray:
     return information
 
 
-def _clocks(scenario: Scenario) -> list[AssumptionRow]:
+def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
-    if by_readings(scenario):
-        words = "nodes transmit when they have sampled, see the row about sensors that sample"
-        return [("nodes transmit at independent Poisson processes", "H II-B b", None, words)]
+    if transmits_at_samples(scenario):
+        evidence = "nodes transmit when they have sampled, see the row about sensors that sample"
+        return [("nodes transmit at independent Poisson processes", "H II-B b", None, evidence)]
     entities, what = clock.entities(scenario.topology), clock.at
     rates = np.array([clock.mean_rate(entity) for entity in entities])
     known = rates[np.isfinite(rates)]
@@ -163,7 +177,7 @@ def _clocks(scenario: Scenario) -> list[AssumptionRow]:
     ]
 
 
-def _channel(scenario: Scenario) -> list[AssumptionRow]:
+def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
     channel = scenario.network.channel
     fixed, symmetric = channel.delay.fixed, balanced(scenario)
     return [

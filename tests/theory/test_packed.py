@@ -11,7 +11,7 @@ from netkf import theory
 from netkf.theory.hybrid import linearised
 from netkf.theory.hybrid.coupled import Coupled
 from netkf.theory.hybrid.packed import Packed
-from netkf.theory.hybrid.taylor import StiffError, followed
+from netkf.theory.hybrid.taylor import StiffError, solve_by_taylor_series
 
 N, n = 5, 3
 
@@ -91,7 +91,7 @@ def test_the_taylor_series_is_that_of_the_solution():
 def test_the_solution_is_followed_to_all_digits():
     e = equations()
     packed, times = Packed(e), np.array([0.0, 0.0, 0.1, 0.5, 2.0, 2.0])
-    got = packed.unpack(followed(packed, times, 1.0, 100_000, 1e150))
+    got = packed.unpack(solve_by_taylor_series(packed, times, 1.0, 100_000, 1e150))
     solved = scipy.integrate.solve_ivp(
         lambda _, y: plain(e, y.reshape(N, n, n), y.reshape(N, n, n)).reshape(-1),
         (0.0, 2.0), e.start.reshape(-1), "DOP853", times[2:5], rtol=1e-13, atol=1e-13,
@@ -101,7 +101,7 @@ def test_the_solution_is_followed_to_all_digits():
     for P, expected in zip(got[2:5], solved.y.T.reshape(-1, N, n, n), strict=True):
         near(P, expected, 1e-9)
     with pytest.raises(StiffError):
-        followed(packed, times, 1.0, 28, 1e150)
+        solve_by_taylor_series(packed, times, 1.0, 28, 1e150)
 
 
 @pytest.fixture

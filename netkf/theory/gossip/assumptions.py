@@ -1,4 +1,4 @@
-"""The assumptions of G about a scenario in slots: C.1, S.1, D.1."""
+"""Assumptions of G on a scenario in slots: C.1, S.1, D.1."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ MAX_SHOWN = 12
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """(assumption, source, holds, evidence) of each assumption."""
+    """Return the rows of G: matching, plant, walk, swaps and first covariances."""
     return [
-        *_matching(scenario),
+        *_matching_rows(scenario),
         *slot_plant_rows(scenario),
-        *_walk(scenario),
-        *_swaps(scenario),
+        *_walk_rows(scenario),
+        *_swap_rows(scenario),
         *start_rows(scenario, "G (10)"),
     ]
 
 
-def _matching(scenario: Scenario) -> list[AssumptionRow]:
+def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
     name = "the mean matching is irreducible and aperiodic"
     try:
-        mean = _mean(scenario)
+        mean = _mean_swaps(scenario)
     except TheoryError as error:
         return [(name, "G C.1", None, f"not decided: {error}")]
     irreducible, aperiodic, period = primitive(mean)
     if not irreducible:
-        words = "some nodes are never reached from others"
+        evidence = "some nodes are never reached from others"
     elif not aperiodic:
-        words = (
+        evidence = (
             f"it has period {period}: tokens visit the two halves of the network in turn, and "
             "filters can blow up though every sensor is observable"
         )
     else:
-        words = f"least positive entry {mean[mean > 0.0].min():.3g}"
-    return [(name, "G C.1", irreducible and aperiodic, words)]
+        evidence = f"least positive entry {mean[mean > 0.0].min():.3g}"
+    return [(name, "G C.1", irreducible and aperiodic, evidence)]
 
 
-def _mean(scenario: Scenario) -> FloatArray:
-    """Abar, with the losses where they are known: a lost swap leaves both alone."""
+def _mean_swaps(scenario: Scenario) -> FloatArray:
+    """Return Abar (N, N) with the losses if these are known, else of the matching alone."""
     try:
         return effective_matching(scenario)
     except TheoryError:
         return mean_matching(scenario)
 
 
-def _walk(scenario: Scenario) -> list[AssumptionRow]:
+def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
     name = "some walk on the network detects the state (weak detectability)"
     try:
         walk = detecting_walk(scenario)
@@ -71,20 +71,20 @@ def _walk(scenario: Scenario) -> list[AssumptionRow]:
                 "sufficient, not necessary: a mode that decays by itself need not be seen",
             )
         ]
-    shown = ", ".join(map(str, walk[:MAX_SHOWN])) + (", ..." if len(walk) > MAX_SHOWN else "")
-    return [(name, "G D.1", True, f"the Gramian of the walk ({shown}) is invertible")]
+    listed = ", ".join(map(str, walk[:MAX_SHOWN])) + (", ..." if len(walk) > MAX_SHOWN else "")
+    return [(name, "G D.1", True, f"the Gramian of the walk ({listed}) is invertible")]
 
 
-def _swaps(scenario: Scenario) -> list[AssumptionRow]:
+def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:
     channel = scenario.network.channel
-    certain = type(channel.loss).__name__ == "NoLoss"
-    holds = certain or channel.symmetric
-    words = (
+    lossless = type(channel.loss).__name__ == "NoLoss"
+    holds = lossless or channel.symmetric
+    evidence = (
         "nothing is lost"
-        if certain
+        if lossless
         else "both messages of a pair are lost together: a swap or none"
         if holds
         else "one of two messages may be lost: a pair is then copied and the other one is gone, so "
         "tokens are no permutation any more"
     )
-    return [("every exchange is a swap", "G (10)", holds, words)]
+    return [("every exchange is a swap", "G (10)", holds, evidence)]

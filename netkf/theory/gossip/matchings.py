@@ -1,4 +1,4 @@
-"""Matchings in the mean and walks that detect: what G asks of a network before it promises."""
+"""Mean matchings and detecting walks, the two conditions of G on a network."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.scenario.scenario import Scenario
 
-LONGEST_WALK = 40
-MAX_PLACES = 20_000
+MAX_WALK = 40  # steps of a walk
+MAX_VISITED = 20_000  # states of the search for a walk
 
 
 def mean_matching(scenario: Scenario) -> FloatArray:
-    """(N, N) exact Abar of the scenario's matching, G section II: entry (i, j) is the probability
-    that i and j are paired in a slot, the diagonal that of staying alone.
+    """Return the exact mean Abar (N, N) of the scenario's matching, G section II.
 
-    For recorded matchings, their frequencies in the slots of the scenario from 1 on. Raises
-    TheoryError where there is no matching or no exact mean.
+    Entry (i, j) is the probability that i and j are paired in a slot, entry (i, i) that i stays
+    alone. For recorded matchings, the frequencies in the slots of the scenario from 1 on. Raises
+    TheoryError if there is no matching or no exact mean.
     """
     activation, topology = scenario.network.activation, scenario.topology
     if isinstance(activation, Matching):
@@ -35,10 +35,10 @@ def mean_matching(scenario: Scenario) -> FloatArray:
 
 
 def effective_matching(scenario: Scenario) -> FloatArray:
-    """(N, N) mean of the swaps that happen: Abar with the losses of the channel.
+    """Return the mean (N, N) of the swaps that succeed: Abar with the losses of the channel.
 
-    Raises TheoryError where slots are not independent of each other, where swaps can become copies,
-    or where messages may be late.
+    Raises TheoryError if slots depend on each other, if a swap can become a copy, or if messages
+    can be late.
     """
     activation, channel = scenario.network.activation, scenario.network.channel
     if not isinstance(activation, Matching):
@@ -57,6 +57,7 @@ def effective_matching(scenario: Scenario) -> FloatArray:
             raise TheoryError("a swap may become a copy")
         a, b = index[i], index[j]
         mean[a, b] = mean[b, a] = forth * mean[a, b]
+    # A lost swap leaves both nodes alone, so that the diagonal takes the missing probability.
     mean[np.diag_indices(len(mean))] = 0.0
     mean[np.diag_indices(len(mean))] = 1.0 - mean.sum(axis=1)
     return mean
@@ -75,14 +76,15 @@ def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
 
 
 def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
-    """Whether a nonnegative matrix is irreducible, whether it is aperiodic too, and its period.
+    """Return if a nonnegative matrix (N, N) is irreducible, if it is also aperiodic, its period.
 
-    Decided on the graph of its positive entries, not on powers: the period is the greatest common
-    divisor of the lengths of its cycles.
+    Both are decided on the graph of its positive entries: the period is the greatest common divisor
+    of the lengths of its cycles.
     """
     graph = networkx.from_numpy_array((matrix > 1e-15).astype(int), create_using=networkx.DiGraph)
     if not networkx.is_strongly_connected(graph):
         return False, False, 0
+    # Every cycle is a sum of terms d(i) + 1 - d(j) over its edges, d the distance from node 0.
     levels = networkx.single_source_shortest_path_length(graph, 0)
     period = 0
     for i, j in graph.edges:
@@ -91,11 +93,11 @@ def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
 
 
 def detecting_walk(scenario: Scenario) -> list[int] | None:
-    """Nodes (n_0, ..., n_l) of a walk on the graph of Abar whose Gramian ``sum_k (F^k)' C' C F^k``,
-    C of node n_k, is invertible (G assumption D.1, weak detectability), or None.
+    """Return the nodes (n_0, ..., n_l) of the shortest detecting walk of up to 40 steps, or None.
 
-    The shortest one, up to 40 steps. It need not visit all nodes. D.1 is an observability
-    condition: sufficient, not necessary (a stable mode that nobody sees does no harm).
+    It is a walk on the graph of Abar with an invertible Gramian ``sum_k (F^k)' C' C F^k``, C of
+    node n_k (G assumption D.1, weak detectability). It need not visit all nodes. D.1 is sufficient,
+    not necessary: a stable mode need not be observed.
     """
     mean, nodes = mean_matching(scenario), scenario.nodes
     F, _ = scenario.slot_belief
@@ -103,26 +105,27 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
     rows = [scenario.observation(node)[0] for node in scenario.nodes]
     neighbours = [np.flatnonzero(mean[i] > 1e-15).tolist() for i in range(len(nodes))]
     size = max(float(np.linalg.norm(F, 2)), 1e-300)
-    step = F / size  # a positive factor a step changes no rank
+    step = F / size  # a positive factor changes no rank and avoids overflow of the powers
     start = np.zeros((0, n))
-    queue = deque((i, _space(start, rows[i]), [nodes[i]], step) for i in range(len(nodes)))
-    seen: set[tuple[int, int, bytes]] = set()
+    # Breadth first over (node, subspace observed so far), so that the first walk found is shortest.
+    queue = deque((i, _extend_basis(start, rows[i]), [nodes[i]], step) for i in range(len(nodes)))
+    visited: set[tuple[int, int, bytes]] = set()
     while queue:
         place, space, walk, power = queue.popleft()
         if len(space) == n:
             return walk
         key = (place, len(walk), np.round(space.T @ space, 8).tobytes())
-        if key in seen or len(seen) > MAX_PLACES or len(walk) > LONGEST_WALK:
+        if key in visited or len(visited) > MAX_VISITED or len(walk) > MAX_WALK:
             continue
-        seen.add(key)
+        visited.add(key)
         for following in neighbours[place]:
-            wider = _space(space, rows[following] @ power)
+            wider = _extend_basis(space, rows[following] @ power)
             queue.append((following, wider, [*walk, nodes[following]], power @ step))
     return None
 
 
-def _space(known: FloatArray, rows: FloatArray) -> FloatArray:
-    """Orthonormal basis (rows) of what known and new rows span."""
+def _extend_basis(known: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return an orthonormal basis, as rows, of the span of ``known`` and of ``rows``."""
     size = np.abs(rows).max(initial=0.0)
     if size == 0.0:
         return known

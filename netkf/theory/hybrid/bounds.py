@@ -1,4 +1,4 @@
-"""The bound H(12) over time."""
+"""The bound H(12) over time: explicit, implicit and piecewise integration, all checked."""
 
 from __future__ import annotations
 
@@ -16,27 +16,31 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import Coupled, coupled
 from netkf.theory.hybrid.packed import Packed
-from netkf.theory.hybrid.taylor import StiffError, followed
+from netkf.theory.hybrid.taylor import StiffError, solve_by_taylor_series
 from netkf.theory.numerics.updates import Observation
 
-TOLERANCE = 1e-10
-DEFECT = 1e-7
-CHECKED_STEPS = 200
-EXPLICIT_EVALUATIONS = 20_000
+TOLERANCE = 1e-10  # relative, of the solver
+DEFECT_TOLERANCE = 1e-7  # relative, of the finished solution
+MAX_CHECKED_STEPS = 200
+MAX_EXPLICIT_EVALUATIONS = 20_000
 OVERFLOW = 1e150
-MAX_ROUNDS, SETTLED = 40, 1e-8
-PARTS = (1, 40, 400)  # of a stretch that a step is at most one of, try after try
+MAX_ROUNDS, ROUND_TOLERANCE = 40, 1e-8  # of Picard iteration
+PARTS = (1, 40, 400)  # the solver's steps are at most this fraction of a piece, try after try
+Slope = Callable[[float, FloatArray], FloatArray]
+"""dy/dt of the flat packed solution y, from t (seconds) and y."""
+
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
-    """(T, N, n, n): the solution of H(12) at ``times`` (increasing seconds), with the effective
-    rates of the channel; for filters that do not talk it is their own covariance.
+    """Return the solution (T, N, n, n) of H(12) at ``times`` (seconds, increasing).
 
-    By H Theorem 2 it bounds E[P_i(t)], and with sensors that sample by Poisson clocks or at known
-    times by docs/poisson_samples.md. Integrated with relative tolerance 1e-10 and returned only
-    when the defect is below that (below 1e-7 with a delay or samples, or where precise sensors hear
-    of large covariances). Raises TheoryError where the theorem does not apply, and says why.
+    The rates are the effective ones of the channel; for filters that do not communicate the
+    solution is their own covariance. It bounds E[P_i(t)] by H Theorem 2, and by
+    docs/poisson_samples.md for sensors that sample by Poisson clocks or at known times. Integrated
+    with relative tolerance 1e-10 and returned only if the defect is below that (below 1e-7 with a
+    delay or samples, or where H(12) is stiff). Raises TheoryError, with the reason, if the theorem
+    does not apply.
     """
     moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if moments.ndim != 1 or not moments.size or not np.isfinite(moments).all():
@@ -47,129 +51,136 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     if equations.jumps and moments[-1] > scenario.horizon:
         raise TheoryError("samples at known times are known up to the horizon")
     if not equations.talks and not equations.samples and not equations.jumps:
-        P = _uncoupled(equations, moments)
+        P = _solve_uncoupled(equations, moments)
     else:
         packed = Packed(equations)
-        P = packed.unpack(_solution(packed, moments))
+        P = packed.unpack(_solve_coupled(packed, moments))
     if not np.abs(P).max() < OVERFLOW:
         raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {moments[-1]:g} s")
     return P
 
 
-def _solution(packed: Packed, times: FloatArray) -> FloatArray:
+def _solve_coupled(packed: Packed, times: FloatArray) -> FloatArray:
+    """Return the packed solution (T, N, m) at ``times``."""
     equations = packed.equations
+    # Without delay the right-hand side is quadratic, and Taylor series are fastest unless stiff.
     if equations.delay == 0.0 and not equations.samples and not equations.jumps:
         with contextlib.suppress(StiffError), np.errstate(over="ignore", invalid="ignore"):
-            return followed(packed, times, _scale(packed), EXPLICIT_EVALUATIONS, OVERFLOW)
-    pieces = _Pieces(packed)
+            return solve_by_taylor_series(
+                packed, times, _scale(packed), MAX_EXPLICIT_EVALUATIONS, OVERFLOW
+            )
+    pieces = _PiecewiseSolution(packed)
     pieces.extend(float(times[-1]))
     return np.stack([pieces(float(t)) for t in times])
 
 
 def _scale(packed: Packed) -> float:
-    """The size of covariances and of what drives them."""
+    """Return the size of the covariances that matter: of the start and of Q."""
     sizes = (np.abs(packed.start).max(), np.abs(packed.equations.Q).max())
     return max(*(float(size) for size in sizes), 1e-300)
 
 
-def _uncoupled(equations: Coupled, times: FloatArray) -> FloatArray:
-    """The Riccati flow of each node by itself."""
+def _solve_uncoupled(equations: Coupled, times: FloatArray) -> FloatArray:
+    """Return P (T, N, n, n) of nodes that receive nothing: the Riccati flow of each by itself."""
     P = np.empty((len(times), *equations.start.shape))
     tables: dict[bytes, RiccatiTable] = {}
-    nothing = np.zeros(len(equations.A))
+    mean = np.zeros(len(equations.A))  # the kernel moves a mean along with P
     with np.errstate(over="ignore", invalid="ignore"):
         for i, (G, start) in enumerate(zip(equations.G, equations.start, strict=True)):
-            key = G.tobytes()
+            key = G.tobytes()  # nodes with equal sensors share a table
             if key not in tables:
                 longest = max(float(times[-1]), 1e-9)
                 tables[key] = riccati_table(equations.A, equations.Q, G, longest)
             for k, t in enumerate(times):
-                P[k, i] = riccati_step(tables[key], start, nothing, float(t))[0] if t else start
+                P[k, i] = riccati_step(tables[key], start, mean, float(t))[0] if t else start
     return P
 
 
-class _Pieces:
-    """The solution up to some time, one dense output for each stretch of one delay."""
+class _PiecewiseSolution:
+    """The solution up to the time that ``extend`` has reached, a dense output for each piece."""
 
     def __init__(self, packed: Packed) -> None:
         self._packed = packed
         equations = packed.equations
+        # Until the first message has taken the delay, nodes lose nothing and receive nothing.
         quiet = tuple(s._replace(heard=0.0 * s.heard) for s in equations.samples)
         self._silent = Packed(equations._replace(coupling=0.0 * equations.coupling, samples=quiet))
-        self._jumps = _Jumps(packed)
+        self._jumps = _SampleJumps(packed)
         self._first = packed.start
         self._jumped: dict[float, FloatArray] = {}
         self._ends: list[float] = [0.0]
         self._outputs: list[Callable[[float], FloatArray]] = []
 
     def __call__(self, t: float) -> FloatArray:
+        """Return the packed solution (N, m) at time ``t`` (seconds)."""
         start = self._packed.start
         if t <= 0.0:
             return start
         if t in self._jumped:
             return self._jumped[t]
-        # t may lie a rounding error beyond what is known so far.
+        # t may exceed the last end by a rounding error.
         piece = min(int(np.searchsorted(self._ends, t)), len(self._outputs)) - 1
         return self._outputs[piece](t).reshape(start.shape)
 
     def extend(self, last: float) -> None:
-        """Integrate on to ``last``.
+        """Integrate up to time ``last`` (seconds).
 
-        With a delay, stretch after stretch: nothing arrives before the first one is over. A stretch
-        is one delay long, over which all that arrives is known, or, where the delay is much
-        shorter than the times between messages, half such a time; what arrives from within it is
-        then found by iteration (Picard), which gains a factor 2 k in the k-th round. Stretches end
-        where the solution jumps and where that arrives.
+        With a delay this goes piece by piece, and nothing arrives in the first one. A piece is one
+        delay long, so that all that arrives in it is known; if the delay is much shorter than the
+        time between messages, a piece is half that time long, and its own arrivals are found by
+        Picard iteration, which reduces the error by a factor 2 k in round k. Pieces end where the
+        solution jumps and where messages sent at jumps arrive.
         """
         delay = self._packed.equations.delay
-        inflow = float(self._packed.leaving.max())
         while self._ends[-1] < last:
             begin = self._ends[-1]
-            if delay == 0.0:
-                end = last
-            elif begin < delay:
-                end = min(last, delay)
-            else:
-                end = min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
-            end = self._jumps.before(begin, end)
-            f = self._slope(begin)
+            end = self._jumps.before(begin, self._piece_end(begin, last))
+            slope = self._slope(begin)
             if delay == 0.0 or end - begin <= delay * (1.0 + 1e-12):
-                self._append(end, self._integrate(begin, end, f))
+                self._append(end, self._integrate(begin, end, slope))
             else:
-                self._iterate(begin, end, f)
-            if self._jumps.happens(end):
-                self._first = self._jumped[end] = self._jumps.after(end, self._first)
+                self._iterate(begin, end, slope)
+            if self._jumps.happen_at(end):
+                self._first = self._jumped[end] = self._jumps.apply(end, self._first)
+
+    def _piece_end(self, begin: float, last: float) -> float:
+        delay = self._packed.equations.delay
+        if delay == 0.0:
+            return last
+        if begin < delay:
+            return min(last, delay)
+        inflow = float(self._packed.leaving.max())
+        return min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
 
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
         self._outputs.append(output)
         self._ends.append(end)
         self._first = output(end).reshape(self._packed.start.shape)
 
-    def _iterate(
-        self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray]
-    ) -> None:
-        first = self._first.reshape(-1)
-        places = np.linspace(begin, end, 9)[1:]
-        jumped = self._first
-        self._append(end, lambda _: first)
+    def _iterate(self, begin: float, end: float, slope: Slope) -> None:
+        """Append a piece longer than the delay by Picard iteration; raises TheoryError."""
+        start = self._first
+        probes = np.linspace(begin, end, 9)[1:]
+        self._append(end, lambda _: start.reshape(-1))  # first guess: constant
         last = np.inf
         for _ in range(MAX_ROUNDS):
-            before = np.array([self(t).reshape(-1) for t in places])
-            self._first = jumped
-            self._outputs[-1] = self._integrate(begin, end, f)
-            self._first = self._outputs[-1](end).reshape(jumped.shape)
-            after = np.array([self(t).reshape(-1) for t in places])
+            before = np.array([self(t).reshape(-1) for t in probes])
+            self._first = start
+            self._outputs[-1] = self._integrate(begin, end, slope)
+            self._first = self._outputs[-1](end).reshape(start.shape)
+            after = np.array([self(t).reshape(-1) for t in probes])
             change = float(np.abs(after - before).max() / np.abs(after).max())
-            # What the steps of the solver change from round to round stays.
-            if change <= TOLERANCE or (0.5 * last < change <= SETTLED):
+            # The solver's choice of steps differs between rounds, which leaves a small change.
+            if change <= TOLERANCE or (0.5 * last < change <= ROUND_TOLERANCE):
                 return
             last = change
-        raise TheoryError(f"what arrives late did not settle between {begin:g} and {end:g} s")
+        raise TheoryError(f"late arrivals did not converge between {begin:g} and {end:g} s")
 
-    def _slope(self, begin: float) -> Callable[[float, FloatArray], FloatArray]:
+    def _slope(self, begin: float) -> Slope:
+        """Return the right-hand side of H(12), flat, for a piece that begins at ``begin``."""
         packed, silent, delay = self._packed, self._silent, self._packed.equations.delay
 
-        def f(t: float, y: FloatArray) -> FloatArray:
+        def slope(t: float, y: FloatArray) -> FloatArray:
             Y = y.reshape(packed.start.shape)
             if not np.abs(y).max() < OVERFLOW:
                 raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {t:g} s")
@@ -179,20 +190,19 @@ class _Pieces:
                 return silent.slope(Y).reshape(-1)
             return packed.slope(Y, self(t - delay)).reshape(-1)
 
-        return f
+        return slope
 
-    def _integrate(
-        self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray]
-    ) -> Callable[[float], FloatArray]:
+    def _integrate(self, begin: float, end: float, slope: Slope) -> Callable[[float], FloatArray]:
+        """Return a dense output over a piece; raises TheoryError if its defect is too large."""
         refused: TheoryError | None = None
-        for parts in PARTS:  # what is wrong between the steps gets better with shorter ones
-            most = (end - begin) / parts if parts > 1 else np.inf
-            solved = self._solved(begin, end, f, most)
+        for parts in PARTS:  # shorter steps reduce the error of the dense output between them
+            max_step = (end - begin) / parts if parts > 1 else np.inf
+            solved = self._choose_method(begin, end, slope, max_step)
             if not solved.success:
                 raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
             assert solved.sol is not None
             try:
-                _check_defect(f, solved.sol)
+                _check_defect(slope, solved.sol)
             except TheoryError as error:
                 refused = refused or error
                 continue
@@ -201,27 +211,26 @@ class _Pieces:
         assert refused is not None
         raise refused
 
-    def _solved(
-        self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], most: float
-    ) -> Any:
+    def _choose_method(self, begin: float, end: float, slope: Slope, max_step: float) -> Any:
+        """Solve by an explicit method unless the equations are stiff, else by an implicit one."""
+        equations = self._packed.equations
         with np.errstate(over="ignore", invalid="ignore"):
-            equations = self._packed.equations
-            # Without delays and samples only what is stiff comes here.
+            # Without delays and samples the Taylor series have found the equations stiff before.
             if equations.delay > 0.0 or equations.samples or equations.jumps:
-                # An explicit stage that overflows is no word about the solution.
+                # An explicit stage that overflows says nothing about the solution itself.
                 with contextlib.suppress(StiffError, TheoryError):
-                    return self._solve(begin, end, _limited(f), method="DOP853", max_step=most)
-            # A blind node's large covariance reaches precise sensors: P G is a large rate.
-            return self._solve(begin, end, f, method="Radau", jac=self._jacobian, max_step=most)
+                    limited = _limit_evaluations(slope)
+                    return self._solve(begin, end, limited, method="DOP853", max_step=max_step)
+            # A large covariance that reaches a node with precise sensors decays at the rate P G.
+            return self._solve(
+                begin, end, slope, method="Radau", jac=self._jacobian, max_step=max_step
+            )
 
-    def _solve(
-        self, begin: float, end: float, f: Callable[[float, FloatArray], FloatArray], **method: Any
-    ) -> Any:
-        y = self._first.reshape(-1)
+    def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
         return scipy.integrate.solve_ivp(
-            f,
+            slope,
             (begin, end),
-            y,
+            self._first.reshape(-1),
             dense_output=True,
             rtol=TOLERANCE,
             atol=1e-3 * TOLERANCE * _scale(self._packed),
@@ -229,87 +238,92 @@ class _Pieces:
         )
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
+        """Return the sparse Jacobian (N m, N m) of the right-hand side at ``y``."""
         linear = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
-        # With a delay what arrives is known, only what leaves depends on P.
+        # With a delay the arrivals are known from earlier pieces and do not depend on y.
         return linear.matrix(arriving=self._packed.equations.delay == 0.0)
 
 
-class _Jumps:
-    """What happens at known times, and when what was sent then arrives."""
+class _SampleJumps:
+    """Jumps of the solution: samples at known times, and the arrivals of messages sent at them."""
 
     def __init__(self, packed: Packed) -> None:
         self._packed = packed
         equations = packed.equations
-        self._happens = {jump.time: jump for jump in equations.jumps}
-        self._arrives: dict[float, tuple[FloatArray, FloatArray]] = {}
+        self._samples = {jump.time: jump for jump in equations.jumps}
+        self._arrivals: dict[float, tuple[FloatArray, FloatArray]] = {}
         delay = equations.delay
         later = [jump.time + delay for jump in equations.jumps]
-        self._times = sorted({*self._happens, *later})
+        self._times = sorted({*self._samples, *later})
 
     def before(self, begin: float, end: float) -> float:
-        """The first of these times after ``begin``, if it is before ``end``."""
+        """Return the first jump (seconds) after ``begin``, or ``end`` if that is earlier."""
         place = bisect.bisect_right(self._times, begin)
         return min(end, self._times[place]) if place < len(self._times) else end
 
-    def happens(self, time: float) -> bool:
-        """Whether anything does."""
-        return time in self._happens or time in self._arrives
+    def happen_at(self, time: float) -> bool:
+        """Return True if the solution jumps at ``time``."""
+        return time in self._samples or time in self._arrivals
 
-    def after(self, time: float, Y: FloatArray) -> FloatArray:
-        """(N, m) once all of that time has happened: samples, and then what arrives."""
+    def apply(self, time: float, Y: FloatArray) -> FloatArray:
+        """Return Y (N, m) after the samples of this time and then its arrivals."""
         packed, equations = self._packed, self._packed.equations
-        jump = self._happens.get(time)
+        jump = self._samples.get(time)
         if jump is not None:
             P = packed.unpack(Y)
-            for node, seen in jump.seen.items():
-                P[node] = _sampled(P[node], seen)
+            for node, observation in jump.observations.items():
+                P[node] = _update(P[node], observation)
             Y = packed.pack(P)
-            if jump.sent is not None:
-                self._arrives[time + equations.delay] = jump.sent, Y
-        arriving = self._arrives.pop(time, None)
+            if jump.weights is not None:
+                self._arrivals[time + equations.delay] = jump.weights, Y
+        arriving = self._arrivals.pop(time, None)
         if arriving is None:
             return Y
         weights, sent = arriving
         if equations.delay > 0.0:
             sent = packed.predicted(sent)
-        kept = 1.0 - weights.sum(axis=1)
-        return np.asarray(kept[:, None] * Y + weights @ sent)
+        # H (9) in the mean: P_i <- (1 - sum_j w_ij) P_i + sum_j w_ij P_j.
+        own = 1.0 - weights.sum(axis=1)
+        return np.asarray(own[:, None] * Y + weights @ sent)
 
 
-def _sampled(P: FloatArray, seen: Observation) -> FloatArray:
-    """``g(P)``, as ``(I - K H) P (I - K H)' + K R K'``."""
-    K = np.linalg.solve(seen.H @ P @ seen.H.T + seen.R, seen.H @ P).T
-    closed = np.eye(len(P)) - K @ seen.H
-    return np.asarray(closed @ P @ closed.T + K @ seen.R @ K.T)
+def _update(P: FloatArray, observation: Observation) -> FloatArray:
+    """Return ``g(P) = (I - K H) P (I - K H)' + K R K'`` (n, n), the Joseph form of the update."""
+    H, R = observation.H, observation.R
+    K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+    closed = np.eye(len(P)) - K @ H
+    return np.asarray(closed @ P @ closed.T + K @ R @ K.T)
 
 
-def _limited(
-    f: Callable[[float, FloatArray], FloatArray],
-) -> Callable[[float, FloatArray], FloatArray]:
-    left = EXPLICIT_EVALUATIONS
+def _limit_evaluations(slope: Slope) -> Slope:
+    """Return ``slope``, which raises StiffError after MAX_EXPLICIT_EVALUATIONS calls."""
+    left = MAX_EXPLICIT_EVALUATIONS
 
     def counted(t: float, y: FloatArray) -> FloatArray:
         nonlocal left
         left -= 1
         if left < 0:
             raise StiffError
-        return f(t, y)
+        return slope(t, y)
 
     return counted
 
 
-def _check_defect(f: Callable[[float, FloatArray], FloatArray], output: Any) -> None:
-    """Compare the change over steps of the solver with the integral of the slope."""
+def _check_defect(slope: Slope, output: Any) -> None:
+    """Compare the change over steps of the solver with the integral of the slope.
+
+    Raises TheoryError if they differ by more than DEFECT_TOLERANCE, relative.
+    """
     times = output.ts
-    steps = np.unique(np.linspace(0, len(times) - 2, CHECKED_STEPS).astype(int))
+    steps = np.unique(np.linspace(0, len(times) - 2, MAX_CHECKED_STEPS).astype(int))
     for k in steps:
         a, b = times[k], times[k + 1]
         middle, half = 0.5 * (a + b), 0.5 * (b - a)
         change = output(b) - output(a)
         integral = half * sum(
-            w * f(middle + half * z, output(middle + half * z))
+            w * slope(middle + half * z, output(middle + half * z))
             for z, w in zip(_GAUSS, _GAUSS_WEIGHTS, strict=True)
         )
         defect = np.abs(change - integral).max()
-        if not defect <= DEFECT * (np.abs(output(b)).max() + np.abs(change).max()):
+        if not defect <= DEFECT_TOLERANCE * (np.abs(output(b)).max() + np.abs(change).max()):
             raise TheoryError(f"H(12) was integrated with a defect of {defect:.1e} at {a:g} s")

@@ -26,13 +26,13 @@ from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid.samples import (
-    Jump,
     PoissonSamples,
-    at_random,
-    by_readings,
-    clock_of,
-    jumps,
+    SampleJump,
     poisson_samples,
+    randomly_sampled_sensors,
+    sample_jumps,
+    sampling_clock,
+    transmits_at_samples,
 )
 
 
@@ -50,25 +50,25 @@ class Coupled(NamedTuple):
     delay: float
     start: FloatArray
     samples: tuple[PoissonSamples, ...] = ()
-    jumps: tuple[Jump, ...] = ()
+    jumps: tuple[SampleJump, ...] = ()
 
     @property
     def talks(self) -> bool:
         """Whether any message ever arrives."""
-        sent = any(jump.sent is not None and jump.sent.any() for jump in self.jumps)
+        sent = any(jump.weights is not None and jump.weights.any() for jump in self.jumps)
         return bool(self.coupling.nnz or any(s.heard.nnz for s in self.samples) or sent)
 
-    def only(self, node: int) -> Coupled:
+    def restrict(self, node: int) -> Coupled:
         """The equation of one node, alone."""
         return self._replace(
             G=self.G[node : node + 1],
             start=self.start[node : node + 1],
             coupling=scipy.sparse.csr_array((1, 1)),
-            samples=tuple(s.only(node) for s in self.samples),
+            samples=tuple(s.restrict(node) for s in self.samples),
             jumps=tuple(
-                Jump(jump.time, {0: jump.seen[node]}, None)
+                SampleJump(jump.time, {0: jump.observations[node]}, None)
                 for jump in self.jumps
-                if node in jump.seen
+                if node in jump.observations
             ),
         )
 
@@ -89,7 +89,7 @@ def not_promised(scenario: Scenario) -> str | None:
     if own:
         return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
     assert isinstance(network.activation, LinkClock)
-    if not by_readings(scenario) and not network.activation.memoryless:
+    if not transmits_at_samples(scenario) and not network.activation.memoryless:
         return (
             f"not promised: the clocks of the {network.activation.at} are not Poisson processes, "
             "and for other clocks of the same rate the mean covariance can lie above H(12)"
@@ -101,8 +101,8 @@ def not_promised(scenario: Scenario) -> str | None:
 
 
 def _samples_not_promised(scenario: Scenario) -> str | None:
-    for node, place in at_random(scenario):
-        clock = clock_of(scenario.sensors[place.entry])
+    for node, place in randomly_sampled_sensors(scenario):
+        clock = sampling_clock(scenario.sensors[place.entry])
         if clock is not None and not clock.memoryless:
             return (
                 f"not promised: when node {node} samples is random and no Poisson process, and for "
@@ -131,7 +131,7 @@ def informations(scenario: Scenario) -> FloatArray:
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times weight."""
     index, size = scenario.topology.index, len(scenario.nodes)
-    rates = {} if by_readings(scenario) else scenario.effective_rates()
+    rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
     heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
     values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
     places = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
@@ -165,7 +165,7 @@ def coupled(scenario: Scenario) -> Coupled:
         delay,
         start,
         poisson_samples(scenario),
-        jumps(scenario),
+        sample_jumps(scenario),
     )
 
 

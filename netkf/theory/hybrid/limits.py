@@ -1,4 +1,4 @@
-"""What the filters come to when links tick ever faster, and the filter that has everything."""
+"""Limits of the filters for ever faster links, and the covariance of the central filter."""
 
 from __future__ import annotations
 
@@ -12,46 +12,60 @@ from netkf.scenario.registry import name_of, spoken
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import Coupled, informations, left_weights, promised
-from netkf.theory.hybrid.samples import PoissonSamples, by_readings, jumps, poisson_samples
+from netkf.theory.hybrid.samples import (
+    PoissonSamples,
+    poisson_samples,
+    sample_jumps,
+    transmits_at_samples,
+)
 from netkf.theory.hybrid.steady import steady_state
 from netkf.theory.intermittent.riccati import filtered_covariance
 from netkf.theory.numerics.matrices import algebraic_riccati, lyapunov
 
 
 def limit_covariance(scenario: Scenario) -> FloatArray:
-    """(n, n): S of H(13), to which H(12) comes as the rates grow (H Theorem 3).
+    """Return S (n, n) of H(13), the limit of H(12) as the link rates grow (H Theorem 3).
 
-    Where the two directions of links arrive at different rates the nodes' information is weighted
-    by the left null vector of the coupling instead of 1/N (derived). Sensors that sample by Poisson
-    clocks enter as they do in (*) of docs/poisson_samples.md. Raises TheoryError where S
-    does not exist.
+    If the two directions of links have different rates of arrival, the nodes' information is
+    weighted by the left null vector of the coupling instead of 1/N (derived). Sensors that sample
+    by Poisson clocks enter as in (*) of docs/poisson_samples.md. Raises TheoryError if S does not
+    exist.
     """
     A, Q = scenario.belief
-    algorithm = scenario.filter.algorithm
-    if algorithm.talks and scenario.hosted.combination != "convex":
-        raise TheoryError(f"H(13) is about the hybrid filter, not about {spoken(algorithm)}")
-    if algorithm.talks and (own := overridden(algorithm)):
-        name = spoken(algorithm)
-        if ":" in name_of("filter", algorithm):
-            name = f"{type(algorithm).__name__}, which defines {own[0]} itself"
-        raise TheoryError(f"H(13) is about the hybrid filter, not about {name}")
-    if by_readings(scenario) and algorithm.talks:
-        raise TheoryError("S is the limit of fast links, and nodes transmit when they sample")
+    _require_limit(scenario)
     w = left_weights(scenario)
     G = np.tensordot(w, informations(scenario), 1)
     if not sampled_sensors(scenario):
         return algebraic_riccati(A, Q, G)
     promised(scenario)
-    if jumps(scenario):
+    if sample_jumps(scenario):
         raise TheoryError("samples at known times lead to a cycle, not to a limit S")
-    S = steady_state(_one(scenario, A, Q, G, w))
+    S = steady_state(_shared_equation(scenario, A, Q, G, w))
     if S is None:
         raise TheoryError("S does not exist: the sensors sample too rarely for it")
     return np.asarray(S[0])
 
 
-def _one(scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: FloatArray) -> Coupled:
-    """The equation of all nodes with one covariance: each sensor counts by its node's weight."""
+def _require_limit(scenario: Scenario) -> None:
+    """Raise TheoryError for filters and clocks that H(13) is not about."""
+    algorithm = scenario.filter.algorithm
+    if not algorithm.talks:
+        return
+    if scenario.hosted.combination != "convex":
+        raise TheoryError(f"H(13) is about the hybrid filter, not about {spoken(algorithm)}")
+    if own := overridden(algorithm):
+        name = spoken(algorithm)
+        if ":" in name_of("filter", algorithm):
+            name = f"{type(algorithm).__name__}, which defines {own[0]} itself"
+        raise TheoryError(f"H(13) is about the hybrid filter, not about {name}")
+    if transmits_at_samples(scenario):
+        raise TheoryError("S is the limit of fast links, and nodes transmit when they sample")
+
+
+def _shared_equation(
+    scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: FloatArray
+) -> Coupled:
+    """Return H(12) of nodes that share one covariance: a sensor counts by its node's weight."""
     groups = []
     for group in poisson_samples(scenario):
         silent = scipy.sparse.csr_array((1, len(group.nodes)))
@@ -63,11 +77,12 @@ def _one(scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: Flo
 
 
 def true_limit_covariance(scenario: Scenario) -> FloatArray:
-    """(n, n): the limit, as the rates grow, of the true covariance of x - xhat_i (derived).
+    """Return the limit (n, n), as the link rates grow, of the true covariance of x - xhat_i.
 
-    All nodes then share one estimate with the gains of S; it averages the sensors' noises, which S
-    does not know: 0 = (A - S Gw) X + X (A - S Gw)' + Q + S (sum w_i^2 G_i) S. A filter's own R and
-    Q may differ from the truth, its A may not. Raises TheoryError where the limit does not exist.
+    Derived: all nodes then share one estimate with the gains of S, which averages the sensors'
+    noises; S does not include that. 0 = (A - S Gw) X + X (A - S Gw)' + Q + S (sum w_i^2 G_i) S. The
+    filters' R and Q may differ from the truth, their A may not. Raises TheoryError if the limit
+    does not exist.
     """
     A, _ = scenario.belief
     if sampled_sensors(scenario):
@@ -76,7 +91,7 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
     S, w = limit_covariance(scenario), left_weights(scenario)
     closed = A - S @ np.tensordot(w, informations(scenario), 1)
-    noise = scenario.truth.Q.copy()
+    noise = scenario.truth.Q.copy()  # plus the true noise of each sensor through the gains w_i S
     for weight, node in zip(w, scenario.nodes, strict=True):
         H, R = scenario.observation(node)
         gain = S @ np.linalg.solve(scenario.observation(node, believed=True)[1], H).T
@@ -85,12 +100,14 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
 
 
 def central_covariance(scenario: Scenario) -> FloatArray:
-    """(n, n): steady covariance of the Kalman-Bucy filter that reads all sensors and knows the
-    true model; in slots that of the Kalman filter, after its reading. Raises TheoryError where it
-    does not exist, and in slots for filters whose samples are predictions: it is none.
+    """Return the steady covariance (n, n) of the central filter.
+
+    It reads all sensors and knows the true model: the Kalman-Bucy filter, in slots the Kalman
+    filter after its update. Raises TheoryError if it does not exist, and in slots for filters whose
+    samples are predictions, which are not comparable.
     """
     if scenario.slotted:
-        return _slot_central(scenario)
+        return _central_slot_covariance(scenario)
     if sampled_sensors(scenario):
         raise TheoryError(
             "sampled sensors: the central covariance goes up and down with the samples"
@@ -102,7 +119,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
     return algebraic_riccati(scenario.truth.A, scenario.truth.Q, G)
 
 
-def _slot_central(scenario: Scenario) -> FloatArray:
+def _central_slot_covariance(scenario: Scenario) -> FloatArray:
     plant = scenario.slot_plant
     if scenario.hosted.predicts:
         raise TheoryError("the filter's samples are predictions, the central filter's are not")

@@ -162,7 +162,7 @@ class Packed:
         blocks = blocks - self.leaving[:, None, None] * np.eye(self.m)
         heard = [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
         for group in self.equations.samples:
-            _, closed = group.gains(P)
+            _, closed = group.update_gains(P)
             closed = closed[:, None]
             maps = self.pack(closed @ self._basis @ np.swapaxes(closed, -1, -2))
             np.add.at(blocks, group.nodes, group.rate[:, None, None] * (maps - np.eye(self.m)))
@@ -177,7 +177,7 @@ class Packed:
         G, q = self.equations.G, self.equations.q
         right = self.pack(self.equations.Q + P @ G @ P + self.leaving[:, None, None] * q)
         for group in self.equations.samples:
-            noise = self.pack(group.noise(P))
+            noise = self.pack(group.gain_noise(P))
             np.add.at(right, group.nodes, group.rate[:, None] * noise)
             right += group.heard @ (noise @ self._predicted)
         return np.asarray(right)

@@ -1,4 +1,4 @@
-"""Sensors that sample, as the bound H(12) meets them.
+"""Terms of the bound H(12) for sensors that sample.
 
 With ``g(P) = P - P H' (H P H' + R)^-1 H P`` a Poisson clock of rate s adds ``s (g(M) - M)``, and a
 reading at a known time makes M jump to g(M); docs/poisson_samples.md has the proof.
@@ -26,8 +26,11 @@ from netkf.theory.numerics.updates import Observation, stack_observations
 class PoissonSamples(NamedTuple):
     """S sensors of p rows each that sample by Poisson clocks.
 
-    nodes (S,) places of their nodes; H (S, p, n), R (S, p, p); rate (S,), per second; heard (N, S)
-    sparse: the rate at which node i uses what the sensor's node sends at its samples, times weight.
+    nodes : (S,) indices of their nodes
+    H, R  : (S, p, n), (S, p, p)
+    rate  : (S,) samples per second
+    heard : (N, S) sparse: rate (per second) at which messages that the sensor's node sends at its
+            samples arrive at node i, times their weight
     """
 
     nodes: np.ndarray
@@ -36,24 +39,24 @@ class PoissonSamples(NamedTuple):
     rate: FloatArray
     heard: scipy.sparse.csr_array
 
-    def gains(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """K (S, n, p) and ``I - K H`` (S, n, n) at covariances (N, n, n)."""
+    def update_gains(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return K (S, n, p) and ``I - K H`` (S, n, n) at covariances P (N, n, n)."""
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         K = np.swapaxes(np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)), 1, 2)
         return K, np.eye(P.shape[-1]) - K @ self.H
 
     def sample_decrease(self, P: FloatArray) -> FloatArray:
-        """(S, n, n): what a sample takes off P (N, n, n)."""
+        """Return the decrease ``P H' (H P H' + R)^-1 H P`` (S, n, n) of P (N, n, n) by a sample."""
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         return np.asarray(C @ np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)))
 
-    def noise(self, P: FloatArray) -> FloatArray:
-        """``K R K'`` (S, n, n)."""
-        K, _ = self.gains(P)
+    def gain_noise(self, P: FloatArray) -> FloatArray:
+        """Return ``K R K'`` (S, n, n) at covariances P (N, n, n)."""
+        K, _ = self.update_gains(P)
         return np.asarray(K @ self.R @ np.swapaxes(K, 1, 2))
 
-    def only(self, node: int) -> PoissonSamples:
-        """Those of one node, as if it were alone."""
+    def restrict(self, node: int) -> PoissonSamples:
+        """Return the sensors of one node as those of a network of that node alone."""
         mine = self.nodes == node
         count = int(mine.sum())
         silent = scipy.sparse.csr_array((1, count))
@@ -62,48 +65,54 @@ class PoissonSamples(NamedTuple):
         )
 
 
-class Jump(NamedTuple):
-    """What happens at a known time: ``seen`` readings by node; ``sent`` (N, N): entry (i, j) is the
-    weight that what j then sends gets at i, on average.
+class SampleJump(NamedTuple):
+    """Samples at a known time (seconds).
+
+    observations : by the index of the node
+    weights      : (N, N) entry (i, j) is the mean weight that node i gives to the message that j
+                   sends at its sample; None if nothing is sent
     """
 
     time: float
-    seen: dict[int, Observation]
-    sent: FloatArray | None
+    observations: dict[int, Observation]
+    weights: FloatArray | None
 
 
-def clock_of(sensor: Sensor) -> Clock | None:
-    """The sampling clock; None of increment sensors and of recorded ones."""
+def sampling_clock(sensor: Sensor) -> Clock | None:
+    """Return a sensor's sampling clock, or None for increment sensors and recorded ones."""
     return sensor.sampling if isinstance(sensor, LinearSensor) else None
 
 
-def planned(sensor: Sensor) -> bool:
-    """Whether the times of a sampled sensor are known before a run."""
-    clock = clock_of(sensor)
+def has_known_times(sensor: Sensor) -> bool:
+    """Return True if the times of a sampled sensor are known before a run."""
+    clock = sampling_clock(sensor)
     if clock is None or isinstance(clock, RecordedSampling):
         return True
     return type(clock) is Periodic and clock.jitter == 0.0 and not isinstance(clock.phase, str)
 
 
-def at_random(scenario: Scenario) -> list[tuple[int, Placed]]:
-    """Sampled sensors by node whose times are not known beforehand."""
+def randomly_sampled_sensors(scenario: Scenario) -> list[tuple[int, Placed]]:
+    """Return (node, sensor) for each sampled sensor whose times are not known beforehand."""
     return [
         (node, place)
         for node, places in sampled_sensors(scenario).items()
         for place in places
-        if not planned(scenario.sensors[place.entry])
+        if not has_known_times(scenario.sensors[place.entry])
     ]
 
 
-def by_readings(scenario: Scenario) -> bool:
-    """Whether nodes transmit when they have sampled."""
+def transmits_at_samples(scenario: Scenario) -> bool:
+    """Return True if the nodes transmit at the instants of their samples."""
     clock = scenario.network.activation
     return isinstance(clock, LinkClock) and clock.at == "readings"
 
 
-def deliveries(scenario: Scenario) -> dict[tuple[int, int], float]:
-    """By places (receiver, sender), the share of messages that arrive times their weight."""
-    if not scenario.filter.algorithm.talks or not by_readings(scenario):
+def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
+    """Return delivery probability times weight of messages sent at samples.
+
+    Keys are the indices (receiver, sender); empty if the nodes do not transmit at samples.
+    """
+    if not scenario.filter.algorithm.talks or not transmits_at_samples(scenario):
         return {}
     index, loss = scenario.topology.index, scenario.network.channel.loss
     return {
@@ -114,65 +123,76 @@ def deliveries(scenario: Scenario) -> dict[tuple[int, int], float]:
 
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
-    """Of all sensors with Poisson clocks, grouped by their number of rows."""
+    """Return all sensors with Poisson clocks, in groups of equal numbers of rows."""
     index, size = scenario.topology.index, len(scenario.nodes)
-    weights = deliveries(scenario)
     pooled = scenario.filter.algorithm.pooled
     found: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
-    for node, place in at_random(scenario):
+    for node, place in randomly_sampled_sensors(scenario):
         sensor = scenario.sensors[place.entry]
-        clock = clock_of(sensor)
+        clock = sampling_clock(sensor)
         assert clock is not None
         rate, R = clock.mean_rate((node, place.ordinal)), scenario.noise(place.entry, True)
+        # All nodes have the covariance of a pooled filter, which uses the readings of each.
         for reader in range(size) if pooled else [index[node]]:
             entry = (reader, np.asarray(sensor.H), R, rate, index[node])
             found.setdefault(len(R), []).append(entry)
     groups = []
     for entries in found.values():
-        heard = np.zeros((size, len(entries)))
-        for k, (_, _, _, rate, sender) in enumerate(entries):
-            for (i, j), weight in weights.items():
-                if j == sender:
-                    heard[i, k] = rate * weight
-        nodes, H_, R_, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
-        groups.append(PoissonSamples(nodes, H_, R_, rates, scipy.sparse.csr_array(heard)))
+        nodes, H, R, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
+        senders = [entry[4] for entry in entries]
+        groups.append(PoissonSamples(nodes, H, R, rates, _arrival_rates(scenario, senders, rates)))
     return tuple(groups)
 
 
-def jumps(scenario: Scenario) -> tuple[Jump, ...]:
-    """All samples at known times below the horizon."""
+def _arrival_rates(
+    scenario: Scenario, senders: list[int], rates: FloatArray
+) -> scipy.sparse.csr_array:
+    """Return ``heard`` (N, S) of sensors with the given nodes and sampling rates (S,)."""
+    heard = np.zeros((len(scenario.nodes), len(senders)))
+    for (i, j), weight in mean_link_weights(scenario).items():
+        for k, sender in enumerate(senders):
+            if j == sender:
+                heard[i, k] = rates[k] * weight
+    return scipy.sparse.csr_array(heard)
+
+
+def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
+    """Return the samples at known times below the horizon, in the order of time."""
     places = {
         (node, place.ordinal): place
         for node, some in sampled_sensors(scenario).items()
         for place in some
-        if planned(scenario.sensors[place.entry])
+        if has_known_times(scenario.sensors[place.entry])
     }
     if not places:
         return ()
     streams, n = Streams(scenario.seed), scenario.plant.n
     times, index = sample_times(scenario, streams), scenario.topology.index
-    here: dict[float, dict[int, list[Observation]]] = {}
+    by_time: dict[float, dict[int, list[Observation]]] = {}
     for (node, ordinal), place in places.items():
         sensor = scenario.sensors[place.entry]
         path = sample_path(scenario, streams, node, place) if sensor.varying else None
         R = scenario.noise(place.entry, True)
         for k, time in enumerate(times[node, ordinal].tolist()):
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
-            here.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))
+            by_time.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))
     everyone = range(len(scenario.nodes))
     found = []
-    for time in sorted(here):
-        seen = {node: stack_observations(readings, n) for node, readings in here[time].items()}
-        sent = _sent(scenario, list(seen))
+    for time in sorted(by_time):
+        observations = {
+            node: stack_observations(readings, n) for node, readings in by_time[time].items()
+        }
+        weights = _sent_weights(scenario, list(observations))
         if scenario.filter.algorithm.pooled:
-            whole = stack_observations(list(itertools.chain(*here[time].values())), n)
-            seen = dict.fromkeys(everyone, whole)
-        found.append(Jump(time, seen, sent))
+            joint = stack_observations(list(itertools.chain(*by_time[time].values())), n)
+            observations = dict.fromkeys(everyone, joint)
+        found.append(SampleJump(time, observations, weights))
     return tuple(found)
 
 
-def _sent(scenario: Scenario, senders: list[int]) -> FloatArray | None:
-    weights = deliveries(scenario)
+def _sent_weights(scenario: Scenario, senders: list[int]) -> FloatArray | None:
+    """Return the weights (N, N) of messages that these nodes send at a sample, None if none do."""
+    weights = mean_link_weights(scenario)
     if not weights:
         return None
     matrix = np.zeros((len(scenario.nodes),) * 2)

@@ -1,10 +1,10 @@
-"""Whether the covariances of H have a variance: second moments of a linear recursion above them.
+"""The condition for the covariances of H to have a variance: second moments of an upper bound.
 
 With the constant gains of the steady bound calP every node's covariance obeys a linear recursion
 that has mean calP and dominates P on every path (derived). Its second moments obey a linear
 equation, ``dY = L Y + Y L' + sum over outcomes of an activation, rate (J Y J' - Y)``; they stay
-finite, and so does the variance of P, where that equation is stable. For one blind scalar node with
-growth a this is rate > 4 a / (pi (2 - pi)).
+finite, and so does the variance of P, if that equation is stable. For one scalar node without a
+sensor, of growth rate a, this is rate > 4 a / (pi (2 - pi)) with pi its weight on the message.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.steady import steady_covariance_bound
 
-LARGEST = 200  # entries of all covariances together
+MAX_ENTRIES = 200  # entries of all covariances together
 
 
 def second_moment_rate(scenario: Scenario) -> float:
-    """Growth rate (1/s) of the second moments of that recursion; below 0 they stay finite.
+    """Return the growth rate (1/s) of the second moments; they stay finite if it is below 0.
 
-    For Poisson clocks with independent losses and no delay; raises TheoryError else, where the
-    steady bound does not exist (then the mean does not either), and for very large networks.
+    Raises TheoryError except for Poisson clocks of links with independent losses and no delay, if
+    the steady bound does not exist (then the mean grows too), and for very large networks.
     """
     channel = scenario.network.channel
     if not isinstance(scenario.network.activation, Poisson):
@@ -37,9 +37,10 @@ def second_moment_rate(scenario: Scenario) -> float:
         raise TheoryError("the second moments of P are known without bursts and delays only")
     nodes, n = len(scenario.nodes), scenario.plant.n
     size = nodes * n * n
-    if size > LARGEST:
+    if size > MAX_ENTRIES:
         raise TheoryError(f"the second moments of P have {size:,}^2 entries, too many to decide")
-    equation = _Equation(scenario, steady_covariance_bound(scenario))
+    equation = _SecondMomentEquation(scenario, steady_covariance_bound(scenario))
+    # Arnoldi's method needs at least three rows.
     if size == 1:
         return float(equation(np.ones(1))[0])
     operator = scipy.sparse.linalg.LinearOperator((size**2, size**2), equation, dtype=float)
@@ -57,8 +58,8 @@ def second_moment_rate(scenario: Scenario) -> float:
     return float(values.real.max())
 
 
-class _Equation:
-    """The right-hand side for second moments (N n n, N n n), flat."""
+class _SecondMomentEquation:
+    """The right-hand side for second moments (N n n, N n n), as a function of flat arrays."""
 
     def __init__(self, scenario: Scenario, bound: FloatArray) -> None:
         n, index = scenario.plant.n, scenario.topology.index
@@ -68,16 +69,18 @@ class _Equation:
             model.A - P @ model.H.T @ np.linalg.solve(model.R, model.H)
             for P, model in zip(bound, scenario.models, strict=True)
         ]
+        # vec of d P_i / dt = (A - P G) P_i + P_i (A - P G)' between events.
         self._own = np.array([np.kron(M, eye) + np.kron(eye, M) for M in closed])
         self._mixing = np.zeros((len(index), len(index)))
         self._outcomes: list[tuple[int, int, float, float, float]] = []
         for i, j in scenario.topology.links:
-            self._add(scenario, i, j, index[i], index[j])
+            self._add_link(scenario, i, j, index[i], index[j])
 
-    def _add(self, scenario: Scenario, i: int, j: int, a: int, b: int) -> None:
+    def _add_link(self, scenario: Scenario, i: int, j: int, a: int, b: int) -> None:
         clock, channel = scenario.network.activation, scenario.network.channel
         assert isinstance(clock, Poisson)
         rate, loss = clock.mean_rate((i, j)), channel.loss
+        # One activation has three outcomes with an effect: either message arrives alone, or both.
         to_j = loss.mean_delivery((i, j), scenario.table_probability((i, j)))
         to_i = loss.mean_delivery((j, i), scenario.table_probability((j, i)))
         both = min(to_i, to_j) if channel.symmetric else to_i * to_j
@@ -93,6 +96,7 @@ class _Equation:
 
     def __call__(self, flat: FloatArray) -> FloatArray:
         Y = np.asarray(flat, dtype=np.float64).reshape(self._shape)
+        # L Y + Y L'
         half = np.einsum("aij,ajbk->aibk", self._own, Y)
         half += np.einsum("ac,cibk->aibk", self._mixing, Y)
         other = np.einsum("bkl,aibl->aibk", self._own, Y)

@@ -20,7 +20,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import Coupled, coupled
 from netkf.theory.hybrid.linearised import solved
 from netkf.theory.hybrid.packed import Packed
-from netkf.theory.hybrid.samples import by_readings
+from netkf.theory.hybrid.samples import transmits_at_samples
 
 GROWN = 1e9  # a covariance that many times the first is taken to grow for ever
 RESIDUAL = 1e-9
@@ -59,7 +59,7 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
     equations = coupled(scenario)
     if equations.talks:
         raise TheoryError("the nodes hear each other: their steady state is one for all")
-    every = [steady_state(equations.only(i)) for i in range(len(equations.G))]
+    every = [steady_state(equations.restrict(i)) for i in range(len(equations.G))]
     nothing = np.full_like(equations.A, np.nan)
     return np.stack([nothing if P is None else P[0] for P in every])
 
@@ -143,7 +143,7 @@ def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
         several = "s" if len(alone) > 1 else ""
         return f"{why}, and the covariance of node{several} {listed} alone has no steady state"
     activation = scenario.network.activation
-    if by_readings(scenario):
+    if transmits_at_samples(scenario):
         return "H(12) has no steady state: nodes that sample more often would transmit more often"
     factor = threshold_factor(equations)
     if factor is None:

@@ -1,5 +1,7 @@
-"""H(12) without delay by Taylor series: the right-hand side is quadratic, so coefficients of any
-order cost about one evaluation each (Moore 1966; Barton, Willers and Zahar 1971).
+"""Integration of H(12) without delay by Taylor series.
+
+The right-hand side is quadratic, so that a coefficient of any order costs about one evaluation
+(Moore 1966; Barton, Willers and Zahar 1971).
 """
 
 from __future__ import annotations
@@ -11,51 +13,55 @@ from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.packed import Packed
 
 ORDER = 28
-LAST_TERM = 1e-11  # of the series, relative to the largest entry of the matrix
-DEFECT = 1e-10  # of a step: its length times what the derivative misses the slope by, relative
-FLOOR = 1e-13  # times the scale of the problem: what no matrix need be more precise than
-SHORTER, MAX_TRIES = 0.7, 40
+TERM_TOLERANCE = 1e-11  # of the last terms of a series, relative to the largest entry
+DEFECT_TOLERANCE = 1e-10  # of a step: its length times the error of the derivative, relative
+FLOOR = 1e-13  # times the scale of the problem: absolute error that is always allowed
+STEP_REDUCTION, MAX_TRIES = 0.7, 40
 
 
 class StiffError(Exception):
-    """Steps would be so short that an implicit method is cheaper."""
+    """Raised when steps become so short that an implicit method is cheaper."""
 
 
-def followed(
-    packed: Packed, times: FloatArray, scale: float, most: int, limit: float
+def solve_by_taylor_series(
+    packed: Packed, times: FloatArray, scale: float, max_orders: int, limit: float
 ) -> FloatArray:
-    """(T, N, m): the solution at ``times`` (increasing), from ``packed.start`` at 0.
+    """Return the solution (T, N, m) at ``times`` (seconds, increasing), from ``packed.start`` at 0.
 
-    Each step is accepted when its last terms are negligible and its polynomial obeys the equation
-    at its end; ``scale`` is the size of a covariance that matters. Raises StiffError after ``most``
-    coefficients or where steps come to nothing, and TheoryError beyond ``limit``.
+    A step is accepted if its last terms are negligible and its polynomial satisfies the equation at
+    its end; ``scale`` is the size of the covariances that matter. Raises StiffError after
+    ``max_orders`` coefficients or if steps shrink to nothing, and TheoryError if an entry exceeds
+    ``limit``.
     """
     Y, now = packed.start, 0.0
     out = np.empty((len(times), *Y.shape))
     done = int(np.searchsorted(times, 0.0, side="right"))
     out[:done] = Y
     slope = packed.slope(Y)
+    # Time is measured in spans, over which the solution changes by about its own size.
     span = float(np.abs(Y).max() + scale) / max(float(np.abs(slope).max()), 1e-300)
     orders = 0
     while done < len(times):
         orders += ORDER
-        if orders > most:
+        if orders > max_orders:
             raise StiffError
         left = float(times[-1]) - now
         span = min(span, left)
         series = packed.series(Y, span, ORDER)
-        step = min(_reach(series, np.abs(Y).max(axis=1) + FLOOR * scale), left / span)
-        for _ in range(MAX_TRIES):
+        step = min(_step_length(series, np.abs(Y).max(axis=1) + FLOOR * scale), left / span)
+        for _ in range(MAX_TRIES):  # until the polynomial satisfies the equation at the end
             last = step * span >= left
             following = float(times[-1]) if last else now + step * span
             until = int(np.searchsorted(times, following, side="right"))
-            places = np.append((times[done:until] - now) / span, step)
-            found = _values(series, places)
+            fractions = np.append((times[done:until] - now) / span, step)
+            found = _evaluate(series, fractions)
             end, derivative = found[-2:]
-            missed = np.abs(derivative - span * packed.slope(end)).max(axis=1)
-            if (step * missed <= DEFECT * (np.abs(end).max(axis=1) + FLOOR * scale)).all():
+            defect = np.abs(derivative - span * packed.slope(end)).max(axis=1)
+            if (
+                step * defect <= DEFECT_TOLERANCE * (np.abs(end).max(axis=1) + FLOOR * scale)
+            ).all():
                 break
-            step *= SHORTER
+            step *= STEP_REDUCTION
         else:
             raise StiffError
         out[done:until] = found[:-2]
@@ -65,21 +71,21 @@ def followed(
     return out
 
 
-def _reach(series: FloatArray, sizes: FloatArray) -> float:
-    """Where the last two terms come to LAST_TERM."""
-    reach = np.inf
+def _step_length(series: FloatArray, sizes: FloatArray) -> float:
+    """Return the step, in spans, at which the last two terms are TERM_TOLERANCE of ``sizes``."""
+    length = np.inf
     for k in (ORDER - 1, ORDER):
         share = float((np.abs(series[k]).max(axis=1) / sizes).max())
         if share > 0.0:
-            reach = min(reach, (LAST_TERM / share) ** (1.0 / k))
-    return reach if np.isfinite(reach) else 1.0
+            length = min(length, (TERM_TOLERANCE / share) ** (1.0 / k))
+    return length if np.isfinite(length) else 1.0
 
 
-def _values(series: FloatArray, places: FloatArray) -> FloatArray:
-    """(K + 1, N, m): the polynomial at K places, and its derivative at the last of them."""
+def _evaluate(series: FloatArray, fractions: FloatArray) -> FloatArray:
+    """Return (K + 1, N, m): the polynomial at K fractions of a span, its derivative at the last."""
     orders = np.arange(len(series))
-    weights = np.empty((len(places) + 1, len(series)))
-    weights[:-1] = places[:, None] ** orders
+    weights = np.empty((len(fractions) + 1, len(series)))
+    weights[:-1] = fractions[:, None] ** orders
     weights[-1, 0] = 0.0
     weights[-1, 1:] = orders[1:] * weights[-2, :-1]
     return np.asarray(np.tensordot(weights, series, 1))

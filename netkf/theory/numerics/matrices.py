@@ -1,4 +1,4 @@
-"""Checked inputs and the algebraic equations that everything else in this room uses."""
+"""Checks of matrices given by users, and the algebraic equations of continuous time."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ RESIDUAL = 1e-9
 
 
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:
-    """Real numbers as an array, one number as 1 x 1; raises TheoryError otherwise."""
+    """Return ``value`` as a float array, a single number as 1 x 1; raises TheoryError otherwise."""
     try:
         if np.iscomplexobj(value):
             raise TypeError
         array: FloatArray = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        words = "must be a matrix of real numbers, rows of equal length"
-        raise TheoryError(f"{name} {words}, got a {type(value).__name__}") from None
+        message = "must be a matrix of real numbers, rows of equal length"
+        raise TheoryError(f"{name} {message}, got a {type(value).__name__}") from None
     return array.reshape(1, 1) if array.ndim == 0 else array
 
 
 def as_whole(name: str, value: object, least: int, most: float = np.inf) -> int:
-    """A whole number in range; raises TheoryError otherwise."""
+    """Return ``value`` as an int in least .. most; raises TheoryError otherwise."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TheoryError(f"{name} must be an integer, got {value!r}")
     if not least <= value <= most:
@@ -35,7 +35,7 @@ def as_whole(name: str, value: object, least: int, most: float = np.inf) -> int:
 
 
 def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
-    """A finite (n, n) float array, from a number where n is 1; raises TheoryError otherwise."""
+    """Return a finite (n, n) array, a number as 1 x 1, any n if None; raises TheoryError."""
     array = as_numbers(name, value)
     wanted = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
@@ -46,7 +46,7 @@ def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
 
 
 def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
-    """A symmetric positive semidefinite (n, n) array; raises TheoryError otherwise."""
+    """Return a symmetric positive semidefinite (n, n) array; raises TheoryError otherwise."""
     array = as_square(name, value, n)
     if n == 0:
         return array
@@ -58,11 +58,11 @@ def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
 
 
 def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: float) -> FloatArray:
-    """The solution at time ``gap`` >= 0 (seconds) of dP = A P + P A' + Q - P G P from ``P``.
+    """Solve dP = A P + P A' + Q - P G P from ``P`` over ``gap`` >= 0 seconds; return P(gap) (n, n).
 
-    All matrices are (n, n); ``G = H' R^-1 H``, H (4b). Relative error about 1e-15 whatever the gap.
-    Raises TheoryError for wrong shapes, a P, Q or G that is not positive semidefinite, a negative
-    or infinite gap, and where the solution overflows.
+    All matrices are (n, n); ``G = H' R^-1 H``, H (4b). The relative error is about 1e-15 for any
+    gap. Raises TheoryError for wrong shapes, a P, Q or G that is not positive semidefinite, a
+    negative or infinite gap, and if the solution overflows.
     """
     drift = as_square("A", A)
     n = len(drift)
@@ -82,21 +82,22 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
 
 
 def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
-    """The stabilising solution of 0 = A S + S A' + Q - S G S.
+    """Return the stabilising solution S (n, n) of 0 = A S + S A' + Q - S G S.
 
-    Raises TheoryError, naming the reason, where there is none, or where the residual or the
-    closed loop says that what was found is not one.
+    Raises TheoryError with the reason if there is none, or if the computed S fails the check of its
+    residual or does not stabilise A - S G.
     """
-    missing = undetectable_mode(A, G)
-    if missing is not None:
+    hidden = undetectable_mode(A, G)
+    if hidden is not None:
         raise TheoryError(
-            f"(A, H) is not detectable: the mode with eigenvalue {missing:.6g} is not seen"
+            f"(A, H) is not detectable: the mode with eigenvalue {hidden:.6g} is not seen"
         )
     try:
         S = scipy.linalg.solve_continuous_are(A.T, square_root(G), Q, np.eye(len(A)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising solution of the Riccati equation: {error}") from None
-    # One step of Newton's method takes what is left of the residual away.
+    # One step of Newton's method (Kleinman) removes the rounding error of the solver:
+    # 0 = (A - S G) S+ + S+ (A - S G)' + Q + S G S.
     closed = A - S @ G
     S = _solve_lyapunov(closed, Q + S @ G @ S)
     residual = A @ S + S @ A.T + Q - S @ G @ S
@@ -109,7 +110,7 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
 
 
 def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """The solution of 0 = A X + X A' + Q for a stable A; raises TheoryError otherwise."""
+    """Return the solution X (n, n) of 0 = A X + X A' + Q; raises TheoryError for an unstable A."""
     if not np.linalg.eigvals(A).real.max() < 0.0:
         raise TheoryError("the error dynamics are not stable, their covariance has no limit")
     X = _solve_lyapunov(A, Q)
@@ -124,22 +125,23 @@ def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def undetectable_mode(A: FloatArray, G: FloatArray) -> complex | None:
-    """An eigenvalue of A with nonnegative real part whose mode G does not see, or None."""
-    return _hidden(A, G, only_unstable=True)
+    """Return an eigenvalue of A with nonnegative real part that G does not observe, or None."""
+    return _hidden_mode(A, G, only_unstable=True)
 
 
 def unobservable_mode(A: FloatArray, G: FloatArray) -> complex | None:
-    """An eigenvalue of A whose mode G does not see (Popov, Belevitch, Hautus), or None."""
-    return _hidden(A, G, only_unstable=False)
+    """Return an eigenvalue of A that G does not observe (Popov, Belevitch, Hautus), or None."""
+    return _hidden_mode(A, G, only_unstable=False)
 
 
-def _hidden(A: FloatArray, G: FloatArray, only_unstable: bool) -> complex | None:
+def _hidden_mode(A: FloatArray, G: FloatArray, only_unstable: bool) -> complex | None:
     n, size = len(A), max(float(np.linalg.norm(A, 2)), 1e-300)
-    seen = G / max(float(np.abs(G).max()), 1e-300) * size
+    scaled = G / max(float(np.abs(G).max()), 1e-300) * size  # rank does not depend on units
     for value in np.linalg.eigvals(A):
         if only_unstable and value.real < -1e-12 * size:
             continue
-        pencil = np.concatenate([A - value * np.eye(n), seen])
+        pencil = np.concatenate([A - value * np.eye(n), scaled])
+        # The mode is hidden if A - value I and G have a common null vector.
         if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9 * size:
             return complex(value)
     return None
