@@ -24,6 +24,7 @@ from netkf.theory import (
     push_sum_limits,
     push_sum_radius,
 )
+from netkf.theory.push_sum.certified_gamma import searches_gamma
 from netkf.trace.run import Run
 
 SLOTS_ONLY = True
@@ -212,6 +213,8 @@ CERTIFIED = Promise(
 
 def promises(scenario: Scenario) -> tuple[Promise, ...]:
     """Those of the scenario; a certified gamma where there is one."""
+    if not searches_gamma(stand_in(scenario)):
+        return PROMISES
     try:
         minimum_gamma(stand_in(scenario), "mean-square")
         exact_minimum_gamma(stand_in(scenario), most=MOST_CERTIFIED)

@@ -8,6 +8,7 @@ that only the pasts are sampled.
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -31,6 +32,8 @@ NOTHING = 1e-12  # an eigenvalue that small, relative to the trace, is 0
 MAX_SEARCHED = 30  # numbers in a past that the search for the worst one can handle
 MAX_TRIES = 300
 QUANTILE = 2.576
+MAX_REGRESSORS = 500  # sensors whose H varies
+TOGETHER = 20  # sensors of one kind whose pasts are looked at in one array
 ACCURACY = 1e-9
 """Relative error of the integral, with room to spare."""
 
@@ -64,9 +67,13 @@ def information_level(
         longest = 2 * scenario.plant.n
         window = next((h for h in range(1, longest) if _row(*whole, h)[2] > 0.0), longest)
     rows = [_row(*whole, window)]
-    rows += [_row(s.node, [s], [p], window) for s, p in zip(sources, past, strict=True)]
+    rows += _each_alone(sources, past, window)
     names = ["node", "window", "level", "low", "high", "mean", "mean_low", "mean_high"]
     return pd.DataFrame(rows, columns=names)
+
+
+Row = tuple[int, int, float, float, float, float, float, float]
+"""node, window, level, low, high, mean, mean_low, mean_high."""
 
 
 class _Source(NamedTuple):
@@ -77,6 +84,13 @@ class _Source(NamedTuple):
     C: FloatArray
     start: FloatArray
     drive: FloatArray
+
+
+def few_regressors(scenario: Scenario) -> bool:
+    """Whether the levels take seconds: pasts are drawn for each sensor whose H varies."""
+    varying = [k for k, sensor in enumerate(scenario.sensors) if sensor.varying]
+    placed = itertools.chain.from_iterable(scenario.placed.values())
+    return sum(place.entry in varying for place in placed) <= MAX_REGRESSORS
 
 
 def _sources(scenario: Scenario) -> list[_Source]:
@@ -119,9 +133,18 @@ def _law(source: _Source, slots: np.ndarray, random: np.random.Generator) -> Flo
     return states
 
 
-def _row(
-    node: int, sources: list[_Source], past: list[FloatArray], window: int
-) -> tuple[int, int, float, float, float, float, float, float]:
+def _each_alone(sources: list[_Source], past: list[FloatArray], window: int) -> list[Row]:
+    """A row for each sensor; fixed sensors of one kind share theirs."""
+    rows: list[Row | None] = [None] * len(sources)
+    for group in _alike(sources):
+        for k in group:
+            same = rows[group[0]] if not sources[k].drive.size else None
+            found = same or _row(sources[k].node, [sources[k]], [past[k]], window)
+            rows[k] = (sources[k].node, *found[1:])
+    return [row for row in rows if row is not None]
+
+
+def _row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> Row:
     values = _levels(sources, past, window)
     mean = float(values.mean())
     error = QUANTILE * float(values.std(ddof=1)) / np.sqrt(len(values))
@@ -166,16 +189,37 @@ def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> Floa
     """lambda_k (k,) for each of k pasts."""
     n = len(sources[0].C)
     total = np.zeros((len(past[0]), n, n))
-    for source, states in zip(sources, past, strict=True):
-        mean = states
-        cov = np.zeros_like(source.A)
-        for _ in range(window):
-            mean = mean @ source.A.T
-            cov = source.A @ cov @ source.A.T + (source.drive if source.drive.size else 0.0)
-            total = total + normalised_outer(mean @ source.C.T, source.C @ cov @ source.C.T)
+    for group in _alike(sources):
+        source, fixed = sources[group[0]], not sources[group[0]].drive.size
+        for start in range(0, 1 if fixed else len(group), TOGETHER):
+            # Fixed sensors of one kind have one past, which counts as often as there are sensors.
+            some = group[:1] if fixed else group[start : start + TOGETHER]
+            states = np.concatenate([past[k][:1] if fixed else past[k] for k in some])
+            found = _excited(source, states, window).reshape(len(some), -1, n, n)
+            total = total + found.sum(axis=0) * (len(group) if fixed else 1)
     values = np.linalg.eigvalsh(symmetric(total))
     least = values[:, 0] / (len(sources) * (window + 1))
     return np.where(values[:, 0] > NOTHING * values.sum(axis=1), least, 0.0)
+
+
+def _alike(sources: list[_Source]) -> list[list[int]]:
+    """Places of the sources of each kind; sources of one kind differ in their pasts only."""
+    groups: dict[tuple[bytes, ...], list[int]] = {}
+    for k, source in enumerate(sources):
+        key = tuple(part.tobytes() for part in (source.A, source.C, source.drive))
+        groups.setdefault(key, []).append(k)
+    return list(groups.values())
+
+
+def _excited(source: _Source, states: FloatArray, window: int) -> FloatArray:
+    """(k, n, n): the sum of the normalised outer products over a window, for each of k pasts."""
+    mean, cov, n = states, np.zeros_like(source.A), len(source.C)
+    total = np.zeros((len(states), n, n))
+    for _ in range(window):
+        mean = mean @ source.A.T
+        cov = source.A @ cov @ source.A.T + (source.drive if source.drive.size else 0.0)
+        total = total + normalised_outer(mean @ source.C.T, source.C @ cov @ source.C.T)
+    return total
 
 
 def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from netkf.theory.push_sum.certified_gamma import Moment, minimum_gamma
 from netkf.theory.push_sum.disconnection import disconnection_probability
 from netkf.theory.push_sum.estimation_steps import averaging_law, estimation_steps
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_filter
-from netkf.theory.push_sum.mean_square import mean_radius, radius
+from netkf.theory.push_sum.mean_square import mean_radius, push_sum_radius
 
 HEAVY = 0.885
 
@@ -161,7 +161,7 @@ def _moments(scenario: Scenario) -> list[AssumptionRow]:
         _certified(scenario, "mean", "P Theorem 5"),
         _exact(
             ("the errors stay bounded in the mean square", "P Lemma 10, derived"),
-            lambda: radius(estimation_steps(scenario)),
+            lambda: push_sum_radius(scenario),
             heavy=True,
         ),
         _certified(scenario, "mean-square", "P Theorem 6"),

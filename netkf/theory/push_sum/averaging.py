@@ -59,15 +59,15 @@ class Averaging:
     @cached_property
     def mean(self) -> FloatArray:
         """(N, N) E[M^gamma], P (28) for fresh links."""
-        if self._held:
-            return self._enumerated[0]
+        if self.enumerated:
+            return self._moments[0]
         return np.linalg.matrix_power(self.mean_step.toarray(), self.gamma)
 
     @cached_property
     def kron(self) -> FloatArray:
         """(N^2, N^2) E[M^gamma (x) M^gamma]."""
-        if self._held:
-            return self._enumerated[1]
+        if self.enumerated:
+            return self._moments[1]
         N, (i, j) = self.nodes, self.links.T
         step = self.mean_step.toarray()
         one = np.kron(step, step)
@@ -84,7 +84,7 @@ class Averaging:
     def second_moment(self, Y: FloatArray) -> FloatArray:
         """(N n, N n) E[(M^gamma (x) I) Y (M^gamma (x) I)'] for one Y of that shape."""
         N, n = self.nodes, len(Y) // self.nodes
-        if self._held or N <= FEW_NODES:
+        if self.enumerated or N <= FEW_NODES:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)
             four = (self.kron @ pairs).reshape(N, N, n, n).transpose(0, 2, 1, 3)
             return np.asarray(four.reshape(N * n, N * n))
@@ -114,7 +114,8 @@ class Averaging:
         return bool(np.isin(self.hears, (0.0, 1.0)).all())
 
     @property
-    def _held(self) -> bool:
+    def enumerated(self) -> bool:
+        """Whether moments need all outcomes of the links, because one draw serves all steps."""
         return self.held and self.gamma > 1 and not self.certain  # else one draw either way
 
     @cached_property
@@ -126,7 +127,7 @@ class Averaging:
         return own, cross, cross, other
 
     @cached_property
-    def _enumerated(self) -> tuple[FloatArray, FloatArray]:
+    def _moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean and mean Kronecker square of M^gamma over all outcomes of one draw."""
         N = self.nodes
         fates = self._fates

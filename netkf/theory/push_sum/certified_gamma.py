@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from netkf.theory.push_sum.mean_square import mean_radius, radius
 Moment = Literal["mean", "mean-square"]
 MAX_STEPS = 10**7
 MAX_EXACT = 1000
+MAX_SEARCHED = 120  # states of all nodes together; beyond it a search over gamma takes minutes
 
 
 class GammaConstants(NamedTuple):
@@ -48,6 +50,12 @@ def gamma_constants(scenario: Scenario) -> GammaConstants:
     """The constants; raises TheoryError where a condition of the theorems fails: delta at or below
     rho(L), a singular P_inf, links held over the steps or failing in one direction.
     """
+    return _constants(scenario)
+
+
+@lru_cache(maxsize=8)
+def _constants(scenario: Scenario) -> GammaConstants:
+    """Kept, because both theorems need them and the disconnection probability takes time."""
     steps = estimation_steps(scenario)
     law, P, N = steps.averaging, steps.limits.P, steps.limits.N
     _conditions(scenario, law, P)
@@ -155,6 +163,11 @@ def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
 
 def _rho(matrix: list[list[float]]) -> float:
     return float(np.abs(np.linalg.eigvals(np.array(matrix))).max())
+
+
+def searches_gamma(scenario: Scenario) -> bool:
+    """Whether a search for the exact smallest gamma takes seconds."""
+    return len(scenario.nodes) * scenario.plant.n <= MAX_SEARCHED
 
 
 def exact_minimum_gamma(

@@ -12,7 +12,14 @@ from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.estimation_steps import estimation_steps
-from netkf.theory.push_sum.mean_square import BASIS, FEW, TINY, mapping, radius, written_out
+from netkf.theory.push_sum.mean_square import (
+    BASIS,
+    FEW,
+    TINY,
+    mapping,
+    push_sum_radius,
+    written_out,
+)
 
 MAX_ROUNDS = 20
 RESIDUAL = 1e-10
@@ -26,8 +33,7 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
     filters' Q and R may differ from the truth. Raises TheoryError where ``push_sum_radius`` is not
     below 1 or does not exist.
     """
-    steps = estimation_steps(scenario)
-    found = radius(steps)
+    found, steps = push_sum_radius(scenario), estimation_steps(scenario)
     if not found < 1.0:
         raise TheoryError(
             f"no steady error covariance: the mean-square radius is {found:.6g}, not below 1; "

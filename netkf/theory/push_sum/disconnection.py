@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import networkx
@@ -26,7 +27,8 @@ from netkf.scenario.scenario import Scenario
 
 MAX_PARTITIONS = 120_000
 MAX_ROOTS = 12
-SAMPLES = 200_000
+MAX_OPEN = 40  # nodes open at a time, from which on partitions are far too many
+SAMPLES, MIN_SAMPLES, NODE_SAMPLES = 200_000, 2_000, 2e7
 BATCH = 2_000_000  # link draws
 CONFIDENCE = 0.99
 
@@ -63,7 +65,7 @@ def disconnection_probability(
     graph: networkx.Graph[Any] | Topology | Scenario | Iterable[Edge],
     delivery: float | Mapping[Edge, float] | None = None,
     seed: int = 0,
-    samples: int = SAMPLES,
+    samples: int | None = None,
 ) -> Probability:
     """The probability that the links which are up leave the network unconnected, p_d.
 
@@ -72,20 +74,38 @@ def disconnection_probability(
     that of the scenario's channel. Links fail independently, in both directions together.
 
     A float with ``low``, ``high`` and ``exact``: exact while at most 120,000 partitions of open
-    nodes occur (any graph of ten nodes, grids ten wide), else the estimate of ``samples`` draws.
+    nodes occur (any graph of ten nodes, grids ten wide), else the estimate of ``samples`` draws
+    (default: 200,000, and fewer in networks of more than 100 nodes, so that it takes seconds).
     Raises TheoryError for directed graphs, and for links without a probability or with one outside
     [0, 1].
     """
-    nodes, chances = _network(graph, delivery)
+    if isinstance(graph, Scenario) and delivery is None:
+        return _of_scenario(graph, seed, samples)
+    return _computed(*_network(graph, delivery), seed, samples)
+
+
+@lru_cache(maxsize=8)
+def _of_scenario(scenario: Scenario, seed: int, samples: int | None) -> Probability:
+    """Kept, because assumptions and promises both ask for it."""
+    return _computed(*_network(scenario, None), seed, samples)
+
+
+def _computed(
+    nodes: int, chances: dict[tuple[int, int], float], seed: int, samples: int | None
+) -> Probability:
+    """Exact where that is within reach, else simulated."""
     neighbours: list[dict[int, float]] = [{} for _ in range(nodes)]
     for (i, j), p in chances.items():
         if p > 0.0:
             neighbours[i][j] = neighbours[j][i] = p
     if not _reaches_all(neighbours):
         return Probability(1.0, 1.0, 1.0, True)
-    cut = _cut(neighbours, _order(neighbours))
+    order = _order(neighbours)
+    cut = None if order is None else _cut(neighbours, order)
     if cut is not None:
         return Probability(cut, cut, cut, True)
+    if samples is None:
+        samples = int(np.clip(NODE_SAMPLES / nodes, MIN_SAMPLES, SAMPLES))
     return _simulated(nodes, chances, seed, samples)
 
 
@@ -161,15 +181,19 @@ def _reaches_all(neighbours: list[dict[int, float]]) -> bool:
     return len(seen) == len(neighbours)
 
 
-def _order(neighbours: list[dict[int, float]]) -> list[int]:
-    """All nodes, so that few are open at a time: greedy, from several first nodes."""
+def _order(neighbours: list[dict[int, float]]) -> list[int] | None:
+    """All nodes, so that few are open at a time: greedy, from several first nodes; None where too
+    many are open in every order found.
+    """
     nodes = range(len(neighbours))
     fewest = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
-    return min((_greedy(neighbours, root) for root in fewest), key=lambda found: found[0])[1]
+    found = [_greedy(neighbours, root) for root in fewest]
+    return min((one for one in found if one is not None), default=(0.0, None))[1]
 
 
-def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]]:
-    """A guess of how many partitions there will be, and the order that was found.
+def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
+    """A guess of how many partitions there will be, and the order that was found; None as soon as
+    more than MAX_OPEN nodes are open.
 
     Next comes the node that closes most open ones and then opens fewest further ones.
     """
@@ -190,8 +214,10 @@ def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[
         for other in neighbours[node]:
             waiting[other].discard(node)
         opened = {k for k in opened if waiting[k]}
+        if len(opened) > MAX_OPEN:
+            return None
         candidates = (candidates | neighbours[node].keys()) - taken
-        effort += 3.0 ** min(len(opened), 600)
+        effort += 3.0 ** len(opened)
     return effort, order
 
 

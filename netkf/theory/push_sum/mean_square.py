@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -27,6 +28,9 @@ from netkf.theory.push_sum.estimation_steps import EstimationSteps, averaging_la
 TINY, FEW = 10, 40  # rows of X up to which T is written out at once, or where nothing else helps
 SLACK = 1e-6  # relative, of the radius where an X proves it
 BASIS = 24  # vectors that Arnoldi's method keeps
+MAX_ROWS = 500  # of X; with twice as many rows a step takes four times the work and memory
+DENSE_ROWS = 300  # of the mean dynamics up to which all eigenvalues are computed
+MEAN_BASIS, MEAN_RESTARTS = 40, 60
 
 
 def push_sum_radius(scenario: Scenario) -> float:
@@ -38,6 +42,12 @@ def push_sum_radius(scenario: Scenario) -> float:
     independent between links, with the probabilities of the channel. Raises TheoryError where the
     links have no such law, the gains do not exist, or held links are too many to enumerate.
     """
+    return _radius_of(scenario)
+
+
+@lru_cache(maxsize=8)
+def _radius_of(scenario: Scenario) -> float:
+    """Kept, because assumptions, promises and the error covariance ask for it one by one."""
     return radius(estimation_steps(scenario))
 
 
@@ -57,7 +67,9 @@ def push_sum_stability(
 
 
 def radius(steps: EstimationSteps) -> float:
-    """The spectral radius of T; the largest over groups of states that do not mix."""
+    """The spectral radius of T; the largest over groups of states that do not mix. Raises
+    TheoryError for networks with more than MAX_ROWS states in a group.
+    """
     return max(_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 
 
@@ -68,8 +80,37 @@ def mean_radius(steps: EstimationSteps) -> float:
 
 def _mean_radius(law: Averaging, closed: FloatArray) -> float:
     N, n, _ = closed.shape
+    if N * n > DENSE_ROWS and not law.enumerated:
+        return _iterated_mean_radius(law, closed)
     whole = np.einsum("ij,jab->iajb", law.mean, closed).reshape(N * n, N * n)
     return float(np.abs(np.linalg.eigvals(whole)).max())
+
+
+def _iterated_mean_radius(law: Averaging, closed: FloatArray) -> float:
+    """By Arnoldi's method with sparse averaging steps, for large networks."""
+    N, n, _ = closed.shape
+
+    def step(e: FloatArray) -> FloatArray:
+        moved = (closed @ e.reshape(N, n, 1))[:, :, 0]
+        for _ in range(law.gamma):
+            moved = law.mean_step @ moved
+        return np.asarray(moved.ravel())
+
+    operator = scipy.sparse.linalg.LinearOperator((N * n, N * n), matvec=step, dtype=np.float64)
+    try:
+        values = scipy.sparse.linalg.eigs(
+            operator,
+            k=2,
+            which="LM",
+            v0=np.linspace(1.0, 2.0, N * n),
+            ncv=MEAN_BASIS,
+            tol=1e-9,
+            maxiter=MEAN_RESTARTS,
+            return_eigenvectors=False,
+        )
+    except scipy.sparse.linalg.ArpackError as error:
+        raise TheoryError(f"the radius of the mean was not found: {error}") from None
+    return float(np.abs(values).max())
 
 
 def _groups(closed: FloatArray) -> list[FloatArray]:
@@ -88,6 +129,11 @@ def _radius(law: Averaging, closed: FloatArray) -> float:
     if law.certain:  # no spread, so that T moves the mean's outer products
         return _mean_radius(law, closed) ** 2
     size = closed.shape[0] * closed.shape[1]
+    if size > MAX_ROWS:
+        raise TheoryError(
+            f"mean squares of {size:,} errors that mix are {size:,}^2 numbers; they are computed "
+            f"for at most {MAX_ROWS} errors, so take a smaller network"
+        )
     if size > TINY:
         value, proved = _arnoldi(law, closed)
         if proved or size > FEW:

@@ -10,13 +10,17 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.limits import central_covariance
-from netkf.theory.push_sum.certified_gamma import exact_minimum_gamma, minimum_gamma
+from netkf.theory.push_sum.certified_gamma import (
+    MAX_SEARCHED,
+    exact_minimum_gamma,
+    minimum_gamma,
+    searches_gamma,
+)
 from netkf.theory.push_sum.covariance import push_sum_error_covariance
 from netkf.theory.push_sum.disconnection import disconnection_probability
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
 from netkf.theory.push_sum.mean_square import push_sum_radius
 
-MAX_STATES = 120  # of all nodes together; beyond it a search over gamma takes minutes
 MAX_STEPS = 20
 
 
@@ -34,8 +38,11 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
 
     def exact_gamma() -> int:
-        if len(scenario.nodes) * scenario.plant.n > MAX_STATES:
-            raise TheoryError("not looked for in a network of this size")
+        if not searches_gamma(scenario):
+            raise TheoryError(
+                f"not looked for: the nodes have more than {MAX_SEARCHED} states together; "
+                "netkf.theory.exact_minimum_gamma looks for it however long it takes"
+            )
         return exact_minimum_gamma(scenario, most=MAX_STEPS)
 
     def cut() -> list[float]:
