@@ -64,7 +64,8 @@ class Paths:
     ) -> None:
         self._blocks = blocks
         plant, probe, samples = (
-            StreamNormals(streams.seed_words(purpose, [()])) for purpose in ("plant", "probe", "samples")
+            StreamNormals(streams.seed_words(purpose, [()]))
+            for purpose in ("plant", "probe", "samples")
         )
         self._paths = scenario.truth.paths(
             plant,
@@ -190,7 +191,7 @@ class Noise:
         """Draw the noise of the next stretch."""
         own, shape = self._own, self._own.noise.shape
         every = np.arange(shape[0] * shape[1])
-        normals = own.noise.reshape(-1, *shape[2:])
+        normals = own.noise.reshape(len(every), *shape[2:])
         fill_sensor_normals(self._noise.states, every, self._rows, normal_ziggurat(), normals)
         own.noise[:] = step_noise(own.noise, self._period)
         own.step[:] = -1
@@ -199,7 +200,7 @@ class Noise:
         """Draw new normals where they are used up."""
         used, shape = self._own.used[run], self._own.normals.shape
         empty = np.flatnonzero(used == shape[2]) + run * shape[1]
-        normals = self._own.normals.reshape(-1, *shape[2:])
+        normals = self._own.normals.reshape(shape[0] * shape[1], *shape[2:])
         fill_sensor_normals(self._cuts.states, empty, self._rows, normal_ziggurat(), normals)
         used[used == shape[2]] = 0
 

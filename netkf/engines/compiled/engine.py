@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +12,9 @@ from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
+from netkf.engines.compiled.batches import flow_batches
 from netkf.engines.compiled.event_loop import event_loop
-from netkf.engines.compiled.flow import FlowRun
-from netkf.engines.compiled.lots import at_a_workspace
+from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.slotted import KERNELS, SlotRun
 from netkf.linalg import compiling
 from netkf.plants.diffusion import Diffusion
@@ -30,6 +31,7 @@ from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
+from netkf.trace.batch import RunBatch
 from netkf.trace.recorder import Recorder
 
 KNOWN = (
@@ -75,5 +77,11 @@ class CompiledEngine(Engine):
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             if scenario.slotted:
                 return SlotRun(scenario, streams, recorder, progress).to_the_end()
-            with at_a_workspace(scenario, streams) as (workspace, draws):
-                return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
+            workspace, draws = Workspace(scenario), Source(scenario, streams)
+            return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
+
+    def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
+        """Yield the runs of consecutive replicas in order."""
+        if scenario.slotted:
+            return super().run_many(scenario, seed, replicas)
+        return flow_batches(scenario, seed, replicas)
