@@ -7,13 +7,19 @@ import pytest
 
 import netkf
 from netkf.engines.compiled.event_loop import event_loop
-from netkf.engines.compiled.slotted import KERNELS
 from netkf.linalg import compiling
 from netkf.scenario.reading import from_table
 
 ROOT = Path(__file__).parent.parent
 SCENARIOS = ROOT / "scenarios"
-ONCE = {event_loop, *KERNELS.values()}
+SLOT_FILTERS = (
+    netkf.parts.Gossip,
+    netkf.parts.Intermittent,
+    netkf.parts.DiffusionFilter,
+    netkf.parts.PushSum,
+    netkf.parts.Local,
+)
+ONCE = {event_loop, *(kind.slot_kernel for kind in SLOT_FILTERS)}
 
 
 def scenario_files():

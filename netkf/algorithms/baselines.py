@@ -7,7 +7,41 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    rebase,
+    show,
+    use_reading,
+)
 from netkf.algorithms.registry import built_in
+from netkf.linalg.compiling import kernel
+
+
+@kernel
+def local_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,  # noqa: ARG001 - nobody talks
+    samples: SlotSamples,
+    room: SlotRoom,
+) -> None:
+    """Carry filters that never talk through the slots of a plan: predict, then update."""
+    H = len(nodes.rows)
+    for r in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.sensed[s]:
+                for h in range(H):
+                    predict(nodes, r * H + h, room)
+                    use_reading(nodes, r * H + h, readings, r, s, h, room.update)
+            show(nodes, plan, samples, r, s)
+            rebase(nodes, readings, r, s)
 
 
 @built_in("local")
@@ -21,6 +55,7 @@ class Local(Filter):
     schedule: ClassVar[tuple[str, ...]] = ("predict", "sense")
     clocks: ClassVar[tuple[str, ...]] = ()
     talks: ClassVar[bool] = False
+    slot_kernel = staticmethod(local_slots)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
         """Return the state: nothing arrives."""
@@ -35,3 +70,4 @@ class Central(Local):
     """One Kalman(-Bucy) filter reads all sensors without delay or loss; every node shows it."""
 
     pooled: ClassVar[bool] = True
+    slot_kernel = staticmethod(local_slots)

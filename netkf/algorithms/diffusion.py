@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -9,13 +10,31 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo
-from netkf.algorithms.kernels.root_update import intersect_roots
+from netkf.algorithms.kernels.root_update import (
+    begin_intersection,
+    end_intersection,
+    intersect_roots,
+    invert_root,
+    merge_information,
+)
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    rebase,
+    show,
+    use_reading,
+)
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, either, field, nested, square
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import compilable
+from netkf.linalg.compiling import kernel
 
 METROPOLIS = "metropolis"
 
@@ -34,6 +53,112 @@ class DiffusionState(NamedTuple):
     def P(self) -> FloatArray:
         """``root root'`` (n, n)."""
         return self.root @ self.root.T
+
+
+class DiffusionWeights(NamedTuple):
+    """What filters give themselves when all messages arrive, ``own`` (H,), and whether they keep
+    the weight of messages that do not; ``inverse`` (H, n, n) is scratch.
+    """
+
+    own: FloatArray
+    keep_own: bool
+    inverse: FloatArray
+
+
+@kernel
+def effective_weights(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
+    """Return the own weight and the divisor of the others, so that all of them sum to 1.
+
+    ``own`` and ``heard`` are the nominal own weight and the sum of those of the messages that
+    arrived, see ``DiffusionFilter.on_loss``.
+    """
+    total = own + heard
+    if keep_own or total == 0.0:
+        return max(0.0, 1.0 - heard), 1.0
+    return own / total, total
+
+
+@kernel
+def diffusion_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+    weights: DiffusionWeights,
+) -> None:
+    """Carry diffusion filters through the slots of a plan, D (6)-(9)."""
+    H = len(nodes.rows)
+    for r in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            show(nodes, plan, samples, r, s)
+            rebase(nodes, readings, r, s)
+            if plan.sensed[s]:
+                for h in range(H):
+                    use_reading(nodes, r * H + h, readings, r, s, h, room.update)
+                    predict(nodes, r * H + h, room)
+            if plan.exchanged[s]:
+                for h in range(H):
+                    copy_estimate(nodes, r * H + h, room, h)
+                    invert_root(weights.inverse[h], nodes.root, r * H + h, 1.0)
+                for h in range(H):
+                    combine(nodes, plan, links, room, weights, r, s, h)
+
+
+@kernel
+def copy_estimate(nodes: SlotNodes, place: int, room: SlotRoom, h: int) -> None:
+    """Keep the estimate of a place as what filter ``h`` sends."""
+    for i in range(nodes.xhat.shape[1]):
+        room.xhat[h, i] = nodes.xhat[place, i]
+
+
+@kernel
+def combine(
+    nodes: SlotNodes,
+    plan: SlotPlan,
+    links: SlotLinks,
+    room: SlotRoom,
+    weights: DiffusionWeights,
+    r: int,
+    s: int,
+    h: int,
+) -> None:
+    """Intersect what filter ``h`` has with what it hears, D (8) and (9)."""
+    heard = 0.0
+    for m in range(links.first[h], links.first[h + 1]):
+        if plan.up[r, s, 0, links.way[m]] == 1:
+            heard += links.weight[m]
+    own, divisor = effective_weights(weights.own[h], heard, weights.keep_own)
+    if own == 1.0:
+        return
+    begin_intersection(room.update)
+    add_information(own, weights.inverse, h, h, room)
+    for m in range(links.first[h], links.first[h + 1]):
+        if plan.up[r, s, 0, links.way[m]] == 1:
+            add_information(links.weight[m] / divisor, weights.inverse, links.sender[m], h, room)
+    place = r * len(nodes.rows) + h
+    end_intersection(nodes.root, nodes.xhat, place, room.xhat, h, room.update)
+
+
+@kernel
+def add_information(
+    weight: float, inverse: FloatArray, sender: int, h: int, room: SlotRoom
+) -> None:
+    """Add ``weight`` times the information that ``sender`` sends to filter ``h``; means count from
+    what the latter had.
+    """
+    n, size = inverse.shape[1], math.sqrt(weight)
+    if weight <= 0.0:
+        return
+    whitened = room.update.whitened
+    for i in range(n):
+        mean = 0.0
+        for j in range(i + 1):
+            whitened[i, j] = size * inverse[sender, i, j]
+            mean += whitened[i, j] * (room.xhat[sender, j] - room.xhat[h, j])
+        whitened[i, n] = mean
+    merge_information(room.update.total, whitened)
 
 
 @built_in("diffusion")
@@ -66,6 +191,15 @@ class DiffusionFilter(Filter):
     predicts: ClassVar[bool] = True
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
+    slot_kernel = staticmethod(diffusion_slots)
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[DiffusionWeights]:
+        """The weights of the nodes."""
+        own = np.array([info.own_weight for info in infos], dtype=np.float64)
+        n = len(states[0].xhat)
+        return (DiffusionWeights(own, self.on_loss == "keep-own", np.zeros((len(own), n, n))),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -119,15 +253,5 @@ class DiffusionFilter(Filter):
         """The own weight and those of the messages that arrived, which sum to 1, from the nominal
         ones.
         """
-        kept, heard = shares(own, np.array(arrived), self.on_loss == "keep-own")
-        return float(kept), heard.tolist()
-
-
-@compilable
-def shares(own: float, arrived: FloatArray, keep_own: bool) -> tuple[float, FloatArray]:
-    """The weights that sum to 1 from the nominal ones, see ``DiffusionFilter.on_loss``."""
-    heard = arrived.sum()
-    total = own + heard
-    if keep_own or total == 0.0:
-        return max(0.0, 1.0 - heard), arrived
-    return own / total, arrived / total
+        kept, divisor = effective_weights(own, math.fsum(arrived), self.on_loss == "keep-own")
+        return kept, [weight / divisor for weight in arrived]

@@ -175,6 +175,8 @@ class Filter(Component):
     talks     nodes exchange messages
     pooled    one filter reads the sensors of all nodes at once
     needs_samples  increment sensors mean nothing to it
+    slot_kernel    the compiled form of the filter in slots (algorithms.kernels.slots), of its own
+              class only; None: it runs in the SimPy engine
     newest_only    of several messages of one sender at one instant the newest counts
     fixed_sensors  it adds up information, so the H of a sensor must not vary
     paper        the paper whose theory and checks speak about it: rooms of that name
@@ -200,6 +202,7 @@ class Filter(Component):
     paper: ClassVar[str] = ""
     combination: ClassVar[str] = ""
     P_by_design: ClassVar[tuple[str, str]] = ("", "")
+    slot_kernel: ClassVar[Any] = None
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -291,6 +294,24 @@ class Filter(Component):
         first step always draws.
         """
         return True
+
+    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
+        """Return False if a node never sends anything in exchange number ``phase``; for compiled
+        filters, ``emit`` says it for the others.
+        """
+        return True
+
+    def slot_stopping(self) -> tuple[int, bool]:
+        """The exchange in which nodes may stop for good (-1: none), and whether they are silent in
+        it from then on; for compiled filters.
+        """
+        return -1, False
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[Any, ...]:
+        """What ``slot_kernel`` is given besides, for so many runs that start in these states."""
+        return ()
 
     def stopped(self, state: Any) -> bool:
         """Return True once the node has permanently frozen its network estimate."""

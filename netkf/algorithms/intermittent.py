@@ -7,10 +7,23 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    rebase,
+    show,
+    use_reading,
+)
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import choice, field, positive
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
 
 SLACK = 1.0 + 1e-6
 """Ages are rounded."""
@@ -52,6 +65,31 @@ class IntermittentState(NamedTuple):
         return self.root @ self.root.T
 
 
+@kernel
+def intermittent_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+) -> None:
+    """Carry intermittent filters through the slots of a plan, R (15)-(18)."""
+    H = len(nodes.rows)
+    for r in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            show(nodes, plan, samples, r, s)
+            rebase(nodes, readings, r, s)
+            if not plan.sensed[s]:
+                continue
+            for h in range(H):
+                use_reading(nodes, r * H + h, readings, r, s, h, room.update)
+                for m in range(links.first[h], links.first[h + 1]):
+                    if plan.up[r, s, 0, links.way[m]] == 1:
+                        use_reading(nodes, r * H + h, readings, r, s, links.sender[m], room.update)
+                predict(nodes, r * H + h, room)
+
+
 @built_in("intermittent")
 @dataclass(frozen=True, eq=False)
 class Intermittent(Filter):
@@ -75,6 +113,11 @@ class Intermittent(Filter):
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
     newest_only: ClassVar[bool] = False
+    slot_kernel = staticmethod(intermittent_slots)
+
+    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
+        """Nodes send their readings."""
+        return has_sensor
 
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo

@@ -18,16 +18,35 @@ import numpy as np
 
 from netkf.algorithms import running_sums
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.square_root import lower_triangular
-from netkf.algorithms.kernels.stopping import RULES, stops
+from netkf.algorithms.kernels.mass import (
+    add_gain,
+    correct_root,
+    keep_share,
+    learn_network,
+    split_mass,
+)
+from netkf.algorithms.kernels.root_update import lower_root, update_scratch
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    predict_mean,
+    rebase,
+    show,
+    whitened,
+)
+from netkf.algorithms.kernels.stopping import PAPER, RULES, has_stopped
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, choice, field, integer, number, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
-from netkf.linalg.compiling import compilable
-from netkf.linalg.small import applied, even, product, solution
+from netkf.linalg.compiling import kernel
 
 MASS, AVERAGE = 0, 1
 """The two exchanges of a slot."""
@@ -66,6 +85,182 @@ class PushSumState(NamedTuple):
         return self.root @ self.root.T
 
 
+class PushSumArrays(NamedTuple):
+    """Mass (R H, m) and nominal ``degree`` (H,) of the nodes; what they take the network to be,
+    ``information`` (R H, n, n) and ``number`` (R H,); the information of a node ``alone``
+    (H, n, n); the settings, and the root of P_inf, ``limit`` (n, n), with asymptotic gains.
+
+    Scratch: ``share`` (H, m), ``before`` (m,), ``found`` (1, n, n), ``found_number`` (1,).
+    """
+
+    mass: FloatArray
+    degree: np.ndarray
+    information: FloatArray
+    number: FloatArray
+    alone: FloatArray
+    rule: int
+    tolerance: float
+    delta: float
+    gamma: int
+    asymptotic: bool
+    limit: FloatArray
+    share: FloatArray
+    before: FloatArray
+    found: FloatArray
+    found_number: FloatArray
+
+
+@kernel
+def push_sum_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+    arrays: PushSumArrays,
+) -> None:
+    """Carry push-sum filters through the slots of a plan, P Fig. 1."""
+    H = len(nodes.rows)
+    for r in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.exchanged[s] and not arrays.asymptotic:
+                exchange_mass(arrays, plan, links, samples, room, r, s)
+            if plan.sensed[s]:
+                for h in range(H):
+                    predict_and_correct(nodes, readings, room, arrays, r, s, h)
+            if plan.exchanged[s]:
+                for step in range(arrays.gamma):
+                    up = plan.up[r, s, 1 + step]
+                    average(nodes.xhat, r * H, links, up, room.xhat, arrays.delta)
+            if plan.sample[s] >= 0:
+                for h in range(H):
+                    samples.conserved[r, h, 0] = arrays.mass[r * H + h, 0]
+                    samples.conserved[r, h, 1] = arrays.mass[r * H + h, 1]
+            show(nodes, plan, samples, r, s)
+            rebase(nodes, readings, r, s)
+
+
+@kernel
+def exchange_mass(
+    arrays: PushSumArrays,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+    r: int,
+    s: int,
+) -> None:
+    """One exchange of mass, P steps 2.1 to 2.3."""
+    H = len(arrays.degree)
+    for h in range(H):
+        split_mass(arrays.mass, r * H + h, arrays.degree[h], arrays.share, h)
+    if arrays.rule == PAPER:  # nodes that have stopped send no mass
+        for m in range(len(links.sender)):
+            if samples.stopped[r, links.sender[m]] < plan.first + s:
+                plan.up[r, s, 0, links.way[m]] = 0
+    for h in range(H):
+        has_stopped = samples.stopped[r, h] < plan.first + s
+        if has_stopped and arrays.rule == PAPER:
+            continue
+        received = mix_mass(arrays, plan, links, r, s, h)
+        if has_stopped:
+            continue
+        if learn(arrays, r * H + h, h, received == arrays.degree[h], room.moved):
+            samples.stopped[r, h] = plan.first + s
+
+
+@kernel
+def mix_mass(
+    arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, r: int, s: int, h: int
+) -> int:
+    """Take the mass that node ``h`` keeps and receives, P (3)-(5); return how many shares came."""
+    received, k, mass, share = 0, r * len(arrays.degree) + h, arrays.mass, arrays.share
+    for i in range(mass.shape[1]):
+        arrays.before[i], mass[k, i] = mass[k, i], 0.0
+    for m in range(links.first[h], links.first[h + 1]):
+        if plan.up[r, s, 0, links.way[m]] == 1:
+            received += 1
+            for i in range(mass.shape[1]):
+                mass[k, i] += share[links.sender[m], i]
+    keep_share(mass, k, share, h, arrays.degree[h] + 1 - received)
+    return received
+
+
+@kernel
+def learn(arrays: PushSumArrays, k: int, h: int, whole: bool, work: FloatArray) -> bool:
+    """P (6) for the mass of place ``k``, a node ``h`` all of whose links were up if ``whole``;
+    return True if the node stops.
+    """
+    learn_network(arrays.mass, k, arrays.alone, h, arrays.found, arrays.found_number)
+    stops = has_stopped(
+        arrays.rule,
+        arrays.tolerance,
+        arrays.mass,
+        k,
+        arrays.before,
+        whole,
+        arrays.found,
+        arrays.found_number,
+        arrays.information,
+        arrays.number,
+        work,
+    )
+    n = arrays.found.shape[1]
+    for i in range(n):
+        for j in range(n):
+            arrays.information[k, i, j] = arrays.found[0, i, j]
+    arrays.number[k] = arrays.found_number[0]
+    return stops
+
+
+@kernel
+def predict_and_correct(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    room: SlotRoom,
+    arrays: PushSumArrays,
+    r: int,
+    s: int,
+    h: int,
+) -> None:
+    """Steps 3 and 4: the prediction, P (7) and (8)."""
+    k, n = r * len(nodes.rows) + h, nodes.xhat.shape[1]
+    if arrays.asymptotic:
+        predict_mean(nodes, k, room)
+        for i in range(n):
+            for j in range(i + 1):
+                nodes.root[k, i, j] = arrays.limit[i, j]
+    else:
+        predict(nodes, k, room)
+        correct_root(nodes.root, k, arrays.information, k, room.moved, room.update)
+    if nodes.rows[h] > 0:
+        H = readings.H[r % readings.H.shape[0], s % readings.H.shape[1], h]
+        y, number = readings.y[r, s, h], arrays.number[k]
+        add_gain(nodes.xhat, nodes.root, k, number, y, H, nodes.rows[h], room.vectors)
+
+
+@kernel
+def average(
+    z: FloatArray, first: int, links: SlotLinks, up: np.ndarray, moves: FloatArray, delta: float
+) -> None:
+    """One averaging step of all nodes, P (9): to the places of z (K, n) from ``first`` on add
+    1 / delta of the differences to the estimates that arrive; ``moves`` (H, n) is scratch.
+    """
+    H, n = len(links.first) - 1, z.shape[1]
+    for h in range(H):
+        for i in range(n):
+            moves[h, i] = 0.0
+        for m in range(links.first[h], links.first[h + 1]):
+            if up[links.way[m]] == 1:
+                sender = first + links.sender[m]
+                for i in range(n):
+                    moves[h, i] += z[sender, i] - z[first + h, i]
+    for h in range(H):
+        for i in range(n):
+            z[first + h, i] += moves[h, i] / delta
+
+
 @built_in("push-sum")
 @dataclass(frozen=True, eq=False)
 class PushSum(Filter):
@@ -100,6 +295,45 @@ class PushSum(Filter):
     clocks: ClassVar[tuple[str, ...]] = ("nodes",)
     first_slot: ClassVar[int] = 1
     needs_samples: ClassVar[bool] = True
+    slot_kernel = staticmethod(push_sum_slots)
+
+    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
+        """With asymptotic gains no mass is sent."""
+        return phase == AVERAGE or not self.asymptotic
+
+    def slot_stopping(self) -> tuple[int, bool]:
+        """Nodes stop when they have exchanged mass; by the paper's rule they send none then."""
+        stops = not self.asymptotic and self.stop != "never"
+        return (MASS if stops else -1), stops and self.stop == "paper"
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[PushSumArrays]:
+        """What the nodes know at the start."""
+        known = [state.network for state in states]
+        alone = np.stack([state.model.information for state in states])
+        H, n = alone.shape[:2]
+        limit = np.zeros((n, n)) if known[0].root is None else known[0].root
+        mass = np.stack([state.mass for state in states])
+        return (
+            PushSumArrays(
+                mass=np.tile(mass, (runs, 1)),
+                degree=np.array([state.degree for state in states], dtype=np.int64),
+                information=np.tile(np.stack([k.information for k in known]), (runs, 1, 1)),
+                number=np.tile(np.array([k.number for k in known], dtype=np.float64), runs),
+                alone=alone,
+                rule=RULES.index(self.stop),
+                tolerance=self.tolerance,
+                delta=self.delta or math.inf,
+                gamma=self.steps(AVERAGE),
+                asymptotic=self.asymptotic,
+                limit=np.ascontiguousarray(limit),
+                share=np.empty((H, mass.shape[1])),
+                before=np.empty(mass.shape[1]),
+                found=np.empty((1, n, n)),
+                found_number=np.empty(1),
+            ),
+        )
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Step 1: the leader gets the weight; with asymptotic gains every node knows the limits."""
@@ -154,10 +388,20 @@ class PushSum(Filter):
         """P (6) and the stop rule; ``whole``: all links of the node were up."""
         if state.stopped:
             return state
-        found = network(state.mass, state.model)
-        known = (*found[:2], *state.network[:2])
-        rule = RULES.index(self.stop)
-        stopped = stops(rule, self.tolerance, state.mass, before, whole, *known)
+        found, former = network(state.mass, state.model), state.network
+        stopped = has_stopped(
+            RULES.index(self.stop),
+            self.tolerance,
+            state.mass[None],
+            0,
+            before,
+            whole,
+            found.information[None],
+            np.array([found.number]),
+            former.information[None],
+            np.array([former.number]),
+            np.empty(found.information.shape),
+        )
         return state._replace(network=found, stopped=stopped)
 
     def update(self, state: Any, reading: Reading) -> Any:
@@ -252,7 +496,6 @@ class PushSum(Filter):
         )
 
 
-@compilable
 def corrected(
     predicted: FloatArray,
     root: FloatArray,
@@ -264,64 +507,55 @@ def corrected(
     """P (8): the prediction (n,) and ``number`` times the gain of the reading, which may have no
     rows.
     """
-    if not len(y):
-        return predicted
-    gain = number * product(root, product(root.T, solution(R, H).T))
-    return predicted + applied(gain, y - applied(H, predicted))
+    x = predicted[None].copy()
+    if len(y):
+        y, H = whitened(y, H, R)
+        add_gain(x, root[None], 0, number, y, H, len(y), np.empty((2, x.shape[1])))
+    return np.asarray(x[0])
 
 
-@compilable
 def share(mass: FloatArray, degree: int) -> FloatArray:
     """What a node of ``degree`` neighbours sends to each of them: its mass over degree + 1."""
-    return mass / (degree + 1)
+    part = np.empty((1, mass.size))
+    split_mass(mass.reshape(1, -1), 0, degree, part, 0)
+    return part.reshape(mass.shape)
 
 
 def mixed(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
     """P (3)-(5) as they conserve mass: the shares ``received`` and the node's own, which it keeps
     once for itself and once for each link of its ``degree`` that failed.
-
-    ``mass`` and shares (m,), or stacks of them.
     """
-    own = kept(mass, len(received), degree)
-    return own + sum(received) if received else own
-
-
-@compilable
-def kept(mass: FloatArray, received: int, degree: int) -> FloatArray:
-    """The node's own share, once for itself and once for each of its links that failed."""
-    return (degree + 1 - received) * share(mass, degree)
+    total = np.array(sum(received, np.zeros(mass.shape))).reshape(1, -1)
+    own = share(mass, degree).reshape(1, -1)
+    keep_share(total, 0, own, 0, degree + 1 - len(received))
+    return total.reshape(mass.shape)
 
 
 def network(mass: FloatArray, model: SlotModel) -> Network:
     """P (6): C~ / w and n~ / w, or what the node knows of itself while its weight is exactly 0."""
-    return Network(*understood(mass, model.information))
+    alone = model.information
+    information, number = np.empty((1, *alone.shape)), np.empty(1)
+    learn_network(mass[None], 0, alone[None], 0, information, number)
+    return Network(information[0], float(number[0]))
 
 
-@compilable
-def understood(mass: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
-    """P (6) from the mass and the node's own information."""
-    weight, n = mass[0], len(information)
-    if weight == 0.0:
-        return information, 1.0
-    return even(mass[2:].reshape(n, n) / weight), mass[1] / weight
-
-
-@compilable
 def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
-    """Root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for ``P = root root'``, possibly singular,
-    and the information G (n, n).
-
-    ``root L^-T`` with ``L L' = I + root' G root``, triangular by reflections: nothing is inverted.
+    """Root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root of P,
+    possibly singular, and the information G (n, n).
     """
-    n = len(root)
-    work = np.empty((n, 2 * n))
-    work[:, :n], work[:, n:] = product(root.T, square_root(information)), np.eye(n)
-    return solution(lower_triangular(work), root.T).T.copy()
+    result, n = root[None].copy(), len(root)
+    room = update_scratch(n, 1)
+    correct_root(result, 0, information[None], 0, np.empty((n, n)), room)
+    return np.asarray(result[0])
 
 
 def averaged(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
     """P (9): z plus 1 / delta of the differences to the estimates that arrived."""
-    return z + sum(other - z for other in received) / delta if received else z
+    x, count = np.stack([z, *received]), len(received)
+    places = np.arange(count)
+    links = SlotLinks(np.array([0, count]), places + 1, places, np.zeros(count))
+    average(x, 0, links, np.ones(count, dtype=np.uint8), np.empty((1, len(z))), delta)
+    return np.asarray(x[0])
 
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
@@ -344,5 +578,5 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
                 return None
             A, G, step, P = A @ left, symmetric(G + A @ right @ A.T), following - P, following
             if np.abs(step).max() <= 1e-15 * np.abs(P).max():
-                return corrected_root(square_root(P), information)
+                return corrected_root(lower_root(square_root(P)), information)
     return None

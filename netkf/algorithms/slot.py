@@ -22,12 +22,10 @@ from netkf.algorithms.baselines import Local as SlotLocal
 from netkf.algorithms.filter import Reading
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.kernels.square_root import lower_triangular, predict_root, update_root
-from netkf.algorithms.models import SlotModel
+from netkf.algorithms.kernels.root_update import lower_root
+from netkf.algorithms.models import SlotModel, sample_update
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray, square_root
-from netkf.linalg.compiling import compilable
-from netkf.linalg.small import applied, product, solution
 
 __all__ = [
     "Gossip",
@@ -39,8 +37,6 @@ __all__ = [
     "SlotLocal",
     "SlotModel",
     "SlotState",
-    "adapted",
-    "filtered",
     "update_and_predict",
 ]
 """Filters and models have moved; classes of users may still ask for them here."""
@@ -157,45 +153,10 @@ class SlotFilter(Component):
 def update_and_predict(
     xhat: FloatArray, root: FloatArray, model: SlotModel, reading: Reading
 ) -> tuple[FloatArray, FloatArray]:
-    """The next prediction and the root of its covariance from a prediction and a reading."""
-    return adapted(xhat, root, model.F, model.root_Q, reading.y, reading.H, reading.R)
-
-
-@compilable
-def adapted(
-    xhat: FloatArray,
-    root: FloatArray,
-    F: FloatArray,
-    root_Q: FloatArray,
-    y: FloatArray,
-    H: FloatArray,
-    R: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Update with a reading, which may have no rows, and predict."""
-    if not len(y):
-        return applied(F, xhat), predict_root(root, F, root_Q)
-    noise: FloatArray = np.asarray(np.linalg.cholesky(R))
-    following, gain = update_root(root, F, root_Q, H, noise)
-    return applied(F, xhat) + applied(gain, y - applied(H, xhat)), following
-
-
-@compilable
-def filtered(
-    xhat: FloatArray,
-    root: FloatArray,
-    F: FloatArray,
-    root_Q: FloatArray,
-    y: FloatArray,
-    H: FloatArray,
-    R: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Predict, and update with a reading, which may have no rows."""
-    xhat, root = applied(F, xhat), predict_root(root, F, root_Q)
-    if not len(y):
-        return xhat, root
-    p, n = H.shape
-    work = np.zeros((p + n, n + p))
-    work[:p, :n], work[:p, n:], work[p:, :n] = product(H, root), np.linalg.cholesky(R), root
-    L = lower_triangular(work)
-    gain = solution(L[:p, :p].T, L[p:, :p].T).T
-    return xhat + applied(gain, y - applied(H, xhat)), L[p:, p:].copy()
+    """The next prediction (n,) and the root (n, n) of its covariance, from a prediction, any root
+    of its covariance, and a reading, which may have no rows.
+    """
+    root = lower_root(root)
+    if len(reading.y):
+        xhat, root = sample_update(xhat, root, reading.y, reading.H, reading.R)
+    return model.predict(xhat, root, model.period)

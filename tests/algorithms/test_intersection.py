@@ -5,7 +5,7 @@ import pytest
 
 import netkf
 from netkf import theory
-from netkf.algorithms.kernels.intersection import intersection
+from netkf.algorithms.kernels.root_update import intersect_roots, lower_root
 from tests.engines.linearity import engine_covariance
 
 PLANAR = {
@@ -36,9 +36,10 @@ def test_it_is_the_textbook_formula(n, seed):
     """P^-1 = sum w P_j^-1, P^-1 x = sum w P_j^-1 x_j, and P <= sum w P_j."""
     rng = np.random.default_rng(seed)
     roots, means = rng.standard_normal((4, n, n)), 100.0 * rng.standard_normal((4, n))
+    roots = np.stack([lower_root(root) for root in roots])
     weights = rng.dirichlet(np.ones(4))
     weights[seed % 4] = 0.0
-    xhat, root = intersection(list(zip(weights, means, roots, strict=True)))
+    xhat, root = intersect_roots(weights, means, roots)
     P = roots @ roots.swapaxes(1, 2)
     inverses = np.linalg.inv(P)
     expected = np.linalg.inv(np.tensordot(weights, inverses, 1))
@@ -53,9 +54,8 @@ def test_it_is_the_textbook_formula(n, seed):
 def test_ill_conditioned_covariances_keep_their_digits():
     """Variances of 1e12 beside 1e-12: what is sure stays sure, to rounding."""
     one, other = np.diag([1e6, 1e-6]), np.diag([1e-6, 1e6])
-    xhat, root = intersection(
-        [(0.5, np.array([3.0, 1.0]), one), (0.5, np.array([2.0, 7.0]), other)]
-    )
+    means = np.array([[3.0, 1.0], [2.0, 7.0]])
+    xhat, root = intersect_roots(np.array([0.5, 0.5]), means, np.stack([one, other]))
     np.testing.assert_allclose(np.diag(root @ root.T), [2e-12, 2e-12], rtol=1e-12)
     np.testing.assert_allclose(xhat, [2.0, 1.0], rtol=1e-12)
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netkf.algorithms.filter import Exchange, Message, NodeInfo
-from netkf.algorithms.kernels.stopping import settled, within
+from netkf.algorithms.kernels import stopping
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.push_sum import (
     MASS,
@@ -188,6 +188,15 @@ def test_the_stop_rule_of_the_paper_breaks_and_the_safe_one_does_not(delivery, w
         found, states = numbers("safe", delivery, 300, seed)
         assert all(state.stopped for state in states)
         np.testing.assert_allclose(found, 10.0, rtol=1e-4)
+
+
+def within(D, bound):
+    mass = np.concatenate([[1.0, 1.0], D.reshape(-1)])[None]
+    return stopping.moved_within(mass, 0, np.zeros(mass.shape[1]), bound, np.empty(D.shape))
+
+
+def settled(information, number, former, former_number, tolerance):
+    return stopping.settled(information[None], number, former[None], 0, former_number, tolerance)
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7])

@@ -285,7 +285,16 @@ def add_to_intersection(
         for j in range(i + 1):
             mean += whitened[i, j] * (x[k, j] - centre[m, j])
         whitened[i, n] = mean
+    merge_information(total, whitened)
+
+
+@kernel
+def merge_information(total: FloatArray, whitened: FloatArray) -> None:
+    """Make ``total`` (n, n + 1) the root of both informations, means in the last column;
+    ``whitened`` (n, n + 1) is used up.
+    """
     # Both are lower triangular, and stay so when columns are emptied from the last one on.
+    n = len(total)
     for j in range(n - 1, -1, -1):
         below = 0.0
         for r in range(j, n):

@@ -1,86 +1,107 @@
 """When a node of the push-sum filter stops learning: P step 2.3 and a safe form of it.
 
-Loops in Python too: the same rounding stops a node in the same slot, compiled or not.
+Both engines call these kernels, since the same rounding must stop a node in the same slot.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import compilable
+from netkf.linalg.compiling import kernel
 
 RULES = ("never", "safe", "paper")
 NEVER, SAFE, PAPER = range(3)
 
 
-@compilable
-def stops(
+@kernel
+def has_stopped(
     rule: int,
     tolerance: float,
     mass: FloatArray,
+    k: int,
     before: FloatArray,
     whole: bool,
     information: FloatArray,
-    number: float,
+    number: FloatArray,
     former: FloatArray,
-    former_number: float,
+    former_number: FloatArray,
+    work: FloatArray,
 ) -> bool:
-    """Whether a node stops by ``rule`` (its place in RULES) when its mass (2 + n n,) has become
-    ``mass`` from what it was ``before``, and what it makes of it ``information`` (n, n) and
-    ``number`` from the ``former`` ones; ``whole``: all links of the node were up.
+    """Return True if a node stops by ``rule`` (its place in RULES).
+
+    Its mass (2 + n n,) became that of place ``k`` from ``before``; what it makes of it became the
+    first place of ``information`` (1, n, n) and ``number`` (1,) from place ``k`` of the ``former``
+    ones. ``whole``: all links of the node were up. ``work`` (n, n) is scratch.
     """
     if rule == PAPER:
-        n = len(information)
-        seen = bool(np.any(mass[2:] != 0.0))
-        return seen and within((mass[2:] - before[2:]).reshape(n, n), tolerance)
-    if rule == SAFE and whole and mass[0] > 0.0:
-        return settled(information, number, former, former_number, tolerance)
+        seen = False
+        for i in range(2, mass.shape[1]):
+            seen = seen or mass[k, i] != 0.0
+        return seen and moved_within(mass, k, before, tolerance, work)
+    if rule == SAFE and whole and mass[k, 0] > 0.0:
+        return settled(information, number[0], former, k, former_number[k], tolerance)
     return False
 
 
-@compilable
-def within(D: FloatArray, bound: float) -> bool:
-    """Whether the spectral norm of a symmetric matrix (n, n) is less than ``bound``: whether
-    ``bound I - D`` and ``bound I + D`` have positive pivots only.
+@kernel
+def moved_within(
+    mass: FloatArray, k: int, before: FloatArray, bound: float, work: FloatArray
+) -> bool:
+    """Return True if the information of place ``k`` moved from ``before`` by a symmetric D of
+    spectral norm below ``bound``: ``bound I - D`` and ``bound I + D`` have positive pivots only.
     """
-    n = len(D)
-    for k in range(n):
-        if not abs(D[k, k]) < bound:
+    n = len(work)
+    for i in range(n):
+        place = 2 + i * n + i
+        if not abs(mass[k, place] - before[place]) < bound:
             return False
     for sign in (-1.0, 1.0):
-        work = sign * D
-        for k in range(n):
-            work[k, k] += bound
-        for k in range(n):
-            if not work[k, k] > 0.0:
-                return False
-            for i in range(k + 1, n):
-                factor = work[i, k] / work[k, k]
-                for j in range(k + 1, i + 1):
-                    work[i, j] -= factor * work[j, k]
+        for i in range(n):
+            for j in range(n):
+                place = 2 + i * n + j
+                work[i, j] = sign * (mass[k, place] - before[place])
+            work[i, i] += bound
+        if not has_positive_pivots(work):
+            return False
     return True
 
 
-@compilable
+@kernel
+def has_positive_pivots(work: FloatArray) -> bool:
+    """Return True if elimination of the symmetric ``work`` (n, n) meets positive pivots only; it
+    works in place.
+    """
+    n = len(work)
+    for k in range(n):
+        if not work[k, k] > 0.0:
+            return False
+        for i in range(k + 1, n):
+            factor = work[i, k] / work[k, k]
+            for j in range(k + 1, i + 1):
+                work[i, j] -= factor * work[j, k]
+    return True
+
+
+@kernel
 def settled(
     information: FloatArray,
     number: float,
     former: FloatArray,
+    k: int,
     former_number: float,
     tolerance: float,
 ) -> bool:
-    """Whether G^(i) (n, n; Frobenius norm) and N^(i) moved by less than ``tolerance``, relative to
-    what they are, from the ``former`` ones.
+    """Return True if G^(i) (1, n, n; Frobenius norm) and N^(i) moved by less than ``tolerance``,
+    relative to what they are, from place ``k`` of the ``former`` ones.
     """
     if not abs(number - former_number) < tolerance * number:
         return False
+    n = information.shape[1]
     moved = size = 0.0
-    for i in range(len(information)):
-        for j in range(len(information)):
-            step = information[i, j] - former[i, j]
+    for i in range(n):
+        for j in range(n):
+            step = information[0, i, j] - former[k, i, j]
             moved += step * step
-            size += information[i, j] * information[i, j]
+            size += information[0, i, j] * information[0, i, j]
     return math.sqrt(moved) <= tolerance * math.sqrt(size)

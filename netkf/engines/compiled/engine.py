@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -12,10 +13,11 @@ from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
-from netkf.engines.compiled.batches import flow_batches
 from netkf.engines.compiled.event_loop import event_loop
-from netkf.engines.compiled.flow import FlowRun, Source, Workspace
-from netkf.engines.compiled.slotted import KERNELS, SlotRun
+from netkf.engines.compiled.flow import FlowRun
+from netkf.engines.compiled.lots import at_a_workspace
+from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
+from netkf.engines.compiled.slot_setup import slot_setup
 from netkf.linalg import compiling
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -38,7 +40,7 @@ KNOWN = (
     *(Diffusion, RecordedDiffusion, UnknownDiffusion),
     *(LinearPlant, RecordedPlant, UnknownPlant),
     *(LinearSensor, RegressorSensor, RecordedSensor),
-    *(Hybrid, CovarianceIntersection, Local, Central, *KERNELS),
+    *(Hybrid, CovarianceIntersection, Local, Central),
 )
 
 
@@ -57,7 +59,8 @@ class CompiledEngine(Engine):
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
         for family, part in parts:
-            if type(part) not in KNOWN:
+            compiled = vars(type(part)).get("slot_kernel") is not None
+            if type(part) not in KNOWN and not compiled:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
@@ -66,7 +69,7 @@ class CompiledEngine(Engine):
     def announce(self, scenario: Scenario) -> None:
         """That code is compiled, where it is not kept from before."""
         if scenario.slotted:
-            compiling.announce(KERNELS[type(scenario.hosted)])
+            compiling.announce(type(scenario.hosted).slot_kernel)
         else:
             compiling.announce(event_loop)
 
@@ -76,12 +79,15 @@ class CompiledEngine(Engine):
         """Simulate up to the horizon; returns complete or diverged."""
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             if scenario.slotted:
-                return SlotRun(scenario, streams, recorder, progress).to_the_end()
-            workspace, draws = Workspace(scenario), Source(scenario, streams)
-            return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
+                return run_slots(scenario, streams, recorder, progress)
+            with at_a_workspace(scenario, streams) as (workspace, draws):
+                return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
 
     def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
-        """Yield the runs of consecutive replicas in order."""
-        if scenario.slotted:
-            return super().run_many(scenario, seed, replicas)
-        return flow_batches(scenario, seed, replicas)
+        """Yield the runs of consecutive replicas, of slots many side by side."""
+        if scenario.slotted and slot_setup(scenario).is_drawn:
+            with np.errstate(over="ignore", invalid="ignore"):
+                for batch in slot_batches(scenario, seed, replicas):
+                    yield with_ends(batch, partial(self.batch_of_one, scenario, seed))
+        else:
+            yield from super().run_many(scenario, seed, replicas)

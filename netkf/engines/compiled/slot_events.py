@@ -1,0 +1,269 @@
+"""Messages in slots made one by one, for channels and activations that kernels cannot draw.
+
+Losses and delays of a user's own, messages that take time, and recorded exchanges. What happens in
+a slot depends on clocks and channels alone; where nodes may fall silent for good, blocks are one
+slot long, and the filters' kernel says who has.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.engines.compiled.slot_messages import (
+    ABSORB,
+    DELIVER,
+    LOST,
+    ROUND,
+    SEND,
+    SENSE,
+    STOP,
+    SWAP,
+    TICK,
+)
+from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.network.channels import ChannelSampler, checked_delay, checked_delivery_probability
+from netkf.network.graphs import Link
+from netkf.network.matchings import Matching, RecordedSlots
+from netkf.rng.streams import Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import NAN
+from netkf.trace.schema import CODES, EVENT
+
+LATE = CODES["late"]
+DRAWN_TOGETHER = 64
+Draw = tuple[float, bool, float]
+Row = tuple[float, int, int, int, int, int, float]
+
+
+class Direction:
+    """One direction of a link: its place, its messages so far and what is drawn for them."""
+
+    def __init__(self, scenario: Scenario, streams: Streams, ends: Link, place: int) -> None:
+        self.ends, self.place, self.messages = ends, place, 0
+        self.probability = scenario.table_probability(ends)
+        self._sampler = ChannelSampler(
+            scenario.network.channel, lambda purpose: streams.generator(purpose, *ends)
+        )
+
+    def draws(self) -> Iterator[Draw]:
+        """What is drawn for its activations, one after the other."""
+        while True:
+            columns = self._sampler.draws(DRAWN_TOGETHER)
+            yield from zip(*(column.tolist() for column in columns), strict=True)
+
+
+class Step(NamedTuple):
+    """One step of an exchange: its ``slot``, number there, ``phase``, step of the phase, times."""
+
+    slot: int
+    step: int
+    phase: int
+    repeat: int
+    begin: float
+    end: float
+
+
+class Closed(NamedTuple):
+    """A step after which nodes may stop: its slot, when it ends, and its number of absorb rows."""
+
+    slot: int
+    end: float
+    rows: int
+
+
+class SlotEvents:
+    """Makes the messages and events of one run, slot after slot."""
+
+    def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
+        self._scenario, self._setup, self._algorithm = scenario, setup, scenario.hosted
+        self._random = streams.generator("matching")
+        self._directions = [
+            Direction(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
+        ]
+        self._places = {way.ends: way.place for way in self._directions}
+        ways, own = setup.ways, setup.streams
+        pairs = [way.ends for way in self._directions[::ways]]
+        self._ways = {
+            link: self._directions[k * ways : (k + 1) * ways] for k, link in enumerate(pairs)
+        }
+        self._draws = {
+            link: [way.draws() for way in both[:own]] for link, both in self._ways.items()
+        }
+        self._last: dict[Link, list[Draw]] = {}
+        self._mail: list[tuple[float, int, int, Direction, int, float, int, int]] = []
+        self._slot, self._order, self._exchanges, self._open = 0, 0, 0, -1
+        self._noted = True
+        self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
+        self._rows: list[Row | Closed | None] = []
+
+    def following(self, rows: int, stopped: np.ndarray) -> tuple[int, np.ndarray]:
+        """The number of slots that were made, up to about so many ``rows`` of events, and ``up``
+        (1, S, E, W); ``stopped`` (N,) is the slot in which each node stopped for good.
+        """
+        setup, made = self._setup, []
+        self._rows, self._stopped = [], stopped
+        while self._slot < setup.slots:
+            made.append(self._one_slot())
+            self._slot += 1
+            if setup.silences or len(self._rows) >= rows:
+                break
+        if self._slot == setup.slots:
+            self._noted = True
+            self._arrivals(math.inf)
+        return len(made), np.stack(made)[None]
+
+    def _one_slot(self) -> np.ndarray:
+        setup, algorithm, slot = self._setup, self._algorithm, self._slot
+        up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
+        start = self._scenario.slot_plant.slot_time(slot)
+        sampled = bool(np.isin(slot, setup.samples))
+        self._arrivals(start)
+        if sampled and algorithm.predicts:
+            self._rows.append(None)
+        self._noted = slot < setup.last
+        if self._noted or not algorithm.predicts:
+            self._stages(slot, start, up)
+        self._noted = True
+        if sampled and not algorithm.predicts:
+            self._rows.append(None)
+        return up
+
+    def _stages(self, slot: int, start: float, up: np.ndarray) -> None:
+        algorithm, repeats = self._algorithm, [0, 0]
+        talks = algorithm.talks and slot >= algorithm.first_slot
+        now = start
+        for step, phase, end in zip(*(c.tolist() for c in self._setup.stages[:3]), strict=True):
+            if step < 0:
+                if slot > 0 or algorithm.predicts:
+                    for node in self._scenario.sensing:
+                        self._note((now, SENSE, node, -1, -1, -1, NAN))
+            elif talks:
+                made = Step(slot, step, phase, repeats[phase], now, start + end)
+                now, repeats[phase] = made.end, repeats[phase] + 1
+                self._exchanges += 1
+                self._open = self._exchanges
+                self._send_all(made)
+                self._arrivals(made.end)
+                self._close(made, up[step])
+
+    def rows(self, stopped: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The events as EVENT rows, and how many come before each sample."""
+        rows: list[Row] = []
+        before = []
+        for row in self._rows:
+            if row is None:
+                before.append(len(rows))
+            elif isinstance(row, Closed):
+                stops: list[Row] = [
+                    (
+                        row.end,
+                        STOP,
+                        self._scenario.nodes[k],
+                        -1,
+                        -1,
+                        self._setup.stages.stopping,
+                        NAN,
+                    )
+                    for k in np.flatnonzero(stopped == row.slot).tolist()
+                ]
+                first = len(rows) - row.rows
+                rows[first:] = sorted([*rows[first:], *stops], key=lambda one: one[2])
+            else:
+                rows.append(row)
+        return np.array(rows, dtype=EVENT), np.array(before, dtype=np.int64)
+
+    def _note(self, row: Row) -> None:
+        if self._noted:
+            self._rows.append(row)
+
+    def _send_all(self, step: Step) -> None:
+        broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
+        pairs, up = self._pairs(step)
+        if broadcast:
+            self._note((now, ROUND, -1, -1, -1, phase, NAN))
+        for i, j in pairs:
+            if not broadcast:
+                self._note((now, TICK, i, j, -1, phase, NAN))
+            ways = self._ways[i, j]
+            if self._setup.fresh[step.step] or (i, j) not in self._last:
+                drawn = [next(draws) for draws in self._draws[i, j]]
+                self._last[i, j] = drawn if len(drawn) == len(ways) else drawn * 2
+            here = up is None or (i, j) in up
+            for way, draw in zip(ways, self._last[i, j], strict=True):
+                if self._setup.talks[step.step, way.place] and not self._is_silent(way, step):
+                    self._send(step, way, draw if here else None)
+
+    def _pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
+        """The links that are used, and of those the ones that are up (None: all)."""
+        activation, topology = self._scenario.network.activation, self._scenario.topology
+        links = list(topology.links)
+        if isinstance(activation, Matching):
+            return activation.draw(topology, self._random), None
+        if not isinstance(activation, RecordedSlots):
+            return links, None
+        listed = activation.pairs(step.slot, step.phase, step.repeat)
+        if self._algorithm.pairwise:
+            return listed, None
+        up = set(listed)
+        return links, up if topology.directed else up | {(j, i) for i, j in listed}
+
+    def _is_silent(self, way: Direction, step: Step) -> bool:
+        """Return True if the sender has stopped for good and sends no more in this step."""
+        if not self._setup.silences or step.step != self._setup.stages.stopping:
+            return False
+        return bool(self._stopped[self._scenario.topology.index[way.ends[0]]] < step.slot)
+
+    def _send(self, step: Step, way: Direction, draw: Draw | None) -> None:
+        (sender, receiver), number, now = way.ends, way.messages, step.begin
+        way.messages = number + 1
+        self._note((now, SEND, sender, receiver, number, step.phase, NAN))
+        channel, delay = self._scenario.network.channel, math.nan
+        if draw is not None:
+            chance = checked_delivery_probability(
+                channel.loss, way.ends, number, draw[1], way.probability
+            )
+            if draw[0] < chance:
+                delay = checked_delay(channel.delay, way.ends, number, draw[2])
+        if math.isnan(delay):
+            self._note((now, LOST, sender, receiver, number, step.phase, NAN))
+        elif delay == 0.0:
+            self._note((now, DELIVER, receiver, sender, number, step.phase, 0.0))
+            self._inbox.setdefault(receiver, {})[sender] = (number, 0.0)
+        elif now + delay < self._scenario.ends:
+            self._order += 1
+            mail = now + delay, way.place, self._order, way, number, now, step.phase, self._open
+            heapq.heappush(self._mail, mail)
+
+    def _arrivals(self, until: float) -> None:
+        """Deliver what arrives by then; in time if the exchange it was sent in is still open."""
+        while self._mail and self._mail[0][0] <= until:
+            now, _, _, way, number, sent, phase, exchange = heapq.heappop(self._mail)
+            (sender, receiver), in_time = way.ends, exchange == self._open
+            if now < self._scenario.horizon:
+                kind = DELIVER if in_time else LATE
+                self._note((now, kind, receiver, sender, number, phase, now - sent))
+            if in_time:
+                self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
+
+    def _close(self, step: Step, up: np.ndarray) -> None:
+        """End a step: what its inboxes hold has arrived."""
+        count = len(self._rows)
+        for node in sorted(self._inbox):
+            taken = self._inbox[node]
+            for peer in sorted(taken):
+                number, age = taken[peer]
+                up[self._places[peer, node]] = 1
+                if self._algorithm.pairwise:
+                    self._note((step.end, SWAP, node, peer, number, step.phase, age))
+            if not self._algorithm.pairwise:
+                oldest = max(age for _, age in taken.values())
+                self._note((step.end, ABSORB, node, -1, -1, step.phase, oldest))
+        if step.step == self._setup.stages.stopping and self._noted:
+            self._rows.append(Closed(step.slot, step.end, len(self._rows) - count))
+        self._inbox.clear()
+        self._open = -1

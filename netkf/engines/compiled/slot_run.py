@@ -1,0 +1,396 @@
+"""Runs in slots: messages, truth and readings of many slots are drawn, then the filters follow.
+
+A call of a kernel takes S slots of R runs at a time. Where channels or clocks are a user's own, or
+messages take time, the messages of one run are made in Python (engines.compiled.slot_events).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.kernels.slots import (
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotSamples,
+    slot_room,
+)
+from netkf.engines.base import Progress
+from netkf.engines.compiled.samples import recorded
+from netkf.engines.compiled.slot_events import SlotEvents
+from netkf.engines.compiled.slot_messages import (
+    Channels,
+    Hearing,
+    Matchings,
+    Rows,
+    SlotTimes,
+    draw_messages,
+    make_rows,
+)
+from netkf.engines.compiled.slot_setup import PlacedSensor, SlotSetup, slot_setup
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
+from netkf.rng.draws import StreamBatch
+from netkf.rng.numbers import normal_ziggurat
+from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
+from netkf.trace.recorder import Recorder
+from netkf.trace.schema import EVENT, KINDS
+
+NEVER = np.iinfo(np.int64).max
+
+
+class Drawn(NamedTuple):
+    """Messages of a block: ``up`` (R, S, E, W), links ``active`` in matchings (R, S, E, A), their
+    number ``pairs`` (R, S, E).
+    """
+
+    up: np.ndarray
+    active: np.ndarray
+    pairs: np.ndarray
+
+
+class SlotBlock(NamedTuple):
+    """Results of S slots of R runs: states absolute and local (R, S, n), the slots that are
+    ``sampled`` (T,), and what the filters had then.
+    """
+
+    absolute: FloatArray
+    local: FloatArray
+    sampled: np.ndarray
+    samples: SlotSamples
+    times: SlotTimes
+    drawn: Drawn
+
+
+class SlotRuns:
+    """R runs of one scenario, side by side."""
+
+    def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams) -> None:
+        self.setup: SlotSetup = slot_setup(scenario)
+        self._scenario, self._streams = scenario, streams
+        self.runs, self._slot = len(streams.per_replica), 0
+        setup, runs = self.setup, self.runs
+        self._nodes = SlotNodes(
+            np.tile(setup.xhat, (runs, 1)),
+            np.tile(setup.root, (runs, 1, 1)),
+            setup.F,
+            setup.root_Q,
+            setup.rows,
+        )
+        self._room = slot_room(setup.hosts, setup.n)
+        self._extra = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
+        self._stopped = np.full((runs, setup.hosts), NEVER)
+        self._conserved = np.zeros((runs, setup.hosts, 2))
+        self._sent = np.zeros((runs, len(setup.directions)), dtype=np.int64)
+        self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
+        self._begin_truth()
+        self._begin_readings()
+        self._events = (
+            None if setup.is_drawn else SlotEvents(scenario, streams.per_replica[0], setup)
+        )
+        self._begin_messages()
+
+    def _begin_truth(self) -> None:
+        plant, setup = self._scenario.slot_plant, self.setup
+        self._truth: Any = None
+        self._path: Path | None = None
+        if not plant.is_random:
+            self._truth = self._scenario.slot_truth(self._streams.per_replica[0])
+            return
+        self._plant_states = StreamBatch(self._streams, "plant", [()]).states
+        x = np.empty((self.runs, setup.n))
+        root = square_root(plant.start_cov)
+        draw_starts(self._plant_states, normal_ziggurat(), plant.start_mean, root, x)
+        origin = np.zeros(x.shape)
+        self._path = Path(plant.F, square_root(plant.Q), setup.frame, x, origin)
+
+    def _begin_readings(self) -> None:
+        setup, streams = self.setup, self._streams
+        entities = [(s.node, s.place.ordinal) for s in setup.drawn]
+        self._noise = StreamBatch(streams, "noise", entities).states
+        self._regressors: list[tuple[Path, np.ndarray]] = []
+        for s, (A, drive, start) in zip(setup.driven, setup.regressors, strict=True):
+            x = np.tile(start, (self.runs, 1))
+            path = Path(A, drive, 0, x, np.zeros(x.shape))
+            states = StreamBatch(streams, "regressor", [(s.node, s.place.ordinal)]).states
+            self._regressors.append((path, states))
+        scenario, first = self._scenario, streams.per_replica[0]
+        self._recorded: list[tuple[PlacedSensor, Any]] = [
+            (s, scenario.slot_path(first, s.node, s.place)) for s in setup.recorded
+        ]
+
+    def _begin_messages(self) -> None:
+        setup, streams, links = self.setup, self._streams, len(self.setup.ends)
+        nothing = np.zeros((0, 4), dtype=np.uint64)
+        drawn = setup.is_drawn and links > 0
+        loss = drawn and not setup.loss.deterministic
+        count = self.runs * len(setup.entities)
+        chain: Any = setup.loss if setup.is_chain else None
+        to_bad, to_good = chain._steps if chain is not None else (0.0, 1.0)
+        entities = setup.entities
+        self._channels = Channels(
+            setup.ends,
+            setup.delivery,
+            StreamBatch(streams, "loss", entities).states if loss else nothing,
+            StreamBatch(streams, "weather", entities).states
+            if loss and setup.is_chain
+            else nothing,
+            np.full(count, -1.0),
+            np.full(count, -1, dtype=np.int64),
+            to_bad,
+            to_good,
+            setup.talks,
+            setup.ways,
+            setup.streams,
+        )
+        protocol, chance, first, members = setup.matching
+        states = np.zeros((self.runs, 6), dtype=np.uint64)
+        if drawn and protocol >= 0:
+            states[:, :4] = StreamBatch(streams, "matching", [()]).states
+        order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
+        self._matchings = Matchings(protocol, chance, states, first, members, order, busy)
+
+    @property
+    def over(self) -> bool:
+        """Whether all slots are done."""
+        return self._slot >= self.setup.slots
+
+    def following(self, rows: int) -> SlotBlock:
+        """Carry the filters through the next slots, of about so many ``rows`` of events at most."""
+        setup, drawn = self.setup, None
+        if self._events is None:
+            count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
+            times = self._times(count)
+            drawn = self._draw_messages(times)
+        else:
+            count, up = self._events.following(rows, self._stopped[0])
+            times = self._times(count)
+            drawn = Drawn(up, *(np.zeros((0,) * d, dtype=np.int64) for d in (4, 3)))
+        local, absolute, rebased = self._states(count)
+        readings = self._readings(times, local, rebased)
+        T = int((times.sample >= 0).sum())
+        n, hosts = setup.n, setup.hosts
+        samples = SlotSamples(
+            np.empty((self.runs, T, hosts, n)),
+            np.empty((self.runs, T, hosts, n, n)),
+            self._stopped,
+            self._conserved,
+        )
+        plan = SlotPlan(self._slot, times.sensed, times.exchanged, times.sample, drawn.up)
+        kernel = type(setup.algorithm).slot_kernel
+        kernel(self._nodes, readings, plan, setup.links, samples, self._room, *self._extra)
+        self._slot += count
+        sampled = np.flatnonzero(times.sample >= 0)
+        return SlotBlock(absolute, local, sampled, samples, times, drawn)
+
+    def _times(self, count: int) -> SlotTimes:
+        setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
+        slots = np.arange(self._slot, self._slot + count)
+        noted = slots < setup.last
+        acts = noted | (not algorithm.predicts)
+        sensed = acts & ((slots > 0) | algorithm.predicts)
+        exchanged = acts & (slots >= algorithm.first_slot) & algorithm.talks
+        sample = np.full(count, -1, dtype=np.int64)
+        here = setup.samples[np.isin(setup.samples, slots)] - self._slot
+        sample[here] = np.arange(len(here))
+        start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
+        return SlotTimes(self._slot, start, noted, sensed, exchanged, sample, algorithm.predicts)
+
+    def _draw_messages(self, times: SlotTimes) -> Drawn:
+        setup = self.setup
+        lead = self.runs, len(times.start), len(setup.fresh)
+        pairs = setup.most_pairs
+        drawn = Drawn(
+            np.zeros((*lead, len(setup.directions)), dtype=np.uint8),
+            np.zeros((*lead, pairs), dtype=np.int64),
+            np.zeros(lead, dtype=np.int64),
+        )
+        if len(setup.directions):
+            draw_messages(self._channels, self._matchings, times.exchanged, setup.fresh, *drawn)
+        return drawn
+
+    def _states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Local and absolute states (R, S, n), and where the origin moves (S,)."""
+        setup = self.setup
+        slots = range(self._slot, self._slot + count)
+        rebased = np.zeros(count, dtype=bool)
+        if self._path is None:
+            x = np.stack([self._truth.state(slot) for slot in slots])
+            x = np.ascontiguousarray(np.broadcast_to(x, (self.runs, *x.shape)))
+            return x, x, rebased
+        if setup.frame:
+            rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
+        shape = self.runs, count, setup.n
+        local, absolute = np.empty(shape), np.empty(shape)
+        room = np.empty((2, max(setup.n, self._path.root.shape[1])))
+        draw_paths(
+            self._path, self._plant_states, normal_ziggurat(), self._slot, room, local, absolute
+        )
+        return local, (absolute if setup.frame else local), rebased
+
+    def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> SlotReadings:
+        setup, count = self.setup, local.shape[1]
+        shape = self.runs, count, setup.hosts, setup.p
+        y = np.zeros(shape)
+        H = np.zeros((*shape, setup.n)) if setup.varies else setup.H
+        if setup.varies:
+            H[:] = setup.H
+        x = local
+        if rebased.any() and setup.algorithm.predicts:  # read in the frame that begins there
+            x = local.copy()
+            x[:, rebased] = 0.0
+        k = setup.sensors.C.shape[2]
+        driven = np.empty((len(self._regressors), self.runs, count, k))
+        for path, (steps, states) in zip(driven, self._regressors, strict=True):
+            room = np.empty((2, max(steps.root.shape)))
+            draw_paths(steps, states, normal_ziggurat(), self._slot, room, path, path)
+        noise, room = self._noise, np.empty(setup.p)
+        draw_readings(setup.sensors, noise, normal_ziggurat(), x, driven, room, y, H)
+        slots = [self._slot + s for s in np.flatnonzero(times.sensed).tolist()]
+        for s, path in self._recorded if slots else []:
+            some = slice(s.row, s.row + len(s.root))
+            values, matrices = path.several(slots, x[0, times.sensed])
+            y[:, times.sensed, s.host, some] = np.linalg.solve(s.root, values.T).T
+            H[:, times.sensed, s.host, some] = np.linalg.solve(s.root, matrices)
+        return SlotReadings(y, H, local, rebased)
+
+    def events(self, block: SlotBlock, wanted: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The EVENT rows of a block of one run and how many of them come before each sample; empty
+        where they are only counted.
+        """
+        if self._events is not None:
+            return self._events.rows(self._stopped[0])
+        setup = self.setup
+        size = setup.rows_of(len(block.times.start)) if wanted else 0
+        places: Any = [np.empty(size, dtype=EVENT[name]) for name in ROW_COLUMNS]
+        at_sample = np.zeros(len(block.sampled) if wanted else 0, dtype=np.int64)
+        rows = Rows._make([*places, at_sample, self.counts])
+        heard = setup.links
+        hearing = Hearing(
+            setup.nodes, setup.sensing, heard.first, heard.sender, heard.way, self._sent,
+            self._stopped, setup.silences,
+        )  # fmt: skip
+        count = make_rows(
+            setup.stages, block.times, self._channels, hearing, *block.drawn,
+            setup.algorithm.pairwise, rows,
+        )  # fmt: skip
+        table = np.empty(min(count, size), dtype=EVENT)
+        for name, column in zip(ROW_COLUMNS, places, strict=True):
+            table[name] = column[: len(table)]
+        return table, at_sample
+
+    def conserved(self) -> dict[str, FloatArray]:
+        """Sums over all nodes that exchanges conserve: (R, 2) at the start and the last sample."""
+        given: list[Any] = [self.setup.algorithm.conserved(s) for s in self.setup.states]
+        found = {}
+        for k, name in enumerate(given[0]):
+            start = math.fsum(values[name] for values in given)
+            now = [math.fsum(column) for column in self._conserved[:, :, k].tolist()]
+            found[name] = np.array([[start, value] for value in now])
+        return found
+
+
+ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
+
+
+def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress) -> str:
+    """Simulate one run in slots up to the horizon; return complete or diverged."""
+    runs = SlotRuns(scenario, streams)
+    recorder.exact_errors = scenario.exact_errors
+    try:
+        while not runs.over:
+            if not _record_block(scenario, runs, recorder, progress):
+                return DIVERGED
+    finally:
+        recorder.flush()
+    return COMPLETE
+
+
+def _record_block(
+    scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
+) -> bool:
+    """Simulate and record some slots; return True if all estimates are sound."""
+    block = runs.following(MOST_ROWS)
+    rows, before = runs.events(block, wanted=True)
+    if len(block.sampled):
+        sums = runs.conserved()
+        recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
+    x = block.absolute[0, block.sampled]
+    fine = recorded(
+        scenario,
+        recorder,
+        progress,
+        block.times.start[block.sampled],
+        x,
+        block.local[0, block.sampled] if runs.setup.frame else x,
+        block.samples.xhat[0],
+        block.samples.P[0],
+        lambda k: recorder.extend(rows[: before[k]]),
+    )
+    if fine:
+        recorder.extend(rows)
+    return fine
+
+
+MOST_ROWS = 1 << 15
+"""Rows of events that are made at once."""
+
+
+def slot_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
+    """Yield the runs of consecutive replicas in order."""
+    setup = slot_setup(scenario)
+    size = setup.batch_runs()
+    for first in range(replicas.start, replicas.stop, size):
+        count = min(size, replicas.stop - first)
+        yield slot_batch(scenario, seed, range(first, first + count))
+
+
+def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
+    """Simulate consecutive replicas side by side; a run that diverges goes on to the end with what
+    it has (``with_ends`` mends that).
+    """
+    runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)))
+    parts: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
+    while not runs.over:
+        block = runs.following(0)
+        runs.events(block, wanted=False)
+        x, local = block.absolute[:, block.sampled], block.local[:, block.sampled]
+        error = local[:, :, None] - block.samples.xhat
+        xhat = block.samples.xhat
+        if runs.setup.frame:
+            xhat = xhat + (x - local)[:, :, None]
+        parts.append((x, xhat, block.samples.P, error))
+    x, xhat, P, error = parts[0]
+    if len(parts) > 1:
+        x, xhat, P, error = (np.concatenate(c, axis=1) for c in zip(*parts, strict=True))
+    return RunBatch(
+        replicas=replicas,
+        times=runs.setup.sample_times,
+        x=x,
+        xhat=xhat,
+        P=P,
+        error=error,
+        lengths=np.full(len(replicas), x.shape[1]),
+        counts=runs.counts,
+        status=np.full(len(replicas), COMPLETE),
+        sums=runs.conserved(),
+        exact_errors=scenario.exact_errors,
+    )
+
+
+def with_ends(batch: RunBatch, again: Callable[[int], RunBatch]) -> RunBatch:
+    """The batch with every run that diverges as it is alone, ``again(replica)``: it ends there."""
+    fine = np.isfinite(batch.xhat).all(axis=(1, 2, 3)) & np.isfinite(batch.P).all(axis=(1, 2, 3, 4))
+    for r in np.flatnonzero(~fine).tolist():
+        one = again(batch.replicas[r])
+        for name in ("x", "xhat", "P", "error", "lengths", "counts", "status"):
+            getattr(batch, name)[r] = getattr(one, name)[0]
+        for name, values in batch.sums.items():
+            values[r] = one.sums[name][0]
+    return batch

@@ -1,0 +1,290 @@
+"""What all runs of a scenario in slots share, as arrays for the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.root_update import lower_root
+from netkf.algorithms.kernels.slots import SlotLinks
+from netkf.engines.compiled.slot_messages import (
+    INDEPENDENT,
+    NODE_WAKEUP,
+    ONE_EDGE,
+    UNIFORM_MAXIMAL,
+    Stages,
+)
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.network.channels import GilbertElliott, identical_per_link
+from netkf.network.graphs import Link
+from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
+from netkf.plants.recorded import RecordedSensor
+from netkf.plants.regressors import RegressorSensor
+from netkf.plants.slot_paths import SlotSensors
+from netkf.plants.transitions import frame_slots
+from netkf.scenario.scenario import Placed, Scenario
+
+_known: WeakKeyDictionary[Scenario, SlotSetup] = WeakKeyDictionary()
+
+
+def slot_setup(scenario: Scenario) -> SlotSetup:
+    """The arrays of a scenario, made once."""
+    if scenario not in _known:
+        _known[scenario] = SlotSetup(scenario)
+    return _known[scenario]
+
+
+class PlacedSensor(NamedTuple):
+    """A sensor of ``node``: which filter reads it (``host``) and its first ``row`` there; ``root``
+    (p, p) is the Cholesky factor of R as the filters believe it.
+    """
+
+    node: int
+    place: Placed
+    host: int
+    row: int
+    root: FloatArray
+
+
+class SlotSetup:
+    """Times, links and sensors of a scenario in slots, and the states of its filters at slot 0."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        algorithm, topology = scenario.hosted, scenario.topology
+        self.algorithm: Filter = algorithm
+        self.n, self.nodes = scenario.plant.n, np.array(scenario.nodes, dtype=np.int64)
+        self.frame = frame_slots(scenario.slot_plant.F) or 0 if scenario.exact_errors else 0
+        self._set_slots(scenario)
+        self._set_stages(scenario)
+        self._set_sensors(scenario)
+        self._set_states(scenario)
+        links = topology.links if algorithm.talks else ()
+        ends = [[topology.index[i], topology.index[j]] for i, j in links]
+        self.ends = np.array(ends, dtype=np.int64).reshape(-1, 2)
+        self.ways = 1 if topology.directed else 2
+        self.directions: tuple[Link, ...] = tuple(
+            way for i, j in links for way in ((i, j), (j, i))[: self.ways]
+        )
+        self.links = self._links(scenario)
+        self._set_channel(scenario)
+        self.matching = matching_lists(scenario)
+        self.is_drawn = self._draws_everything(scenario)
+
+    def _set_slots(self, scenario: Scenario) -> None:
+        """The slots of a run: the last one, at the horizon, is there if it is sampled."""
+        plant, last = scenario.slot_plant, 0
+        last = max(0, int(scenario.horizon / plant.period) - 2)
+        while not plant.over(last, scenario.horizon):
+            last += 1
+        self.samples = np.array(sorted(set(scenario.slots)), dtype=np.int64)
+        self.slots = last + bool(len(self.samples) and self.samples[-1] >= last)
+        self.last = last
+        self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
+
+    def _set_stages(self, scenario: Scenario) -> None:
+        algorithm, phase, step = self.algorithm, 0, 0
+        length = scenario.phase_length if algorithm.talks else 0.0
+        stages: list[tuple[int, int, float]] = []
+        fresh: list[bool] = []
+        for kind in algorithm.schedule or ():
+            if kind == "sense":
+                stages.append((-1, -1, 0.0))
+            elif kind == "exchange":
+                steps = algorithm.steps(phase) if algorithm.talks else 0
+                for k in range(steps):
+                    stages.append((step, phase, (phase + (k + 1) / steps) * length))
+                    fresh.append(algorithm.redraws_links(phase, k))
+                    step += 1
+                phase += 1
+        numbers, phases, ends = zip(*stages, strict=True)
+        stopping, self.silences = algorithm.slot_stopping()
+        self.stages = Stages(
+            np.array(numbers, dtype=np.int64),
+            np.array(phases, dtype=np.int64),
+            np.array(ends, dtype=np.float64),
+            stopping,
+        )
+        self.fresh = np.array(fresh, dtype=bool)
+        self.phases = [phase for step, phase, _ in stages if step >= 0]
+
+    def _set_sensors(self, scenario: Scenario) -> None:
+        """Where the readings of each sensor go: one filter reads those of one node, or of all."""
+        pooled = self.algorithm.pooled
+        self.hosts = 1 if pooled else len(scenario.nodes)
+        rows = np.zeros(self.hosts, dtype=np.int64)
+        self.sensing = np.array(scenario.sensing, dtype=np.int64)
+        self.placed: list[PlacedSensor] = []
+        for node in scenario.sensing:
+            host = 0 if pooled else scenario.topology.index[node]
+            for place in scenario.placed[node]:
+                R = scenario.noise(place.entry, believed=True)
+                root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
+                self.placed.append(PlacedSensor(node, place, host, int(rows[host]), root))
+                rows[host] += len(root)
+        self.rows, self.p = rows, int(rows.max(initial=1))
+        kinds = [type(scenario.sensors[s.place.entry]) for s in self.placed]
+        self.recorded = [s for s, k in zip(self.placed, kinds, strict=True) if k is RecordedSensor]
+        self.drawn = [s for s, k in zip(self.placed, kinds, strict=True) if k is not RecordedSensor]
+        self.driven = [s for s, k in zip(self.placed, kinds, strict=True) if k is RegressorSensor]
+        self.varies = bool(self.recorded or self.driven)
+        self.H = np.zeros((1, 1, self.hosts, self.p, self.n))
+        self._set_drawn(scenario)
+
+    def _set_drawn(self, scenario: Scenario) -> None:
+        count, p, n = len(self.drawn), self.p, self.n
+        H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
+        driven = np.full(count, -1, dtype=np.int64)
+        for m, s in enumerate(self.drawn):
+            sensor = scenario.sensors[s.place.entry]
+            rows = len(s.root)
+            true = np.linalg.cholesky(sensor.R)
+            noise[m, :rows, :rows] = np.linalg.solve(s.root, true)
+            if isinstance(sensor, RegressorSensor):
+                driven[m], H[m, 0, 0] = self.driven.index(s), 1.0 / s.root[0, 0]
+                continue
+            H[m, :rows] = np.linalg.solve(s.root, sensor.H)
+            self.H[0, 0, s.host, s.row : s.row + rows] = H[m, :rows]
+        regressors: list[Any] = [scenario.sensors[s.place.entry] for s in self.driven]
+        k = max((len(sensor.A) for sensor in regressors), default=1)
+        q = max((sensor.B.shape[1] for sensor in regressors), default=1)
+        C = np.zeros((len(regressors), n, k))
+        self.regressors = []
+        for d, sensor in enumerate(regressors):
+            size = len(sensor.A)
+            A, drive, start = np.zeros((k, k)), np.zeros((k, q)), np.zeros(k)
+            root = sensor.B @ square_root(sensor.xi_cov)
+            A[:size, :size], drive[:size, : root.shape[1]] = sensor.A, root
+            C[d, :, :size], start[:size] = sensor.C, sensor.start
+            self.regressors.append((A, np.ascontiguousarray(drive[:, : root.shape[1]]), start))
+        self.sensors = SlotSensors(
+            np.array([s.host for s in self.drawn], dtype=np.int64),
+            np.array([s.row for s in self.drawn], dtype=np.int64),
+            np.array([len(s.root) for s in self.drawn], dtype=np.int64),
+            H,
+            noise,
+            driven,
+            C,
+        )
+
+    def _set_states(self, scenario: Scenario) -> None:
+        """The filters at slot 0; equal nodes share what is worked out for one."""
+        infos: Sequence[NodeInfo] = scenario.node_infos
+        models: Sequence[Any] = scenario.slot_models
+        if self.algorithm.pooled:
+            infos, models = infos[:1], [scenario.pooled_slot_model]
+        self.infos = infos
+        self.states = [
+            self.algorithm.init(model, *scenario.start(info.node), info)
+            for info, model in zip(infos, models, strict=True)
+        ]
+        self.F, self.root_Q = np.array(models[0].F), lower_root(models[0].root_Q)
+        self.xhat = np.stack([state.xhat for state in self.states])
+        self.root = np.stack([state.root for state in self.states])
+
+    def _links(self, scenario: Scenario) -> SlotLinks:
+        index = scenario.topology.index
+        heard = sorted(
+            (index[receiver], index[sender], way, scenario.weight(receiver, sender))
+            for way, (sender, receiver) in enumerate(self.directions)
+        )
+        receivers, senders, ways, weights = zip(*heard, strict=True) if heard else [()] * 4
+        first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.hosts + 1))
+        return SlotLinks(
+            np.asarray(first, dtype=np.int64),
+            np.array(senders, dtype=np.int64),
+            np.array(ways, dtype=np.int64),
+            np.array(weights, dtype=np.float64),
+        )
+
+    def _set_channel(self, scenario: Scenario) -> None:
+        """Chances of the directions, and the entities whose streams decide about messages."""
+        channel, ways = scenario.network.channel, self.ways
+        self.loss, bad = channel.loss, (False, True)
+        self.is_chain = type(self.loss) is GilbertElliott
+        self.has_known_chances = identical_per_link(self.loss) or self.is_chain
+        self.delivery = np.ones((2, len(self.directions)))
+        if self.has_known_chances:
+            for w, way in enumerate(self.directions):
+                table = scenario.table_probability(way)
+                self.delivery[:, w] = [
+                    self.loss.delivery_probability(way, 0, b, table) for b in bad
+                ]
+        self.streams = 1 if channel.symmetric else ways
+        self.entities = [way for w, way in enumerate(self.directions) if w % ways < self.streams]
+        sends = self.algorithm.sends_in_slots
+        talks = [
+            [sends(phase, way[0] in scenario.placed) for way in self.directions]
+            for phase in self.phases
+        ]
+        self.talks = np.array(talks, dtype=np.uint8).reshape(len(talks), len(self.directions))
+
+    def _draws_everything(self, scenario: Scenario) -> bool:
+        """Return True if kernels can draw all messages, else they are made one by one."""
+        network = scenario.network
+        exchanges = type(network.activation) in (Matching, Broadcast) or not self.algorithm.talks
+        return self.has_known_chances and network.channel.delay.fixed == 0.0 and exchanges
+
+    @property
+    def most_pairs(self) -> int:
+        """The largest number of pairs in a matching, 0 without matchings."""
+        return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
+
+    def rows_of(self, slots: int) -> int:
+        """The largest number of events in so many slots."""
+        pairs = self.most_pairs
+        sends = self.ways * (pairs if self.matching[0] >= 0 else len(self.ends))
+        steps = len(self.fresh) * (1 + pairs + 2 * sends + len(self.nodes))
+        return slots * (len(self.sensing) + steps + len(self.nodes))
+
+    def bytes_of_slot(self) -> int:
+        """What is drawn for one slot of one run."""
+        floats = self.hosts * self.p * (1 + self.varies * self.n) + 3 * self.n
+        messages = len(self.fresh) * (len(self.directions) + 8 * self.most_pairs + 8)
+        return 8 * floats + messages
+
+    def block_slots(self, runs: int, rows: int) -> int:
+        """Slots of so many runs that one call takes; with about so many ``rows`` of events, if that
+        is not 0.
+        """
+        slots = BLOCK_BYTES // (runs * self.bytes_of_slot())
+        if rows:
+            slots = min(slots, rows // max(1, self.rows_of(1)))
+        return max(1, int(slots))
+
+    def batch_runs(self) -> int:
+        """Runs that are simulated side by side."""
+        samples = 8 * len(self.samples) * self.hosts * (2 + self.n) * self.n
+        runs = min(BLOCK_BYTES // self.bytes_of_slot() // max(1, self.slots), MOST_RUNS)
+        return max(1, int(min(runs, SAMPLE_BYTES // max(1, samples))))
+
+
+BLOCK_BYTES = 1 << 20
+"""Of what is drawn for one call of a filter's kernel: about what a core keeps close by."""
+SAMPLE_BYTES, MOST_RUNS = 1 << 23, 256
+"""Of the samples of a batch, and its largest number of runs."""
+
+
+def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
+    """Place of the protocol in PROTOCOLS (-1: no matching), its chance, and the lists that
+    ``slot_messages.Matchings`` describes.
+    """
+    activation, topology = scenario.network.activation, scenario.topology
+    if not isinstance(activation, Matching):
+        return -1, 0.0, np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    protocol, links = PROTOCOLS.index(activation.protocol), topology.links
+    lists: list[list[int]] = []
+    if protocol == NODE_WAKEUP:
+        peers: dict[int, dict[int, int]] = {node: {} for node in topology.nodes}
+        for k, (i, j) in enumerate(links):
+            peers[i][j] = peers[j][i] = k
+        lists = [[here[peer] for peer in sorted(here)] for here in peers.values()]
+    if protocol == UNIFORM_MAXIMAL:
+        number = {link: k for k, link in enumerate(links)}
+        lists = [[number[link] for link in some] for some in maximal_matchings(links)]
+    chance = {ONE_EDGE: activation.lazy, INDEPENDENT: activation.p}.get(protocol) or 0.0
+    first = np.cumsum([0, *map(len, lists)], dtype=np.int64)
+    return protocol, chance, first, np.array([k for some in lists for k in some], dtype=np.int64)
