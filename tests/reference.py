@@ -110,3 +110,31 @@ def intersection(weights, means, covariances):
     inverses = [w * solve(cov, eye) for w, cov in zip(weights, covariances, strict=True)]
     P = solve(sum(inverses), eye)
     return P, P @ sum(inv @ mean for inv, mean in zip(inverses, means, strict=True))
+
+
+def polynomial(series, gap):
+    """``sum_k gap^k series[k]``."""
+    return sum(row * gap**k for k, row in enumerate(series))
+
+
+def triangular_root(array):
+    """L, lower triangular with a diagonal that is not negative, and ``L L' = array array'``."""
+    L = np.linalg.qr(array.T, mode="r").T
+    return L * np.where(np.diag(L) < 0.0, -1.0, 1.0)
+
+
+def switched_riccati(P, modes, F, Q, readings):
+    """P after the slots of ``modes``: which reading (H, R) each has, H of no rows for none."""
+    for m in modes:
+        H, R = readings[m]
+        moved = F @ P @ F.T + Q
+        if len(H):
+            cross = F @ P @ H.T
+            moved = moved - cross @ solve(H @ P @ H.T + R, cross.T)
+        P = (moved + moved.T) / 2
+    return P
+
+
+def moments_update(P, x, moments, U, W, C):
+    """The estimate once the moments of a reading are used, with gains ``U + P W``."""
+    return x + (U + P @ W) @ (moments - C @ x)

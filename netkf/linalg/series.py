@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import in_place
+from netkf.linalg.compiling import kernel
 
 ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
 NOTHING = 1e-30  # of the largest entry
@@ -35,7 +35,7 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
     return np.column_stack([series, reach])
 
 
-@in_place
+@kernel
 def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
     """Write the first entries of the sum into a vector."""
     size, reach = len(out), series.shape[1] - 1
@@ -50,10 +50,9 @@ def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
         k += 2
 
 
+@kernel(allocates=True)
 def polynomial(series: FloatArray, gap: float) -> FloatArray:
-    """The sum (size,) of a table (terms, size + 1)."""
-    terms = int(np.searchsorted(series[:-1, -1], gap)) + 1
-    powers = np.empty(terms)
-    powers[0] = 1.0
-    powers[1:] = gap
-    return np.asarray(np.multiply.accumulate(powers) @ series[:terms, :-1])
+    """Return the sum (size,) of a table (terms, size + 1)."""
+    out = np.empty(series.shape[1] - 1)
+    fill_polynomial(out, series, gap)
+    return out

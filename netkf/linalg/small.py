@@ -1,4 +1,8 @@
-"""Products of small matrices: numpy in Python, loops without a call where they are compiled."""
+"""Products and solutions of small matrices, as loops: at n = 2 to 16 a call of BLAS costs more than
+the arithmetic.
+
+All are kernels: other kernels and Python call them alike.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,118 @@ import numpy as np
 from scipy.linalg.lapack import dgesv
 
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import compilable_as, in_place
+from netkf.linalg.compiling import compilable_as, in_place, kernel
+
+
+@kernel(allocates=True)
+def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return ``a b`` (r, c) of (r, m) and (m, c)."""
+    return add_matmul(np.zeros((a.shape[0], b.shape[1])), a, b)
+
+
+@kernel(allocates=True)
+def add_matmul(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return ``c + a b`` (r, s) of (r, s), (r, m) and (m, s)."""
+    out = np.empty(c.shape)
+    for i in range(c.shape[0]):
+        for j in range(c.shape[1]):
+            total = c[i, j]
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+    return out
+
+
+@kernel(allocates=True)
+def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
+    """Return ``a x`` (r,) of (r, m) and (m,)."""
+    out = np.empty(a.shape[0])
+    for i in range(a.shape[0]):
+        total = 0.0
+        for k in range(a.shape[1]):
+            total += a[i, k] * x[k]
+        out[i] = total
+    return out
+
+
+@kernel(allocates=True)
+def symmetrize(P: FloatArray) -> FloatArray:
+    """Return the symmetric part of one matrix (n, n)."""
+    out = np.empty(P.shape)
+    for i in range(P.shape[0]):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
+    return out
+
+
+@kernel
+def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
+    """Write ``L^-1 out`` over ``out`` (n, c), and rubbish over the first ``n`` rows of L (., n).
+
+    ``out`` is nan where L is singular. Gauss with the largest pivot of each column, as in LAPACK.
+    """
+    columns = out.shape[1]
+    for k in range(n):
+        best = largest_pivot(L, k, n)
+        if L[best, k] == 0.0:
+            out[:n] = np.nan
+            return
+        if best != k:
+            swap_rows(L, k, best, k, n)
+            swap_rows(out, k, best, 0, columns)
+        for i in range(k + 1, n):
+            factor = L[i, k] / L[k, k]
+            for j in range(k + 1, n):
+                L[i, j] -= factor * L[k, j]
+            for j in range(columns):
+                out[i, j] -= factor * out[k, j]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            for j in range(columns):
+                out[i, j] -= L[i, k] * out[k, j]
+        for j in range(columns):
+            out[i, j] /= L[i, i]
+
+
+@kernel
+def largest_pivot(L: FloatArray, k: int, n: int) -> int:
+    """Return the row, from k to n - 1, with the largest entry in column k."""
+    best = k
+    for i in range(k + 1, n):
+        if abs(L[i, k]) > abs(L[best, k]):
+            best = i
+    return best
+
+
+@kernel
+def swap_rows(a: FloatArray, i: int, k: int, first: int, last: int) -> None:
+    """Swap rows i and k from column ``first`` to before ``last``."""
+    for j in range(first, last):
+        a[i, j], a[k, j] = a[k, j], a[i, j]
+
+
+@kernel(allocates=True)
+def solve(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return ``left^-1 right`` (n, c) of (n, n) and (n, c); nan if it is singular or overflows."""
+    out = right.copy()
+    solve_inplace(left.copy(), out, len(left))
+    return out
+
+
+@kernel
+def copy_vector(target: FloatArray, source: FloatArray) -> None:
+    """Write a vector into another of its size."""
+    # A compiled assignment of arrays brings messages about shapes: seconds of compiling.
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@kernel
+def copy_matrix(target: FloatArray, source: FloatArray) -> None:
+    """Write a matrix into another of its size."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
 
 
 def _product_loops(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -1,10 +1,11 @@
-"""Many chains of random Riccati equations: compiled loops, stacks and single steps agree."""
+"""Many chains of random Riccati equations: kernels and single steps agree."""
 
 import numpy as np
 import pytest
 
 from netkf import theory
 from netkf.algorithms.kernels import chains
+from tests import reference
 
 RANDOM = np.random.default_rng(5)
 READINGS = [  # of no, one and two rows
@@ -17,11 +18,8 @@ HALF = RANDOM.standard_normal((3, 3))
 Q = HALF @ HALF.T
 
 
-@pytest.mark.parametrize("fast", [True, False])
 @pytest.mark.parametrize("size", [1.0, 1e12])
-def test_words_are_steps_one_after_the_other(fast, size, monkeypatch):
-    if not fast:
-        monkeypatch.setattr(chains, "compiled", lambda function: None)
+def test_words_are_steps_one_after_the_other(size):
     words = RANDOM.integers(3, size=(7, 40))
     starts = size * np.array([np.diag(d) for d in RANDOM.uniform(0.5, 2.0, (7, 3))])
     letters = chains.alphabet(READINGS, 3)
@@ -33,12 +31,20 @@ def test_words_are_steps_one_after_the_other(fast, size, monkeypatch):
         np.testing.assert_allclose(roots[k] @ roots[k].T, P, rtol=1e-9, atol=1e-12 * size)
 
 
-def test_loops_are_the_same_interpreted():
-    """What the compiler gets is what Python would do."""
-    words = RANDOM.integers(3, size=(2, 5)).astype(np.uint8)
-    roots = np.repeat(np.eye(3)[None], 2, axis=0)
-    letters = chains.alphabet(READINGS, 3)
-    low_Q = np.linalg.cholesky(Q)
-    expected = chains.advance(roots, words, F, low_Q, letters)
-    chains.run_words(roots, words, F, low_Q, *letters)
-    np.testing.assert_allclose(roots, expected, rtol=1e-12, atol=1e-14)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("n", [1, 2, 4, 6])
+def test_the_kernel_is_the_formula(seed, n):
+    random = np.random.default_rng(seed)
+    readings = []
+    for p in range(n + 1):
+        noise = random.normal(size=(p, p))
+        readings.append((random.normal(size=(p, n)), noise @ noise.T + 0.1 * np.eye(p)))
+    A, half = random.normal(size=(n, n)) / np.sqrt(n), random.normal(size=(n, n))
+    words, start = random.integers(n + 1, size=(5, 12)), np.eye(n)
+    roots = chains.advance(
+        np.broadcast_to(start, (5, n, n)), words, A, half, chains.alphabet(readings, n)
+    )
+    for root, modes in zip(roots, words, strict=True):
+        expected = reference.switched_riccati(start, modes, A, half @ half.T, readings)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(root @ root.T, expected, rtol=0, atol=1e-10 * scale)

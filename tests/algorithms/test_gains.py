@@ -6,9 +6,10 @@ import scipy.linalg
 
 from netkf.algorithms.filter import Estimate, Exchange, Increments, Message, State
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.kernels.gains import gain_table, longest_interval
+from netkf.algorithms.kernels.gains import gain_table, gain_update, longest_interval
 from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
 from netkf.algorithms.models import FlowModel
+from tests import reference
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
 
@@ -58,6 +59,22 @@ def test_gains_are_the_projections_of_the_exact_weight(seed):
     root = np.linalg.cholesky(P)
     state = Hybrid(epsilon=0.5).update(State(x, root, model), Increments(moments, g))
     np.testing.assert_allclose(state.xhat, expected, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("n", "p"), [(1, 1), (2, 1), (4, 2), (6, 3)])
+def test_the_kernel_is_the_formula(seed, n, p):
+    A, Q, H, R, P = system(seed, n, p)
+    gap = 0.5 * longest_interval(A, Q, H, R)
+    table = gain_table(A, Q, H, R, gap)
+    values = reference.polynomial(table.series[:, :-1], gap)
+    U, W, C = (part.reshape(-1, n) for part in np.split(values, 3))
+    U, W = U.reshape(n, 2 * p), W.reshape(n, 2 * p)
+    random = np.random.default_rng(seed)
+    x, moments = random.normal(size=n), random.normal(size=2 * p)
+    expected = reference.moments_update(P, x, moments, U, W, C)
+    found = gain_update(table, P, x, moments, gap)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 
 def test_the_innovation_does_not_see_the_state():

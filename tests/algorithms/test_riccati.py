@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 import netkf
 from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from tests import reference
 
 WALK = np.array([[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
 PUSH = np.diag([0.0, 0.25, 0.0, 0.25])
@@ -43,6 +44,24 @@ def test_flow_agrees_with_arbitrary_precision(name, gap):
         truth = exact(P, A, Q, G, gap)
         got = netkf.theory.riccati_flow(P, A, Q, G, gap)
         assert np.abs(got - truth).max() <= 1e-12 * np.abs(truth).max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("n", [1, 2, 4])
+@pytest.mark.parametrize("reads", [True, False])
+def test_the_kernel_is_the_formula(seed, n, reads):
+    random = np.random.default_rng(seed)
+    A, B, C, S = (random.normal(size=(n, n)) for _ in range(4))
+    Q, G, P, x = B @ B.T, C @ C.T * reads, S @ S.T, random.normal(size=n)
+    table = riccati_table(A, Q, G, 2.0)
+    for gap in (0.13, 1.7):
+        with reference.precisely():
+            triple = reference.flow_triple(*reference.exactly(A, Q, G), gap)
+            exact = reference.flow(*reference.exactly(P, x), triple)
+        expected, moved = (reference.rounded(part) for part in exact)
+        found, seen = riccati_step(table, P, x, gap)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+        np.testing.assert_allclose(seen, moved, rtol=0, atol=1e-10 * np.abs(moved).max())
 
 
 @settings(max_examples=60, deadline=None)

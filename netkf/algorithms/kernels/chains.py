@@ -14,14 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.square_root import (
-    lower_triangular,
-    predict_root,
-    reflect,
-    update_root,
-)
+from netkf.algorithms.kernels.square_root import lower_triangular, reflect
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import compiled
+from netkf.linalg.compiling import kernel
 
 FEW = 4096  # chain steps for which threads do not pay
 
@@ -51,24 +46,22 @@ def alphabet(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> Lette
 def advance(
     roots: FloatArray, words: np.ndarray, F: FloatArray, root_Q: FloatArray, letters: Letters
 ) -> FloatArray:
-    """Roots (K, n, n) after each chain's word: row k of ``words`` (K, T), first letter first.
+    """Return roots (K, n, n) after each chain's word: row k of ``words`` (K, T), first letter
+    first.
 
-    Compiled, and on all cores, where numba is installed; else slot by slot in numpy.
+    Works on all cores where there is enough to do.
     """
-    fast = compiled(run_words)
-    if fast is None:
-        return _stack_by_stack(roots, words, F, root_Q, letters)
     moved = np.ascontiguousarray(lower_triangular(roots))
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
     spelled = np.ascontiguousarray(words, dtype=np.uint8 if len(letters.rows) < 256 else np.int64)
     workers = min(os.cpu_count() or 1, len(roots))
     if words.size < FEW or workers < 2:
-        fast(moved, spelled, F, low_Q, *letters)
+        run_words(moved, spelled, F, low_Q, *letters)
         return moved
     cuts = np.linspace(0, len(roots), workers + 1).astype(int)
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
-            pool.submit(fast, moved[a:b], spelled[a:b], F, low_Q, *letters)
+            pool.submit(run_words, moved[a:b], spelled[a:b], F, low_Q, *letters)
             for a, b in itertools.pairwise(cuts)
         ]
         for job in jobs:
@@ -76,22 +69,7 @@ def advance(
     return moved
 
 
-def _stack_by_stack(
-    roots: FloatArray, words: np.ndarray, F: FloatArray, root_Q: FloatArray, letters: Letters
-) -> FloatArray:
-    for slot in words.T:
-        following = np.empty_like(roots)
-        for m in np.unique(slot):
-            p, chosen = int(letters.rows[m]), slot == m
-            H, root_R = letters.H[m, :p], letters.root_R[m, :p, :p]
-            if p:
-                following[chosen] = update_root(roots[chosen], F, root_Q, H, root_R)[0]
-            else:
-                following[chosen] = predict_root(roots[chosen], F, root_Q)
-        roots = following
-    return roots
-
-
+@kernel(allocates=True)
 def run_words(
     roots: FloatArray,
     words: np.ndarray,
@@ -101,33 +79,45 @@ def run_words(
     root_R: FloatArray,
     rows: np.ndarray,
 ) -> None:
-    """The same as loops for a compiler, in place, on lower triangular roots (root_Q too).
+    """Move the roots (K, n, n) in place along their words; roots and root_Q are lower triangular.
 
     square_root's triangularisation without its zeros: some 300 operations a step at n = 4.
     """
-    count, steps = words.shape
-    n = len(F)
-    work = np.empty((H.shape[1] + n, 2 * n + H.shape[1]))
-    for chain in range(count):
-        S = roots[chain]
-        for step in range(steps):
-            m = words[chain, step]
-            p = rows[m]
-            # [[H S, root_R, 0], [F S, 0, root_Q]]
-            for i in range(p + n):
-                for j in range(n):
-                    total = 0.0
-                    for k in range(j, n):
-                        total += (H[m, i, k] if i < p else F[i - p, k]) * S[k, j]
-                    work[i, j] = total
-                for j in range(p):
-                    work[i, n + j] = root_R[m, i, j] if i < p else 0.0
-                for j in range(n):
-                    work[i, n + p + j] = root_Q[i - p, j] if i >= p else 0.0
-            # Householder's reflections of the columns make it lower triangular, row by row; right
-            # of the end there are zeros, because root_Q is lower triangular.
-            for i in range(p + n):
-                reflect(work, i, p + n, n + p + max(0, i - p + 1))
-            for i in range(n):
-                for j in range(i + 1):
-                    S[i, j] = work[p + i, p + j]
+    work = np.empty((H.shape[1] + len(F), 2 * len(F) + H.shape[1]))
+    for chain in range(words.shape[0]):
+        for step in range(words.shape[1]):
+            step_root(roots, chain, words[chain, step], F, root_Q, H, root_R, rows, work)
+
+
+@kernel
+def step_root(
+    roots: FloatArray,
+    chain: int,
+    m: int,
+    F: FloatArray,
+    root_Q: FloatArray,
+    H: FloatArray,
+    root_R: FloatArray,
+    rows: np.ndarray,
+    work: FloatArray,
+) -> None:
+    """Move one root by ``f_m``: update with reading ``m`` and predict."""
+    n, p = len(F), rows[m]
+    # [[H S, root_R, 0], [F S, 0, root_Q]]
+    for i in range(p + n):
+        for j in range(n):
+            total = 0.0
+            for k in range(j, n):
+                total += (H[m, i, k] if i < p else F[i - p, k]) * roots[chain, k, j]
+            work[i, j] = total
+        for j in range(p):
+            work[i, n + j] = root_R[m, i, j] if i < p else 0.0
+        for j in range(n):
+            work[i, n + p + j] = root_Q[i - p, j] if i >= p else 0.0
+    # Householder's reflections of the columns make it lower triangular, row by row; right of the
+    # end there are zeros, because root_Q is lower triangular.
+    for i in range(p + n):
+        reflect(work, i, p + n, n + p + max(0, i - p + 1))
+    for i in range(n):
+        for j in range(i + 1):
+            roots[chain, i, j] = work[p + i, p + j]

@@ -18,9 +18,10 @@ import numpy as np
 
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
 from netkf.linalg.legendre import MOMENTS, backward_coefficients
 from netkf.linalg.series import polynomial, with_reach
-from netkf.linalg.small import added, applied
+from netkf.linalg.small import add_matmul, matvec
 
 LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
 
@@ -77,6 +78,7 @@ def _terms(size: float) -> int:
     return terms
 
 
+@kernel(allocates=True)
 def gain_update(
     table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
@@ -86,4 +88,4 @@ def gain_update(
     U = values[: n * q].reshape(n, q)
     W = values[n * q : 2 * n * q].reshape(n, q)
     C = values[2 * n * q :].reshape(q, n)
-    return np.asarray(x + applied(added(U, P, W), moments - applied(C, x)))
+    return x + matvec(add_matmul(U, P, W), moments - matvec(C, x))

@@ -19,14 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.compiling import kernel
 from netkf.linalg.series import polynomial, with_reach
-from netkf.linalg.small import (
-    added,
-    applied,
-    even,
-    product,
-    solution,
-)
+from netkf.linalg.small import add_matmul, matmul, matvec, solve, symmetrize
 
 TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
 
@@ -36,16 +31,16 @@ class RiccatiTable(NamedTuple):
 
     series : (terms, 5 n n + 1) Taylor coefficients of the blocks of ``exp(M g)`` and of
              ``exp(A g)``, with their reach, see linalg/series
-    blind  : (terms, 2 n n + 1) those of ``exp(A g)`` and of W where G = 0, else no row
+    unobserved : (terms, 2 n n + 1) those of ``exp(A g)`` and of W where G = 0, else no row
     unit   : gap that the series covers, seconds
-    jump, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
+    transition, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
     """
 
     n: int
     unit: float
     series: FloatArray
-    blind: FloatArray
-    jump: FloatArray
+    unobserved: FloatArray
+    transition: FloatArray
     F: FloatArray
     G: FloatArray
     Q: FloatArray
@@ -60,8 +55,8 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
     return series
 
 
-def growth_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
-    """(terms, n, n): those of ``W`` with ``dW = A W + W A' + Q`` from W = 0 on."""
+def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
+    """Return (terms, n, n), those of ``W`` with ``dW = A W + W A' + Q`` from W = 0 on."""
     series = np.zeros((terms, *A.shape))
     series[1] = Q
     for k in range(2, terms):
@@ -87,20 +82,20 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
     """Tabulate the flow for gaps up to ``longest`` seconds; ``A, Q, G`` are (n, n)."""
     n = len(A)
     M, scale = hamiltonian(A, Q, G)
-    norm, size, blind = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
-    if blind:  # W grows by A from both sides
+    norm, size, unobserved = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
+    if unobserved:  # W grows by A from both sides
         norm = max(norm, float(size.sum(axis=0).max() + size.sum(axis=1).max()))
     # A power of two, so that a whole number of units is exact.
     unit = 2.0 ** np.floor(np.log2(min(1.0 / max(norm, 1e-300), longest)))
     blocks = exponential_series(M, TAYLOR_TERMS)
     blocks[:, :n, n:] /= scale
     blocks[:, n:, :n] *= scale
-    moves = exponential_series(A, TAYLOR_TERMS)
-    series, lean = _side_by_side(unit, blocks, moves), np.zeros((0, 2 * n * n + 1))
-    if blind:
-        lean = _side_by_side(unit, moves, growth_series(A, Q, TAYLOR_TERMS))
+    transition = exponential_series(A, TAYLOR_TERMS)
+    series, short = _side_by_side(unit, blocks, transition), np.zeros((0, 2 * n * n + 1))
+    if unobserved:
+        short = _side_by_side(unit, transition, lyapunov_series(A, Q, TAYLOR_TERMS))
     levels = max(1, int(longest / unit).bit_length())
-    return RiccatiTable(n, unit, series, lean, *_triples(M, scale, A, unit, levels))
+    return RiccatiTable(n, unit, series, short, *_triples(M, scale, A, unit, levels))
 
 
 def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
@@ -118,15 +113,15 @@ def _triples(
     E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
     inverse = _inverse(E[:n, :n])
     F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
-    jump = np.tensordot(wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1)
+    move = np.tensordot(wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1)
     tables = tuple(np.empty((levels, n, n)) for _ in range(4))
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable blind plant overflows late
         for level in range(levels):
             G, Q = symmetric(G), symmetric(Q)
-            for table, value in zip(tables, (jump, F, G / scale, Q * scale), strict=True):
+            for table, value in zip(tables, (move, F, G / scale, Q * scale), strict=True):
                 table[level] = value
             W = _inverse(np.eye(n) + G @ Q)
-            jump, F, G, Q = jump @ jump, F @ W.T @ F, G + F.T @ W @ G @ F, Q + F @ Q @ W @ F.T
+            move, F, G, Q = move @ move, F @ W.T @ F, G + F.T @ W @ G @ F, Q + F @ Q @ W @ F.T
     return tables  # type: ignore[return-value]
 
 
@@ -145,42 +140,40 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return inverse
 
 
-def evaluate_hamiltonian(table: RiccatiTable, gap: float) -> tuple[FloatArray, FloatArray]:
-    """``exp(M gap)`` (2n, 2n) and ``exp(A gap)`` (n, n) for a gap of at most one unit."""
-    n = table.n
-    values = polynomial(table.series, gap)
-    return values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
-
-
-def part_of_unit(
+@kernel(allocates=True)
+def substep(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """``riccati_step`` for a gap of at most one unit."""
+    """Return what ``riccati_step`` does, for a gap of at most one unit."""
     n = table.n
-    if len(table.blind):
-        values = polynomial(table.blind, gap)
-        transition, grown = values.reshape(2, n, n)
-        return even(added(grown, product(transition, P), transition.T)), applied(transition, x)
-    E, transition = evaluate_hamiltonian(table, gap)
-    X = added(E[:n, :n], E[:n, n:], P)
-    Y = added(E[n:, :n], E[n:, n:], P)
-    return even(solution(X.T, Y.T)), applied(transition, x)
+    if len(table.unobserved):
+        values = polynomial(table.unobserved, gap)
+        transition, noise = values[: n * n].reshape(n, n), values[n * n :].reshape(n, n)
+        moved = matmul(transition, P)
+        return symmetrize(add_matmul(noise, moved, transition.T)), matvec(transition, x)
+    values = polynomial(table.series, gap)
+    E, transition = values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
+    # [X; Y] = E [I; P], and the new P is Y X^-1
+    X = add_matmul(E[:n, :n], E[:n, n:], P)
+    Y = add_matmul(E[n:, :n], E[n:, n:], P)
+    return symmetrize(solve(X.T, Y.T)), matvec(transition, x)
 
 
+@kernel(allocates=True)
 def riccati_step(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """``P`` (n, n) moved by the flow over ``gap`` seconds, and ``x`` (n,) by ``exp(A gap)``."""
-    n, whole = table.n, int(gap / table.unit)
-    level = 0
+    """Return P (n, n) moved by the flow over ``gap`` seconds and x (n,) by ``exp(A gap)``."""
+    P, x = P.copy(), x.copy()  # of one layout, whatever the caller's
+    whole, level = int(gap / table.unit), 0
     while whole >> level:
-        if whole >> level & 1:
+        if whole >> level & 1:  # Q + F P (I + G P)^-1 F' over 2^level units
             F = table.F[level]
-            middle = solution(added(np.eye(n), P, table.G[level]), P)
-            P = even(added(table.Q[level], product(F, middle), F.T))
-            x = applied(table.jump[level], x)
+            middle = solve(add_matmul(np.eye(table.n), P, table.G[level]), P)
+            P = symmetrize(add_matmul(table.Q[level], matmul(F, middle), F.T))
+            x = matvec(table.transition[level], x)
         level += 1
     rest = gap - whole * table.unit
     if rest <= 0.0:
         return P, x
-    return part_of_unit(table, P, x, rest)
+    return substep(table, P, x, rest)

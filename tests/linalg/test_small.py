@@ -1,0 +1,58 @@
+"""Kernels on small matrices against numpy, which says the same in one line."""
+
+import numpy as np
+import pytest
+
+from netkf.linalg import small
+
+CASES = [(seed, n) for seed in range(3) for n in (1, 2, 4, 7)]
+
+
+def drawn(seed, *shapes):
+    random = np.random.default_rng(seed)
+    return [random.normal(size=shape) for shape in shapes]
+
+
+def same(found, expected):
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(("seed", "n"), CASES)
+def test_products(seed, n):
+    a, b, c, x = drawn(seed, (n, n + 2), (n + 2, n + 1), (n, n + 1), n + 2)
+    same(small.matmul(a, b), a @ b)
+    same(small.add_matmul(c, a, b), c + a @ b)
+    same(small.matvec(a, x), a @ x)
+
+
+@pytest.mark.parametrize(("seed", "n"), CASES)
+def test_the_symmetric_part(seed, n):
+    (P,) = drawn(seed, (n, n))
+    found = small.symmetrize(P)
+    same(found, (P + P.T) / 2)
+    assert np.array_equal(found, found.T)
+
+
+@pytest.mark.parametrize(("seed", "n"), CASES)
+def test_solutions(seed, n):
+    left, right = drawn(seed, (n, n), (n, 3))
+    before = left.copy(), right.copy()
+    same(small.solve(left, right), np.linalg.solve(left, right))
+    assert np.array_equal(left, before[0])
+    assert np.array_equal(right, before[1])
+    wide = np.concatenate([left, np.zeros((n, 2))], axis=1)
+    small.solve_inplace(wide, right, n)
+    same(right, np.linalg.solve(*before))
+
+
+def test_a_singular_matrix_has_no_solution():
+    assert np.isnan(small.solve(np.ones((2, 2)), np.eye(2))).all()
+
+
+def test_copies():
+    a, b = drawn(1, (2, 3), 3)
+    target, vector = np.zeros((2, 3)), np.zeros(3)
+    small.copy_matrix(target, a)
+    small.copy_vector(vector, b)
+    assert np.array_equal(target, a)
+    assert np.array_equal(vector, b)
