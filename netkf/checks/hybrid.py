@@ -25,7 +25,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, limit_covariance, steady_covariance_bound
-from netkf.theory.hybrid.coupled import coupling, not_promised
+from netkf.theory.hybrid.coupled import coupling, reason_without_bound
 from netkf.theory.hybrid.second_moments import second_moment_rate
 from netkf.theory.numerics.matrices import undetectable_mode
 from netkf.trace.run import Run
@@ -56,7 +56,7 @@ class Observed(Seen):
 def rows(scenario: Scenario) -> list[Row]:
     """What the tests need beyond the assumptions of the paper."""
     promised = stand_in(scenario)
-    why = not_promised(promised)
+    why = reason_without_bound(promised)
     return [
         Row("H(12) speaks about the scenario", "H (12)", why is None, why or "it does"),
         exact_start(scenario),

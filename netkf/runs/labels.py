@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from netkf.algorithms.registry import overridden
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import balanced
+from netkf.theory.hybrid.coupled import has_balanced_rates
 
 
 def limit_words(scenario: Scenario) -> str:
     """What the limit of the bound as links tick ever faster is for this scenario."""
-    words = "limit S of H(13)" if balanced(scenario) else "weighted limit (not S of H(13))"
+    balanced = has_balanced_rates(scenario)
+    words = "limit S of H(13)" if balanced else "weighted limit (not S of H(13))"
     return words + without_delay(scenario)
 
 

@@ -14,7 +14,7 @@ from netkf.runs.labels import limit_words, mismatch_words, nees_words
 from netkf.runs.transmissions import Transmissions
 from netkf.scenario.scenario import Scenario
 from netkf.theory import central_covariance, covariance_bound, limit_covariance
-from netkf.theory.hybrid.coupled import not_promised
+from netkf.theory.hybrid.coupled import reason_without_bound
 from netkf.theory.hybrid.steady import has_steady_state
 from netkf.trace.nees import errors
 from netkf.trace.recorder import Sink
@@ -152,14 +152,14 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
         bound,
         _trace(limit_covariance, scenario),
         _trace(central_covariance, scenario),
-        reason or not_promised(scenario) or "",
+        reason or reason_without_bound(scenario) or "",
         limit_words(scenario),
         tuple(filter(None, notes)),
     )
 
 
 def _steady_note(scenario: Scenario) -> str:
-    if scenario.slotted or not_promised(scenario) or has_steady_state(scenario):
+    if scenario.slotted or reason_without_bound(scenario) or has_steady_state(scenario):
         return ""
     if not scenario.filter.algorithm.talks:
         return "at some nodes P has no steady state, it grows without end; see netkf theory"

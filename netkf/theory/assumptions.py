@@ -14,7 +14,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
 from netkf.theory.common.papers import paper_function
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
-from netkf.theory.hybrid.coupled import balanced
+from netkf.theory.hybrid.coupled import has_balanced_rates
 from netkf.theory.hybrid.samples import (
     randomly_sampled_sensors,
     sampling_clock,
@@ -179,7 +179,7 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
     channel = scenario.network.channel
-    fixed, symmetric = channel.delay.fixed, balanced(scenario)
+    fixed, symmetric = channel.delay.fixed, has_balanced_rates(scenario)
     return [
         (
             "losses are independent of each other and of the past",

@@ -17,8 +17,8 @@ import scipy.linalg
 import scipy.sparse.linalg
 
 import netkf
-from netkf.theory.hybrid.coupled import coupled
-from netkf.theory.hybrid.packed import Packed
+from netkf.theory.hybrid.coupled import coupled_riccati
+from netkf.theory.hybrid.packed import PackedRiccati
 
 EPOCH = datetime.datetime(2000, 1, 1)
 
@@ -239,7 +239,7 @@ class StackedBound:
     """H(12) as one system of N n n equations, its right-hand side in numpy and one CSR product."""
 
     def __init__(self, case):
-        self._equations = e = coupled(case)
+        self._equations = e = coupled_riccati(case)
         self._leaving = np.asarray(e.coupling.sum(axis=1)).reshape(-1, 1, 1)
         self.start = e.start.reshape(-1)
         self.evaluations = 0
@@ -263,7 +263,7 @@ class StackedBound:
 
 def time_constant(case):
     """Seconds: of the slowest mode of H(12) made linear at its steady state."""
-    packed = Packed(coupled(case))
+    packed = PackedRiccati(coupled_riccati(case))
     blocks = packed.linear(netkf.theory.steady_covariance_bound(case))
 
     def applied(x):

@@ -9,8 +9,8 @@ import scipy.sparse
 
 from netkf import theory
 from netkf.theory.hybrid import linearised
-from netkf.theory.hybrid.coupled import Coupled
-from netkf.theory.hybrid.packed import Packed
+from netkf.theory.hybrid.coupled import CoupledRiccati
+from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.taylor import StiffError, solve_by_taylor_series
 
 N, n = 5, 3
@@ -28,7 +28,7 @@ def equations(delay=0.0, seed=1):
     T, q = scipy.linalg.expm(A * delay), delay * np.eye(n)
     start = random.normal(size=(N, n, n))
     start = start @ np.swapaxes(start, 1, 2)
-    return Coupled(A, B @ B.T, G, scipy.sparse.csr_array(coupling), T, q, delay, start)
+    return CoupledRiccati(A, B @ B.T, G, scipy.sparse.csr_array(coupling), T, q, delay, start)
 
 
 def plain(e, P, sent):
@@ -52,7 +52,7 @@ def near(got, expected, tolerance=1e-12):
 @pytest.mark.parametrize("delay", [0.0, 0.3])
 def test_the_slope_is_the_right_hand_side(delay):
     e, other = equations(delay), equations(seed=2).start
-    packed = Packed(e)
+    packed = PackedRiccati(e)
     near(packed.unpack(packed.slope(packed.start, packed.pack(other))), plain(e, e.start, other))
     if delay == 0.0:
         near(packed.unpack(packed.slope(packed.start)), plain(e, e.start, e.start))
@@ -61,7 +61,7 @@ def test_the_slope_is_the_right_hand_side(delay):
 @pytest.mark.parametrize("arriving", [True, False])
 def test_the_linear_part_is_the_derivative_of_the_slope(arriving):
     e = equations(0.3)
-    packed, X = Packed(e), equations(seed=2).start
+    packed, X = PackedRiccati(e), equations(seed=2).start
     # The right-hand side is quadratic: central differences are exact.
     sent = X if arriving else 0.0 * X
     expected = 0.5 * (plain(e, e.start + X, sent) - plain(e, e.start - X, -sent))
@@ -76,11 +76,11 @@ def test_the_taylor_series_is_that_of_the_solution():
     """A scalar node: P' = 2 a P + q - g P^2 in 40 digits."""
     a, q, g, P0, span = 0.3, 0.7, 1.9, 2.5, 0.25
     one = [np.array(x, dtype=float).reshape(1, 1) for x in (a, q, 1.0, 0.0)]
-    e = Coupled(
+    e = CoupledRiccati(
         one[0], one[1], np.full((1, 1, 1), g), scipy.sparse.csr_array((1, 1)), one[2], one[3], 0.0,
         np.full((1, 1, 1), P0),
     )  # fmt: skip
-    series = Packed(e).series(np.array([[P0]]), span, 9)[:, 0, 0]
+    series = PackedRiccati(e).series(np.array([[P0]]), span, 9)[:, 0, 0]
     with mpmath.workdps(40):
         root = mpmath.sqrt(mpmath.mpf(a) ** 2 + mpmath.mpf(g) * q)
         c = mpmath.acoth((mpmath.mpf(g) * P0 - a) / root)
@@ -90,7 +90,7 @@ def test_the_taylor_series_is_that_of_the_solution():
 
 def test_the_solution_is_followed_to_all_digits():
     e = equations()
-    packed, times = Packed(e), np.array([0.0, 0.0, 0.1, 0.5, 2.0, 2.0])
+    packed, times = PackedRiccati(e), np.array([0.0, 0.0, 0.1, 0.5, 2.0, 2.0])
     got = packed.unpack(solve_by_taylor_series(packed, times, 1.0, 100_000, 1e150))
     solved = scipy.integrate.solve_ivp(
         lambda _, y: plain(e, y.reshape(N, n, n), y.reshape(N, n, n)).reshape(-1),
@@ -126,7 +126,7 @@ def test_a_large_network_comes_to_its_steady_state(random_graph, monkeypatch):
     def refused(*_):
         raise AssertionError("1000 nodes would take minutes")
 
-    monkeypatch.setattr(linearised, "_eliminated", refused)
+    monkeypatch.setattr(linearised, "_eliminate", refused)
     scenario = random_graph(250)
     steady = theory.steady_covariance_bound(scenario)
     near(theory.covariance_bound(scenario, [0.0, 150.0])[1], steady, 1e-9)

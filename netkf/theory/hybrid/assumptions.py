@@ -1,4 +1,4 @@
-"""The assumptions of H about the weights of a filter."""
+"""Assumption of H on the weights of the reset."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from netkf.theory.common.evidence import AssumptionRow
 
 
 def weight_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """(assumption, source, holds, evidence): Pi = I - epsilon L is doubly stochastic, H (5)."""
+    """Return the row: Pi = I - epsilon L is doubly stochastic, H (5)."""
     algorithm = scenario.filter.algorithm
     assert isinstance(algorithm, Hybrid)
     epsilon = algorithm.epsilon
-    most = max(scenario.topology.degrees.values())
-    low = 1.0 - epsilon * most
+    degree = max(scenario.topology.degrees.values())
+    diagonal = 1.0 - epsilon * degree
     return [
         (
             "Pi is doubly stochastic, 0 < epsilon <= 1/max degree",
             "H (5)",
-            low >= -1e-12,
-            f"epsilon {epsilon:g}, largest degree {most}, least diagonal entry {low:.3g}",
+            diagonal >= -1e-12,
+            f"epsilon {epsilon:g}, largest degree {degree}, least diagonal entry {diagonal:.3g}",
         )
     ]

@@ -14,8 +14,8 @@ from netkf.algorithms.kernels.riccati import RiccatiTable, riccati_step, riccati
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import Coupled, coupled
-from netkf.theory.hybrid.packed import Packed
+from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
+from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.taylor import StiffError, solve_by_taylor_series
 from netkf.theory.numerics.updates import Observation
 
@@ -47,20 +47,20 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
         raise TheoryError("times must be a list of finite numbers that is not empty")
     if (np.diff(moments) < 0.0).any() or moments[0] < 0.0:
         raise TheoryError("times must be increasing and not negative")
-    equations = coupled(scenario)
+    equations = coupled_riccati(scenario)
     if equations.jumps and moments[-1] > scenario.horizon:
         raise TheoryError("samples at known times are known up to the horizon")
     if not equations.talks and not equations.samples and not equations.jumps:
         P = _solve_uncoupled(equations, moments)
     else:
-        packed = Packed(equations)
+        packed = PackedRiccati(equations)
         P = packed.unpack(_solve_coupled(packed, moments))
     if not np.abs(P).max() < OVERFLOW:
         raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {moments[-1]:g} s")
     return P
 
 
-def _solve_coupled(packed: Packed, times: FloatArray) -> FloatArray:
+def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
     """Return the packed solution (T, N, m) at ``times``."""
     equations = packed.equations
     # Without delay the right-hand side is quadratic, and Taylor series are fastest unless stiff.
@@ -74,13 +74,13 @@ def _solve_coupled(packed: Packed, times: FloatArray) -> FloatArray:
     return np.stack([pieces(float(t)) for t in times])
 
 
-def _scale(packed: Packed) -> float:
+def _scale(packed: PackedRiccati) -> float:
     """Return the size of the covariances that matter: of the start and of Q."""
     sizes = (np.abs(packed.start).max(), np.abs(packed.equations.Q).max())
     return max(*(float(size) for size in sizes), 1e-300)
 
 
-def _solve_uncoupled(equations: Coupled, times: FloatArray) -> FloatArray:
+def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray:
     """Return P (T, N, n, n) of nodes that receive nothing: the Riccati flow of each by itself."""
     P = np.empty((len(times), *equations.start.shape))
     tables: dict[bytes, RiccatiTable] = {}
@@ -99,12 +99,13 @@ def _solve_uncoupled(equations: Coupled, times: FloatArray) -> FloatArray:
 class _PiecewiseSolution:
     """The solution up to the time that ``extend`` has reached, a dense output for each piece."""
 
-    def __init__(self, packed: Packed) -> None:
+    def __init__(self, packed: PackedRiccati) -> None:
         self._packed = packed
         equations = packed.equations
         # Until the first message has taken the delay, nodes lose nothing and receive nothing.
         quiet = tuple(s._replace(heard=0.0 * s.heard) for s in equations.samples)
-        self._silent = Packed(equations._replace(coupling=0.0 * equations.coupling, samples=quiet))
+        silent = equations._replace(coupling=0.0 * equations.coupling, samples=quiet)
+        self._silent = PackedRiccati(silent)
         self._jumps = _SampleJumps(packed)
         self._first = packed.start
         self._jumped: dict[float, FloatArray] = {}
@@ -247,7 +248,7 @@ class _PiecewiseSolution:
 class _SampleJumps:
     """Jumps of the solution: samples at known times, and the arrivals of messages sent at them."""
 
-    def __init__(self, packed: Packed) -> None:
+    def __init__(self, packed: PackedRiccati) -> None:
         self._packed = packed
         equations = packed.equations
         self._samples = {jump.time: jump for jump in equations.jumps}
@@ -281,7 +282,7 @@ class _SampleJumps:
             return Y
         weights, sent = arriving
         if equations.delay > 0.0:
-            sent = packed.predicted(sent)
+            sent = packed.predict(sent)
         # H (9) in the mean: P_i <- (1 - sum_j w_ij) P_i + sum_j w_ij P_j.
         own = 1.0 - weights.sum(axis=1)
         return np.asarray(own[:, None] * Y + weights @ sent)

@@ -1,11 +1,11 @@
 """The coupled Riccati equations H(12) of a scenario, as arrays.
 
-d P_i = A P_i + P_i A' + Q - P_i G_i P_i + sum_j c_ij (T P_j T' + q - P_i)
+    dP_i/dt = A P_i + P_i A' + Q - P_i G_i P_i + sum_j c_ij (T P_j T' + q - P_i)
 
-``c_ij`` is the rate at which messages from j arrive at i times the weight they get. Sensors that
-sample add terms and jumps of their own, see theory/hybrid/samples.py. A message that
-took a fixed time d is predicted first, ``T = exp(A d)`` and ``q`` the noise of d seconds, and
-P_j is then the one from d seconds ago; without delay ``T = I``, ``q = 0``.
+``c_ij`` is the rate at which messages from j arrive at i, times their weight. A message with a
+fixed delay of d seconds is predicted over them, ``T = exp(A d)`` and ``q`` the noise of d seconds,
+and P_j is that of d seconds ago; without delay ``T = I`` and ``q = 0``. Sensors that sample add
+terms and jumps, see theory/hybrid/samples.py.
 """
 
 from __future__ import annotations
@@ -35,10 +35,21 @@ from netkf.theory.hybrid.samples import (
     transmits_at_samples,
 )
 
+RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-12, 1e-8  # between rates that count as equal
+RESIDUAL_TOLERANCE = 1e-9  # of the left null vector, relative
 
-class Coupled(NamedTuple):
-    """A (n, n), Q (n, n), G (N, n, n) of increments, coupling (N, N) sparse, T (n, n), q (n, n),
-    delay (s), start (N, n, n), ``samples`` by Poisson clocks, ``jumps`` at known times.
+
+class CoupledRiccati(NamedTuple):
+    """Coefficients of H(12) for N nodes of n states.
+
+    A, Q     : (n, n) drift and noise that the filters assume
+    G        : (N, n, n) information of increments per second
+    coupling : (N, N) sparse, c_ij per second
+    T, q     : (n, n) prediction over the delay
+    delay    : seconds
+    start    : (N, n, n) P at 0
+    samples  : sensors with Poisson clocks
+    jumps    : samples at known times
     """
 
     A: FloatArray
@@ -54,12 +65,12 @@ class Coupled(NamedTuple):
 
     @property
     def talks(self) -> bool:
-        """Whether any message ever arrives."""
+        """True if any message ever arrives."""
         sent = any(jump.weights is not None and jump.weights.any() for jump in self.jumps)
         return bool(self.coupling.nnz or any(s.heard.nnz for s in self.samples) or sent)
 
-    def restrict(self, node: int) -> Coupled:
-        """The equation of one node, alone."""
+    def restrict(self, node: int) -> CoupledRiccati:
+        """Return the equation of one node without the others."""
         return self._replace(
             G=self.G[node : node + 1],
             start=self.start[node : node + 1],
@@ -72,16 +83,16 @@ class Coupled(NamedTuple):
             ),
         )
 
-    def faster(self, factor: float) -> Coupled:
-        """With clocks of links, directions or nodes that tick so many times as often."""
+    def scale_rates(self, factor: float) -> CoupledRiccati:
+        """Return the equations with all link rates multiplied by ``factor``."""
         return self._replace(coupling=factor * self.coupling)
 
 
-def not_promised(scenario: Scenario) -> str | None:
-    """Why H Theorem 2 does not speak about the scenario, in words; None where it does."""
+def reason_without_bound(scenario: Scenario) -> str | None:
+    """Return the reason why H Theorem 2 does not apply to a scenario, or None if it applies."""
     algorithm, network = scenario.filter.algorithm, scenario.network
     if not scenario.slotted and not algorithm.talks:
-        return _samples_not_promised(scenario)
+        return _reason_of_samples(scenario)
     name = type(algorithm).__name__
     if scenario.hosted.paper != "hybrid":
         return f"H(12) is about the hybrid filter in continuous time, not about {spoken(algorithm)}"
@@ -96,11 +107,12 @@ def not_promised(scenario: Scenario) -> str | None:
         )
     if network.channel.delay.fixed is None:
         return "not promised: H(12) holds for no delay or a fixed one, and the delay is random"
-    bursts = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
-    return _samples_not_promised(scenario) if network.channel.loss.independent else bursts
+    dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
+    return _reason_of_samples(scenario) if network.channel.loss.independent else dependent
 
 
-def _samples_not_promised(scenario: Scenario) -> str | None:
+def _reason_of_samples(scenario: Scenario) -> str | None:
+    """Return the reason why docs/poisson_samples.md does not apply, or None if it applies."""
     for node, place in randomly_sampled_sensors(scenario):
         clock = sampling_clock(scenario.sensors[place.entry])
         if clock is not None and not clock.memoryless:
@@ -111,25 +123,26 @@ def _samples_not_promised(scenario: Scenario) -> str | None:
     return None
 
 
-def promised(scenario: Scenario) -> None:
-    """Raise TheoryError with the reason where H Theorem 2 does not apply."""
-    reason = not_promised(scenario)
+def require_bound(scenario: Scenario) -> None:
+    """Raise TheoryError with the reason if H Theorem 2 does not apply to a scenario."""
+    reason = reason_without_bound(scenario)
     if reason is not None:
         raise TheoryError(reason)
 
 
-def informations(scenario: Scenario) -> FloatArray:
-    """(N, n, n): ``G_i`` of the increments as the filters believe it; a pooled filter's is the same
-    at all nodes.
+def increment_informations(scenario: Scenario) -> FloatArray:
+    """Return ``G_i = H_i' R_i^-1 H_i`` (N, n, n) of the increments, with the R that filters assume.
+
+    A pooled filter has the same G, of all sensors, at every node.
     """
-    seen = [one.H.T @ np.linalg.solve(one.R, one.H) for one in increment_observations(scenario)]
+    found = [one.H.T @ np.linalg.solve(one.R, one.H) for one in increment_observations(scenario)]
     if scenario.filter.algorithm.pooled:
-        seen = seen * len(scenario.nodes)
-    return np.stack(seen)
+        found = found * len(scenario.nodes)
+    return np.stack(found)
 
 
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
-    """(N, N) sparse: entry (i, j) is the rate of messages from j that reach i times weight."""
+    """Return c (N, N), sparse: rate (per second) of arrivals from j at i, times their weight."""
     index, size = scenario.topology.index, len(scenario.nodes)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
     heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
@@ -141,9 +154,9 @@ def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     return matrix
 
 
-def coupled(scenario: Scenario) -> Coupled:
-    """The equations of a scenario; raises TheoryError where H(12) does not apply."""
-    promised(scenario)
+def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
+    """Return the equations of a scenario; raises TheoryError if H(12) does not apply."""
+    require_bound(scenario)
     A, Q = scenario.belief
     n = scenario.plant.n
     delay = scenario.network.channel.delay.fixed or 0.0
@@ -151,14 +164,15 @@ def coupled(scenario: Scenario) -> Coupled:
         delay = 0.0
     T, q = np.eye(n), np.zeros((n, n))
     if delay > 0.0:
+        # Without readings (G = 0) the Riccati flow is the prediction; T from its unit vectors.
         table = riccati_table(A, Q, np.zeros((n, n)), delay)
         q, _ = riccati_step(table, q, np.zeros(n), delay)
         T = np.column_stack([riccati_step(table, q, e, delay)[1] for e in np.eye(n)])
     start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
-    return Coupled(
+    return CoupledRiccati(
         A,
         Q,
-        informations(scenario),
+        increment_informations(scenario),
         coupling(scenario),
         T,
         q,
@@ -169,32 +183,33 @@ def coupled(scenario: Scenario) -> Coupled:
     )
 
 
-def balanced(scenario: Scenario) -> bool | None:
-    """Whether both directions of each link arrive at one rate, so that the limit is S of H(13);
-    None where the rates are not known beforehand.
+def has_balanced_rates(scenario: Scenario) -> bool | None:
+    """Return True if both directions of each link have one rate, so that the limit is S of H(13).
+
+    None if the rates are not known beforehand.
     """
     if not np.isfinite(list(scenario.effective_rates().values())).all():
         return None
-    return _symmetric(coupling(scenario))
+    return _is_symmetric(coupling(scenario))
 
 
-def _symmetric(c: scipy.sparse.csr_array) -> bool:
-    apart, size = abs(c - c.T), abs(c.T)
-    return bool((apart - RATE_TOLERANCE * size).max() <= SAME_RATE)
+def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
+    difference, size = abs(c - c.T), abs(c.T)
+    return bool((difference - RELATIVE_TOLERANCE * size).max() <= ABSOLUTE_TOLERANCE)
 
 
 def left_weights(scenario: Scenario) -> FloatArray:
-    """(N,): the weights with which the nodes' information enters when links tick ever faster.
+    """Return the weights (N,) of the nodes' information in the limit of ever faster links.
 
-    The left null vector of the coupling, scaled to sum 1: 1/N where both directions of a link
-    arrive at one rate. Raises TheoryError where some node is never heard.
+    They are the left null vector of the coupling, scaled to sum 1: 1/N if both directions of each
+    link have one rate. Raises TheoryError if messages do not connect all nodes.
     """
     algorithm = scenario.filter.algorithm
     if len(scenario.nodes) == 1:
         return np.ones(1)
     if not algorithm.talks:
         raise TheoryError(f"the {spoken(algorithm)} filter does not talk, links mean nothing to it")
-    if balanced(scenario) is None:
+    if has_balanced_rates(scenario) is None:
         raise TheoryError("how often messages arrive is not known beforehand (a recorded table?)")
     c = coupling(scenario)
     if not c.nnz:
@@ -208,12 +223,12 @@ def left_weights(scenario: Scenario) -> FloatArray:
 
 
 def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
-    """Places of the nodes whose messages reach all others, sooner or later and over others; None
-    where no node's do.
+    """Return the indices of the nodes whose information reaches all others, None if no node's does.
 
-    They are the one strongly connected part that hears nobody outside; with two such parts the
-    coupling has two left null vectors.
+    They are the one strongly connected component that receives nothing from outside; with two such
+    components the coupling has two left null vectors.
     """
+    # Row i of c has the senders that node i receives from.
     count, part = scipy.sparse.csgraph.connected_components(c, connection="strong")
     hears, heard = c.nonzero()
     outside = part[hears] != part[heard]
@@ -222,9 +237,12 @@ def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
 
 
 def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
-    """(M,) w with ``w (D - C) = 0`` and sum 1 for strongly connected nodes, D the row sums of C."""
+    """Return w (M,) with ``w (D - C) = 0`` and sum 1, D the row sums of C.
+
+    The nodes must be strongly connected. Raises TheoryError if the residual is too large.
+    """
     size = c.shape[0]
-    if size == 1 or _symmetric(c):
+    if size == 1 or _is_symmetric(c):
         return np.full(size, 1.0 / size)
     leaving = np.asarray(c.sum(axis=1)).reshape(-1)
     transposed = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - c).T
@@ -233,10 +251,6 @@ def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
     w = np.ones(size)
     w[1:] = scipy.sparse.linalg.spsolve(rest[:, 1:], -rest[:, [0]].toarray().reshape(-1))
     w = np.maximum(w, 0.0) / np.maximum(w, 0.0).sum()
-    if not np.abs(transposed @ w).max() <= RESIDUAL_WEIGHTS * leaving.max():
+    if not np.abs(transposed @ w).max() <= RESIDUAL_TOLERANCE * leaving.max():
         raise TheoryError("the messages that arrive do not join all nodes")
     return np.asarray(w)
-
-
-RATE_TOLERANCE, SAME_RATE = 1e-12, 1e-8  # of rates that are equal: relative, absolute
-RESIDUAL_WEIGHTS = 1e-9

@@ -11,7 +11,12 @@ from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.scenario.registry import name_of, spoken
 from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import Coupled, informations, left_weights, promised
+from netkf.theory.hybrid.coupled import (
+    CoupledRiccati,
+    increment_informations,
+    left_weights,
+    require_bound,
+)
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
     poisson_samples,
@@ -34,10 +39,10 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     A, Q = scenario.belief
     _require_limit(scenario)
     w = left_weights(scenario)
-    G = np.tensordot(w, informations(scenario), 1)
+    G = np.tensordot(w, increment_informations(scenario), 1)
     if not sampled_sensors(scenario):
         return algebraic_riccati(A, Q, G)
-    promised(scenario)
+    require_bound(scenario)
     if sample_jumps(scenario):
         raise TheoryError("samples at known times lead to a cycle, not to a limit S")
     S = steady_state(_shared_equation(scenario, A, Q, G, w))
@@ -64,7 +69,7 @@ def _require_limit(scenario: Scenario) -> None:
 
 def _shared_equation(
     scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: FloatArray
-) -> Coupled:
+) -> CoupledRiccati:
     """Return H(12) of nodes that share one covariance: a sensor counts by its node's weight."""
     groups = []
     for group in poisson_samples(scenario):
@@ -73,7 +78,7 @@ def _shared_equation(
         groups.append(PoissonSamples(nodes, group.H, group.R, rate, silent))
     start = np.asarray(scenario.start(scenario.nodes[0])[1])[None]
     nothing, eye = scipy.sparse.csr_array((1, 1)), np.eye(len(A))
-    return Coupled(A, Q, G[None], nothing, eye, 0.0 * eye, 0.0, start, tuple(groups))
+    return CoupledRiccati(A, Q, G[None], nothing, eye, 0.0 * eye, 0.0, start, tuple(groups))
 
 
 def true_limit_covariance(scenario: Scenario) -> FloatArray:
@@ -90,7 +95,7 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
     if not np.array_equal(A, scenario.truth.A):
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
     S, w = limit_covariance(scenario), left_weights(scenario)
-    closed = A - S @ np.tensordot(w, informations(scenario), 1)
+    closed = A - S @ np.tensordot(w, increment_informations(scenario), 1)
     noise = scenario.truth.Q.copy()  # plus the true noise of each sensor through the gains w_i S
     for weight, node in zip(w, scenario.nodes, strict=True):
         H, R = scenario.observation(node)

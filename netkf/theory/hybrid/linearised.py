@@ -1,9 +1,9 @@
-"""Linear equations of H(12) made linear: ``op_P(X) = -right`` for all nodes together.
+"""Linear equations ``op_P(X) = -right``, with H(12) linearised at P, for all nodes together.
 
-Few unknowns are eliminated, and many where the network has small cuts (rings, rows, narrow grids).
-Elsewhere elimination fills in (1000 nodes of a random graph would take minutes), so many unknowns
-are found by GMRES, each node's own block inverted beforehand; what does not converge is eliminated
-after all if that is possible at all.
+Few unknowns are eliminated, and many if the network has small cuts (rings, rows, narrow grids).
+In other networks the fill-in is large (1000 nodes of a random graph would take minutes): GMRES
+solves for many unknowns, preconditioned by each node's own block, and elimination only if GMRES
+does not converge.
 """
 
 from __future__ import annotations
@@ -14,59 +14,67 @@ import numpy as np
 import scipy.sparse.linalg
 
 from netkf.linalg.arrays import FloatArray
-from netkf.theory.hybrid.packed import Linear, Packed
+from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
 
 FEW_UNKNOWNS = 2000
-ROUNDS, GAIN = 4, 1e-7  # each round solves for what the one before has left
-PRECISE = 1e-14
-RESTART, RESTARTS = 60, 3
+ROUNDS, ROUND_TOLERANCE = 4, 1e-7  # each round reduces the residual by this factor
+RESIDUAL_TOLERANCE = 1e-14
+RESTART, RESTARTS = 60, 3  # of GMRES
 
 
-def solved(packed: Packed, P: FloatArray, right: FloatArray) -> FloatArray:
-    """(N, m): rows X of the equation for gains of P (N, n, n), ``right`` (N, m); nan where it is
-    singular.
-    """
+def solve_linearised(packed: PackedRiccati, P: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solution X (N, m) for the gains of P (N, n, n); nan if the map is singular."""
     linear = packed.linear(P)
     few = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
     with np.errstate(all="ignore"):
-        X = None if few else _iterated(linear, right)
-        return _eliminated(linear, right) if X is None else X
+        X = None if few else _solve_by_gmres(linear, right)
+        return _eliminate(linear, right) if X is None else X
 
 
-def _eliminated(linear: Linear, right: FloatArray) -> FloatArray:
+def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
         X = scipy.sparse.linalg.spsolve(linear.matrix(), -right.reshape(-1))
     return np.asarray(X).reshape(right.shape)
 
 
-def _iterated(linear: Linear, right: FloatArray) -> FloatArray | None:
-    """None where it does not converge."""
+def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray | None:
+    """Return the solution by GMRES with rounds of iterative refinement, None if it diverges.
+
+    The preconditioner inverts each node's own block.
+    """
     blocks = linear.blocks
     try:
         inverse = np.linalg.inv(blocks)
     except np.linalg.LinAlgError:
         return None
 
-    def applied(x: FloatArray) -> FloatArray:
+    def apply(x: FloatArray) -> FloatArray:
         X = x.reshape(right.shape)
         return np.asarray(np.einsum("ik,ikl->il", X, blocks) + linear.arriving(X)).reshape(-1)
 
-    def alone(x: FloatArray) -> FloatArray:
+    def precondition(x: FloatArray) -> FloatArray:
         return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)
 
     shape = (right.size, right.size)
-    operator = scipy.sparse.linalg.LinearOperator(shape, matvec=applied, dtype=np.float64)
-    own = scipy.sparse.linalg.LinearOperator(shape, matvec=alone, dtype=np.float64)
+    operator = scipy.sparse.linalg.LinearOperator(shape, matvec=apply, dtype=np.float64)
+    preconditioner = scipy.sparse.linalg.LinearOperator(
+        shape, matvec=precondition, dtype=np.float64
+    )
     x, left, size = np.zeros(right.size), -right.reshape(-1), float(np.linalg.norm(right))
     for _ in range(ROUNDS):
         step, failed = scipy.sparse.linalg.gmres(
-            operator, left, rtol=GAIN, M=own, restart=RESTART, maxiter=RESTARTS
+            operator,
+            left,
+            rtol=ROUND_TOLERANCE,
+            M=preconditioner,
+            restart=RESTART,
+            maxiter=RESTARTS,
         )
         if failed or not np.isfinite(step).all():
             return None
         x = x + step
-        left = -right.reshape(-1) - applied(x)
-        if np.linalg.norm(left) <= PRECISE * size:
+        left = -right.reshape(-1) - apply(x)
+        if np.linalg.norm(left) <= RESIDUAL_TOLERANCE * size:
             break
     return np.asarray(x).reshape(right.shape)

@@ -1,8 +1,8 @@
-"""H(12) with each symmetric matrix kept as its upper triangle, a row of m = n (n + 1) / 2 numbers.
+"""H(12) with symmetric matrices stored as upper triangles, rows of m = n (n + 1) / 2 numbers.
 
-Its parts then are what they are: one sparse product over neighbours for all entries at once, one
-small matrix for A P + P A' that is the same at all nodes, and P G P where there is a sensor, as
-``(P C)(P C)'`` with ``G = C C'``.
+The terms then have their natural cost: one sparse product over neighbours for all entries at once,
+one small matrix for A P + P A' that is the same at all nodes, and P G P only at nodes with a
+sensor, as ``(P C)(P C)'`` with ``G = C C'``.
 """
 
 from __future__ import annotations
@@ -16,17 +16,20 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from netkf.linalg.arrays import FloatArray
-from netkf.theory.hybrid.coupled import Coupled
+from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.samples import PoissonSamples
 
 NO_INFORMATION = 1e-15  # eigenvalues of G, its diagonal made 1, that are rounding
 ELIMINATION_WORK = 3e9  # multiplications up to which elimination is taken
 
 
-class Packed:
-    """The equations of a scenario, on rows ``Y`` (N, m)."""
+class PackedRiccati:
+    """The right-hand side of H(12) and its linearisation, on rows ``Y`` (N, m).
 
-    def __init__(self, equations: Coupled) -> None:
+    ``leaving`` (N,) is the sum of c_ij over j, per second.
+    """
+
+    def __init__(self, equations: CoupledRiccati) -> None:
         self.equations = equations
         n = len(equations.A)
         self._i, self._j = np.triu_indices(n)
@@ -49,9 +52,10 @@ class Packed:
         self._C = _factors(equations.G[self._sensed])
         self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
 
-    def shifted(self, A: FloatArray, Q: FloatArray) -> Packed:
-        """The equations of the same network with another drift A and noise Q (n, n) or (N, n, n);
-        what depends on the network alone is shared.
+    def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
+        """Return the equations with another drift A (n, n) and noise Q (n, n) or (N, n, n).
+
+        Arrays that depend on the network alone are shared.
         """
         other = copy.copy(self)
         other.equations = self.equations._replace(A=A, Q=Q)
@@ -65,7 +69,7 @@ class Packed:
 
     @cached_property
     def eliminates_cheaply(self) -> bool:
-        """Whether elimination fills in little, because the network has small cuts everywhere."""
+        """True if elimination has little fill-in, because the network has small cuts everywhere."""
         coupling = scipy.sparse.csr_array(self.equations.coupling)
         order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling)
         place = np.empty(len(order), dtype=np.int64)
@@ -76,71 +80,74 @@ class Packed:
 
     @cached_property
     def arriving_matrix(self) -> scipy.sparse.csr_array:
-        """(N m, N m): what arrives at the ticks of clocks, as one sparse matrix."""
+        """Sparse matrix (N m, N m) of the arrivals at the ticks of link clocks."""
         matrix = scipy.sparse.kron(self.equations.coupling, self._predicted.T, "csr")
         return scipy.sparse.csr_array(matrix)
 
     def pack(self, P: FloatArray) -> FloatArray:
-        """(..., n, n) to (..., m)."""
+        """Return the upper triangles (..., m) of symmetric P (..., n, n)."""
         return np.ascontiguousarray(P[..., self._i, self._j])
 
     def unpack(self, Y: FloatArray) -> FloatArray:
-        """(..., m) to (..., n, n)."""
+        """Return the symmetric matrices (..., n, n) of upper triangles Y (..., m)."""
         n = len(self.equations.A)
         return np.asarray(Y[..., self._places].reshape(*Y.shape[:-1], n, n))
 
-    def predicted(self, Y: FloatArray) -> FloatArray:
-        """(N, m): rows that took the delay to arrive."""
+    def predict(self, Y: FloatArray) -> FloatArray:
+        """Return rows (N, m) predicted over the delay, ``T P T' + q``."""
         return np.asarray(Y @ self._predicted + self._q)
 
     def slope(self, Y: FloatArray, sent: FloatArray | None = None) -> FloatArray:
-        """(N, m): the right-hand side where ``sent`` (N, m) arrives; without delay that is Y."""
+        """Return dY/dt (N, m); ``sent`` (N, m) is Y a delay ago, and Y itself if None."""
         if sent is None:
             change = self._exchange @ Y + Y @ self._own + self._Q
         else:
             change = Y @ self._own + self._Q - self.leaving[:, None] * Y
-            change += self.equations.coupling @ self.predicted(sent)
+            change += self.equations.coupling @ self.predict(sent)
+        # - P G P = - (P C)(P C)' at the nodes with a sensor
         M = self.unpack(Y[self._sensed]) @ self._C
         change[self._sensed] -= self.pack(M @ np.swapaxes(M, 1, 2))
         for group in self.equations.samples:
-            self._sample(change, group, self.unpack(Y), None if sent is None else self.unpack(sent))
+            self._add_samples(
+                change, group, self.unpack(Y), None if sent is None else self.unpack(sent)
+            )
         return np.asarray(change)
 
-    def _sample(
+    def _add_samples(
         self, change: FloatArray, group: PoissonSamples, P: FloatArray, sent: FloatArray | None
     ) -> None:
-        """Add ``s (g(P) - P)``, and what arrives of estimates sent at samples."""
-        off = self.pack(group.sample_decrease(P))
-        np.subtract.at(change, group.nodes, group.rate[:, None] * off)
+        """Add ``s (g(P) - P)`` and the arrivals of estimates that were sent at samples."""
+        decrease = self.pack(group.sample_decrease(P))
+        np.subtract.at(change, group.nodes, group.rate[:, None] * decrease)
         if not group.heard.nnz:
             return
         if sent is None:
-            arriving = self.pack(P)[group.nodes] - off
+            arriving = self.pack(P)[group.nodes] - decrease
         else:
             after = self.pack(sent)[group.nodes] - self.pack(group.sample_decrease(sent))
-            arriving = self.predicted(after)
+            arriving = self.predict(after)
         change += group.heard @ arriving
 
     def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
-        """(order + 1, N, m): Taylor coefficients of the solution through ``Y``, without delay, in
-        powers of seconds / ``span``.
+        """Return the Taylor coefficients (order + 1, N, m) of the solution through ``Y``.
 
-        The right-hand side is quadratic: each coefficient follows from those before it.
+        Without delay, in powers of seconds / ``span``. The right-hand side is quadratic, so that
+        each coefficient follows from those before it.
         """
         series = np.empty((order + 1, *Y.shape))
         series[0] = Y
         # P G P is the sum of M_i M_j' over i + j = k with M = P C. Nodes come last, so that numpy
         # runs along them; the half with i <= j and its transpose are enough.
-        n, r, seen = self._across.shape
-        every = np.empty((order, n, r, seen))
+        n, r, sensed = self._across.shape
+        every = np.empty((order, n, r, sensed))
         for k in range(order):
             change = self._exchange @ series[k]
             change += series[k] @ self._own
             if k == 0:
                 change += self._Q
-            if seen:
+            if sensed:
                 rows = np.ascontiguousarray(series[k, self._sensed].T)
-                P = rows[self._places].reshape(n, n, seen)
+                P = rows[self._places].reshape(n, n, sensed)
                 np.einsum("ijs,jrs->irs", P, self._across, out=every[k])
                 before = (k + 1) // 2
                 half = np.einsum("kirs,kjrs->ijs", every[:before], every[k : k - before : -1])
@@ -152,9 +159,10 @@ class Packed:
             np.multiply(change, span / (k + 1), out=series[k + 1])
         return series
 
-    def linear(self, P: FloatArray) -> Linear:
-        """H(12) made linear at ``P`` (N, n, n): with its gains, which a change of P leaves alone to
-        first order.
+    def linear(self, P: FloatArray) -> LinearisedRiccati:
+        """Return H(12) linearised at ``P`` (N, n, n), that is with the gains of P held fixed.
+
+        P minimises the right-hand side over gains, so that their change has no first-order effect.
         """
         K = P @ self.equations.G
         change = -(K[:, None] @ self._basis)
@@ -168,11 +176,12 @@ class Packed:
             np.add.at(blocks, group.nodes, group.rate[:, None, None] * (maps - np.eye(self.m)))
             if group.heard.nnz:
                 heard.append((group.heard, group.nodes, maps @ self._predicted))
-        return Linear(np.asarray(blocks), heard, self)
+        return LinearisedRiccati(np.asarray(blocks), heard, self)
 
     def driven(self, P: FloatArray) -> FloatArray:
-        """(N, m): what H(12) made linear at P adds whatever P is: Q, the noises of readings, and
-        those of messages under way.
+        """Return the constant term (N, m) of H(12) linearised at P (N, n, n).
+
+        It is Q, the noises of readings through the gains, and the noise of messages under way.
         """
         G, q = self.equations.G, self.equations.q
         right = self.pack(self.equations.Q + P @ G @ P + self.leaving[:, None, None] * q)
@@ -183,18 +192,21 @@ class Packed:
         return np.asarray(right)
 
 
-class Linear(NamedTuple):
-    """``blocks`` (N, m, m): what becomes of each row by itself, ``X_i B_i``; ``heard``: rates (N,
-    S) of what arrives from nodes (S,), each row times a map (S, m, m) or one map (1, m, m);
-    ``packed``: the equations.
+class LinearisedRiccati(NamedTuple):
+    """H(12) linearised at some P, as a linear map on rows X (N, m).
+
+    blocks : (N, m, m) the map ``X_i B_i`` of each row by itself
+    heard  : for each kind of arrival the rates (N, S), the indices (S,) of the senders, and maps
+             (S, m, m), or one map (1, m, m), of the sender's row
+    packed : the equations
     """
 
     blocks: FloatArray
     heard: list[tuple[scipy.sparse.csr_array, np.ndarray, FloatArray]]
-    packed: Packed
+    packed: PackedRiccati
 
     def arriving(self, X: FloatArray) -> FloatArray:
-        """(N, m): what arrives at each node of rows X (N, m)."""
+        """Return the arrivals (N, m) at each node for rows X (N, m)."""
         total = np.zeros_like(X)
         for rates, nodes, maps in self.heard:
             each = X[nodes]
@@ -202,7 +214,7 @@ class Linear(NamedTuple):
         return total
 
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
-        """(N m, N m): one sparse matrix, with what is arriving or without."""
+        """Return the operator as a sparse matrix (N m, N m), without the arrivals if not wanted."""
         size, m, _ = self.blocks.shape
         shape = (size * m, size * m)
         turned = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))
@@ -223,12 +235,12 @@ class Linear(NamedTuple):
 
 
 def _factors(G: FloatArray) -> FloatArray:
-    """(S, n, r) C with ``C C' = G`` (S, n, n), r the largest rank."""
+    """Return C (S, n, r) with ``C C' = G`` (S, n, n), r the largest rank."""
     # Scaled to a diagonal of ones, so that the units of the states do not matter to what is small.
     scale = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
     divided = 1.0 / np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(G * divided[:, :, None] * divided[:, None, :])
-    kept = values > NO_INFORMATION
-    rank = int(kept.sum(axis=1).max(initial=0))
-    C = scale[:, :, None] * vectors * np.sqrt(np.where(kept, values, 0.0))[:, None, :]
+    positive = values > NO_INFORMATION
+    rank = int(positive.sum(axis=1).max(initial=0))
+    C = scale[:, :, None] * vectors * np.sqrt(np.where(positive, values, 0.0))[:, None, :]
     return np.ascontiguousarray(C[:, :, C.shape[2] - rank :])

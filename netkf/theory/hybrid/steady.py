@@ -1,10 +1,10 @@
-"""The steady state of H(12), and how fast links must tick for it to exist.
+"""The steady state of H(12), and the least link rates for which it exists.
 
-A steady state exists if and only if some gains make the linear part of H(12) stable (for a
-controllable plant). Gains are looked for along H(12) itself, by implicit steps whose length grows
-while gains keep stabilising the shifted problem: where a steady state exists they come to gains
-that need no shift, which one linear equation proves; where none exists the steps stay shorter than
-the time in which H(12) grows, and P grows past every bound.
+A steady state exists if and only if some gains make the linearisation of H(12) stable (for a
+controllable plant). The search for such gains follows H(12) itself by implicit steps, whose length
+grows as long as the gains stabilise the shifted problem. If a steady state exists, the steps reach
+gains that need no shift, which one linear equation proves; if none exists, the steps stay shorter
+than the time in which H(12) grows, and P exceeds every bound.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ import scipy.sparse.linalg
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import Coupled, coupled
-from netkf.theory.hybrid.linearised import solved
-from netkf.theory.hybrid.packed import Packed
+from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
+from netkf.theory.hybrid.linearised import solve_linearised
+from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import transmits_at_samples
 
-GROWN = 1e9  # a covariance that many times the first is taken to grow for ever
+MAX_GROWTH = 1e9  # of P relative to its start, beyond which it is taken to grow without bound
 RESIDUAL = 1e-9
-MOST_STEPS = 400
-LARGEST_FACTOR = 1e6
+MAX_STEPS = 400  # implicit steps of the search for gains
+MAX_FACTOR = 1e6
 POWER_STEPS = 60
 NEWTON_STEPS = 12
-MOST_FACTORED = 3000  # nodes of any network whose coupling is factored
-SHOWN = 12
-FEW_UNKNOWNS = 400
+MAX_FACTORED = 3000  # nodes of a network without small cuts up to which its coupling is factored
+MAX_LISTED = 12  # nodes that a message names
+FEW_UNKNOWNS = 400  # up to which the threshold is found to 1e-6
 
 
 def steady_covariance_bound(scenario: Scenario) -> FloatArray:
-    """(N, n, n): the steady state of H(12).
+    """Return the steady state (N, n, n) of H(12), with a relative residual below 1e-9.
 
-    Newton's method from gains that a linear equation has proved stabilising; returned with a
-    relative residual below 1e-9. Raises TheoryError where there is none, with the threshold that
-    the link rates would have to reach for one to exist.
+    Newton's method from gains that a linear equation has proved stabilising. Raises TheoryError if
+    there is none, with the threshold that the link rates would have to reach, and if H(12) does not
+    apply.
     """
-    equations = coupled(scenario)
+    equations = coupled_riccati(scenario)
     P = steady_state(equations)
     if P is None:
         raise TheoryError(_no_steady_state(scenario, equations))
@@ -48,15 +48,16 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
 
 
 def has_steady_state(scenario: Scenario) -> bool:
-    """Whether H(12) has a steady state; raises TheoryError where H(12) does not apply."""
-    return steady_state(coupled(scenario)) is not None
+    """Return True if H(12) has a steady state; raises TheoryError if H(12) does not apply."""
+    return steady_state(coupled_riccati(scenario)) is not None
 
 
 def steady_by_node(scenario: Scenario) -> FloatArray:
-    """(N, n, n): for filters that do not talk, each node's own steady covariance, nan where it has
-    none.
+    """Return each node's own steady covariance (N, n, n), nan if it has none.
+
+    Raises TheoryError if nodes communicate.
     """
-    equations = coupled(scenario)
+    equations = coupled_riccati(scenario)
     if equations.talks:
         raise TheoryError("the nodes hear each other: their steady state is one for all")
     every = [steady_state(equations.restrict(i)) for i in range(len(equations.G))]
@@ -64,16 +65,19 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
     return np.stack([nothing if P is None else P[0] for P in every])
 
 
-def steady_state(equations: Coupled) -> FloatArray | None:
-    """(N, n, n), None where there is none; raises TheoryError where readings come at known times:
-    the bound then comes to a cycle.
+def steady_state(equations: CoupledRiccati) -> FloatArray | None:
+    """Return the steady state (N, n, n) of the equations, or None if there is none.
+
+    Raises TheoryError for samples at known times, which lead to a cycle, and if the residual of the
+    computed state is too large.
     """
     if equations.jumps:
         raise TheoryError("samples at known times lead to a cycle, not to a steady state")
-    packed = Packed(equations)
-    P = _stabilising(packed)
+    packed = PackedRiccati(equations)
+    P = _find_stabilising(packed)
     if P is None:
         return None
+    # Newton's method converges monotonically from stabilising gains, quadratically in the end.
     for _ in range(60):
         following = _newton(packed, P)
         change = np.abs(following - P).max()
@@ -91,24 +95,26 @@ def steady_state(equations: Coupled) -> FloatArray | None:
     return P
 
 
-def _newton(packed: Packed, P: FloatArray) -> FloatArray:
-    return packed.unpack(solved(packed, P, packed.driven(P)))
+def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
+    """Return the fixed point (N, n, n) of H(12) with the gains of P held fixed (Kleinman)."""
+    return packed.unpack(solve_linearised(packed, P, packed.driven(P)))
 
 
-def _stable(packed: Packed, P: FloatArray) -> bool:
-    """Whether the gains of P stabilise H(12) made linear.
+def _is_stabilised(packed: PackedRiccati, P: FloatArray) -> bool:
+    """Return True if the gains of P stabilise the linearisation X -> op(X) of H(12).
 
-    That map X -> op(X) is a generator of positive maps, so it is stable if and only if
-    op(X) = -I has a positive definite solution.
+    op generates positive maps, so that it is stable if and only if op(X) = -I has a positive
+    definite solution.
     """
     right = packed.pack(np.broadcast_to(np.eye(P.shape[-1]), P.shape))
-    X = packed.unpack(solved(packed, P, right))
+    X = packed.unpack(solve_linearised(packed, P, right))
     return bool(np.isfinite(X).all() and np.linalg.eigvalsh(X)[:, 0].min() > 0.0)
 
 
-def _stabilising(packed: Packed, first: FloatArray | None = None) -> FloatArray | None:
-    """Covariances whose gains stabilise H(12), looked for from ``first`` (N, n, n) on; None where
-    none were found.
+def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) -> FloatArray | None:
+    """Return covariances (N, n, n) whose gains stabilise H(12), or None if none were found.
+
+    The search starts from ``first`` (N, n, n).
     """
     equations, n = packed.equations, len(packed.equations.A)
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
@@ -117,27 +123,29 @@ def _stabilising(packed: Packed, first: FloatArray | None = None) -> FloatArray 
     leaving = float(packed.leaving.max()) + sampling
     drift = float(np.abs(equations.A).max()) + 1e-9
     step = 0.1 / (drift + leaving) if first is None else 1.0 / drift
-    for _ in range(MOST_STEPS):
-        if _stable(packed, P):
+    for _ in range(MAX_STEPS):
+        if _is_stabilised(packed, P):
             return P
+        # One implicit step of dP/dt = H12(P): 0 = H12(P+) + (P - P+) / step.
         shift = equations.A - 0.5 / step * np.eye(n)
-        implicit = packed.shifted(shift, equations.Q + P / step)
-        if not _stable(implicit, P):
+        implicit = packed.shift(shift, equations.Q + P / step)
+        if not _is_stabilised(implicit, P):
             step *= 0.5
             continue
         for _ in range(3):
             P = _newton(implicit, P)
-        if not np.abs(P).max() < GROWN * size:
+        if not np.abs(P).max() < MAX_GROWTH * size:
             return None
         step *= 1.5
     return None
 
 
-def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
+def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
+    """Return the message that says why there is no steady state and what would give one."""
     if not equations.talks:
         missing = np.isnan(steady_by_node(scenario)[:, 0, 0])
         alone = [str(node) for node, no in zip(scenario.nodes, missing, strict=True) if no]
-        listed = ", ".join(alone[:SHOWN]) + (", ..." if len(alone) > SHOWN else "")
+        listed = ", ".join(alone[:MAX_LISTED]) + (", ..." if len(alone) > MAX_LISTED else "")
         talks = scenario.filter.algorithm.talks
         why = "no message ever arrives" if talks else "the filter does not talk"
         several = "s" if len(alone) > 1 else ""
@@ -150,16 +158,16 @@ def _no_steady_state(scenario: Scenario, equations: Coupled) -> str:
         return "H(12) has no steady state, and faster links do not give it one"
     rate = getattr(activation, "rate", None)
     what = {"nodes": "node", "directions": "direction"}.get(getattr(activation, "at", ""), "link")
-    words = f"every {what} rate must be at least {factor:.5g} times what it is"
+    remedy = f"every {what} rate must be at least {factor:.5g} times what it is"
     if rate is not None and not getattr(activation, "rates", ()):
-        words = f"the rate {rate:g} is below the threshold {factor * rate:.5g}"
-    return f"H(12) has no steady state: {words}"
+        remedy = f"the rate {rate:g} is below the threshold {factor * rate:.5g}"
+    return f"H(12) has no steady state: {remedy}"
 
 
-def threshold_factor(equations: Coupled) -> float | None:
-    """The factor on all link rates from which on H(12) has a steady state, by bisection between a
-    factor that has none and one that has (to 1e-6, or 1e-3 for large networks); None where no
-    factor up to 1e6 helps.
+def threshold_factor(equations: CoupledRiccati) -> float | None:
+    """Return the least factor on all link rates for which H(12) has a steady state.
+
+    By bisection to 1e-6, or 1e-3 for large networks; None if no factor up to 1e6 suffices.
     """
     low = _necessary_factor(equations)
     if low is None:
@@ -167,7 +175,7 @@ def threshold_factor(equations: Coupled) -> float | None:
     low, high = max(1.0, low), max(2.0, 1.25 * low)
     while (P := _steady_at(equations, high, None)) is None:
         low, high = high, 2.0 * high
-        if high > LARGEST_FACTOR:
+        if high > MAX_FACTOR:
             return None
     fine = 1e-6 if equations.start.size <= FEW_UNKNOWNS else 1e-3
     known, guesses = [(high, 1.0 / float(np.abs(P).max()))], 0
@@ -187,13 +195,18 @@ def threshold_factor(equations: Coupled) -> float | None:
     return high
 
 
-def _steady_at(equations: Coupled, factor: float, first: FloatArray | None) -> FloatArray | None:
-    """(N, n, n): the steady state with links that tick so many times as often, to a few digits;
-    None where there is none.
+def _steady_at(
+    equations: CoupledRiccati, factor: float, first: FloatArray | None
+) -> FloatArray | None:
+    """Return the steady state (N, n, n), to a few digits, with link rates times ``factor``.
+
+    None if there is none. ``first`` starts the search.
     """
-    packed = Packed(equations.faster(factor))
-    P = _stabilising(packed, first)
-    for _ in range(NEWTON_STEPS if P is not None else 0):
+    packed = PackedRiccati(equations.scale_rates(factor))
+    P = _find_stabilising(packed, first)
+    if P is None:
+        return None
+    for _ in range(NEWTON_STEPS):
         before, P = P, _newton(packed, P)
         if np.abs(P - before).max() <= 1e-4 * np.abs(P).max():
             break
@@ -201,8 +214,9 @@ def _steady_at(equations: Coupled, factor: float, first: FloatArray | None) -> F
 
 
 def _guess(known: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
-    """A factor beside the one at which covariances become infinite: in the end their inverse falls
-    linearly to 0.
+    """Return a factor close to the threshold, extrapolated from (factor, 1 / max P) of two others.
+
+    The inverse of the covariances falls to 0 at the threshold, linearly in the end.
     """
     (f, inverse), (g, following) = known[-2:]
     place = g - following * (f - g) / (inverse - following) if inverse != following else high
@@ -212,36 +226,37 @@ def _guess(known: list[tuple[float, float]], low: float, high: float, fine: floa
     return factor if low < factor < high else float(np.sqrt(low * high))
 
 
-def _necessary_factor(equations: Coupled) -> float | None:
-    """A factor on all link rates at or below which H(12) has no steady state; None where no factor
-    gives it one.
+def _necessary_factor(equations: CoupledRiccati) -> float | None:
+    """Return a factor on all link rates at or below which H(12) has no steady state.
 
-    Nodes without sensors grow at least as if all others had no error: by the largest eigenvalue of
-    their own coupling and 2 a, a the growth rate of the plant's fastest mode.
+    None if no factor gives it one. The covariances of nodes without sensors grow at least as if all
+    other nodes had no error: by the largest eigenvalue of their own coupling and 2 a, where a is
+    the growth rate of the plant's fastest mode.
     """
     if not equations.coupling.nnz:
         return None
     growth = 2.0 * float(np.linalg.eigvals(equations.A).real.max())
-    blind = np.abs(equations.G).max(axis=(1, 2)) == 0.0
+    unobserved = np.abs(equations.G).max(axis=(1, 2)) == 0.0
     for group in equations.samples:
-        blind[group.nodes] = False
-    if growth <= 0.0 or not blind.any() or any(group.heard.nnz for group in equations.samples):
+        unobserved[group.nodes] = False
+    if growth <= 0.0 or not unobserved.any() or any(group.heard.nnz for group in equations.samples):
         return 0.0
-    if not Packed(equations).eliminates_cheaply and blind.sum() > MOST_FACTORED:
+    if not PackedRiccati(equations).eliminates_cheaply and unobserved.sum() > MAX_FACTORED:
         return 0.0
-    leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)[blind]
-    inner = scipy.sparse.csc_array(equations.coupling[blind][:, blind])
+    leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)[unobserved]
+    inner = scipy.sparse.csc_array(equations.coupling[unobserved][:, unobserved])
     arriving = inner * float(np.exp(growth * equations.delay))
     longest = _longest_lag(scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - arriving))
     return None if longest is None else growth * longest
 
 
 def _longest_lag(M: scipy.sparse.csc_array) -> float | None:
-    """A lower bound on the largest eigenvalue of ``M^-1``, None where M (of off-diagonal entries at
-    most 0) is no nonsingular M-matrix, so that some eigenvalue of M is at most 0.
+    """Return a lower bound on the largest eigenvalue of ``M^-1`` (seconds).
 
-    The least share by which the power method still grows an entry is below the eigenvalue (Collatz
-    and Wielandt); parts of the network that do not touch have eigenvalues of their own.
+    None if M, whose off-diagonal entries are at most 0, is not a nonsingular M-matrix, so that some
+    eigenvalue of M is at most 0. The least factor by which a step of the power method multiplies an
+    entry is below the eigenvalue (Collatz and Wielandt); disconnected parts of the network have
+    eigenvalues of their own.
     """
     try:
         factors = scipy.sparse.linalg.splu(M)

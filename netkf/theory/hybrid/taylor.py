@@ -10,7 +10,7 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.theory.hybrid.packed import Packed
+from netkf.theory.hybrid.packed import PackedRiccati
 
 ORDER = 28
 TERM_TOLERANCE = 1e-11  # of the last terms of a series, relative to the largest entry
@@ -24,7 +24,7 @@ class StiffError(Exception):
 
 
 def solve_by_taylor_series(
-    packed: Packed, times: FloatArray, scale: float, max_orders: int, limit: float
+    packed: PackedRiccati, times: FloatArray, scale: float, max_orders: int, limit: float
 ) -> FloatArray:
     """Return the solution (T, N, m) at ``times`` (seconds, increasing), from ``packed.start`` at 0.
 

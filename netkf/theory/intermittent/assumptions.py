@@ -1,4 +1,4 @@
-"""The assumptions of R about a scenario in slots."""
+"""Assumptions of R on a scenario in slots."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from netkf.theory.intermittent.riccati import (
 )
 
 MAX_SHOWN, MAX_HEARD = 12, 8
-OFTEN = "readings arrive often enough for a bounded mean (sufficient)"
+BOUNDED_MEAN = "readings arrive often enough for a bounded mean (sufficient)"
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """(assumption, source, holds, evidence) of each assumption."""
+    """Return the rows of R: plant, detectability, arrivals and first covariances."""
     return [
         *slot_plant_rows(scenario),
-        *_readings(scenario),
-        *_arrivals(scenario),
+        *_detectability_rows(scenario),
+        *_arrival_rows(scenario),
         *start_rows(scenario, "G (10)"),
     ]
 
 
-def _sight(scenario: Scenario) -> dict[int, FloatArray]:
-    """For each node, H of all readings that can reach it."""
+def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
+    """Return by node the stacked H (p, n) of all readings that can reach it."""
     near: dict[int, set[int]] = {node: {node} for node in scenario.nodes}
     for i, j in scenario.topology.directions:
         near[j].add(i)
@@ -42,22 +42,22 @@ def _sight(scenario: Scenario) -> dict[int, FloatArray]:
     }
 
 
-def _readings(scenario: Scenario) -> list[AssumptionRow]:
+def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
     F = scenario.slot_plant.F
     name = "(F, H) is detectable at every node"
     try:
-        sight = _sight(scenario)
+        reachable = _reachable_readings(scenario)
     except TheoryError as error:
         return [(name, "R Theorem 9", None, f"not decided: {error}")]
-    blind = [node for node, H in sight.items() if undetectable_slot_mode(F, H) is not None]
-    words = "its own readings and its neighbours' see every mode that does not decay"
+    blind = [node for node, H in reachable.items() if undetectable_slot_mode(F, H) is not None]
+    evidence = "its own readings and its neighbours' see every mode that does not decay"
     if blind:
         several, listed = "s" if len(blind) > 1 else "", ", ".join(map(str, blind[:MAX_SHOWN]))
-        words = f"not at node{several} {listed}"
-    return [(name, "R Theorem 9", not blind, words)]
+        evidence = f"not at node{several} {listed}"
+    return [(name, "R Theorem 9", not blind, evidence)]
 
 
-def _arrivals(scenario: Scenario) -> list[AssumptionRow]:
+def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     loss = scenario.network.channel.loss
     rates = [
         loss.mean_delivery(link, scenario.table_probability(link))
@@ -82,35 +82,42 @@ def _arrivals(scenario: Scenario) -> list[AssumptionRow]:
     if any(sensor.varying for sensor in scenario.sensors):
         return rows
     if loss.independent and len(known) == len(rates):
-        rows.append(_often_enough(scenario))
+        rows.append(_bounded_mean_row(scenario))
     return rows
 
 
-def _often_enough(scenario: Scenario) -> AssumptionRow:
+def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
+    """Return the row on R (32), for the node at which arrivals are least sufficient."""
     F, sensing = scenario.slot_plant.F, set(scenario.sensing)
     worst: tuple[float, int, list[float]] | None = None
-    for node, H in _sight(scenario).items():
+    for node, H in _reachable_readings(scenario).items():
         own, _ = scenario.observation(node)
+        # Nodes that need no message, and those that no message can help, say nothing about (32).
         if undetectable_slot_mode(F, own) is None or undetectable_slot_mode(F, H) is not None:
             continue
         heard = [(i, j) for i, j in scenario.topology.directions if j == node and i in sensing]
         if len(heard) > MAX_HEARD:
-            return (OFTEN, "R (32)", None, f"not decided: node {node} hears {len(heard)} sensors")
-        radius = contraction_radius(F, _arriving(scenario, own, heard))
+            return (
+                BOUNDED_MEAN,
+                "R (32)",
+                None,
+                f"not decided: node {node} hears {len(heard)} sensors",
+            )
+        radius = contraction_radius(F, _arrival_sets(scenario, own, heard))
         if worst is None or radius > worst[0]:
             worst = radius, node, _deliveries(scenario, heard)
     if worst is None:
-        return (OFTEN, "R (32)", True, "every node sees enough by itself")
+        return (BOUNDED_MEAN, "R (32)", True, "every node sees enough by itself")
     radius, node, deliveries = worst
-    words = (
+    evidence = (
         f"node {node}: the best gains multiply mean squares by {radius:.6g} a slot (below 1 is "
         f"sufficient), delivery from {min(deliveries):g}"
     )
     if len(deliveries) == 1:
-        lower, upper = critical_probability(F, _sight(scenario)[node])
-        words += f", critical probability in [{lower:.6g}, {upper:.6g}] by R (31), (32)"
-    words += "; below it P is still stochastically bounded, its mean may not be"
-    return (OFTEN, "R (32)", radius < 1.0, words)
+        lower, upper = critical_probability(F, _reachable_readings(scenario)[node])
+        evidence += f", critical probability in [{lower:.6g}, {upper:.6g}] by R (31), (32)"
+    evidence += "; below it P is still stochastically bounded, its mean may not be"
+    return (BOUNDED_MEAN, "R (32)", radius < 1.0, evidence)
 
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:
@@ -118,13 +125,13 @@ def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]
     return [loss.mean_delivery(link, scenario.table_probability(link)) for link in heard]
 
 
-def _arriving(
+def _arrival_sets(
     scenario: Scenario, own: FloatArray, heard: list[tuple[int, int]]
 ) -> list[tuple[float, FloatArray]]:
-    """Every set of readings that may arrive together: its probability and H."""
-    found, chances = [], _deliveries(scenario, heard)
+    """Return the probability and the stacked H of every set of readings that may arrive."""
+    found, probabilities = [], _deliveries(scenario, heard)
     for arrived in itertools.product((False, True), repeat=len(heard)):
-        p = np.prod([g if up else 1.0 - g for g, up in zip(chances, arrived, strict=True)])
+        p = np.prod([g if up else 1.0 - g for g, up in zip(probabilities, arrived, strict=True)])
         parts = [
             scenario.observation(i)[0] for (i, _), up in zip(heard, arrived, strict=True) if up
         ]

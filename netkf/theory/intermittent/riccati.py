@@ -1,7 +1,7 @@
 """Intermittent observations: the random Riccati equation P_{t+1} = f_gamma(P_t) of R.
 
-``f_0(P) = F P F' + Q`` without the reading, ``f_1`` with it, R (15)-(18). P is the one-step
-prediction covariance and ``delivery`` the probability that a reading arrives.
+In a slot without a reading ``f_0(P) = F P F' + Q``, with one ``f_1``, R (15)-(18). P is the
+one-step prediction covariance, ``delivery`` the probability that a reading arrives.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.rng.streams import Streams
 from netkf.theory.numerics.matrices import RESIDUAL, as_covariance, as_numbers, as_square, as_whole
 
-DEEPEST, MAX_POLICIES = 22, 40
-COALESCED = 1e-9
-FIRST_PAST, LONGEST_PAST = 32, 100_000
-BLOCK = 20_000  # draws at once
+MAX_DEPTH = 22  # of the tree of compositions: 4 million covariances
+MAX_POLICIES = 40  # policy iterations at one value of s
+COALESCENCE_TOLERANCE = 1e-9  # relative difference of coupled chains that have met
+FIRST_PAST, MAX_PAST = 32, 100_000  # slots
+MAX_SAMPLES_AT_ONCE = 20_000
 
 
 class SlotSystem(NamedTuple):
@@ -36,7 +37,7 @@ class SlotSystem(NamedTuple):
 
 
 def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> SlotSystem:
-    """The matrices as checked arrays; raises TheoryError."""
+    """Return the matrices as arrays; raises TheoryError if shapes or definiteness are wrong."""
     F_ = as_square("F", F)
     n = len(F_)
     H_ = _observation(H, n)
@@ -54,7 +55,7 @@ def _observation(H: ArrayLike, n: int) -> FloatArray:
 
 
 def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
-    """``f_0(P) = F P F' + Q`` (n, n), R (15): a slot without a reading."""
+    """Return ``f_0(P) = F P F' + Q`` (n, n), R (15): a slot without a reading."""
     transition = as_square("F", F)
     n = len(transition)
     return symmetric(
@@ -65,9 +66,10 @@ def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
 def riccati_step(
     P: ArrayLike, F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike
 ) -> FloatArray:
-    """``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), R (16): a slot with one.
+    """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), R (16).
 
-    Computed from square roots by an orthogonal triangularisation, without a subtraction.
+    A slot with a reading. Computed from square roots by an orthogonal triangularisation, which
+    subtracts nothing. Raises TheoryError if shapes or definiteness are wrong.
     """
     system = check_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
@@ -78,25 +80,26 @@ def riccati_step(
 def _root(P: FloatArray) -> FloatArray:
     try:
         return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
-    except np.linalg.LinAlgError:  # singular
+    except np.linalg.LinAlgError:  # semidefinite: a root from eigenvalues
         return square_root(P)
 
 
 def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
-    """P* (n, n), the stabilising fixed point of f_1.
+    """Return P* (n, n), the stabilising fixed point of f_1.
 
-    Raises TheoryError, naming the mode, where (F, H) is not detectable, and where what was found
-    does not solve the equation or does not stabilise the filter.
+    Raises TheoryError if (F, H) is not detectable, with the mode, and if the computed P* fails the
+    check of its residual or does not stabilise the filter.
     """
     F, Q, H, R = check_system(F, Q, H, R)
     hidden = undetectable_slot_mode(F, H)
     if hidden is not None:
         raise TheoryError(f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g}")
     try:
-        P = np.zeros_like(F)  # without readings the step below finds all
+        P = np.zeros_like(F)  # without readings the step below solves the equation
         if len(H):
             P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
-        # One step of Newton's method takes what is left of the residual away.
+        # One step of Newton's method (Hewer) removes the rounding error of the solver:
+        # P+ = (F - K H) P+ (F - K H)' + Q + K R K'.
         K = _gain(P, F, H, R)
         P = symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(F - K @ H, Q + K @ R @ K.T)))
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -110,38 +113,40 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
 
 
 def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """(n, n): the steady covariance after a reading, where P* is that before it; P (12)."""
+    """Return the steady covariance (n, n) after a reading, P (12); P* is that before it."""
     P = steady_covariance(F, Q, H, R)
     information = H.T @ np.linalg.solve(R, H)
+    # (P^-1 + G)^-1 = (I + P G)^-1 P, which needs no inverse of P.
     return symmetric(np.asarray(np.linalg.solve(np.eye(len(P)) + P @ information, P)))
 
 
 def _gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the predictor's gain ``F P H' (H P H' + R)^-1`` (n, p)."""
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
 
 
 def undetectable_slot_mode(F: FloatArray, H: FloatArray) -> complex | None:
-    """An eigenvalue of F on or outside the unit circle whose mode H does not see, or None."""
+    """Return an eigenvalue of F on or outside the unit circle that H does not observe, or None."""
     size = max(float(np.linalg.norm(F, 2)), 1e-300)
-    seen = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
+    scaled = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
     for value in np.linalg.eigvals(F):
         if abs(value) < 1.0 - 1e-12:
             continue
-        pencil = np.concatenate([F - value * np.eye(len(F)), seen])
+        pencil = np.concatenate([F - value * np.eye(len(F)), scaled])
         if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9 * size:
             return complex(value)
     return None
 
 
-class Critical(NamedTuple):
+class CriticalProbability(NamedTuple):
     """Bounds on the delivery probability above which the mean covariance stays bounded.
 
-    lower : R (31), necessary, not sufficient
-    upper : R (32), from there on sufficient
-    gain  : (n, p) K with spectral radius below 1 of ``(1-g) F x F + g (F+KH) x (F+KH)`` at
-            ``g = upper + 1e-6``: proves the upper bound
-    perron: (n, n) X >= 0 with ``min over K of (1-g) F X F' + g (F+KH) X (F+KH)' >= X`` at
-            ``g = upper - 1e-6``: proves that no gain will do there
+    lower  : R (31), necessary, not sufficient
+    upper  : R (32), sufficient from there on
+    gain   : (n, p) K with spectral radius below 1 of ``(1-g) F x F + g (F+KH) x (F+KH)`` at
+             ``g = upper + 1e-6``: proves the upper bound
+    perron : (n, n) X >= 0 with ``min over K of (1-g) F X F' + g (F+KH) X (F+KH)' >= X`` at
+             ``g = upper - 1e-6``: proves that no gain suffices there
     """
 
     lower: float
@@ -151,18 +156,21 @@ class Critical(NamedTuple):
 
 
 def critical_probability(F: ArrayLike, H: ArrayLike) -> tuple[float, float]:
-    """(lower, upper) bounds on the critical delivery probability, R (31) and (32).
+    """Return the bounds (lower, upper) on the critical delivery probability, R (31) and (32).
 
     The upper one is the smallest g for which some K makes the mean of the Kronecker squares
-    contract; it is found by policy iteration over K inside a root search over g, to about 1e-12.
-    Raises TheoryError where (F, H) is not detectable: then no probability will do.
+    contract. Policy iteration over K inside a root search over g finds it to about 1e-12. Raises
+    TheoryError if (F, H) is not detectable: then no probability suffices.
     """
     found = critical_certificate(F, H)
     return found.lower, found.upper
 
 
-def critical_certificate(F: ArrayLike, H: ArrayLike) -> Critical:
-    """The bounds of critical_probability with what proves the upper one from both sides."""
+def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
+    """Return the bounds of ``critical_probability`` with proofs of the upper one from both sides.
+
+    Raises TheoryError as that does.
+    """
     transition = as_square("F", F)
     n = len(transition)
     observation = _observation(H, n)
@@ -171,79 +179,93 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> Critical:
         raise TheoryError(
             f"(F, H) is not detectable: the mode with eigenvalue {hidden:.6g} is never seen"
         )
-    alpha = float(np.abs(np.linalg.eigvals(transition)).max())
+    search = _GainSearch(transition, (observation[:0], observation))
+    lower, upper = _critical_bounds(transition, observation, search)
+    above, below = min(1.0, upper + 1e-6), max(0.0, upper - 1e-6)
+    _, gains, _ = search.best((1.0 - above, above))
+    _, _, perron = search.best((1.0 - below, below))
+    return CriticalProbability(lower, upper, gains[1], perron)
+
+
+def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple[float, float]:
+    """Return R (31) and R (32); raises TheoryError if the latter is not found."""
+    moduli = np.abs(np.linalg.eigvals(F))
+    alpha = float(moduli.max())
     lower = max(0.0, 1.0 - 1.0 / alpha**2) if alpha > 0.0 else 0.0
-    search = _Contraction(transition, (observation[:0], observation))
 
     def radius(g: float) -> float:
         return search.best((1.0 - g, g))[0]
 
     if alpha <= 1.0:
-        upper = lower
-    elif np.linalg.matrix_rank(observation) == 1:
-        growing = np.maximum(np.abs(np.linalg.eigvals(transition)), 1.0)
-        upper = float(-np.expm1(-2.0 * np.log(growing).sum()))  # R (32) in closed form
-    elif radius(lower) <= 1.0 + 1e-13:
-        upper = lower
-    elif not radius(1.0) < 1.0:
+        return lower, lower
+    if np.linalg.matrix_rank(H) == 1:
+        # Closed form for one output: 1 - 1 / (product of the squares of unstable eigenvalues).
+        growing = np.maximum(moduli, 1.0)
+        return lower, float(-np.expm1(-2.0 * np.log(growing).sum()))
+    if radius(lower) <= 1.0 + 1e-13:
+        return lower, lower
+    if not radius(1.0) < 1.0:
         raise TheoryError("R (32) was not found: the system is too close to an undetectable one")
-    else:
-        upper = float(scipy.optimize.brentq(lambda g: np.log(radius(g)), lower, 1.0, xtol=1e-14))
-    above, below = min(1.0, upper + 1e-6), max(0.0, upper - 1e-6)
-    _, gains, _ = search.best((1.0 - above, above))
-    _, _, perron = search.best((1.0 - below, below))
-    return Critical(lower, upper, gains[1], perron)
+    root = scipy.optimize.brentq(lambda g: np.log(radius(g)), lower, 1.0, xtol=1e-14)
+    return lower, float(root)
 
 
 def contraction_radius(F: FloatArray, arrivals: Sequence[tuple[float, FloatArray]]) -> float:
-    """The least spectral radius, over gains K_s, of ``X -> sum_s p_s (F + K_s H_s) X (F + K_s
-    H_s)'``, for sets s of readings, ``H_s`` (p, n) together, that arrive with probability p_s.
+    """Return the least spectral radius over gains of the mean-square dynamics.
 
-    Below 1 the mean of the covariance stays bounded (R (32), derived for several links).
+    ``X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'`` over sets s of readings, with stacked ``H_s``
+    (p, n), that arrive with probability p_s. Below 1 the mean of the covariance stays bounded
+    (R (32), derived for several links).
     """
-    return _Contraction(F, [H for _, H in arrivals]).best([p for p, _ in arrivals])[0]
+    return _GainSearch(F, [H for _, H in arrivals]).best([p for p, _ in arrivals])[0]
 
 
-class _Contraction:
-    """min over K_s of the spectral radius of ``X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'``."""
+class _GainSearch:
+    """Minimises the spectral radius of ``L: X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'``.
+
+    Policy iteration over the gains K_s: L is a positive map, so that its radius is an eigenvalue
+    with a semidefinite X, and gains that minimise L(X) for this X do not raise the radius.
+    """
 
     def __init__(self, F: FloatArray, readings: Sequence[FloatArray]) -> None:
         self._F, self._readings = F, readings
         n = len(F)
         rows, columns = np.triu_indices(n)
-        # vec of a symmetric matrix from its upper triangle, and the triangle of a vec
+        # vec(X) of a symmetric X from its upper triangle, and the places of the triangle in vec(X).
         self._expand = np.zeros((n * n, len(rows)))
         self._expand[rows * n + columns, np.arange(len(rows))] = 1.0
         self._expand[columns * n + rows, np.arange(len(rows))] = 1.0
         self._pick = rows * n + columns
 
-    def best(self, chances: Sequence[float]) -> tuple[float, list[FloatArray], FloatArray]:
-        """The least spectral radius, the gains that reach it and the Perron matrix."""
+    def best(self, probabilities: Sequence[float]) -> tuple[float, list[FloatArray], FloatArray]:
+        """Return the least spectral radius, the gains (n, p) that attain it, the Perron matrix."""
         n = len(self._F)
-        gains = self._improved([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
-        gains = self._lowered(chances, gains)
-        best, X = self._perron(chances, gains)
+        gains = self._improve([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
+        gains = self._start(probabilities, gains)
+        best, X = self._perron(probabilities, gains)
         for _ in range(500):
-            following = self._improved(gains, X)
-            rho, X_new = self._perron(chances, following)
+            following = self._improve(gains, X)
+            rho, X_new = self._perron(probabilities, following)
             if not rho < best * (1.0 - 1e-15):
                 break
             best, X, gains = rho, X_new, following
         return best, gains, X
 
-    def _lowered(self, chances: Sequence[float], gains: list[FloatArray]) -> list[FloatArray]:
-        """Gains near the best ones, whatever the first: policy iteration with the resolvent
-        ``X = (s - L)^-1 I`` at s above the radius of L in place of its Perron matrix, which may be
-        singular and say nothing about a direction. X > 0, so each step lowers the radius below s.
+    def _start(self, probabilities: Sequence[float], gains: list[FloatArray]) -> list[FloatArray]:
+        """Return gains near the best ones, from any first ones.
+
+        Policy iteration with the resolvent ``X = (s - L)^-1 I``, s above the radius of L, in place
+        of the Perron matrix, which may be singular and then determines no gain in some direction.
+        X > 0, so that each step lowers the radius below s.
         """
-        best = self._perron(chances, gains)[0]
+        best = self._perron(probabilities, gains)[0]
         for excess in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8):
             for _ in range(MAX_POLICIES):
-                X = self._resolvent(chances, gains, best * (1.0 + excess) + 1e-300)
+                X = self._resolvent(probabilities, gains, best * (1.0 + excess) + 1e-300)
                 if X is None:
                     break
-                following = self._improved(gains, X)
-                rho = self._perron(chances, following)[0]
+                following = self._improve(gains, X)
+                rho = self._perron(probabilities, following)[0]
                 if not rho < best:
                     break
                 gains, before, best = following, best, rho
@@ -252,38 +274,42 @@ class _Contraction:
         return gains
 
     def _resolvent(
-        self, chances: Sequence[float], gains: list[FloatArray], s: float
+        self, probabilities: Sequence[float], gains: list[FloatArray], s: float
     ) -> FloatArray | None:
-        n, whole = len(self._F), self._operator(chances, gains)
+        """Return ``(s - L)^-1 I`` (n, n), or None if it is not positive definite."""
+        n, operator = len(self._F), self._operator(probabilities, gains)
         identity = np.eye(n).reshape(-1)[self._pick]
         try:
-            X = self._expand @ np.linalg.solve(s * np.eye(len(whole)) - whole, identity)
+            X = self._expand @ np.linalg.solve(s * np.eye(len(operator)) - operator, identity)
         except np.linalg.LinAlgError:
             return None
         matrix = symmetric(X.reshape(n, n))
         positive = np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0.0
         return matrix if positive else None
 
-    def _improved(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
-        # Where X says nothing about a direction, what is known of it is kept.
+    def _improve(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
+        """Return the gains ``K = -F X H' (H X H')^-1``, which minimise L(X)."""
+        # In the kernel of H X H' any gain is optimal: the pseudo-inverse keeps the present one.
         found = []
         for K, H in zip(gains, self._readings, strict=True):
             S = H @ X @ H.T
-            wanted = -(self._F @ X @ H.T) - K @ S
-            found.append(np.asarray(K + wanted @ np.linalg.pinv(S, rcond=1e-13, hermitian=True)))
+            change = -(self._F @ X @ H.T) - K @ S
+            found.append(np.asarray(K + change @ np.linalg.pinv(S, rcond=1e-13, hermitian=True)))
         return found
 
-    def _operator(self, chances: Sequence[float], gains: list[FloatArray]) -> FloatArray:
-        whole = np.zeros((len(self._F) ** 2,) * 2)
-        for p, K, H in zip(chances, gains, self._readings, strict=True):
+    def _operator(self, probabilities: Sequence[float], gains: list[FloatArray]) -> FloatArray:
+        """Return L as a matrix on upper triangles."""
+        kron = np.zeros((len(self._F) ** 2,) * 2)
+        for p, K, H in zip(probabilities, gains, self._readings, strict=True):
             closed = self._F + K @ H
-            whole += p * np.kron(closed, closed)
-        return np.asarray(whole[self._pick] @ self._expand)
+            kron += p * np.kron(closed, closed)
+        return np.asarray(kron[self._pick] @ self._expand)
 
     def _perron(
-        self, chances: Sequence[float], gains: list[FloatArray]
+        self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> tuple[float, FloatArray]:
-        values, vectors = np.linalg.eig(self._operator(chances, gains))
+        """Return the spectral radius of L and its Perron matrix X (n, n), of positive trace."""
+        values, vectors = np.linalg.eig(self._operator(probabilities, gains))
         k = int(np.argmax(values.real))
         vector = (self._expand @ vectors[:, k]).real
         X = symmetric(vector.reshape(self._F.shape))
@@ -291,14 +317,14 @@ class _Contraction:
 
 
 def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) -> FloatArray:
-    """(2^depth, n, n): all words of ``depth`` letters over {f_0, f_1} applied to P*, right to left.
+    """Return all compositions (2^depth, n, n) of ``depth`` maps f_0 or f_1, applied to P*.
 
-    Entry k belongs to the word whose letters are the binary digits of k, the first (applied last)
-    leading. R Theorem 10: the closure of these points over all depths is the support of the
-    invariant law; f_1(P*) = P*, so each depth holds the ones before. Raises TheoryError for a depth
-    outside 0 .. 22 and where P* does not exist.
+    The binary digits of the index k are the maps of entry k, the leading digit being applied last.
+    By R Theorem 10 the closure of these points over all depths is the support of the invariant law;
+    f_1(P*) = P*, so that each depth contains the ones before. Raises TheoryError for a depth
+    outside 0 .. 22 and if P* does not exist.
     """
-    depth = as_whole("depth", depth, 0, DEEPEST)
+    depth = as_whole("depth", depth, 0, MAX_DEPTH)
     F, Q, H, R = check_system(F, Q, H, R)
     roots = _root(steady_covariance(F, Q, H, R))[None]
     root_Q, root_R = square_root(Q), _root(R)
@@ -318,14 +344,14 @@ def invariant_samples(
     samples: int,
     seed: int,
 ) -> FloatArray:
-    """(samples, n, n): independent draws from the invariant law of the random Riccati equation.
+    """Return independent draws (samples, n, n) from the invariant law of the Riccati equation.
 
     Coupling from the past (Propp and Wilson, 1996): each draw has its own arrivals, drawn backwards
-    from now; the equation runs through the last T of them from P*, the least point of the support,
-    and from a covariance a million times larger. Where the two ends differ by more than 1e-9, T is
-    doubled. Both then show what every start in the infinite past leads to; stopping a chain when it
-    has forgotten its start would prefer draws with recent arrivals. Raises TheoryError where no
-    invariant law exists or that does not happen. Much faster with the extra ``fast``.
+    from the present; the equation runs through the last T of them from P*, the least point of the
+    support, and from a covariance a million times larger. T is doubled until the two ends differ by
+    at most 1e-9: then every start in the infinite past leads there. (A forward chain that stops
+    when it has forgotten its start would favour draws with recent arrivals.) Raises TheoryError if
+    no invariant law exists or the ends do not meet.
     """
     F, Q, H, R = check_system(F, Q, H, R)
     if as_numbers("delivery", delivery).size != 1 or not 0.0 < delivery <= 1.0:
@@ -333,44 +359,50 @@ def invariant_samples(
     samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)
     n, P = len(F), steady_covariance(F, Q, H, R)
     random = Streams(seed).generator("arrivals")
-    letters = alphabet([(H[:0], R[:0, :0]), (H, R)], n)
+    modes = alphabet([(H[:0], R[:0, :0]), (H, R)], n)
     starts = np.stack([_root(P), 1e3 * _root(P + np.trace(P) * np.eye(n))])
     drawn = np.empty((samples, n, n))
-    for first in range(0, samples, BLOCK):
-        some = min(BLOCK, samples - first)
-        drawn[first : first + some] = _coupled(
+    for first in range(0, samples, MAX_SAMPLES_AT_ONCE):
+        some = min(MAX_SAMPLES_AT_ONCE, samples - first)
+        drawn[first : first + some] = _couple_from_the_past(
             lambda K, T: random.random((K, T)) < delivery,
-            lambda roots, words: advance(roots, words, F, square_root(Q), letters),
+            lambda roots, arrivals: advance(roots, arrivals, F, square_root(Q), modes),
             starts,
             some,
         )
     return drawn
 
 
-def _coupled(
+def _couple_from_the_past(
     draw: Callable[[int, int], np.ndarray],
-    advanced: Callable[[FloatArray, np.ndarray], FloatArray],
+    propagate: Callable[[FloatArray, np.ndarray], FloatArray],
     starts: FloatArray,
     samples: int,
 ) -> FloatArray:
-    """(samples, n, n) by coupling from the past; ``draw(K, T)`` gives earlier letters."""
+    """Return draws (samples, n, n) from the law that forward chains converge to.
+
+    ``draw(K, T)`` returns T arrivals, earlier than those drawn before, for K chains;
+    ``propagate(roots, arrivals)`` moves roots (K, n, n) through arrivals (K, T). Raises TheoryError
+    if chains from the two ``starts`` (2, n, n) do not meet within MAX_PAST slots.
+    """
     out = np.empty((samples, *starts.shape[1:]))
     left = np.arange(samples)
-    words = draw(samples, FIRST_PAST)
+    arrivals = draw(samples, FIRST_PAST)
     while len(left):
-        ends = advanced(
-            np.repeat(starts, len(left), axis=0), np.concatenate([words, words])
+        ends = propagate(
+            np.repeat(starts, len(left), axis=0), np.concatenate([arrivals, arrivals])
         ).reshape(2, len(left), *starts.shape[1:])
         pair = ends @ np.swapaxes(ends, -1, -2)
         if not np.isfinite(pair).all():
             break
         apart = np.abs(pair[0] - pair[1]).max(axis=(-1, -2))
-        met = apart <= COALESCED * np.abs(pair[0]).max(axis=(-1, -2))
+        met = apart <= COALESCENCE_TOLERANCE * np.abs(pair[0]).max(axis=(-1, -2))
         out[left[met]] = symmetric(pair[0, met])
-        left, words = left[~met], words[~met]
-        if 2 * words.shape[1] > LONGEST_PAST:
+        left, arrivals = left[~met], arrivals[~met]
+        if 2 * arrivals.shape[1] > MAX_PAST:
             break
-        words = np.concatenate([draw(*words.shape), words], axis=1)
+        # The past grows at its far end: arrivals that were used stay the last ones.
+        arrivals = np.concatenate([draw(*arrivals.shape), arrivals], axis=1)
     if len(left):
         raise TheoryError("the equation does not forget its start: no invariant law was reached")
     return out

@@ -1,13 +1,13 @@
 """The exact invariant law of the scalar random Riccati equation (derived; the paper simulates it).
 
-Where ``sup f_1 < f_0(P*)`` the images of f_0 and f_1 do not meet: the support falls apart into
-what an arrival made, below sup f_1 = F^2 R / H^2 + Q, and what an outage made, from f_0(P*) on.
-Then the distribution function obeys a recursion with one branch at a time,
+If ``sup f_1 < f_0(P*)`` the images of f_0 and f_1 are disjoint: the support splits into the values
+after an arrival, below sup f_1 = F^2 R / H^2 + Q, and those after an outage, from f_0(P*) on. The
+distribution function then obeys a recursion with one branch,
 
     P(X <= x) = g P(X <= f_1^-1(x)) below the hole,   g + (1 - g) P(X <= f_0^-1(x)) above it,
 
-and its inverse the same backwards. In the example of R, F = sqrt 2 and H = Q = R = 1, outages of n
-slots or more have probability (1-g)^n and the hole above them is (2^(n+1) + 1, ...).
+and the quantile function its inverse. In the example of R, F = sqrt 2 and H = Q = R = 1, outages
+of n slots or more have probability (1-g)^n and the hole above them is (2^(n+1) + 1, ...).
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
 from netkf.theory.intermittent.riccati import check_system, steady_covariance
 
-NEGLIGIBLE = 1e-18
-DEPTH = 18
+NEGLIGIBLE = 1e-18  # probability of the values that the recursion has not resolved yet
+DEPTH = 18  # maps that the bounds of the mean compose
+MIN_MAPS, MAX_MAPS = 60, 2000  # of the expansion of a quantile
 
 
 @dataclass(frozen=True)
@@ -37,61 +38,67 @@ class ScalarLaw:
     """P*, the least point of the support."""
 
     def without(self, P: FloatArray) -> FloatArray:
-        """``f_0``."""
-        with np.errstate(over="ignore"):  # at a hole's lower edge all earlier letters are outages
+        """Return ``f_0(P)``, elementwise."""
+        with np.errstate(over="ignore"):  # at a hole's lower edge all earlier slots are outages
             return np.asarray(self.F**2 * P + self.Q)
 
     def with_reading(self, P: FloatArray) -> FloatArray:
-        """``f_1``, also at infinity."""
+        """Return ``f_1(P)``, elementwise, also at infinity."""
         with np.errstate(invalid="ignore"):
             gain = np.where(np.isinf(P), self.R / self.H**2, P * self.R / (self.H**2 * P + self.R))
         return np.asarray(self.F**2 * gain + self.Q)
 
     @property
     def hole(self) -> tuple[float, float]:
-        """The open interval (sup f_1, f_0(P*)), which the law never meets."""
+        """The open interval (sup f_1, f_0(P*)), which has probability 0."""
         return self.F**2 * self.R / self.H**2 + self.Q, float(self.without(np.array(self.least)))
 
     def cdf(self, x: ArrayLike) -> FloatArray:
-        """P(X <= x), exact to about 1e-15, elementwise."""
-        place = np.array(x, dtype=np.float64)
-        total, share = np.zeros_like(place), np.ones_like(place)
+        """Return P(X <= x), exact to about 1e-15, elementwise."""
+        point = np.array(x, dtype=np.float64)
+        total, share = np.zeros_like(point), np.ones_like(point)
         top = self.hole[0]
         while (share > NEGLIGIBLE).any():
-            share = np.where(place < self.least * (1.0 - 1e-15), 0.0, share)
-            above = place >= top
+            share = np.where(point < self.least * (1.0 - 1e-15), 0.0, share)
+            # Above the hole every value after an arrival is smaller, and the last slot an outage.
+            above = point >= top
             total = total + np.where(above, share * self.delivery, 0.0)
             share = share * np.where(above, 1.0 - self.delivery, self.delivery)
             with np.errstate(divide="ignore", invalid="ignore"):
-                reduced = (place - self.Q) / self.F**2
+                reduced = (point - self.Q) / self.F**2
                 before = reduced * self.R / (self.R - self.H**2 * reduced)
-            place = np.where(above, reduced, before)
+            point = np.where(above, reduced, before)
         return total
 
     def quantile(self, u: ArrayLike) -> FloatArray:
-        """The least x with P(X <= x) >= u for 0 <= u < 1, elementwise."""
+        """Return the least x with P(X <= x) >= u, elementwise; raises TheoryError for other u.
+
+        u must lie in [0, 1).
+        """
         level = np.array(u, dtype=np.float64)
         if ((level < 0.0) | (level >= 1.0)).any():
             raise TheoryError("quantiles are for levels in [0, 1)")
-        letters = []
-        for _ in range(2000):
+        # The level determines if the last slot was an outage, and the level within that branch.
+        outages = []
+        for _ in range(MAX_MAPS):
             outage = level > self.delivery
-            letters.append(outage)
+            outages.append(outage)
             level = np.where(
                 outage, (level - self.delivery) / (1.0 - self.delivery), level / self.delivery
             )
-            if len(letters) >= 60 and not outage.any():
+            if len(outages) >= MIN_MAPS and not outage.any():
                 break
         P = np.full_like(level, self.least)
-        for outage in reversed(letters):
+        for outage in reversed(outages):
             P = np.where(outage, self.without(P), self.with_reading(P))
         return P
 
     def mean(self) -> float:
-        """E[X], infinite where (1-g) F^2 >= 1; to about 1e-9 relative.
+        """Return E[X] to about 1e-9 relative, infinite if (1-g) F^2 >= 1; raises TheoryError.
 
-        E = g E[f_1(X)] + (1-g)(F^2 E + Q), and E[f_1(X)] lies between two sums over the words of 18
-        letters, which bound X from both sides.
+        E = g E[f_1(X)] + (1-g)(F^2 E + Q), and E[f_1(X)] lies between two sums over all
+        compositions of 18 maps, applied to P* and to infinity. TheoryError if these differ by more
+        than 1e-6.
         """
         growth = (1.0 - self.delivery) * self.F**2
         if growth >= 1.0:
@@ -112,10 +119,10 @@ class ScalarLaw:
 def scalar_law(
     F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, delivery: float
 ) -> ScalarLaw:
-    """The exact invariant law of a scalar system (1 x 1 matrices or numbers).
+    """Return the exact invariant law of a scalar system (1 x 1 matrices or numbers).
 
-    Raises TheoryError where the system is not scalar, has no P*, or where the images of f_0 and
-    f_1 meet, so that the recursion does not close.
+    Raises TheoryError if the system is not scalar, has no P*, or if the images of f_0 and f_1
+    overlap, so that the recursion has two branches.
     """
     system = check_system(*(np.atleast_2d(value) for value in (F, Q, H, R)))
     if len(system.F) != 1 or len(system.H) != 1:

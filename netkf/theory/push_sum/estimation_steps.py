@@ -1,4 +1,4 @@
-"""Steps 4 and 5 of the push-sum filter at the asymptotic gains, as one linear random system."""
+"""P steps 4 and 5 at the asymptotic gains as one linear system with random coefficients."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from netkf.theory.push_sum.limits import PushSumLimits, push_sum_filter, push_su
 
 @dataclass(frozen=True, eq=False)
 class EstimationSteps:
-    """``e+ = (M (x) I)(diag(A_i) e + h)`` of the stacked errors, P (25).
+    """Dynamics ``e+ = (M (x) I)(diag(A_i) e + h)`` of the stacked errors, P (25).
 
     averaging : the law of M
     closed    : (N, n, n) A_i = (I - K_i H_i) F
-    process   : (N, n, n) I - K_i H_i, how the plant's noise enters h, P (27)
-    own       : (N, n, n) K_i R_i K_i', the sensors' part of its covariance
+    process   : (N, n, n) I - K_i H_i, by which the plant's noise enters h, P (27)
+    own       : (N, n, n) K_i R_i K_i', the covariance of the sensors' noise in h
     Q         : (n, n) of the plant
-    limits    : what the gains are made of
+    limits    : the limits of steps 2 and 3, from which the gains are computed
     """
 
     averaging: Averaging
@@ -36,30 +36,33 @@ class EstimationSteps:
 
     @cached_property
     def scale(self) -> FloatArray:
-        """(n,) units in which P_inf has a diagonal of ones, but for states known almost exactly."""
+        """Units (n,) in which P_inf has a unit diagonal, except for states known almost exactly."""
         variances = np.diagonal(self.limits.P)
         return np.sqrt(np.maximum(variances, max(1e-12 * variances.max(), 1e-150)))
 
     @cached_property
     def scaled(self) -> FloatArray:
-        """(N, n, n) ``closed`` in those units."""
+        """``closed`` (N, n, n) in the units of ``scale``."""
         return np.asarray(self.closed * (self.scale / self.scale[:, None]))
 
     @cached_property
     def noise(self) -> FloatArray:
-        """(N n, N n) covariance of h."""
+        """Covariance (N n, N n) of h."""
         N, n, _ = self.closed.shape
-        whole = np.einsum("iab,bc,jdc->iajd", self.process, self.Q, self.process, optimize=True)
+        # The plant's noise is common to all nodes, the sensors' noises are independent.
+        covariance = np.einsum(
+            "iab,bc,jdc->iajd", self.process, self.Q, self.process, optimize=True
+        )
         each = np.arange(N)
-        whole[each, :, each] += self.own
-        return symmetric(whole.reshape(N * n, N * n))
+        covariance[each, :, each] += self.own
+        return symmetric(covariance.reshape(N * n, N * n))
 
 
 def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> EstimationSteps:
-    """Steps 4 and 5 of a scenario, with its own links or others.
+    """Return steps 4 and 5 of a scenario, with its own links or the given ``averaging``.
 
-    The filters' Q and R may differ from the truth, their F may not. Raises TheoryError where
-    asymptotic gains do not exist or the law of the links is not one of independent draws.
+    The filters' Q and R may differ from the truth, their F may not. Raises TheoryError if
+    asymptotic gains do not exist or the links are not drawn independently.
     """
     limits = push_sum_limits(scenario)
     F, _ = scenario.slot_belief
@@ -75,10 +78,10 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
 
 
 def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averaging:
-    """The links of step 5 as the channel makes them, or all with one ``delivery`` probability.
+    """Return the law of step 5 for the scenario's channel, or one ``delivery`` for all links.
 
-    Raises TheoryError for recorded links, for losses that depend on the past and for delays by
-    which messages may come late.
+    Raises TheoryError for recorded links, for losses that depend on the past, and for delays by
+    which messages can be late.
     """
     algorithm, topology = push_sum_filter(scenario), scenario.topology
     channel = scenario.network.channel
@@ -103,7 +106,7 @@ def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averagin
 
 
 def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
-    """(E, 2): that the first end of a link hears the second, and the other way round."""
+    """Return (E, 2) probabilities that the first end of a link hears the second, and vice versa."""
     loss, links = scenario.network.channel.loss, scenario.topology.links
     if delivery is not None:
         if not 0.0 <= delivery <= 1.0:

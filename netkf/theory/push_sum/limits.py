@@ -1,4 +1,4 @@
-"""What steps 2 and 3 of the push-sum filter come to, and the bounds on its consensus gain."""
+"""Limits of P steps 2 and 3, and bounds on the consensus gain of the push-sum filter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from netkf.theory.intermittent.riccati import filtered_covariance
 
 
 class PushSumLimits(NamedTuple):
-    """What steps 2 and 3 come to, in the order of the nodes.
+    """Limits of steps 2 and 3, in the order of the nodes.
 
     mass      : (N, n, n) of C~, P (16)
     number    : (N,) of n~, P (17)
@@ -38,11 +38,11 @@ class PushSumLimits(NamedTuple):
 
 
 def push_sum_limits(scenario: Scenario) -> PushSumLimits:
-    """P Theorem 1, and Theorem 2 (in probability) when links fail in both directions together.
+    """Return the limits of P Theorem 1, and of Theorem 2 (in probability) for failing links.
 
-    With what the filters believe of the plant and the sensors. Raises TheoryError where the graph
-    is not connected, where P_inf does not exist, for sensors whose H varies and for scenarios
-    without the push-sum filter.
+    Theorem 2 needs links that fail in both directions together. F, Q, H and R are those that the
+    filters assume. Raises TheoryError if the graph is not connected or P_inf does not exist, for
+    sensors whose H varies, and for scenarios without the push-sum filter.
     """
     push_sum_filter(scenario)
     if any(sensor.varying for sensor in scenario.sensors):
@@ -53,6 +53,7 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     if parts > 1:
         raise TheoryError(f"the graph must be connected, it has {parts} parts")
     models, degrees = scenario.slot_models, scenario.topology.degrees
+    # Node i has degree + 1 shares, so that the stationary weight is proportional to that, P (18).
     share = np.array([degrees[node] + 1.0 for node in scenario.nodes])
     share /= share.sum()
     each = [np.linalg.solve(m.R, m.H).T for m in models]
@@ -64,7 +65,7 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
 
 
 def push_sum_filter(scenario: Scenario) -> PushSum:
-    """The filter of the scenario; raises TheoryError where it is not the push-sum filter."""
+    """Return the scenario's filter; raises TheoryError unless it is the push-sum filter."""
     algorithm = scenario.filter.algorithm
     name = type(algorithm).__name__
     if not isinstance(algorithm, PushSum):
@@ -76,10 +77,10 @@ def push_sum_filter(scenario: Scenario) -> PushSum:
 
 
 class GainBound(NamedTuple):
-    """Three values that bound the consensus gain delta from below, the sharpest first.
+    """Three lower bounds on the consensus gain delta, the sharpest first.
 
-    radius : rho(L) of the Laplacian; above it P Theorems 3 to 6 speak, above half of it averaging
-             contracts
+    radius : rho(L) of the Laplacian; P Theorems 3 to 6 need delta above it, and averaging contracts
+             for delta above half of it
     local  : largest sum over a link of its ends' degrees, at least rho(L); nodes can find it alone
     nodes  : N, at least rho(L)
     """
@@ -90,8 +91,10 @@ class GainBound(NamedTuple):
 
 
 def consensus_gain_bound(graph: Scenario | Topology) -> GainBound:
-    """rho(L) and what bounds it from above. The largest degree of a node, or that plus one as P
-    has it, lies *below* rho(L) on every graph with a link. Raises TheoryError for directed graphs.
+    """Return rho(L) and two upper bounds on it.
+
+    The largest degree of a node, or that plus one as in P, lies *below* rho(L) on every graph with
+    a link. Raises TheoryError for directed graphs.
     """
     topology = graph.topology if isinstance(graph, Scenario) else graph
     if topology.directed:
