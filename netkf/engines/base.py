@@ -19,8 +19,8 @@ from netkf.engines.soundness import sound
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.batch import RunBatch, batch_of_one
-from netkf.trace.recorder import MemorySink, Recorder
+from netkf.trace.batch import BatchSink, RunBatch
+from netkf.trace.recorder import Recorder
 
 
 class Rank(IntEnum):
@@ -77,23 +77,17 @@ class Engine(ABC):
         engine; each run is to the last bit what ``run`` gives for its replica.
         """
         for replica in replicas:
-            yield self.batch_of_one(scenario, seed, replica)
-
-    def batch_of_one(self, scenario: Scenario, seed: int, replica: int) -> RunBatch:
-        """Simulate one replica with ``run`` and count its events."""
-        memory = MemorySink()
-        recorder = Recorder([memory], counts_only=True)
-        status = self.run(scenario, Streams(seed, replica), recorder, silent)
-        return recorded_batch(scenario, replica, memory, recorder, status)
+            sink = batch_sink(scenario, range(replica, replica + 1))
+            recorder = Recorder([sink], counts_only=True)
+            status = self.run(scenario, Streams(seed, replica), recorder, silent)
+            sink.finish(recorder, status)
+            yield sink.batch()
 
 
-def recorded_batch(
-    scenario: Scenario, replica: int, memory: MemorySink, recorder: Recorder, status: str
-) -> RunBatch:
-    """The batch of one run from its recorder and the samples kept in memory."""
+def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
+    """A sink for the samples of some recorded runs of a scenario."""
     filters = 1 if scenario.hosted.pooled else len(scenario.nodes)
-    shape = filters, scenario.plant.n
-    return batch_of_one(replica, scenario.times, shape, memory, recorder, status)
+    return BatchSink(replicas, scenario.times, (filters, scenario.plant.n))
 
 
 def broken(

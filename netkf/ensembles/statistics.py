@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.engines.base import Engine, recorded_batch, silent
+from netkf.engines.base import Engine, batch_sink, silent
 from netkf.ensembles.merge_tree import MergeTree, aligned_pieces
 from netkf.ensembles.moments import Moments, merge_moments, moments_of
 from netkf.ensembles.reduction import reduce_batch
@@ -111,30 +111,19 @@ def _batches(
             yield batch, "", ()
 
 
-class _Samples(MemorySink):
-    """Keeps samples, and events where they are wanted."""
-
-    def __init__(self, traced: bool) -> None:
-        super().__init__()
-        self._traced = traced
-
-    def events(self, rows: np.ndarray) -> None:
-        if self._traced:
-            super().events(rows)
-
-
 def _recorded_run(
     scenario: Scenario, seed: int, replica: int, engine: Engine, traced: bool
 ) -> tuple[RunBatch, str, tuple[Trace, ...]]:
-    memory = _Samples(traced)
-    recorder = Recorder([memory])
+    """Simulate one replica with its fingerprint and, if it is ``traced``, its trace."""
+    sink, memory = batch_sink(scenario, range(replica, replica + 1)), MemorySink()
+    recorder = Recorder([sink, memory] if traced else [sink])
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)
-    batch = recorded_batch(scenario, replica, memory, recorder, status)
+    sink.finish(recorder, status)
     if not traced:
-        return batch, recorder.fingerprint, ()
+        return sink.batch(), recorder.fingerprint, ()
     run = collect(scenario, memory, recorder, seed, replica, engine.name, status)
     trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
-    return batch, run.fingerprint, (trace,)
+    return sink.batch(), run.fingerprint, (trace,)
 
 
 class RunValues(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,6 +15,7 @@ from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
 from netkf.plants.transitions import Transitions, frame_period
 from netkf.plants.truth import SampledTruth, multiples
+from netkf.rng.normals import GeneratorNormals, Normals
 
 LONGEST_STEP = 8.0
 NO_TIMES = np.empty(0)
@@ -74,29 +74,35 @@ class Diffusion(Plant):
         grid, ``probing`` only for those shown off both. With ``frames``, states are local, see
         ``truth``, in frames that begin before the ``horizon``.
         """
-        samplings = [] if sampling is None else [sampling]
-        paths = self.paths([random], [probing], shown, samplings, sampled, frames)
+        own, shows = GeneratorNormals([random]), GeneratorNormals([probing])
+        samples = GeneratorNormals([] if sampling is None else [sampling])
+        paths = self.paths(own, shows, shown, samples, sampled, frames)
         return DiffusionPath(paths, horizon)
 
     def paths(
         self,
-        randoms: Sequence[np.random.Generator],
-        probings: Sequence[np.random.Generator],
+        normals: Normals,
+        probing: Normals,
         shown: FloatArray,
-        samplings: Sequence[np.random.Generator] = (),
+        sampling: Normals | None = None,
         sampled: FloatArray = NO_TIMES,
         frames: bool = False,
     ) -> DiffusionPaths:
         """The paths of several runs together, which are sampled and shown at the same times."""
-        start = np.stack([self.start(random) for random in randoms])
-        cuts = [Cuts(sampled, samplings)] if len(sampled) else []
+        start = self.starts(normals)
+        cuts = [] if sampling is None or not len(sampled) else [Cuts(sampled, sampling)]
         steps = self.frame_steps if frames else None
-        return DiffusionPaths(self.laws, start, randoms, [*cuts, Cuts(shown, probings)], steps)
+        return DiffusionPaths(self.laws, start, normals, [*cuts, Cuts(shown, probing)], steps)
 
     def start(self, random: np.random.Generator) -> FloatArray:
         """(n,) x(0), drawn."""
-        normals = random.standard_normal((1, self.n))
-        return np.asarray(self.start_mean + (normals @ square_root(self.start_cov).T)[0])
+        return np.asarray(self.starts(GeneratorNormals([random]))[0])
+
+    def starts(self, normals: Normals) -> FloatArray:
+        """(B, n) x(0) of each run, drawn."""
+        # Row by row, so that no state is rounded as its neighbours happen to be.
+        drawn = normals.draw((1, self.n)) @ square_root(self.start_cov).T
+        return np.asarray(self.start_mean + drawn[:, 0])
 
     @property
     def frame_steps(self) -> int | None:

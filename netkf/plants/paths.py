@@ -23,6 +23,7 @@ from netkf.linalg.series import fill_polynomial, polynomial
 from netkf.linalg.small import added, applied
 from netkf.plants.laws import GridLaws, grid_time
 from netkf.plants.transitions import Transitions
+from netkf.rng.normals import Normals
 
 BLOCK = 64  # steps drawn at once, or a multiple of it
 _THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -68,15 +69,15 @@ class Block(NamedTuple):
 
 
 class Cuts(NamedTuple):
-    """Increasing ``times`` at which steps are cut, and the generator of each run."""
+    """Increasing ``times`` at which steps are cut, and the normals of each run."""
 
     times: FloatArray
-    randoms: Sequence[np.random.Generator]
+    normals: Normals
 
 
 class DiffusionPaths:
-    """The paths of B runs, which are cut at the same times: ``start`` (B, n), the generator of
-    each, and where states are sampled or shown (``cuts``, one after the other).
+    """The paths of B runs, which are cut at the same times: ``start`` (B, n), the normals of each,
+    and where states are sampled or shown (``cuts``, one after the other).
 
     With ``frame_steps``, states are local: they start again from zero every so many steps, so that
     a piece may end at a state that the next one does not start from.
@@ -88,11 +89,11 @@ class DiffusionPaths:
         self,
         laws: GridLaws,
         start: FloatArray,
-        randoms: Sequence[np.random.Generator],
+        normals: Normals,
         cuts: Sequence[Cuts],
         frame_steps: int | None = None,
     ) -> None:
-        self.laws, self._randoms, self._cuts = laws, randoms, cuts
+        self.laws, self._normals, self._cuts = laws, normals, cuts
         self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
 
@@ -101,7 +102,7 @@ class DiffusionPaths:
         laws, (count, n), total = self.laws, self._x.shape, blocks * BLOCK
         # Block by block, so that no path is rounded as its neighbours happen to be.
         size = blocks, BLOCK, 3 * n
-        normals = np.stack([random.standard_normal(size) for random in self._randoms])
+        normals = self._normals.draw(size)
         noise = (normals @ laws.noise_factor.T).reshape(count * blocks, BLOCK, 3, n)
         cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
         onwards = noise[:, :, 0].reshape(count, blocks, BLOCK, n)
@@ -125,7 +126,7 @@ class DiffusionPaths:
             shown = cuts.times[first:last]
             inside = shown[~np.isin(shown, block.end)]
             if len(inside):
-                block = self._cut(block, inside, cuts.randoms)
+                block = self._cut(block, inside, cuts.normals)
         return block
 
     def _states(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -153,13 +154,10 @@ class DiffusionPaths:
             first = end
         return before, after
 
-    def _cut(
-        self, block: Block, shown: FloatArray, randoms: Sequence[np.random.Generator]
-    ) -> Block:
+    def _cut(self, block: Block, shown: FloatArray, source: Normals) -> Block:
         """The block with pieces that also end at the times ``shown``, inside its own pieces."""
         owners = np.searchsorted(block.end, shown)
-        size = len(shown), 3 * self.laws.n
-        normals = np.stack([random.standard_normal(size) for random in randoms])
+        normals = source.draw((len(shown), 3 * self.laws.n))
         counts = 1 + np.bincount(owners, minlength=len(block.end))
         # A piece cut twice is cut at the first time, and what is left of it at the second.
         turn = np.arange(len(shown)) - np.searchsorted(owners, owners)

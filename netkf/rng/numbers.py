@@ -2,7 +2,7 @@
 
 ``rng.draws`` holds the words and the uniform and exponential numbers. Normals come from the
 ziggurat of Marsaglia and Tsang (2000) with numpy's 256 layers (``ziggurat_normal.npz``), integers
-from Lemire's method (ACM TOMACS 29, 2019) and orders from masked halves of words; tests/rng
+from Lemire's method (ACM TOMACS 29, 2019) and orders from masked halves of words. tests/rng
 compares all of them with numpy.
 """
 

@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.random.bit_generator import ISeedSequence
 
+from netkf.rng.seeding import POOL
+from netkf.rng.seeding import seed_words as fill_seed_words
+
 
 @dataclass(frozen=True)
 class Streams:
@@ -38,7 +41,7 @@ class Streams:
 
     @property
     def per_replica(self) -> tuple[Streams, ...]:
-        """As of several runs, see ``ReplicaStreams``."""
+        """The source of each run, as ``ReplicaStreams`` has several."""
         return (self,)
 
     def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
@@ -91,15 +94,17 @@ class ReplicaStreams:
         """(count K, 4) words of 64 bits that seed the generators of K entities, run by run."""
         if not entities:
             return np.empty((0, 4), dtype=np.uint64)
-        replicas = range(self.replica, self.replica + self.count)
-        few = self.count * len(entities) < FEW
-        if few or replicas[-1] >= WORD or not _small(entities):
+        last = self.replica + self.count - 1
+        if last >= WORD or not _small(entities):
             some = [s._sequence(purpose, *entity) for s in self.per_replica for entity in entities]
             return np.array([sequence.generate_state(4, np.uint64) for sequence in some])
         keys = np.empty((self.count, len(entities), 2 + len(entities[0])), dtype=np.uint32)
-        keys[:, :, 0] = np.array(replicas, dtype=np.uint32)[:, None]
+        keys[:, :, 0] = np.arange(self.replica, last + 1, dtype=np.uint32)[:, None]
         keys[:, :, 1], keys[:, :, 2:] = _code(purpose), np.array(entities, dtype=np.uint32)
-        return _all_words(self.seed, keys.reshape(-1, keys.shape[2]))
+        words = np.empty((self.count * len(entities), 4), dtype=np.uint64)
+        pool = np.empty(POOL, dtype=np.uint32)
+        fill_seed_words(_entropy(self.seed), keys.reshape(len(words), -1), pool, words)
+        return words
 
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
@@ -125,53 +130,17 @@ def _small(entities: Sequence[tuple[int, ...]]) -> bool:
     return max(max(entity, default=0) for entity in entities) < WORD
 
 
-FEW = 16  # seeds, which numpy makes faster one by one
-POOL, WORD, MASK = 4, 1 << 32, (1 << 32) - 1
+WORD, MASK = 1 << 32, (1 << 32) - 1
 
 
-def _all_words(seed: int, keys: np.ndarray) -> np.ndarray:
-    """(N, 4) what SeedSequence(seed, spawn_key=key) gives PCG64DXSM for all keys (N, k): numpy's
-    algorithm, which its policy keeps as it is (M. E. O'Neill's seed_seq_fe).
-    """
-    root = _words_of(seed)
-    root += [0] * (POOL - len(root))
-    columns = [np.full(len(keys), word, dtype=np.uint32) for word in root]
-    columns += list(keys.T.copy())
-    constant = 0x43B0D7E5
-
-    def hashed(value: np.ndarray) -> np.ndarray:
-        nonlocal constant
-        value = value ^ np.uint32(constant)
-        constant = constant * 0x931E8875 & MASK
-        value = value * np.uint32(constant)
-        return np.asarray(value ^ (value >> np.uint32(16)))
-
-    def mixed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        value: Any = np.uint32(0xCA01F9DD) * x - np.uint32(0x4973F715) * y
-        return np.asarray(value ^ (value >> np.uint32(16)))
-
-    pool = [hashed(column) for column in columns[:POOL]]
-    for source in range(POOL):
-        for target in range(POOL):
-            if source != target:
-                pool[target] = mixed(pool[target], hashed(pool[source]))
-    for column in columns[POOL:]:
-        for target in range(POOL):
-            pool[target] = mixed(pool[target], hashed(column))
-    out, constant = np.empty((len(keys), 2 * POOL), dtype=np.uint32), 0x8B51F9DD
-    for k in range(2 * POOL):
-        value = pool[k % POOL] ^ np.uint32(constant)
-        constant = constant * 0x58F38DED & MASK
-        value = value * np.uint32(constant)
-        out[:, k] = value ^ (value >> np.uint32(16))
-    return out.astype("<u4").view("<u8").astype(np.uint64)
-
-
-def _words_of(number: int) -> list[int]:
-    words = [number & MASK]
-    while number := number >> 32:
-        words.append(number & MASK)
-    return words
+@cache
+def _entropy(seed: int) -> np.ndarray:
+    """The words of a seed, lowest first, at least as many as the pool has."""
+    words = [seed & MASK]
+    while seed := seed >> 32:
+        words.append(seed & MASK)
+    words += [0] * (POOL - len(words))
+    return np.array(words, dtype=np.uint32)
 
 
 @cache

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.trace.recorder import MemorySink, Recorder
-from netkf.trace.schema import CODES
+from netkf.trace.recorder import Recorder, Sink
+from netkf.trace.schema import CODES, KINDS
 
 COMPLETE, DIVERGED = "complete", "diverged"
 
@@ -59,37 +60,60 @@ class RunBatch:
         return np.asarray(self.counts[:, CODES[kind]])
 
 
-def batch_of_one(
-    replica: int,
-    times: FloatArray,
-    shape: tuple[int, int],
-    memory: MemorySink,
-    recorder: Recorder,
-    status: str,
-) -> RunBatch:
-    """The batch of a single run that was recorded; ``times`` (T,) are the sample times of a run
-    that completes, and ``shape`` = (F, n) is the number of filters and of states.
+class BatchSink(Sink):
+    """Gathers the samples of recorded runs as a batch; ``finish`` ends each run.
+
+    ``times`` (T,) are the sample times of a run that completes, ``shape`` = (F, n) is the number of
+    filters and of states.
     """
-    count, n = shape
-    shapes = (n,), (count, n), (count, n, n), (count, n)
-    whole = [np.full((1, len(times), *shape), np.nan) for shape in shapes]
-    first = 0
-    for t, *arrays in memory.samples:
-        for array, given, wanted in zip(whole, arrays, shapes, strict=True):
-            # A pooled filter is recorded once for every node.
-            array[0, first : first + len(t)] = given[:, :count] if len(wanted) > 1 else given
-        first += len(t)
-    x, xhat, P, error = whole
-    return RunBatch(
-        replicas=range(replica, replica + 1),
-        times=times,
-        x=x,
-        xhat=xhat,
-        P=P,
-        error=error,
-        lengths=np.array([first]),
-        counts=recorder.counts[None],
-        status=np.array([status]),
-        sums={name: np.array([pair]) for name, pair in recorder.sums.items()},
-        exact_errors=recorder.exact_errors,
-    )
+
+    thread_safe: ClassVar[bool] = True
+
+    def __init__(self, replicas: range, times: FloatArray, shape: tuple[int, int]) -> None:
+        (filters, n), count = shape, (len(replicas), len(times))
+        self._replicas, self._times, self._filters = replicas, times, filters
+        self._x = np.full((*count, n), np.nan)
+        self._xhat, self._error = (np.full((*count, filters, n), np.nan) for _ in range(2))
+        self._P = np.full((*count, filters, n, n), np.nan)
+        self._lengths = np.zeros(len(replicas), dtype=np.int64)
+        self._counts = np.zeros((len(replicas), len(KINDS)), dtype=np.int64)
+        self._status: list[str] = []
+        self._sums: list[dict[str, tuple[float, float]]] = []
+
+    def events(self, rows: np.ndarray) -> None:
+        """Counted by the recorder."""
+
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
+        """Put behind the samples of the present run."""
+        run = len(self._status)
+        first, last = self._lengths[run], self._lengths[run] + len(t)
+        self._x[run, first:last] = x
+        # A pooled filter is recorded once for every node.
+        self._xhat[run, first:last] = xhat[:, : self._filters]
+        self._P[run, first:last] = P[:, : self._filters]
+        self._error[run, first:last] = error[:, : self._filters]
+        self._lengths[run] = last
+
+    def finish(self, recorder: Recorder, status: str) -> None:
+        """End the present run; what follows belongs to the next replica."""
+        self._counts[len(self._status)] = recorder.counts
+        self._status.append(status)
+        self._sums.append(recorder.sums)
+
+    def batch(self) -> RunBatch:
+        """The batch of all runs."""
+        return RunBatch(
+            replicas=self._replicas,
+            times=self._times,
+            x=self._x,
+            xhat=self._xhat,
+            P=self._P,
+            error=self._error,
+            lengths=self._lengths,
+            counts=self._counts,
+            status=np.array(self._status),
+            sums={name: np.array([sums[name] for sums in self._sums]) for name in self._sums[0]},
+            exact_errors=self.exact_errors,
+        )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.engines.compiled import batches
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.trace.schema import KINDS
@@ -12,6 +13,24 @@ from tests.conftest import scenario_files
 SHORT = {"delayed_links": 6.0, "intel_lab": 240.0, "intel_lab_radio": 240.0, "push_sum_planar": 3.0}
 FILES = {file.stem: file for file in scenario_files()}
 UNSTABLE = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
+BURSTS = {"mean_loss": 0.3, "mean_burst": 3.0}
+SAMPLED = {"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[0.25]]}
+CASES = {
+    "plain": {},
+    "each way": {"network.channel.symmetric": False},
+    "bursts": {"network.channel.loss": {"kind": "gilbert-elliott", **BURSTS}},
+    "late": {"network.channel.delay": {"kind": "exponential", "mean": 0.4}},
+    "other clocks": {"network.activation": {"kind": "periodic", "period": 0.3}},
+    "nodes": {"network.activation": {"kind": "poisson", "rate": 1.0, "at": "nodes"}},
+    "directions": {"network.activation": {"kind": "poisson", "rate": 1.0, "at": "directions"}},
+    "silent": {"filter": {"kind": "local"}},
+    "pooled": {"filter": {"kind": "central"}},
+    "intersecting": {"filter": {"kind": "covariance-intersection", "epsilon": 0.3}},
+    "blind": {"sensors": []},
+    "off the grid": {"probe": 0.17},
+    "sampled": {"sensors": [{**SAMPLED, "sampling": {"kind": "poisson", "rate": 3.0}}]},
+    "two rows": {"sensors": [{**SAMPLED, "H": np.eye(2).tolist(), "R": np.eye(2).tolist()}]},
+}
 
 
 def assert_alone(scenario, engine, seed, replicas):
@@ -34,6 +53,19 @@ def assert_alone(scenario, engine, seed, replicas):
                 expected = expected[:, :1] if pooled else expected
                 np.testing.assert_array_equal(found, expected, err_msg=name)
     assert done == list(replicas)
+
+
+@pytest.mark.parametrize("largest", [256, 3])
+@pytest.mark.parametrize("name", CASES)
+def test_runs_drawn_together_are_what_they_are_alone(ring, monkeypatch, name, largest):
+    monkeypatch.setattr(batches, "LARGEST_BATCH", largest)
+    assert_alone(ring.replace({"horizon": 15.0, **CASES[name]}), CompiledEngine(), 7, range(1, 6))
+
+
+def test_a_batch_of_one_where_memory_is_short(ring, monkeypatch):
+    monkeypatch.setattr(batches, "MOST_BYTES", 1 << 12)
+    assert batches.batch_size(ring) == 1
+    assert_alone(ring.replace({"horizon": 2.0}), CompiledEngine(), 7, range(2))
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -13,7 +13,6 @@ import netkf
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.kernels import square_root
 from netkf.core.errors import EngineError, ScenarioError
-from netkf.engines.compiled import lots
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.linalg import compiling, small
@@ -537,6 +536,9 @@ def test_a_singular_matrix_gives_nan_in_both():
     assert np.isnan(small.solution(singular, right)).all()
 
 
+BURSTS = {"mean_loss": 0.3, "mean_burst": 3.0}
+
+
 def test_fates_drawn_at_once_are_those_drawn_one_by_one():
     for loss in ({"kind": "bernoulli", "delivery": 0.5}, {"kind": "gilbert-elliott", **BURSTS}):
         for delay in ({"kind": "lognormal", "mean": 1.0, "sigma": 0.5}, {"kind": "none"}):
@@ -550,86 +552,6 @@ def test_fates_drawn_at_once_are_those_drawn_one_by_one():
             singles = [one.draw() for _ in range(100)]
             for many, column in zip(other.draws(100), zip(*singles, strict=True), strict=True):
                 assert many.tolist() == list(column)
-
-
-BURSTS = {"mean_loss": 0.3, "mean_burst": 3.0}
-LOTS = {
-    "plain": {},
-    "each way": {"network.channel.symmetric": False},
-    "bursts": {"network.channel.loss": {"kind": "gilbert-elliott", **BURSTS}},
-    "late": {"network.channel.delay": {"kind": "exponential", "mean": 0.4}},
-    "other clocks": {"network.activation": {"kind": "periodic", "period": 0.3}},
-    "silent": {"filter": {"kind": "local"}},
-    "pooled": {"filter": {"kind": "central"}},
-    "intersecting": {"filter": {"kind": "covariance-intersection", "epsilon": 0.3}},
-    "blind": {"sensors": []},
-    "off the grid": {"probe": 0.17},
-}
-
-
-@pytest.mark.parametrize("name", LOTS)
-def test_runs_drawn_together_are_what_they_are_alone(ring, monkeypatch, name):
-    """To the last bit, however many there are in a lot, and also where one is asked for twice: that
-    one draws for itself.
-    """
-    case = ring.replace({"horizon": 15.0, **LOTS[name]})
-    alone = [netkf.simulate(case, 7, k, engine="compiled") for k in range(5)]
-    made = []
-    plain = lots.Lots._draw
-    monkeypatch.setattr(lots.Lots, "_draw", lambda self, k: (made.append(k), plain(self, k))[1])
-    for largest in (64, 3):
-        monkeypatch.setattr(lots, "LARGEST_LOT", largest)
-        made.clear()
-        with lots.together(case, 7, 0, 4):
-            runs = [netkf.simulate(case, 7, k, engine="compiled") for k in (0, 1, 2, 3, 4, 2)]
-        assert made == ([0] if largest == 64 else [0, 3])
-        for k, run in zip((0, 1, 2, 3, 4, 2), runs, strict=True):
-            assert run.fingerprint == alone[k].fingerprint
-            for part in ("x", "xhat", "P"):
-                np.testing.assert_array_equal(getattr(run, part), getattr(alone[k], part))
-
-
-def test_lots_are_for_the_runs_that_were_expected(ring, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(lots.Lots, "_draw", lambda self, k: drawn.append(k))
-    case = ring.replace({"horizon": 2.0})
-    with lots.together(case, 7, 0, 4):
-        netkf.simulate(case, 8, 1, engine="compiled")
-        netkf.simulate(case.replace({}), 7, 1, engine="compiled")
-        netkf.simulate(case, 7, 4, engine="compiled")
-        netkf.simulate(case, 7, 1, engine="processes")
-    netkf.simulate(case, 7, 1, engine="compiled")
-    assert not drawn
-    monkeypatch.setattr(lots, "MOST_BYTES", 1 << 12)  # too little for two of them
-    with lots.together(case, 7, 0, 4):
-        netkf.simulate(case, 7, 1, engine="compiled")
-    assert not drawn
-
-
-def test_a_run_within_a_run_has_a_desk_of_its_own(ring):
-    case, inner = ring.replace({"horizon": 4.0}), []
-    alone = [netkf.simulate(case, 7, k, engine="compiled") for k in range(3)]
-
-    def progress(time):
-        inner.append(netkf.simulate(case, 7, 1, engine="compiled"))
-
-    with lots.together(case, 7, 0, 3):
-        outer = netkf.simulate(case, 7, 0, engine="compiled", progress=progress)
-        after = netkf.simulate(case, 7, 1, engine="compiled")
-    for run, one in ((outer, alone[0]), (inner[0], alone[1]), (after, alone[1])):
-        assert run.fingerprint == one.fingerprint
-        np.testing.assert_array_equal(run.P, one.P)
-
-
-def test_a_lot_with_a_run_that_diverges(build):
-    plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
-    grown = build(horizon=600.0, probe=10.0, plant=plant, filter={"kind": "local"})
-    alone = [netkf.simulate(grown, 0, k, engine="compiled") for k in range(3)]
-    with lots.together(grown, 0, 0, 3):
-        runs = [netkf.simulate(grown, 0, k, engine="compiled") for k in range(3)]
-    for run, one in zip(runs, alone, strict=True):
-        assert run.status == one.status == "diverged"
-        assert run.fingerprint == one.fingerprint
 
 
 def test_a_block_of_rows_is_recorded_like_one_row_after_the_other():

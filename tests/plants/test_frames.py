@@ -8,6 +8,7 @@ from netkf.plants import linear
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.transitions import Transitions, frame_period, frame_slots
+from netkf.rng.normals import GeneratorNormals
 
 SPIRAL = np.array([[0.3, 1.0], [-1.0, 0.3]])
 COV = np.array([[2.0, 0.5], [0.5, 1.0]])
@@ -98,8 +99,12 @@ def test_local_states_and_origins_make_the_absolute_ones(kind):
 
 def test_blocks_do_not_show_in_frames():
     plant = Diffusion(SPIRAL, np.eye(2), mean=[1.0, 0.0], cov=COV, sensing_period=0.2)
-    made = plant.paths(*[[g] for g in generators(2)], np.array([3.33]), frames=True)
-    again = plant.paths(*[[g] for g in generators(2)], np.array([3.33]), frames=True)
+    made = plant.paths(
+        *[GeneratorNormals([g]) for g in generators(2)], np.array([3.33]), frames=True
+    )
+    again = plant.paths(
+        *[GeneratorNormals([g]) for g in generators(2)], np.array([3.33]), frames=True
+    )
     one = made.following(4)
     parts = [again.following(k) for k in (1, 2, 1)]
     for name in ("x_start", "x_end", "moments"):

@@ -11,10 +11,13 @@ import numpy as np
 
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time
 from netkf.plants.paths import BLOCK
 from netkf.plants.sensors import step_noise
+from netkf.rng.normals import StreamNormals
+from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Placed, Scenario
 
@@ -60,12 +63,15 @@ class Paths:
         sampled: FloatArray = NO_TIMES,
     ) -> None:
         self._blocks = blocks
-        sampling = streams.generators("samples", [()]) if len(sampled) else []
+        plant, probe, samples = (
+            StreamNormals(streams.seed_words(purpose, [()]))
+            for purpose in ("plant", "probe", "samples")
+        )
         self._paths = scenario.truth.paths(
-            streams.generators("plant", [()]),
-            streams.generators("probe", [()]),
+            plant,
+            probe,
             scenario.times,
-            sampling,
+            samples,
             sampled,
             scenario.exact_errors,
         )
@@ -144,12 +150,12 @@ class Noise:
         placed = increments(scenario)
         sensors = [scenario.sensors[place.entry] for _, place in placed]
         keys = [(node, place.ordinal) for node, place in placed]
-        self._noise = streams.generators("noise", keys)
-        self._cuts = streams.generators("cut", keys)
+        self._noise = StreamNormals(streams.seed_words("noise", keys))
+        self._cuts = StreamNormals(streams.seed_words("cut", keys))
         self._period, self._steps = (scenario.truth.sensing_period or 1.0) if placed else 1.0, steps
         n, count, runs = scenario.plant.n, len(sensors), len(streams.per_replica)
-        self._rows = [len(sensor.R) for sensor in sensors]
-        most = max(self._rows, default=0)
+        self._rows = np.array([len(sensor.R) for sensor in sensors], dtype=np.int64)
+        most = int(self._rows.max(initial=0))
         H, root = np.zeros((count, most, n)), np.zeros((count, most, most))
         for k, sensor in enumerate(sensors):
             p = self._rows[k]
@@ -163,7 +169,7 @@ class Noise:
             normals=np.zeros((runs, count, cuts, 2, most)),
             used=np.full((runs, count), cuts, dtype=np.int64),
         )
-        rows, host = np.array(self._rows, dtype=np.int64), np.array(hosts, dtype=np.int64)
+        rows, host = self._rows, np.array(hosts, dtype=np.int64)
         node = np.array(list(scenario.increment_sensors), dtype=np.int64)
         self.sensing = [
             Sensing(
@@ -183,19 +189,37 @@ class Noise:
 
     def following(self) -> None:
         """Draw the noise of the next stretch."""
-        own, count = self._own, len(self._rows)
-        for k, random in enumerate(self._noise):
-            p = self._rows[k % count]
-            own.noise[*divmod(k, count), :, :, :p] = random.standard_normal((self._steps, 2, p))
+        own, shape = self._own, self._own.noise.shape
+        every = np.arange(shape[0] * shape[1])
+        normals = own.noise.reshape(len(every), *shape[2:])
+        fill_sensor_normals(self._noise.states, every, self._rows, normal_ziggurat(), normals)
         own.noise[:] = step_noise(own.noise, self._period)
         own.step[:] = -1
 
     def more_cuts(self, run: int) -> None:
         """Draw new normals where they are used up."""
-        used, normals = self._own.used[run], self._own.normals[run]
-        cuts = normals.shape[1]
-        for k in np.flatnonzero(used == cuts):
-            p = self._rows[k]
-            random = self._cuts[run * len(self._rows) + k]
-            normals[k, :, :, :p] = random.standard_normal((cuts, 2, p))
-            used[k] = 0
+        used, shape = self._own.used[run], self._own.normals.shape
+        empty = np.flatnonzero(used == shape[2]) + run * shape[1]
+        normals = self._own.normals.reshape(shape[0] * shape[1], *shape[2:])
+        fill_sensor_normals(self._cuts.states, empty, self._rows, normal_ziggurat(), normals)
+        used[used == shape[2]] = 0
+
+
+@kernel
+def fill_sensor_normals(
+    states: np.ndarray,
+    which: np.ndarray,
+    rows: np.ndarray,
+    ziggurat: NormalZiggurat,
+    out: FloatArray,
+) -> None:
+    """Write standard normals into ``out[k]`` (C, 2, >= p) for each k of ``which``: the next numbers
+    of stream k, which belongs to sensor k modulo S with ``rows`` (S,) p.
+    """
+    for m in range(len(which)):
+        k = which[m]
+        p = rows[k % len(rows)]
+        for c in range(out.shape[1]):
+            for half in range(2):
+                for i in range(p):
+                    out[k, c, half, i] = next_normal(states, k, ziggurat)

@@ -13,9 +13,9 @@ from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.hybrid import Hybrid
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
+from netkf.engines.compiled.batches import flow_batches
 from netkf.engines.compiled.event_loop import event_loop
-from netkf.engines.compiled.flow import FlowRun
-from netkf.engines.compiled.lots import at_a_workspace
+from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
 from netkf.linalg import compiling
@@ -80,14 +80,16 @@ class CompiledEngine(Engine):
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             if scenario.slotted:
                 return run_slots(scenario, streams, recorder, progress)
-            with at_a_workspace(scenario, streams) as (workspace, draws):
-                return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
+            workspace, draws = Workspace(scenario), Source(scenario, streams)
+            return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
 
     def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
-        """Yield the runs of consecutive replicas, of slots many side by side."""
-        if scenario.slotted and slot_setup(scenario).is_drawn:
-            with np.errstate(over="ignore", invalid="ignore"):
-                for batch in slot_batches(scenario, seed, replicas):
-                    yield with_ends(batch, partial(self.batch_of_one, scenario, seed))
-        else:
+        """Yield the runs of consecutive replicas in order."""
+        if not scenario.slotted:
+            yield from flow_batches(scenario, seed, replicas)
+        elif not slot_setup(scenario).is_drawn:
             yield from super().run_many(scenario, seed, replicas)
+        else:
+            alone = partial(super().run_many, scenario, seed)
+            for batch in slot_batches(scenario, seed, replicas):
+                yield with_ends(batch, alone)

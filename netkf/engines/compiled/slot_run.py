@@ -358,7 +358,8 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)))
     parts: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
     while not runs.over:
-        block = runs.following(0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            block = runs.following(0)
         runs.events(block, wanted=False)
         x, local = block.absolute[:, block.sampled], block.local[:, block.sampled]
         error = local[:, :, None] - block.samples.xhat
@@ -384,11 +385,11 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
     )
 
 
-def with_ends(batch: RunBatch, again: Callable[[int], RunBatch]) -> RunBatch:
-    """The batch with every run that diverges as it is alone, ``again(replica)``: it ends there."""
+def with_ends(batch: RunBatch, alone: Callable[[range], Iterator[RunBatch]]) -> RunBatch:
+    """The batch with every run that diverges as it is ``alone``, where it ends."""
     fine = np.isfinite(batch.xhat).all(axis=(1, 2, 3)) & np.isfinite(batch.P).all(axis=(1, 2, 3, 4))
     for r in np.flatnonzero(~fine).tolist():
-        one = again(batch.replicas[r])
+        (one,) = alone(batch.replicas[r : r + 1])
         for name in ("x", "xhat", "P", "error", "lengths", "counts", "status"):
             getattr(batch, name)[r] = getattr(one, name)[0]
         for name, values in batch.sums.items():

@@ -1,0 +1,53 @@
+"""Standard normal numbers of several streams at once, as arrays with the streams first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import demanded, kernel
+from netkf.rng.draws import seed_states
+from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+
+
+class Normals(Protocol):
+    """K streams of standard normal numbers."""
+
+    def draw(self, shape: tuple[int, ...]) -> FloatArray:
+        """(K, *shape) the next numbers of each stream."""
+
+
+class GeneratorNormals:
+    """The streams of numpy's generators."""
+
+    def __init__(self, randoms: Sequence[np.random.Generator]) -> None:
+        self._randoms = randoms
+
+    def draw(self, shape: tuple[int, ...]) -> FloatArray:
+        """(K, *shape) the next numbers of each generator."""
+        return np.stack([random.standard_normal(shape) for random in self._randoms])
+
+
+class StreamNormals:
+    """The same streams from their seeds ``words`` (K, 4), drawn in compiled code."""
+
+    def __init__(self, words: np.ndarray) -> None:
+        self.states = np.empty(words.shape, dtype=np.uint64)
+        demanded(seed_states)(words, self.states)
+
+    def draw(self, shape: tuple[int, ...]) -> FloatArray:
+        """(K, *shape) the next numbers of each stream."""
+        out = np.empty((len(self.states), *shape))
+        fill_normals_of_all(self.states, normal_ziggurat(), out.reshape(len(out), -1))
+        return out
+
+
+@kernel
+def fill_normals_of_all(states: np.ndarray, ziggurat: NormalZiggurat, out: FloatArray) -> None:
+    """Write the next numbers of each stream of ``states`` (K, >= 4) into its row of ``out``."""
+    for k in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            out[k, m] = next_normal(states, k, ziggurat)
