@@ -19,6 +19,7 @@ from netkf.checks.exact import (
     within_reach,
 )
 from netkf.checks.laws import exact_start
+from netkf.checks.mode_sequences import watched_places
 from netkf.checks.samples import Seen, bounded, replay
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
@@ -47,10 +48,11 @@ class Witness(NamedTuple):
 
 def witness(scenario: Scenario, run: Run) -> Witness:
     """Reduce a run whose samples are those of ``look_at``."""
-    alone = np.full(run.P.shape[1:], np.nan)
+    watched = watched_places(scenario)
+    alone = np.full(run.P[0, watched].shape, np.nan)
     if run.replica < MOST and within_reach(scenario).holds:
         silent = _silent(scenario)
-        alone = error_covariance(silent, simulate(silent, run.seed, run.replica))[-1]
+        alone = error_covariance(silent, simulate(silent, run.seed, run.replica))[-1][watched]
     return Witness(*exact(scenario, run), alone)
 
 

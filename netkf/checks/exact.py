@@ -13,6 +13,7 @@ import numpy as np
 from netkf.algorithms.registry import built_in_class, overridden
 from netkf.checks.evidence import Finding, Row, identity, left_out, rounded_away
 from netkf.checks.laws import NEES, chi_squared, worst
+from netkf.checks.mode_sequences import watched_note, watched_places
 from netkf.checks.statistics import mean_ratio, off_by
 from netkf.core.errors import TheoryError
 from netkf.core.fields import Component
@@ -32,7 +33,8 @@ SAMPLED, EXACT = 0.02, 1e-8
 
 
 class Exact(NamedTuple):
-    """What one run says at K times; nan in replicas whose exact covariances are not computed.
+    """What one run says at K times of N watched nodes; nan in replicas whose exact covariances are
+    not computed.
 
     P, e       : (K, N, n, n), (K, N, n) covariances and errors, nan where rounding blurs them
     nees       : (K, N) e' P^-1 e
@@ -51,23 +53,26 @@ class Exact(NamedTuple):
 
 
 def exact(scenario: Scenario, run: Run) -> Exact:
-    """Reduce a run."""
+    """Reduce a run; of large networks the watched nodes are kept."""
+    watched = watched_places(scenario)
     _, nees = errors(run.error, run.P)
     e = np.where(blurred(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
-    replayed = Sigma = np.full(run.P.shape, np.nan)
+    P, e, nees = run.P[:, watched], e[:, watched], nees[:, watched]
+    replayed = Sigma = np.full(P.shape, np.nan)
     whole = np.full((len(run.times), 2), np.nan)
     if run.replica < MOST and within_reach(scenario).holds:
         try:
             replayed, stacked = replayed_covariances(stand_in(scenario), run)
         except TheoryError:  # rows about them are not promised then
-            return Exact(run.P, e, nees, replayed, Sigma, whole)
+            return Exact(P, e, nees, replayed, Sigma, whole)
         Sigma = diagonal_blocks(stacked, len(scenario.nodes))
-        e = np.where(blurred(run, Sigma)[..., None], np.nan, e)
-        nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
         least = EXACT if scenario.slotted else SAMPLED
         whole = whitened(run.error, stacked, least, (BLUR * run.rounding) ** 2)
-    return Exact(run.P, e, nees, replayed, Sigma, whole)
+        replayed, Sigma = replayed[:, watched], Sigma[:, watched]
+        e = np.where(blurred(run, Sigma)[..., None], np.nan, e)
+        nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
+    return Exact(P, e, nees, replayed, Sigma, whole)
 
 
 def within_reach(scenario: Scenario) -> Row:
@@ -75,6 +80,12 @@ def within_reach(scenario: Scenario) -> Row:
     size = len(scenario.nodes) * scenario.plant.n
     words = f"{size} errors of all nodes together, at most {LARGEST}"
     return Row("exact errors are within reach", "netkf", size <= LARGEST, words)
+
+
+def all_watched(scenario: Scenario) -> Row:
+    """Whether samples of every node are kept, which promises about the whole network need."""
+    note = watched_note(scenario)
+    return Row("every node is watched", "netkf", not note, note or "samples of all nodes are kept")
 
 
 def whitened(

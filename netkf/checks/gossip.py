@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.checks.evidence import Finding, Promise, Row, identity
-from netkf.checks.exact import as_computed, exact, within_reach
+from netkf.checks.exact import all_watched, as_computed, exact, within_reach
 from netkf.checks.laws import (
     Pair,
     distances,
@@ -25,11 +25,12 @@ from netkf.checks.mode_sequences import (
     reference_size,
     start_roots,
     token_places,
+    watched_places,
 )
 from netkf.checks.samples import Seen, bounded, nees_is_chi_squared, replay
 from netkf.checks.statistics import off_by, share
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.gossip.matchings import effective_matching
@@ -53,8 +54,8 @@ class Witness(NamedTuple):
     replayed : (K, N, n, n) what G (10) makes of the run's swaps
     restarted: (N, n, n) the same at the last slot from another start
     bounds   : (K, N, n, n) what the last readings of each pair allow, whatever was before
-    places   : (K, N) where each token took its last reading; -1 where pairs were copied
-    pairs    : (N, N) number of slots in which j handed its pair to i, from slot 1 on
+    tokens   : (N, n, n) the pair of each token at the last slot; anything where pairs were copied
+    pairs    : number of slots in which j handed its pair to i, from slot 1 on, for all ``handing``
     slots    : their number
     """
 
@@ -66,7 +67,7 @@ class Witness(NamedTuple):
     replayed: FloatArray
     restarted: FloatArray
     bounds: FloatArray
-    places: np.ndarray
+    tokens: FloatArray
     pairs: np.ndarray
     slots: int
 
@@ -75,23 +76,21 @@ def witness(scenario: Scenario, run: Run) -> Witness:
     """Reduce a run whose samples are those of ``look_at``."""
     slots = list(look_at(scenario))
     came, book = handed_over(scenario, run, slots[-1]), gossip_book(scenario)
-    starts, n = start_roots(scenario), scenario.plant.n
-    replayed, bounds, places = [], [], []
+    starts, n, watched = start_roots(scenario), scenario.plant.n, watched_places(scenario)
+    replayed, bounds = [], []
     for slot in slots:
         line = lineage(came, slot)
-        replayed.append(book.along(starts[line.origin], line.path, [slot])[0])
-        recent = line.path[:, -WINDOW:]
+        origin, path = line.origin[watched], line.path[watched]
+        replayed.append(book.along(starts[origin], path, [slot])[0])
+        recent = path[:, -WINDOW:]
         everything = np.repeat(HUGE * np.eye(n)[None], len(recent), axis=0)
         bounds.append(book.along(everything, recent, [recent.shape[1]])[0])
-        token = token_places(came, slot)
-        places.append(np.full(len(starts), -1) if token is None else token)
-    restarted = book.along(FAR * starts[line.origin] + np.eye(n), line.path, [slots[-1]])[0]
-    pairs = np.zeros((len(starts), len(starts)), dtype=int)
-    for t in range(1, slots[-1]):
-        pairs[np.arange(len(starts)), came[t]] += 1
+    token = token_places(came, slots[-1])
+    held = np.full(len(starts), -1) if token is None else token
+    restarted = book.along(FAR * starts[origin] + np.eye(n), path, [slots[-1]])[0]
     seen = exact(scenario, run)
     return Witness(
-        run.P,
+        seen.P,
         seen.nees,
         seen.e,
         seen.Sigma,
@@ -99,10 +98,34 @@ def witness(scenario: Scenario, run: Run) -> Witness:
         np.array(replayed),
         restarted,
         np.array(bounds),
-        np.array(places),
-        pairs,
+        run.P[-1, held[watched]],
+        _handed(scenario, came[1 : slots[-1]]),
         slots[-1] - 1,
     )
+
+
+def handing(scenario: Scenario) -> tuple[IntArray, IntArray]:
+    """Places i and j of the pairs whose swaps are counted: all in a network without unwatched
+    nodes, else the ends of links, in both directions.
+    """
+    if len(watched_places(scenario)) == len(scenario.nodes):
+        i, j = np.nonzero(~np.eye(len(scenario.nodes), dtype=bool))
+        return i, j
+    index = scenario.topology.index
+    ends = [(index[a], index[b]) for a, b in scenario.topology.directions]
+    i, j = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+    return i, j
+
+
+def _handed(scenario: Scenario, came: np.ndarray) -> np.ndarray:
+    """Counts of the slots (rows of ``came``) in which j handed its pair to i."""
+    size = len(scenario.nodes)
+    codes, counts = np.unique(np.arange(size) * size + came, return_counts=True)
+    i, j = handing(scenario)
+    if not len(codes):
+        return np.zeros(len(i), dtype=int)
+    place = np.minimum(np.searchsorted(codes, i * size + j), len(codes) - 1)
+    return np.where(codes[place] == i * size + j, counts[place], 0)
 
 
 class Reference(NamedTuple):
@@ -159,6 +182,7 @@ def rows(scenario: Scenario) -> list[Row]:
         Row("slots are independent and Abar is known", "G II-A", known, words),
         exact_start(scenario),
         within_reach(scenario),
+        all_watched(scenario),
     ]
 
 
@@ -182,15 +206,15 @@ def walks(seen: Observed, level: float) -> Finding:
 
 def pairings(seen: Observed, level: float) -> Finding:
     """Tokens move by the mean matching; slots are independent, so counts are binomial."""
-    i, j = np.nonzero(~np.eye(len(seen.matching), dtype=bool))
+    i, j = handing(seen.scenario)
     trials, totals = int(np.sum(seen.runs.slots)), seen.runs.pairs.sum(axis=0)
     nodes = seen.scenario.nodes
     found = [
         (
-            off_by(seen.matching[a, b], share(int(totals[a, b]), trials, level / len(i))),
+            off_by(seen.matching[a, b], share(int(total), trials, level / len(i))),
             f"from node {nodes[b]} to {nodes[a]}",
         )
-        for a, b in zip(i, j, strict=True)
+        for a, b, total in zip(i.tolist(), j.tolist(), totals, strict=True)
     ]
     return worst(found, SHARE, f"largest difference from Abar over {trials:,} slots")
 
@@ -213,17 +237,17 @@ def each_sensor(seen: Observed, level: float) -> Finding:
     pairs = [
         Pair(f"slot {slot}, node {node}", seen.runs.P[:, k, i], P[k, places[:, slot - 1] == i])
         for k, slot in enumerate(look_at(seen.scenario))
-        for i, node in enumerate(seen.scenario.nodes)
+        for i, node in enumerate(seen.nodes)
     ]
     return same_laws(pairs, level)
 
 
 def tokens(seen: Observed, level: float) -> Finding:
     """Each token at the end against the stationary switched chain, which may not be there yet."""
-    runs, last, pairs = np.arange(seen.count), len(look_at(seen.scenario)) - 1, []
+    last, pairs = len(look_at(seen.scenario)) - 1, []
     everywhere, origin = seen.reference.P[last], seen.reference.places[:, 0]
-    for i, node in enumerate(seen.scenario.nodes):
-        own = seen.runs.P[runs, last, seen.runs.places[:, last, i]]
+    for i, node in enumerate(seen.nodes):
+        own = seen.runs.tokens[:, i]
         known = distances(everywhere[origin == i], everywhere)
         pairs.append(Pair(f"token {node}", own, everywhere, known))
     return same_laws(pairs, level)
@@ -233,7 +257,7 @@ def forgotten(seen: Observed, level: float) -> Finding:
     """The runs against their own swaps from a start a thousand times larger."""
     runs, (P, restarted, places) = seen.runs, seen.reference
     pairs = []
-    for i, node in enumerate(seen.scenario.nodes):
+    for i, node in enumerate(seen.nodes):
         here = places[:, -1] == i
         known = distances(P[-1, here], restarted[here])
         pairs.append(Pair(f"node {node}", runs.P[:, -1, i], runs.restarted[:, i], known))
@@ -241,7 +265,9 @@ def forgotten(seen: Observed, level: float) -> Finding:
 
 
 CHAIN = ("every exchange is a swap", "slots are independent")
-ERGODIC = (*CHAIN, "G C.1", "G S.1", "G D.1")
+LAWS = (*CHAIN, "every node is watched")
+STABLE = (*CHAIN, "G C.1", "G S.1", "G D.1")
+ERGODIC = (*LAWS, "G C.1", "G S.1", "G D.1")
 PROMISES = (
     Promise(
         "pairs are swapped first and updated after: P_n(t+1) = f_{p_n(t)}(P_n(t))",
@@ -266,13 +292,13 @@ PROMISES = (
     Promise(
         "a random sensor has the law of the switched chain, at every time",
         "G (67), Theorems 8 and 10 [i]",
-        CHAIN,
+        LAWS,
         random_sensor,
     ),
     Promise(
         "each sensor has the law of the switched chain that is there",
         "derived from G (19)",
-        CHAIN,
+        LAWS,
         each_sensor,
     ),
     Promise(
@@ -284,7 +310,7 @@ PROMISES = (
     Promise(
         "covariances are stochastically bounded: their laws do not grow any more",
         "G Theorem 10 [iii], (26)",
-        ERGODIC,
+        STABLE,
         bounded,
     ),
     Promise("the law in the end does not depend on the start", "G Theorem 8", ERGODIC, forgotten),

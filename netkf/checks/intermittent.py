@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,8 @@ from netkf.checks.mode_sequences import (
     peers_of,
     reference_size,
     start_roots,
+    watched_nodes,
+    watched_places,
 )
 from netkf.checks.samples import Seen, bounded, nees_is_chi_squared, replay
 from netkf.checks.statistics import (
@@ -80,13 +83,14 @@ def directions(scenario: Scenario) -> list[tuple[int, int]]:
     return [(peer, node) for node in scenario.nodes for peer in peers[node]]
 
 
+@lru_cache(maxsize=8)
 def least_roots(scenario: Scenario) -> FloatArray:
-    """(N, n, n) roots of P* of each node, with all readings that can reach it; nan where it has
-    none.
+    """(W, n, n) roots of P* of each watched node, with all readings that can reach it; nan where it
+    has none.
     """
     full, n = everything(scenario, 1), scenario.plant.n
     F, Q = scenario.slot_belief
-    roots = np.full((len(scenario.nodes), n, n), np.nan)
+    roots = np.full((len(full.words), n, n), np.nan)
     for k, letter in enumerate(full.words[:, 0].tolist()):
         p = int(full.book.letters.rows[letter])
         H, root = full.book.letters.H[letter, :p], full.book.letters.root_R[letter, :p, :p]
@@ -100,7 +104,8 @@ def least_roots(scenario: Scenario) -> FloatArray:
 def witness(scenario: Scenario, run: Run) -> Witness:
     """Reduce a run whose samples are those of ``look_at``."""
     slots = list(look_at(scenario))
-    seen, starts = arrivals(scenario, run, slots[-1]), start_roots(scenario)
+    seen = arrivals(scenario, run, slots[-1])
+    starts = start_roots(scenario)[watched_places(scenario)]
     replayed = seen.book.along(starts, seen.words, slots)
     far = FAR * starts + np.eye(scenario.plant.n)
     restarted = seen.book.along(far, seen.words, slots[-1:])[0]
@@ -111,7 +116,7 @@ def witness(scenario: Scenario, run: Run) -> Witness:
     }
     errors = exact(scenario, run)
     return Witness(
-        run.P,
+        errors.P,
         errors.nees,
         errors.e,
         errors.Sigma,
@@ -128,10 +133,8 @@ def _count(scenario: Scenario, run: Run, kind: str, sender: str, slots: int) -> 
     receiver = "peer" if sender == "node" else "node"
     rows = run.log[run.log["kind"] == CODES[kind]]
     rows = rows[scenario.slot_plant.slots_of(rows["t"]) < slots]
-    return np.array(
-        [((rows[sender] == i) & (rows[receiver] == j)).sum() for i, j in directions(scenario)],
-        dtype=int,
-    )
+    counts = Counter(zip(rows[sender].tolist(), rows[receiver].tolist(), strict=True))
+    return np.array([counts[pair] for pair in directions(scenario)], dtype=int)
 
 
 class Reference(NamedTuple):
@@ -153,8 +156,10 @@ class Observed(Seen):
         scenario, slots = self.scenario, list(look_at(self.scenario))
         starts, peers = start_roots(scenario), peers_of(scenario)
         found, again = [], []
-        samples = reference_size(scenario, len(scenario.nodes))
-        for k, node in enumerate(scenario.nodes):
+        watched = watched_places(scenario).tolist()
+        samples = reference_size(scenario, len(watched))
+        for k in watched:
+            node = scenario.nodes[k]
             random = Streams(self.seed).generator("arrivals", node)
             own = (node,) if node in scenario.placed else ()
             chances = np.array([delivered(scenario, (peer, node)) for peer in peers[node]])
@@ -207,7 +212,8 @@ def above_least(seen: Observed, level: float) -> Finding:
     """No path is below the one on which every reading arrives; that one converges to P*."""
     slots = list(look_at(seen.scenario))
     full = everything(seen.scenario, slots[-1])
-    least = full.book.along(start_roots(seen.scenario), full.words, slots)
+    starts = start_roots(seen.scenario)[watched_places(seen.scenario)]
+    least = full.book.along(starts, full.words, slots)
     size = np.trace(seen.runs.P, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
         gap = np.linalg.eigvalsh(np.nan_to_num(seen.runs.P - least, nan=-np.inf, posinf=-1e300))
@@ -255,7 +261,7 @@ def law(seen: Observed, level: float) -> Finding:
     pairs = [
         Pair(f"slot {slot}, node {node}", seen.runs.P[:, k, i], seen.reference.P[i, k])
         for k, slot in enumerate(look_at(seen.scenario))
-        for i, node in enumerate(seen.scenario.nodes)
+        for i, node in enumerate(seen.nodes)
     ]
     return same_laws(pairs, level)
 
@@ -270,22 +276,25 @@ def forgotten(seen: Observed, level: float) -> Finding:
             seen.runs.restarted[:, i],
             distances(P[i, -1], restarted[i]),
         )
-        for i, node in enumerate(seen.scenario.nodes)
+        for i, node in enumerate(seen.nodes)
     ]
     return same_laws(pairs, level)
 
 
 def listeners(scenario: Scenario) -> dict[int, ScalarLaw]:
-    """Nodes of a scalar scenario whose only reading comes over one link, with their exact laws."""
-    laws = {}
-    for node, peers in peers_of(scenario).items():
+    """Exact laws of the watched nodes (by their number among these) of a scalar scenario whose only
+    reading comes over one link.
+    """
+    laws, everyone = {}, peers_of(scenario)
+    for k, node in enumerate(watched_nodes(scenario)):
+        peers = everyone[node]
         if scenario.plant.n != 1 or node in scenario.placed or len(peers) != 1:
             continue
         model = scenario.slot_models[scenario.topology.index[peers[0]]]
         F, Q = scenario.slot_belief
         try:
             chance = delivered(scenario, (peers[0], node))
-            laws[scenario.topology.index[node]] = scalar_law(F, Q, model.H, model.R, chance)
+            laws[k] = scalar_law(F, Q, model.H, model.R, chance)
         except TheoryError:
             continue
     return laws
@@ -301,7 +310,7 @@ def cells(seen: Observed, level: float) -> Finding:
         g = known.delivery
         chances = np.append(g * (1.0 - g) ** np.arange(CELLS), (1.0 - g) ** CELLS)
         p, used = chi_square(counts, chances)
-        found.append((p, used, counts, chances, seen.scenario.nodes[k]))
+        found.append((p, used, counts, chances, seen.nodes[k]))
     p, used, counts, chances, node = min(found, key=lambda item: item[0])
     off = [
         off_by(chance, share(int(count), int(counts.sum()), level / len(chances)))
@@ -329,7 +338,7 @@ def scalar(seen: Observed, level: float) -> Finding:
     found = [
         (
             distance_to(known.cdf, seen.runs.P[:, -1, k, 0, 0], level / len(laws)),
-            f"at node {seen.scenario.nodes[k]}",
+            f"at node {seen.nodes[k]}",
         )
         for k, known in laws.items()
     ]

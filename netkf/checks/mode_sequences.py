@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.chains import Letters, advance, alphabet
-from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
+from netkf.linalg.arrays import FloatArray, IntArray, block_diagonal, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 MOST, FEWEST, BUDGET = 20_000, 4_000, 1e10
+MAX_NODES, MIN_WATCHED, MAX_WATCHED, MAX_ENTRIES = 60, 20, 50, 6400
 
 
 class Book(NamedTuple):
@@ -51,10 +52,38 @@ def look_at(scenario: Scenario) -> tuple[int, ...]:
     return tuple(sorted({min(2, last), min(5, last), max(1, last // 2), last}))
 
 
+def watched_places(scenario: Scenario) -> IntArray:
+    """(W,) places of the nodes whose samples are kept: all nodes of a small network, and in one of
+    more than MAX_NODES evenly chosen ones, fewer where covariances are large.
+    """
+    nodes, n = len(scenario.nodes), scenario.plant.n
+    if nodes <= MAX_NODES:
+        return np.arange(nodes)
+    count = int(np.clip(MAX_ENTRIES // n**2, MIN_WATCHED, MAX_WATCHED))
+    return np.round(np.linspace(0, nodes - 1, count)).astype(np.int64)
+
+
+def watched_nodes(scenario: Scenario) -> list[int]:
+    """Ids of the nodes at ``watched_places``."""
+    return [scenario.nodes[k] for k in watched_places(scenario).tolist()]
+
+
+def watched_note(scenario: Scenario) -> str:
+    """What is left out of a large network, in words; empty if nothing is."""
+    count, nodes = len(watched_places(scenario)), len(scenario.nodes)
+    if count == nodes:
+        return ""
+    return (
+        f"looked at {count} of {nodes:,} nodes, evenly chosen: samples of all are kept in networks "
+        f"of at most {MAX_NODES} nodes"
+    )
+
+
 def reference_size(scenario: Scenario, laws: int) -> int:
-    """How many chains stand for a law: fewer where a step costs more."""
+    """Number of chains that stand for a law: fewer where a step costs more."""
     step = (3 * scenario.plant.n) ** 3
-    return int(np.clip(BUDGET / (laws * look_at(scenario)[-1] * step), FEWEST, MOST))
+    budget = BUDGET if len(scenario.nodes) <= MAX_NODES else 0.1 * BUDGET
+    return int(np.clip(budget / (laws * look_at(scenario)[-1] * step), FEWEST, MOST))
 
 
 def start_roots(scenario: Scenario) -> FloatArray:
@@ -117,7 +146,7 @@ def gossip_book(scenario: Scenario) -> Book:
 
 
 class Arrivals(NamedTuple):
-    """Which readings each node used: ``words`` (N, slots) of letters of ``book``."""
+    """Which readings each watched node used: ``words`` (W, slots) of letters of ``book``."""
 
     book: Book
     words: np.ndarray
@@ -156,8 +185,9 @@ def arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
     ):
         used.setdefault((node, t), []).append(peer)
     sets: dict[tuple[int, ...], int] = {}
-    words = np.empty((len(scenario.nodes), slots), dtype=int)
-    for k, node in enumerate(scenario.nodes):
+    watched = watched_nodes(scenario)
+    words = np.empty((len(watched), slots), dtype=int)
+    for k, node in enumerate(watched):
         own = (node,) if node in scenario.placed else ()
         for t in range(slots):
             nodes = tuple(sorted((*own, *used.get((node, t), ()))))
@@ -169,8 +199,9 @@ def everything(scenario: Scenario, slots: int) -> Arrivals:
     """As if every reading had arrived."""
     peers = peers_of(scenario)
     sets: dict[tuple[int, ...], int] = {}
-    words = np.empty((len(scenario.nodes), slots), dtype=int)
-    for k, node in enumerate(scenario.nodes):
+    watched = watched_nodes(scenario)
+    words = np.empty((len(watched), slots), dtype=int)
+    for k, node in enumerate(watched):
         own = (node,) if node in scenario.placed else ()
         words[k] = sets.setdefault(tuple(sorted((*own, *peers[node]))), len(sets))
     return Arrivals(intermittent_book(scenario, list(sets)), words, list(sets))

@@ -12,6 +12,7 @@ import scipy.special
 from netkf.checks.evidence import Finding, Promise, Row, identity, rounded_away
 from netkf.checks.exact import as_computed, exact, stand_in, within_reach
 from netkf.checks.laws import exact_start, worst
+from netkf.checks.mode_sequences import watched_places
 from netkf.checks.samples import Seen, relative, replay
 from netkf.checks.statistics import Interval, mean_of, off_by
 from netkf.core.errors import TheoryError
@@ -66,7 +67,8 @@ class Observed(Seen):
         Sigma = push_sum_error_covariance(stand_in(self.scenario))
         values, vectors = np.linalg.eigh(Sigma)
         roots = vectors / np.sqrt(values)[:, None, :]
-        return np.asarray(np.einsum("iab,ria->rib", roots, self.runs.e[:, -1]))
+        kept = roots[watched_places(self.scenario)]
+        return np.asarray(np.einsum("iab,ria->rib", kept, self.runs.e[:, -1]))
 
 
 def rows(scenario: Scenario) -> list[Row]:
@@ -113,7 +115,7 @@ def settled(seen: Observed, level: float) -> Finding:
 
 def unbiased(seen: Observed, level: float) -> Finding:
     """The mean of the whitened errors at the end is 0 in all directions at once."""
-    nodes = seen.scenario.nodes
+    nodes = seen.nodes
     if not np.isfinite(seen.whitened).all():
         return rounded_away(BIAS)
     found = []
@@ -136,7 +138,7 @@ def _normal_reach(level: float, n: int) -> float:
 
 def mean_square(seen: Observed, level: float) -> Finding:
     """The mean square of the whitened errors at the end is 1 on average over directions."""
-    nodes, n = seen.scenario.nodes, seen.scenario.plant.n
+    nodes, n = seen.nodes, seen.scenario.plant.n
     if not np.isfinite(seen.whitened).all():
         return rounded_away(SQUARE)
     found = []

@@ -9,7 +9,7 @@ import numpy as np
 
 from netkf.checks.evidence import Finding, identity, left_out, rounded_away
 from netkf.checks.laws import NEES, Pair, chi_squared, not_growing
-from netkf.checks.mode_sequences import look_at
+from netkf.checks.mode_sequences import look_at, watched_nodes
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
@@ -39,6 +39,11 @@ class Seen:
         return len(self.runs.P)
 
     @property
+    def nodes(self) -> list[int]:
+        """Ids of the W nodes whose samples were kept."""
+        return watched_nodes(self.scenario)
+
+    @property
     def moments(self) -> list[str]:
         """Words for each of the K times."""
         if self.scenario.slotted:
@@ -48,7 +53,7 @@ class Seen:
     @property
     def places(self) -> list[str]:
         """Words for each of the (K, N) places, time by time."""
-        return [f"{t}, node {node}" for t in self.moments for node in self.scenario.nodes]
+        return [f"{t}, node {node}" for t in self.moments for node in self.nodes]
 
 
 def replay(seen: Seen, level: float) -> Finding:
@@ -59,7 +64,7 @@ def replay(seen: Seen, level: float) -> Finding:
     P, expected = seen.runs.P[kept], seen.runs.replayed[kept]
     apart = relative(P, expected).max(axis=(-1, -2))
     run, time, node = np.unravel_index(int(np.argmax(apart)), apart.shape)
-    place = seen.places[int(time) * len(seen.scenario.nodes) + int(node)]
+    place = seen.places[int(time) * len(seen.nodes) + int(node)]
     words = (
         f"{apart.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(kept)[run]} at {place}"
@@ -77,7 +82,7 @@ def relative(P: FloatArray, expected: FloatArray) -> FloatArray:
 def bounded(seen: Seen, level: float) -> Finding:
     """The end against half of the time."""
     P = seen.runs.P
-    nodes = enumerate(seen.scenario.nodes)
+    nodes = enumerate(seen.nodes)
     return not_growing([Pair(f"node {node}", P[:, -2, i], P[:, -1, i]) for i, node in nodes], level)
 
 

@@ -38,6 +38,7 @@ def add_parser(commands: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the command and return the exit status: 1 if a promise is broken."""
     from netkf.checks.check import check, verdict_json, verdict_text
+    from netkf.checks.mode_sequences import watched_note
 
     scenario = load_scenario(options)
     with ProgressLine() as line:
@@ -49,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
             scheduler=options.scheduler,
             progress=line.counter("runs"),
         )
-    print_notes(scenario.notes)
+    print_notes((*scenario.notes, *filter(None, [watched_note(scenario)])))
     if options.json:
         print_json(verdict_json(verdict))
     else:

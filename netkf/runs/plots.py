@@ -9,11 +9,14 @@ from typing import Any
 import matplotlib as mpl
 import networkx
 import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from netkf.linalg.arrays import FloatArray
+from netkf.network.graphs import Topology
 from netkf.runs.files import write_atomically
 from netkf.runs.labels import by_design
 from netkf.runs.run import CompletedRun
@@ -23,6 +26,7 @@ from netkf.scenario.scenario import Scenario
 SENSING, RELAY, PROMISE, DARK, EXACT = "#c1440e", "#3b6ea5", "#222222", "#555555", "#2e8b57"
 MAX_LINES = 60
 """Curves of single nodes in one panel; of larger networks an even selection is drawn."""
+MAX_LINKS, MAX_KAMADA_KAWAI, PIVOTS = 20_000, 150, 50
 MAX_LABELLED_NODES = 60
 LONGEST_LEGEND = 72
 """Characters of a legend that fit in one row."""
@@ -197,7 +201,7 @@ def _draw_network(figure: Figure, axes: Any, scenario: Scenario, completed: Comp
     axes.margins(0.08)
     axes.axis("off")
     axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.04))
-    axes.set_title(_network_title(completed.summary["messages"]), fontsize=9)
+    axes.set_title(_network_title(scenario, completed.summary["messages"]), fontsize=9)
     label = "RMS error" if scenario.plant.truth_known else "mean trace P"
     figure.colorbar(dots, ax=axes, shrink=0.5, label=label, pad=0.01)
 
@@ -206,7 +210,7 @@ def _draw_links(
     axes: Any, scenario: Scenario, positions: Positions, delivered: dict[tuple[int, int], int]
 ) -> None:
     """Draw each link as wide as the number of messages that it delivered."""
-    pairs = sorted({(min(i, j), max(i, j)) for i, j in scenario.topology.links})
+    pairs = _spread(sorted({(min(i, j), max(i, j)) for i, j in scenario.topology.links}))
     if not pairs:
         return
     counts = np.array([delivered.get(pair, 0) for pair in pairs], dtype=float)
@@ -218,6 +222,13 @@ def _draw_links(
         zorder=1,
     )
     axes.add_collection(lines)
+
+
+def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return at most MAX_LINKS of the pairs, evenly chosen."""
+    if len(pairs) <= MAX_LINKS:
+        return pairs
+    return [pairs[k] for k in np.linspace(0, len(pairs) - 1, MAX_LINKS).astype(int).tolist()]
 
 
 def _draw_nodes(
@@ -248,24 +259,46 @@ def _draw_nodes(
     return dots
 
 
-def _network_title(messages: dict[str, Any]) -> str:
+def _network_title(scenario: Scenario, messages: dict[str, Any]) -> str:
     sent = f"{messages['sent']:,} messages"
     if messages["transmissions"] < messages["sent"]:
         sent += f" in {messages['transmissions']:,} transmissions"
-    return f"links as wide as they delivered; {sent}, {messages['lost']:,} lost"
+    links = "links" if len(scenario.topology.links) <= MAX_LINKS else f"{MAX_LINKS:,} links"
+    return f"{links} as wide as they delivered; {sent}, {messages['lost']:,} lost"
 
 
 def _layout(scenario: Scenario) -> Positions:
     """Return positions of the nodes for a topology that has none of its own."""
     topology = scenario.topology
+    if len(topology.nodes) > MAX_KAMADA_KAWAI:  # it needs the paths between all pairs of nodes
+        return _pivot_layout(topology)
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(topology.nodes)  # in their order, which is that around a circle
     graph.add_edges_from(topology.links)
     degrees = set(topology.degrees.values())
     if len(topology.nodes) <= 30 and degrees <= {0, 2}:
         placed: dict[int, Any] = networkx.circular_layout(graph)
-    elif len(topology.nodes) <= 150:
+    else:
         placed = networkx.kamada_kawai_layout(graph)
-    else:  # Kamada-Kawai needs all shortest paths, too slow for large graphs
-        placed = networkx.spring_layout(graph, seed=0, iterations=30)
     return {node: (float(x), float(y)) for node, (x, y) in placed.items()}
+
+
+def _pivot_layout(topology: Topology) -> Positions:
+    """Return the two principal axes of the distances to a few nodes (Pivot MDS: Brandes and Pich,
+    Graph Drawing 2006), which takes one search of the network per pivot.
+    """
+    ends = np.array([(topology.index[i], topology.index[j]) for i, j in topology.links])
+    size, (rows, columns) = len(topology.nodes), ends.reshape(-1, 2).T
+    adjacency = scipy.sparse.csr_array((np.ones(len(ends)), (rows, columns)), shape=(size, size))
+    pivots = np.linspace(0, size - 1, PIVOTS).astype(int)
+    distances = scipy.sparse.csgraph.dijkstra(
+        adjacency, directed=False, unweighted=True, indices=pivots
+    )
+    reached = np.isfinite(distances)
+    distances[~reached] = 1.5 * max(float(distances[reached].max()), 1.0)
+    squares = distances.T**2
+    centred = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    xy = centred @ axes[:, :-3:-1]
+    xy = xy / max(float(np.abs(xy).max()), 1e-300)
+    return {node: (float(x), float(y)) for node, (x, y) in zip(topology.nodes, xy, strict=True)}

@@ -12,7 +12,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import finite
 from netkf.runs.labels import limit_words, mismatch_words, without_delay
-from netkf.runs.tables import MAX_NODES, number, shorten, table
+from netkf.runs.tables import MAX_NODES, number, table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
@@ -137,9 +137,21 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
 
 
 def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
+    """A row per node; of large networks the nodes with the smallest, middle and largest bounds."""
     rows = [
         [str(node), *(number(c["trace"][k] if c["trace"] else None) for c in columns)]
         for k, node in enumerate(scenario.nodes)
     ]
     header = ["node", f"at {scenario.horizon:g} s", "steady state"]
-    return table(header, shorten(rows, MAX_NODES))
+    if len(rows) <= MAX_NODES:
+        return table(header, rows)
+    traces = [c["trace"] for c in columns if c["trace"]]
+    sizes = np.nan_to_num(np.array(traces[-1], dtype=np.float64), nan=np.inf)
+    order, third = np.argsort(sizes, kind="stable"), MAX_NODES // 3
+    middle = (len(order) - third) // 2
+    shown = [*order[:third], *order[middle : middle + third], *order[-third:]]
+    line = (
+        f"the {third} nodes with the smallest, the middle and the largest bound of "
+        f"{len(rows):,}; --json has all"
+    )
+    return "\n".join([line, table(header, [rows[k] for k in shown])])

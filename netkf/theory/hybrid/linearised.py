@@ -2,8 +2,9 @@
 
 Few unknowns are eliminated, and many if the network has small cuts (rings, rows, narrow grids).
 In other networks the fill-in is large (1000 nodes of a random graph would take minutes): GMRES
-solves for many unknowns, preconditioned by each node's own block, and elimination only if GMRES
-does not converge.
+solves for many unknowns, preconditioned by each node's own block and by that of all nodes together
+(fast links make all nodes change together, slowly), and elimination only if GMRES does not
+converge.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray 
     blocks = linear.blocks
     try:
         inverse = np.linalg.inv(blocks)
+        coarse = np.linalg.inv(linear.mean_map())
     except np.linalg.LinAlgError:
         return None
 
@@ -53,8 +55,12 @@ def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray 
         X = x.reshape(right.shape)
         return np.asarray(np.einsum("ik,ikl->il", X, blocks) + linear.arriving(X)).reshape(-1)
 
-    def precondition(x: FloatArray) -> FloatArray:
+    def solve_alone(x: FloatArray) -> FloatArray:
         return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)
+
+    def precondition(x: FloatArray) -> FloatArray:
+        together = np.tile(x.reshape(right.shape).mean(axis=0) @ coarse, len(right))
+        return together + solve_alone(x - apply(together))
 
     shape = (right.size, right.size)
     operator = scipy.sparse.linalg.LinearOperator(shape, matvec=apply, dtype=np.float64)

@@ -213,6 +213,14 @@ class LinearisedRiccati(NamedTuple):
             total += rates @ (each @ maps[0] if len(maps) == 1 else (each[:, None] @ maps)[:, 0])
         return total
 
+    def mean_map(self) -> FloatArray:
+        """(m, m): what becomes of the mean over the nodes of rows that are equal everywhere."""
+        total = self.blocks.mean(axis=0)
+        for rates, _, maps in self.heard:
+            share = np.asarray(rates.sum(axis=0)).reshape(-1) / len(self.blocks)
+            total += share.sum() * maps[0] if len(maps) == 1 else np.tensordot(share, maps, 1)
+        return np.asarray(total)
+
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
         """Return the operator as a sparse matrix (N m, N m), without the arrivals if not wanted."""
         size, m, _ = self.blocks.shape

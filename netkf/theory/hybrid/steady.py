@@ -9,6 +9,8 @@ than the time in which H(12) grows, and P exceeds every bound.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
@@ -40,6 +42,12 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     there is none, with the threshold that the link rates would have to reach, and if H(12) does not
     apply.
     """
+    return _steady_bound(scenario).copy()
+
+
+@lru_cache(maxsize=8)
+def _steady_bound(scenario: Scenario) -> FloatArray:
+    """Kept, because several promises are about it."""
     equations = coupled_riccati(scenario)
     P = steady_state(equations)
     if P is None:
