@@ -42,7 +42,8 @@ def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
 def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray | None:
     """Return the solution by GMRES with rounds of iterative refinement, None if it diverges.
 
-    The preconditioner inverts each node's own block.
+    The preconditioner solves for a change that all nodes share, and then inverts each node's own
+    block.
     """
     blocks = linear.blocks
     try:
