@@ -6,6 +6,7 @@ layout of numba's own array structure (tests/linalg/test_structs.py).
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import numpy as np
@@ -38,12 +39,9 @@ class StructType(types.Type):
 
     def __init__(self, name: str, fields: tuple[tuple[str, int, Any], ...]) -> None:
         self.fields = fields
-        super().__init__(name)
-
-    @property
-    def key(self) -> Any:
-        """What makes two types equal."""
-        return self.name, self.fields
+        # numba hashes types at every call: a text knows its hash, a tree of types does not.
+        layout = hashlib.sha256(str(fields).encode()).hexdigest()[:16]
+        super().__init__(f"{name}.{layout}")
 
     def field(self, name: str) -> tuple[int, Any]:
         """Offset and type of a field."""
