@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
     from netkf.runs.run import save
     from netkf.runs.simulate import simulate
+    from netkf.scenario.model import Belief, Filtering, Network
     from netkf.scenario.reading import load
-    from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
+    from netkf.scenario.scenario import Scenario
     from netkf.studies.compare import compare
     from netkf.studies.consistency import consistency
     from netkf.studies.size import size
@@ -23,10 +24,10 @@ if TYPE_CHECKING:
     from netkf.trace.run import Run, first_difference
 
 _WHERE = {
-    "Belief": "netkf.scenario.scenario",
+    "Belief": "netkf.scenario.model",
     "Ensemble": "netkf.ensembles.monte_carlo",
-    "Filtering": "netkf.scenario.scenario",
-    "Network": "netkf.scenario.scenario",
+    "Filtering": "netkf.scenario.model",
+    "Network": "netkf.scenario.model",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
     "compare": "netkf.studies.compare",

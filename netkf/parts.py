@@ -34,10 +34,8 @@ from netkf.core.fields import (
     number,
     positive,
     probability,
+    setting,
     vector,
-)
-from netkf.core.fields import (
-    field as setting,
 )
 from netkf.network.channels import (
     Bernoulli,
@@ -83,8 +81,9 @@ from netkf.plants.recorded import (
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
-from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
+from netkf.scenario.scenario import Scenario
 
 SlotLocal, SlotCentral = Local, Central
 """Their former names in slots."""

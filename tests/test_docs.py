@@ -8,9 +8,10 @@ import pytest
 
 import netkf
 from netkf.cli.main import make_parser
+from netkf.scenario.model import Belief
 from netkf.scenario.reading import from_table
 from netkf.scenario.registry import KINDS
-from netkf.scenario.scenario import Belief, Scenario
+from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT_COLUMNS
 from tests.conftest import ROOT, SCENARIOS
 

@@ -62,6 +62,10 @@ def field(rule: Rule, default: Any = MISSING) -> Any:
     )
 
 
+setting = field
+"""The public name of ``field``: classes of users import it from netkf.parts."""
+
+
 @dataclass(frozen=True, eq=False)
 class Component:
     """Base class of everything that a scenario is made of: an immutable set of checked fields.

@@ -19,8 +19,8 @@ import pyarrow.parquet as pq
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.plugins import module_files
-from netkf.scenario.reading import source_files
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolved, to_toml
 from netkf.trace.recorder import Sink
 from netkf.trace.run import event_columns, state_table

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from netkf.algorithms.kernels.gains import longest_interval
@@ -16,20 +14,18 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.combination import check_invertible, check_regressor, check_weights
 from netkf.scenario.compatibility import check_activation, check_readings, check_time
+from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import spoken
 from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.shapes import demand_shape
-
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
 
 MOST_SAMPLES = 10_000_000
 MOST_STEPS = 100_000_000
 MOST_TICKS = 1e9
 
 
-def check(scenario: Scenario) -> None:
+def check(scenario: DerivedScenario) -> None:
     """Everything that no single part can know."""
     _times(scenario)
     _plant(scenario)
@@ -47,7 +43,7 @@ def check(scenario: Scenario) -> None:
     scenario.hosted.check_scenario(scenario)
 
 
-def _times(scenario: Scenario) -> None:
+def _times(scenario: DerivedScenario) -> None:
     probe, horizon = scenario.probe, scenario.horizon
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
@@ -74,7 +70,7 @@ def _times(scenario: Scenario) -> None:
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
 
 
-def _plant(scenario: Scenario) -> None:
+def _plant(scenario: DerivedScenario) -> None:
     plant, n = scenario.plant, scenario.plant.n
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
@@ -88,7 +84,7 @@ def _plant(scenario: Scenario) -> None:
         demand_shape("plant.cov", plant.cov, (n, n), why)
 
 
-def _sensors(scenario: Scenario) -> None:
+def _sensors(scenario: DerivedScenario) -> None:
     n, known = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
@@ -121,7 +117,7 @@ def _ids(nodes: tuple[int, ...]) -> str:
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
-def _network(scenario: Scenario) -> None:
+def _network(scenario: DerivedScenario) -> None:
     network, topology = scenario.network, scenario.topology
     algorithm = scenario.hosted
     for key, part in (
@@ -166,7 +162,7 @@ def _network(scenario: Scenario) -> None:
         )
 
 
-def _ticks(scenario: Scenario) -> None:
+def _ticks(scenario: DerivedScenario) -> None:
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     what = clock.at.removesuffix("s")
@@ -181,7 +177,7 @@ def _ticks(scenario: Scenario) -> None:
             )
 
 
-def _filter(scenario: Scenario) -> None:
+def _filter(scenario: DerivedScenario) -> None:
     filtering, n = scenario.filter, scenario.plant.n
     why = f"the state has {n} components"
     for key, value, shape in (
@@ -227,7 +223,7 @@ def _filter(scenario: Scenario) -> None:
     _degrees(scenario)
 
 
-def _believed_noise(scenario: Scenario) -> None:
+def _believed_noise(scenario: DerivedScenario) -> None:
     R, sensors = scenario.filter.model.R, scenario.sensors
     if R is None:
         return
@@ -246,7 +242,7 @@ def _believed_noise(scenario: Scenario) -> None:
         demand_shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
 
 
-def _degrees(scenario: Scenario) -> None:
+def _degrees(scenario: DerivedScenario) -> None:
     algorithm = scenario.filter.algorithm
     if not algorithm.talks or not scenario.topology.links:
         return
@@ -260,7 +256,7 @@ def _degrees(scenario: Scenario) -> None:
         )
 
 
-def _sensing_period(scenario: Scenario) -> None:
+def _sensing_period(scenario: DerivedScenario) -> None:
     period, horizon = scenario.truth.sensing_period, scenario.horizon
     assert period is not None
     if horizon / period > MOST_STEPS:
@@ -298,11 +294,11 @@ def _sensing_period(scenario: Scenario) -> None:
     )
 
 
-def _longest(scenario: Scenario, model: FlowModel) -> float:
+def _longest(scenario: DerivedScenario, model: FlowModel) -> float:
     return longest_interval(*scenario.belief, model.H, model.R)
 
 
-def _slots(scenario: Scenario) -> None:
+def _slots(scenario: DerivedScenario) -> None:
     plant, algorithm = scenario.slot_plant, scenario.hosted
     off = [
         t

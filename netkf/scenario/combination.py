@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.plants.regressors import RegressorSensor
+from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.registry import spoken
 from netkf.scenario.shapes import demand_shape
 
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
 
-
-def check_regressor(scenario: Scenario, key: str, sensor: RegressorSensor) -> None:
+def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:
     """Raise ScenarioError where the matrices of a regressor do not fit, or time is continuous."""
     if not scenario.slotted:
         raise ScenarioError(
@@ -35,7 +31,7 @@ def check_regressor(scenario: Scenario, key: str, sensor: RegressorSensor) -> No
     demand_shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
 
 
-def check_weights(scenario: Scenario) -> None:
+def check_weights(scenario: DerivedScenario) -> None:
     """Raise ScenarioError where weights given pair by pair do not fit nodes and links."""
     given, nodes = scenario.hosted.pair_weights, scenario.nodes
     if given is None:
@@ -53,7 +49,7 @@ def check_weights(scenario: Scenario) -> None:
             )
 
 
-def check_invertible(scenario: Scenario) -> None:
+def check_invertible(scenario: DerivedScenario) -> None:
     """Raise ScenarioError where a covariance may become singular: unless noise reaches every state,
     or none starts so and no state is forgotten at once.
     """

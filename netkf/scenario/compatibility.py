@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import SlotActivation
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.model import takes_samples
 from netkf.scenario.registry import spoken, time_words
-from netkf.scenario.sampling import samples
-
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
 
 SAMPLING = 'sampling = { kind = "periodic", period = ... }'
 
 
-def check_time(scenario: Scenario) -> None:
+def check_time(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if the filter or the activation belongs to the other kind of time."""
     given, hosted, slotted = scenario.filter.algorithm, scenario.hosted, scenario.slotted
     name = spoken(given)
@@ -35,7 +31,7 @@ def check_time(scenario: Scenario) -> None:
         raise ScenarioError("network.activation.kind", time_words(slotted), kind, remedy)
 
 
-def check_activation(scenario: Scenario) -> None:
+def check_activation(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if the filter cannot run under the clocks, or these not on the graph."""
     clock, hosted, topology = scenario.network.activation, scenario.hosted, scenario.topology
     if not isinstance(clock, LinkClock) or not hosted.talks:
@@ -51,7 +47,7 @@ def check_activation(scenario: Scenario) -> None:
         )
     if clock.at not in hosted.clocks:
         _wrong_at(clock.at, hosted.clocks, name)
-    if clock.at == "readings" and not any(map(samples, scenario.sensors)):
+    if clock.at == "readings" and not any(map(takes_samples, scenario.sensors)):
         raise ScenarioError(
             "network.activation.kind",
             "needs a sensor that takes samples, and there is none",
@@ -69,17 +65,17 @@ def _wrong_at(at: str, clocks: tuple[str, ...], name: str) -> None:
     raise ScenarioError(f"network.activation.{key}", words, at, "write that, or change the filter")
 
 
-def check_readings(scenario: Scenario) -> None:
+def check_readings(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if the filter cannot use the readings of a sensor."""
     if not scenario.slotted:
         for k, sensor in enumerate(scenario.sensors):
             _readings(scenario, f"sensors[{k}]", sensor)
 
 
-def _readings(scenario: Scenario, key: str, sensor: Sensor) -> None:
+def _readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
     algorithm, hosted = scenario.filter.algorithm, scenario.hosted
     name = spoken(algorithm)
-    if isinstance(algorithm, FlowFilter) and samples(sensor):
+    if isinstance(algorithm, FlowFilter) and takes_samples(sensor):
         raise ScenarioError(
             f"{key}.sampling" if isinstance(sensor, LinearSensor) else f"{key}.kind",
             f"must be continuous for the {name} filter, a FlowFilter, which takes no samples",
@@ -93,7 +89,7 @@ def _readings(scenario: Scenario, key: str, sensor: Sensor) -> None:
             None,
             "leave out the columns phi0, ..., or use another filter",
         )
-    if hosted.needs_samples and not samples(sensor):
+    if hosted.needs_samples and not takes_samples(sensor):
         raise ScenarioError(
             f"{key}.sampling",
             f"is missing, and the {name} filter uses samples, no continuous increments",

@@ -1,44 +1,32 @@
-"""TOML to scenario: every mistake is found here, with the path of its key."""
+"""Scenario files: TOML text to a checked scenario."""
 
 from __future__ import annotations
 
-import dataclasses
 import tomllib
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from netkf.core.errors import ScenarioError, nearest
-from netkf.core.fields import Component, SourceFile, integer, source_file
-from netkf.network.channels import Channel
-from netkf.scenario.plugins import blame, in_words, is_ours
-from netkf.scenario.registry import SLOTTED, find
-from netkf.scenario.scenario import Belief, Filtering, Network, Scenario
-from netkf.scenario.writing import as_table
-
-FORMAT = 1
-UNKNOWN = "is not a key here"
-TABLES = ("plant", "network", "filter")
+from netkf.core.errors import ScenarioError
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.tables import build_scenario, explain_left_over, with_changes
 
 
 def load(path: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
-    """The scenario of a file, with some keys changed. Raises ScenarioError with one line."""
+    """Return the scenario of a file, with some keys changed.
+
+    Raises ScenarioError with one line for the first mistake.
+    """
     path = Path(path)
     try:
         return from_table(with_changes(_parsed(path), changes or {}), path.parent)
     except ScenarioError as error:
-        raise _left_over(error, changes or {}).in_file(str(path)) from None
+        raise explain_left_over(error, changes or {}).in_file(str(path)) from None
 
 
-def _left_over(error: ScenarioError, changes: Mapping[str, Any]) -> ScenarioError:
-    """The mistake in other words where a change of kind left keys of the former kind behind."""
-    table = error.key.rpartition(".")[0]
-    if error.rule != UNKNOWN or f"{table}.kind" not in changes or error.key in changes:
-        return error
-    rule = f"is left over from the former kind of {table}"
-    remedy = f"set the whole table, --set '{table}={{ kind = \"...\", ... }}'"
-    return ScenarioError(error.key, rule, error.value, remedy, error.file)
+def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
+    """Return a scenario from the tables of a file that lies in ``folder``."""
+    return build_scenario(Scenario, table, folder)
 
 
 def _parsed(path: Path) -> dict[str, Any]:
@@ -55,193 +43,3 @@ def _parsed(path: Path) -> dict[str, Any]:
     except ValueError as error:  # TOMLDecodeError among them
         words = f"is not valid TOML: {' '.join(str(error).split())[:120]}"
         raise ScenarioError("", words, None, "mend that line") from None
-
-
-def changed(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
-    """The scenario with some keys changed, see Scenario.replace."""
-    folder = getattr(scenario, "_folder", None)
-    if folder is None:  # built in Python
-        folder = next((s.folder for s in source_files(scenario)), Path.cwd())
-    try:
-        return from_table(with_changes(as_table(scenario), changes), folder)
-    except ScenarioError as error:
-        raise _left_over(error, changes) from None
-
-
-def source_files(part: Any) -> list[SourceFile]:
-    """Every file that a scenario names."""
-    if isinstance(part, SourceFile):
-        return [part]
-    if isinstance(part, tuple):
-        return [source for item in part for source in source_files(item)]
-    if isinstance(part, Component):
-        values = [getattr(part, field.name) for field in dataclasses.fields(part)]
-        return [source for value in values for source in source_files(value)]
-    return []
-
-
-def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of the table with the values at some key paths replaced or added."""
-    for path, value in changes.items():
-        keys = path.replace("[", ".").replace("]", "").split(".")
-        table = _set(table, keys, value, path)
-    return table
-
-
-def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
-    if not keys:
-        return value
-    key, rest = keys[0], keys[1:]
-    if isinstance(node, (list, tuple)):
-        if not key.isdecimal() or int(key) >= len(node):
-            raise ScenarioError(
-                path, f"has no entry {key!r} in a list of {len(node)}", None, "count from 0"
-            )
-        place = int(key)
-        return [*node[:place], _set(node[place], rest, value, path), *node[place + 1 :]]
-    if node is None:
-        node = {}
-    if not isinstance(node, dict) or not key:
-        raise ScenarioError(path, "is not a key path of a scenario", None, "see the file's keys")
-    return {**node, key: _set(node.get(key), rest, value, path)}
-
-
-def from_table(table: Mapping[str, Any], folder: Path) -> Scenario:
-    """A scenario from the tables of a file that lies in ``folder``."""
-    table = dict(table)
-    version = table.pop("format", None)
-    if version is None:
-        raise ScenarioError("format", "is missing", None, f"write format = {FORMAT} first")
-    if integer()("format", version) != FORMAT:
-        raise ScenarioError("format", f"must be {FORMAT}", version, "this netkf reads no other")
-    table.setdefault("sensors", [])
-    time = ""
-    if "plant" in table:
-        table["plant"] = _under("plant", lambda value: _plant(value, folder), table["plant"])
-        time = "slot " if isinstance(table["plant"], SLOTTED) else ""
-    readers: dict[str, Callable[[Any], Any]] = {
-        "sensors": lambda value: _list(value, folder),
-        "network": lambda value: _network(value, folder, time),
-        "filter": lambda value: _filtering(value, folder),
-    }
-    for key, reader in readers.items():
-        if key in table:
-            table[key] = _under(key, reader, table[key])
-    scenario: Scenario = _part(Scenario, table, folder, ("format",))
-    object.__setattr__(scenario, "_folder", folder)  # where replace looks files and modules up
-    return scenario
-
-
-def _under(key: str, reader: Any, value: Any) -> Any:
-    try:
-        return reader(value)
-    except ScenarioError as error:
-        raise error.under(key) from None
-
-
-def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str, ...] = ()) -> Any:
-    """``others`` are keys that stand in the same table and are read elsewhere."""
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    for key, value in table.items():
-        if key not in fields:
-            known = ", ".join([*others, *fields])
-            hint = nearest(key, [*others, *fields])
-            raise ScenarioError(key, UNKNOWN, value, f"{hint}keys are {known}")
-    for name, field in fields.items():
-        if field.default is dataclasses.MISSING and name not in table:
-            remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
-            raise ScenarioError(name, "is missing", None, remedy)
-    values = {
-        name: SourceFile(value, folder)
-        if fields[name].metadata.get("rule") is source_file and isinstance(value, str)
-        else value
-        for name, value in table.items()
-    }
-    return _made(cls, values)
-
-
-def _made(cls: type[Any], values: dict[str, Any]) -> Any:
-    try:
-        return cls(**values)
-    except ScenarioError:
-        raise
-    except Exception as error:
-        # A class of the user's failed, this one or one that the scenario asked.
-        words = f"{cls.__name__} could not be made ({in_words(error)})"
-        if is_ours(cls):
-            words = blame(tuple(values.values()), error) or ""
-        if not words:
-            raise
-        raise ScenarioError("", words, None, "mend the class or its settings") from error
-
-
-def _plant(value: Any, folder: Path) -> Any:
-    table = _table(value)
-    known = table.get("kind") in ("recorded", "unknown")
-    continuous = known and ("A" in table or "B" in table)
-    return _kind("continuous plant" if continuous else "plant", folder, table)
-
-
-def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:
-    table = _table(value)
-    kind = table.pop("kind", default)
-    if kind is None:
-        raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
-    others = ("kind", "mean", "cov", "model") if family == "filter" else ("kind",)
-    return _part(find(family, kind, folder), table, folder, others)
-
-
-def _table(value: Any) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ScenarioError("", "must be a table", value, "write key = value pairs")
-    return dict(value)
-
-
-def _list(value: Any, folder: Path) -> tuple[Any, ...]:
-    if not isinstance(value, (list, tuple)):
-        raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
-    return tuple(
-        _under(f"[{k}]", lambda item: _sensor(item, folder), item) for k, item in enumerate(value)
-    )
-
-
-def _sensor(value: Any, folder: Path) -> Any:
-    table = _table(value)
-    if isinstance(table.get("sampling"), Mapping):
-        read = partial(_kind, "sampling", folder)
-        table["sampling"] = _under("sampling", read, table["sampling"])
-    return _kind("sensor", folder, table, "linear")
-
-
-def _network(value: Any, folder: Path, time: str) -> Network:
-    table = _table(value)
-    for key, family in (("graph", "graph"), ("activation", f"{time}activation")):
-        if key in table:
-            table[key] = _under(key, partial(_kind, family, folder), table[key])
-    if "channel" in table:
-        table["channel"] = _under("channel", lambda v: _channel(v, folder), table["channel"])
-    network: Network = _part(Network, table, folder)
-    return network
-
-
-def _channel(value: Any, folder: Path) -> Channel:
-    table = _table(value)
-    for family in ("loss", "delay"):
-        if family in table:
-            table[family] = _under(family, partial(_kind, family, folder), table[family])
-    channel: Channel = _part(Channel, table, folder)
-    return channel
-
-
-def _filtering(value: Any, folder: Path) -> Filtering:
-    table = _table(value)
-    shared: dict[str, Any] = {
-        key: table.pop(key) for key in ("mean", "cov", "model") if key in table
-    }
-    if "model" in shared:
-        shared["model"] = _under(
-            "model", lambda v: _part(Belief, _table(v), folder), shared["model"]
-        )
-    algorithm = _kind("filter", folder, table)
-    filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, folder)
-    return filtering

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,13 +11,11 @@ from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
 from netkf.plants.truth import TOLERANCE
 from netkf.rng.streams import Streams
+from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.sampling import all_sample_times, sample_times
 
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
 
-
-def check_records(scenario: Scenario) -> None:
+def check_records(scenario: DerivedScenario) -> None:
     """Raise ScenarioError where a table does not fit, or a run would look for a row in vain."""
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
@@ -45,7 +42,7 @@ def _under(key: str, check: Callable[[], None]) -> None:
         raise error.under(key) from None
 
 
-def _readings(scenario: Scenario, key: str, sensor: RecordedSensor) -> None:
+def _readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> None:
     for node in sensor.listed:
         if node not in scenario.topology.index:
             words = f"{sensor.path.name} names a node that the graph does not have"
@@ -54,7 +51,7 @@ def _readings(scenario: Scenario, key: str, sensor: RecordedSensor) -> None:
         _under(key, lambda: sensor.demand(scenario.slot_plant.period))
 
 
-def sensed_slots(scenario: Scenario) -> range:
+def sensed_slots(scenario: DerivedScenario) -> range:
     """The slots in which a run hands readings to its filters."""
     plant, algorithm = scenario.slot_plant, scenario.hosted
     end = max(int(scenario.horizon / plant.period) - 1, 0)
@@ -65,7 +62,7 @@ def sensed_slots(scenario: Scenario) -> range:
     return range(1, end + (end in scenario.slots))
 
 
-def _exchanges(scenario: Scenario) -> None:
+def _exchanges(scenario: DerivedScenario) -> None:
     activation, algorithm = scenario.network.activation, scenario.hosted
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
@@ -82,12 +79,12 @@ def _exchanges(scenario: Scenario) -> None:
             )
 
 
-def exchange_slots(scenario: Scenario) -> range:
+def exchange_slots(scenario: DerivedScenario) -> range:
     """The slots in which nodes exchange."""
     return range(scenario.hosted.first_slot, sensed_slots(scenario).stop)
 
 
-def used_states(scenario: Scenario) -> tuple[str, int, int] | None:
+def used_states(scenario: DerivedScenario) -> tuple[str, int, int] | None:
     """File, rows and used rows of recorded states; None if the states are not recorded."""
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion):
@@ -97,7 +94,7 @@ def used_states(scenario: Scenario) -> tuple[str, int, int] | None:
     return plant.path.name, len(plant.table), len(_wanted(scenario) & plant.table.keys())
 
 
-def _used_rows(scenario: Scenario, plant: RecordedDiffusion) -> int:
+def _used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
     """Rows at probe times, and at the sample times of sensors that are drawn, in replica 0."""
     times = [scenario.times]
     if any(sensor.is_random for sensor in scenario.sensors):
@@ -109,13 +106,13 @@ def _used_rows(scenario: Scenario, plant: RecordedDiffusion) -> int:
     )
 
 
-def _wanted(scenario: Scenario) -> set[int]:
+def _wanted(scenario: DerivedScenario) -> set[int]:
     """The slots in which a run needs the state."""
     drawn = any(sensor.is_random for sensor in scenario.sensors)
     return {*scenario.slots, *(sensed_slots(scenario) if drawn else ())}
 
 
-def record_notes(scenario: Scenario) -> tuple[str, ...]:
+def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:
     """One line where recorded exchanges are in slots in which nothing is exchanged."""
     activation = scenario.network.activation
     if not isinstance(activation, RecordedSlots) or not scenario.slotted:

@@ -8,56 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netkf.algorithms.filter import commutes
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
-from netkf.plants.linear import LinearPlant
-from netkf.plants.recorded import RecordedDiffusion, RecordedSensor, UnknownDiffusion
+from netkf.plants.recorded import RecordedDiffusion, RecordedSensor
 from netkf.plants.sampling import RecordedSampling, Samples
-from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.plants.transitions import frame_period, frame_slots
-from netkf.plants.truth import ContinuousTruth
+from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
-
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Placed, Scenario
+from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 
 MOST_SAMPLES = 1e9
-Places = dict[int, tuple["Placed", ...]]
 
 
-def samples(sensor: Sensor) -> bool:
-    """Whether a sensor over a diffusion samples it, else it gives increments."""
-    return isinstance(sensor, RecordedSensor) or (
-        isinstance(sensor, LinearSensor) and sensor.sampling is not None
-    )
-
-
-def _chosen(scenario: Scenario, sampled: bool) -> Places:
-    if scenario.slotted:
-        return {}
-    found = {
-        node: tuple(p for p in places if samples(scenario.sensors[p.entry]) == sampled)
-        for node, places in scenario.placed.items()
-    }
-    return {node: places for node, places in found.items() if places}
-
-
-def increment_sensors(scenario: Scenario) -> Places:
-    """The sensors of each node that give increments; empty in slots."""
-    return _chosen(scenario, False)
-
-
-def sampled_sensors(scenario: Scenario) -> Places:
-    """The sensors of each node that sample a diffusion; empty in slots."""
-    return _chosen(scenario, True)
-
-
-def sample_times(scenario: Scenario, streams: Streams) -> dict[tuple[int, int], FloatArray]:
+def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:
     """The increasing times below the horizon at which each sensor (node, ordinal) samples."""
     found = {}
     for node, place in _placed(scenario):
@@ -70,23 +35,27 @@ def sample_times(scenario: Scenario, streams: Streams) -> dict[tuple[int, int], 
     return found
 
 
-def sample_path(scenario: Scenario, streams: Streams, node: int, place: Placed) -> Samples:
+def sample_path(
+    scenario: ScenarioModel, streams: Streams, node: int, place: PlacedSensor
+) -> Samples:
     """The samples of one sensor of a node in one run."""
     sensor = scenario.sensors[place.entry]
     return sensor.samples(node, _generator(streams, node, place), scenario.horizon)
 
 
-def _placed(scenario: Scenario) -> Iterator[tuple[int, Placed]]:
+def _placed(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
     for node, places in scenario.sampled_sensors.items():
         for place in places:
             yield node, place
 
 
-def _generator(streams: Streams, node: int, place: Placed) -> Callable[[str], np.random.Generator]:
+def _generator(
+    streams: Streams, node: int, place: PlacedSensor
+) -> Callable[[str], np.random.Generator]:
     return lambda purpose: streams.generator(purpose, node, place.ordinal)
 
 
-def sample_rate(scenario: Scenario, node: int) -> float:
+def sample_rate(scenario: ScenarioModel, node: int) -> float:
     """Instants a second at which a node samples, in the long run; nan if it is not known."""
     places = scenario.sampled_sensors.get(node, ())
     if len(places) != 1:  # several may sample at one instant
@@ -101,7 +70,7 @@ def all_sample_times(times: dict[tuple[int, int], FloatArray]) -> FloatArray:
     return np.unique(np.concatenate([np.empty(0), *times.values()]))
 
 
-def uses_grid(scenario: Scenario) -> bool:
+def uses_grid(scenario: ScenarioModel) -> bool:
     """Whether the truth in continuous time is drawn on a sensing grid: where sensors give
     increments, or there are no sensors at all.
     """
@@ -109,45 +78,7 @@ def uses_grid(scenario: Scenario) -> bool:
     return drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
-def exact_errors(scenario: Scenario) -> bool:
-    """Whether errors are simulated in frames, see plants.truth: the plant is unstable, its state
-    and all readings are drawn, the filters have its A (in slots F) and commute with a shift.
-    """
-    if not scenario.is_random or not commutes(scenario.hosted):
-        return False
-    plant = scenario.plant
-    if isinstance(plant, LinearPlant):
-        same = np.array_equal(scenario.slot_belief[0], plant.F)
-        return same and frame_slots(plant.F) is not None
-    same = np.array_equal(scenario.belief[0], scenario.truth.A)
-    return same and frame_period(scenario.truth.A) is not None
-
-
-def continuous_truth(
-    scenario: Scenario,
-    streams: Streams,
-    frames: bool = False,
-    times: dict[tuple[int, int], FloatArray] | None = None,
-) -> ContinuousTruth:
-    """The truth of one run, at sample times, probe times and frame times: of increments a
-    ``DiffusionPath``, else a ``SampledTruth``, or a ``RecordedTruth``.
-
-    ``times`` are those of ``sample_times``, where they are known. Raises ScenarioError where a
-    recorded truth has no row for one of them.
-    """
-    given, plant = sample_times(scenario, streams) if times is None else times, scenario.truth
-    if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
-        demand_states(scenario, given)
-        return plant.recorded_truth
-    sampled, horizon = all_sample_times(given), scenario.horizon
-    random, probing = streams.generator("plant"), streams.generator("probe")
-    if not uses_grid(scenario):
-        return plant.sampled_truth(random, probing, sampled, scenario.times, horizon, frames)
-    sampling = streams.generator("samples") if len(sampled) else None
-    return plant.path(random, probing, scenario.times, sampling, sampled, horizon, frames)
-
-
-def demand_states(scenario: Scenario, times: dict[tuple[int, int], FloatArray]) -> None:
+def demand_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray]) -> None:
     """Raise ScenarioError where a recorded truth lacks the state at a probe time, or at the sample
     time of a sensor that is drawn.
     """
@@ -163,7 +94,7 @@ def demand_states(scenario: Scenario, times: dict[tuple[int, int], FloatArray]) 
         raise error.under("plant") from None
 
 
-def check_sampling(scenario: Scenario) -> None:
+def check_sampling(scenario: ScenarioModel) -> None:
     """Raise ScenarioError where sampled sensors, or a recorded or unknown diffusion, do not fit the
     rest of the scenario.
     """
@@ -171,7 +102,7 @@ def check_sampling(scenario: Scenario) -> None:
         key = f"sensors[{k}]"
         if isinstance(sensor, LinearSensor) and sensor.sampling is not None:
             _check_clock(scenario, key, sensor)
-        if not scenario.slotted and not scenario.plant.is_random and not samples(sensor):
+        if not scenario.slotted and not scenario.plant.is_random and not takes_samples(sensor):
             raise ScenarioError(
                 f"{key}.sampling",
                 "must be a clock, since increments of a recorded state are unknown",
@@ -188,7 +119,7 @@ def check_sampling(scenario: Scenario) -> None:
         demand_states(scenario, sample_times(scenario, Streams(scenario.seed)))
 
 
-def _check_clock(scenario: Scenario, key: str, sensor: LinearSensor) -> None:
+def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor) -> None:
     clock = sensor.sampling
     assert clock is not None
     if scenario.slotted:
@@ -227,7 +158,7 @@ def _check_clock(scenario: Scenario, key: str, sensor: LinearSensor) -> None:
             )
 
 
-def sampling_notes(scenario: Scenario) -> tuple[str, ...]:
+def sampling_notes(scenario: ScenarioModel) -> tuple[str, ...]:
     """One line for each table of readings that has none of a node of its sensor."""
     notes: list[str] = []
     for sensor in scenario.sensors:

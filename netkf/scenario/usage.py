@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor
+from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import exchange_slots, sensed_slots, used_states
-
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
 
 Use = dict[str, Any]
 OUTCOMES = {
@@ -30,7 +28,7 @@ NO_DELAY = "took no time unless lost"
 """What became of messages beyond a record of delays with ``after`` "deliver"."""
 
 
-def record_usage(scenario: Scenario, sent: Mapping[Link, int] | None) -> dict[str, Use]:
+def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> dict[str, Use]:
     """What one run to the horizon used of each table, by the key path of the part that names it.
 
     ``sent`` counts the messages of each directed link, lost ones included; None leaves out the
@@ -75,7 +73,7 @@ def _use(path: str, rows: int, unused: int) -> Use:
     return {"path": path, "rows": rows, "unused": unused}
 
 
-def _activation(scenario: Scenario) -> Use | None:
+def _activation(scenario: DerivedScenario) -> Use | None:
     activation, talks = scenario.network.activation, scenario.filter.algorithm.talks
     if isinstance(activation, RecordedClock):
         rows = activation.rows
@@ -89,7 +87,7 @@ def _activation(scenario: Scenario) -> Use | None:
     return None
 
 
-def _sensors(scenario: Scenario) -> dict[str, Use]:
+def _sensors(scenario: DerivedScenario) -> dict[str, Use]:
     """Sampling times and readings; tables are told apart by their files."""
     nodes: dict[tuple[str, Any], set[int]] = {}
     parts: dict[tuple[str, Any], tuple[str, RecordedSampling | RecordedSensor]] = {}
@@ -107,7 +105,9 @@ def _sensors(scenario: Scenario) -> dict[str, Use]:
     return {key: _times(scenario, part, nodes[table]) for table, (key, part) in parts.items()}
 
 
-def _times(scenario: Scenario, part: RecordedSampling | RecordedSensor, nodes: set[int]) -> Use:
+def _times(
+    scenario: DerivedScenario, part: RecordedSampling | RecordedSensor, nodes: set[int]
+) -> Use:
     if isinstance(part, RecordedSensor):
         listed = part.row_times
     else:

@@ -12,16 +12,17 @@ from netkf.core.fields import Component, SourceFile
 from netkf.network.graphs import RandomGraph
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
+from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.model import Filtering
 from netkf.scenario.registry import name_of
-from netkf.scenario.scenario import Filtering, Scenario
 
 
-def as_table(scenario: Scenario) -> dict[str, Any]:
+def as_table(scenario: DerivedScenario) -> dict[str, Any]:
     """The tables of a file that says what the scenario was given, defaults left out."""
     return _scenario(scenario, defaults=False)
 
 
-def resolved(scenario: Scenario) -> dict[str, Any]:
+def resolved(scenario: DerivedScenario) -> dict[str, Any]:
     """The tables of a file with every default written out; it gives the same runs."""
     network = scenario.network
     if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
@@ -42,12 +43,12 @@ def resolved(scenario: Scenario) -> dict[str, Any]:
     return _scenario(filled, defaults=True)
 
 
-def _filled(scenario: Scenario) -> Plant:
+def _filled(scenario: DerivedScenario) -> Plant:
     plant = scenario.plant if scenario.slotted else scenario.truth
     return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
 
 
-def _scenario(scenario: Scenario, defaults: bool) -> dict[str, Any]:
+def _scenario(scenario: DerivedScenario, defaults: bool) -> dict[str, Any]:
     network, table = scenario.network, _fields(scenario, defaults)
     table["plant"] = _kind("plant", scenario.plant, defaults)
     table["sensors"] = [_sensor(sensor, defaults) for sensor in scenario.sensors]

@@ -15,7 +15,8 @@ from netkf.engines.base import Engine
 from netkf.ensembles.statistics import RunValues, count_messages, run_values
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
-from netkf.scenario.scenario import Filtering, Scenario
+from netkf.scenario.model import Filtering
+from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, error_covariance, riccati_step
 from netkf.trace.schema import KINDS
 

@@ -13,7 +13,8 @@ from netkf.algorithms.filter import Exchange, Increments, Message
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel
 from netkf.linalg.arrays import FloatArray
-from netkf.testing.filters import System, check_estimate
+from netkf.testing.estimates import check_estimate
+from netkf.testing.systems import System
 from netkf.testing.trials import Trial
 from netkf.testing.watching import Watched, demand
 

@@ -1,9 +1,8 @@
-"""Whether a filter keeps its contract: what both kinds of time share."""
+"""Check that a filter keeps its contract in both kinds of time."""
 
 from __future__ import annotations
 
-import pickle
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,29 +11,15 @@ from netkf.algorithms.filter import CLOCKS, Filter, commutes
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.slot import SlotFilter
 from netkf.linalg.arrays import FloatArray
-from netkf.rng.streams import Streams
-from netkf.testing.watching import Watched, demand, difference, leaves, made
+from netkf.testing.shifts import all_trials, check_shift
+from netkf.testing.watching import Watched, demand, made
 
-SYMMETRY, SEMIDEFINITE = 1e-9, 1e-9
 MOST_LINKS = 8
 PHASES = ("predict", "sense", "exchange")
 FLAGS = (
     *("predicts", "pairwise", "one_way", "inverts", "talks", "pooled"),
     *("needs_samples", "newest_only"),
 )
-
-
-class System(NamedTuple):
-    """A small random system: dynamics M and noise Q (n, n), a sensor H (p, n), R (p, p), and the
-    law of x(0), mean (n,) and cov (n, n).
-    """
-
-    M: FloatArray
-    Q: FloatArray
-    H: FloatArray
-    R: FloatArray
-    mean: FloatArray
-    cov: FloatArray
 
 
 def check_filter(filter: Any, /, **settings: Any) -> None:
@@ -52,9 +37,6 @@ def check_filter(filter: Any, /, **settings: Any) -> None:
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    from netkf.testing.shifts import check_shift
-    from netkf.testing.trials import trials
-
     part = made(filter, (Filter, FlowFilter, SlotFilter), settings)
     hosted = adapt(part)
     watched = Watched(hosted, part, former_names(hosted))
@@ -64,7 +46,7 @@ def check_filter(filter: Any, /, **settings: Any) -> None:
         _weights(watched)
     if hosted.schedule is not None:
         _schedule(watched)
-    plain = list(trials(watched))
+    plain = list(all_trials(watched))
     for trial in plain:
         trial.run()
     if commutes(hosted):
@@ -79,86 +61,6 @@ def former_names(hosted: Filter) -> dict[str, str]:
     if isinstance(hosted, SlotAdapter):
         return {"update": "sense", "schedule": "programme", "redraws_links": "redraws"}
     return {}
-
-
-def systems(inverts: bool) -> list[System]:
-    """Of 1, 2 and 3 states with 0, 1 and 2 readings, from a certain start and from an uncertain one
-    where filters allow that.
-    """
-    random = Streams(0).generator("testing")
-    found = []
-    for n, p, certain in ((1, 1, False), (2, 1, True), (3, 0, False), (3, 2, False)):
-        noise, spread = random.normal(size=(2, n, n))
-        eye = np.eye(n)
-        found.append(
-            System(
-                M=0.8 * eye + 0.3 * random.normal(size=(n, n)) / np.sqrt(n),
-                Q=noise @ noise.T / n + 0.1 * eye,
-                H=random.normal(size=(p, n)),
-                R=np.diag(random.uniform(0.5, 1.5, p)),
-                mean=random.normal(size=n),
-                cov=np.zeros((n, n)) if certain and not inverts else spread @ spread.T + eye,
-            )
-        )
-    return found
-
-
-def check_estimate(
-    watched: Watched, state: Any, n: int, after: str
-) -> tuple[FloatArray, FloatArray | None]:
-    """``estimate`` after a method: shapes, finite; P None, or symmetric, positive semidefinite."""
-    where = f"{watched.name}.estimate after {watched.spoken(after)}"
-    pair = watched.call("estimate", state)
-    demand(isinstance(pair, tuple) and len(pair) == 2, where, "must be (xhat, P)", pair)
-    xhat = np.asarray(pair[0])
-    _check_array(where, "xhat", xhat, (n,))
-    if pair[1] is None:
-        return xhat, None
-    P = np.asarray(pair[1])
-    _check_array(where, "P", P, (n, n))
-    _check_covariance(where, P)
-    return xhat, P
-
-
-def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
-    demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
-    demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
-    remedy = "return None where the filter has no P" if name == "P" else ""
-    demand(np.isfinite(array).all(), where, f"{name} must be finite", array, remedy)
-
-
-def _check_covariance(where: str, P: FloatArray) -> None:
-    size = max(float(np.abs(P).max()), np.finfo(float).tiny)
-    skew = float(np.abs(P - P.T).max())
-    demand(
-        skew <= SYMMETRY * size,
-        where,
-        "P must be symmetric",
-        f"P - P' of up to {skew:.3g}",
-        "return 0.5 * (P + P.T)",
-    )
-    least = float(np.linalg.eigvalsh(P)[0])
-    demand(
-        least >= -SEMIDEFINITE * size,
-        where,
-        "P must be positive semidefinite",
-        f"least eigenvalue {least:.4g}",
-        "look for a sign, or for weights that sum to more than 1",
-    )
-
-
-def check_state_pickles(watched: Watched, state: Any) -> None:
-    """A state that went through pickle shows the same estimate."""
-    where = f"{watched.name}.init"
-    try:
-        copy = pickle.loads(pickle.dumps(state))
-    except Exception as error:
-        raise AssertionError(
-            f"{where}: states must be picklable; got {type(error).__name__}: {error}; make the "
-            "state a NamedTuple of arrays at the top level of a module"
-        ) from error
-    one, other = (dict(leaves(watched.part.estimate(s))) for s in (state, copy))
-    demand(difference(one, other) is None, where, "states must be themselves after pickling")
 
 
 def _class_variables(watched: Watched) -> None:

@@ -1,24 +1,45 @@
-"""Whether a filter that says so commutes with a shift of the truth."""
+"""Run all trials of a filter, and check that it commutes with a shift of the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from netkf.algorithms.adapters import SlotAdapter
 from netkf.linalg.arrays import FloatArray
-from netkf.testing.trials import Shown, Trial, trials
+from netkf.testing.clocked import ClockTrial
+from netkf.testing.slotted import SlotTrial
+from netkf.testing.systems import systems
+from netkf.testing.trials import Shown, Trial
 from netkf.testing.watching import Watched, demand
 
 SHIFT = np.array([7.0, -11.0, 5.0])
 ROUNDING = 1e-9
 
 
+def all_trials(watched: Watched, shift: FloatArray | None = None) -> Iterator[Trial]:
+    """Yield a trial of every kind that the class supports, on every system."""
+    part = watched.part
+    drawn = systems(part.inverts)
+    clocks: list[str | None] = list(part.clocks) if part.talks else [None]
+    if isinstance(part, SlotAdapter):
+        clocks = []
+    for system in drawn:
+        moved = None if shift is None else shift[: len(system.M)]
+        if part.schedule is not None:
+            yield SlotTrial(watched, system, moved)
+        for clock in clocks:
+            # What depends on the system shows under one clock as under another.
+            if clock == clocks[0] or system is drawn[-1]:
+                yield from ClockTrial.each_reading(watched, system, moved, clock)
+
+
 def check_shift(watched: Watched, plain: Sequence[Trial]) -> None:
     """Run everything again with a truth that is shifted on the way: estimates must be shifted like
     it from those of the ``plain`` runs, covariances stay what they are.
     """
-    for before, shifted in zip(plain, trials(watched.once(), SHIFT), strict=True):
+    for before, shifted in zip(plain, all_trials(watched.once(), SHIFT), strict=True):
         shifted.run()
         _compare(watched, before, shifted)
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.adapters import SlotAdapter
 from netkf.algorithms.filter import Exchange, Message, NodeInfo, Reading
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
-from netkf.testing.filters import System, check_estimate, check_state_pickles, systems
+from netkf.testing.estimates import check_estimate, check_state_pickles
+from netkf.testing.systems import System
 from netkf.testing.watching import Watched, demand
 
 CONSERVED = 1e-9
@@ -145,23 +145,3 @@ def _network(part: Any) -> tuple[range, FloatArray]:
     if given is None:
         given = np.full((count, count), part.weight(count - 1, count - 1))
     return range(count), np.asarray(given) * (1.0 - np.eye(count))
-
-
-def trials(watched: Watched, shift: FloatArray | None = None) -> Iterator[Trial]:
-    """All runs that the class says it can do, on every system."""
-    from netkf.testing.clocked import ClockTrial
-    from netkf.testing.slotted import SlotTrial
-
-    part = watched.part
-    drawn = systems(part.inverts)
-    clocks: list[str | None] = list(part.clocks) if part.talks else [None]
-    if isinstance(part, SlotAdapter):
-        clocks = []
-    for system in drawn:
-        moved = None if shift is None else shift[: len(system.M)]
-        if part.schedule is not None:
-            yield SlotTrial(watched, system, moved)
-        for clock in clocks:
-            # What depends on the system shows under one clock as under another.
-            if clock == clocks[0] or system is drawn[-1]:
-                yield from ClockTrial.each_reading(watched, system, moved, clock)

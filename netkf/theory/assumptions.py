@@ -9,7 +9,6 @@ import numpy as np
 from netkf.network.clocks import LinkClock, RecordedClock
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
-from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
 from netkf.theory.common.papers import paper_function
@@ -118,7 +117,7 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
 
 def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return a row on the times of sampled sensors, which must be Poisson or known beforehand."""
-    if not sampled_sensors(scenario):
+    if not scenario.sampled_sensors:
         return []
     name = "sensors sample by Poisson clocks or at known times"
     source = "derived, docs/poisson_samples.md"

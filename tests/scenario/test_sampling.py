@@ -114,12 +114,12 @@ def test_streams_of_samples_have_their_names(make):
 @pytest.mark.parametrize("frames", [False, True])
 def test_the_truth_is_known_at_samples_and_probes(sensors, kind, frames, make):
     scenario = make(sensors)
-    truth = sampling.continuous_truth(scenario, Streams(4), frames)
+    truth = scenario.continuous_truth(Streams(4), frames)
     assert isinstance(truth, kind)
     assert len(truth.frame_times) == (frames and 1)
-    assert sampling.exact_errors(scenario) == (sensors != [RECORDED])
+    assert scenario.exact_errors == (sensors != [RECORDED])
     sampled = sampling.all_sample_times(scenario.sample_times(Streams(4)))
-    plain = sampling.continuous_truth(scenario, Streams(4))
+    plain = scenario.continuous_truth(Streams(4), frames=False)
     k = 0
     for t in np.union1d(sampled, scenario.times).tolist():
         if k < len(truth.frame_times) and t >= truth.frame_times[k]:
@@ -142,7 +142,7 @@ def test_network_and_probes_do_not_move_the_truth_at_samples(make):
             },
         ),
     ):
-        paths = [sampling.continuous_truth(s, Streams(4)) for s in (base, other)]
+        paths = [s.continuous_truth(Streams(4), frames=False) for s in (base, other)]
         for t in sampling.all_sample_times(base.sample_times(Streams(4)))[:20]:
             np.testing.assert_array_equal(*(path.local(t) for path in paths))
 
@@ -152,7 +152,7 @@ def test_recorded_states_and_readings_over_a_diffusion(make):
     scenario = make([RECORDED, {**SAMPLED, "sampling": {"kind": "periodic", "period": 0.5}}], plant)
     assert not scenario.is_random
     assert scenario.sensing == (0, 1, 2)
-    truth = sampling.continuous_truth(scenario, Streams(4))
+    truth = scenario.continuous_truth(Streams(4), frames=False)
     assert isinstance(truth, RecordedTruth)
     np.testing.assert_array_equal(truth.absolute(3.5), [7.0, -7.0])
     assert np.isnan(truth.local(0.35)).all()  # nobody needs it: that reading is recorded
@@ -165,7 +165,7 @@ def test_recorded_states_and_readings_over_a_diffusion(make):
 
 def test_unknown_states_are_nan(make):
     scenario = make([RECORDED], {"kind": "unknown"})
-    truth = sampling.continuous_truth(scenario, Streams(4))
+    truth = scenario.continuous_truth(Streams(4), frames=False)
     local, absolute = truth.states(scenario.times)
     assert local.shape == (41, 2)
     assert np.isnan(local).all()

@@ -19,7 +19,8 @@ from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
-from netkf.scenario.scenario import Placed, Scenario
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.scenario import Scenario
 
 LEAST_CUTS, MOST_CUTS = 64, 256  # normals that a sensor has ready
 MOST_BLOCKS = 16  # of steps that are drawn at once
@@ -36,7 +37,7 @@ def blocks_to_the_end(scenario: Scenario) -> int:
     return blocks
 
 
-def increments(scenario: Scenario) -> list[tuple[int, Placed]]:
+def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
     """All increment sensors: node and place, in order."""
     found = scenario.increment_sensors.items()
     return [(node, place) for node, places in found for place in places]

@@ -10,7 +10,8 @@ from netkf.engines.compiled.state import Instants
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.sampling import Samples
 from netkf.rng.streams import Streams
-from netkf.scenario.scenario import Placed, Scenario
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.scenario import Scenario
 
 
 class SampledSensor(NamedTuple):
@@ -69,7 +70,7 @@ class SampleTables:
 
 
 def _instants(
-    scenario: Scenario, placed: list[tuple[int, Placed]], t: FloatArray, sensor: np.ndarray
+    scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
     index, pooled, n = scenario.topology.index, scenario.hosted.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)

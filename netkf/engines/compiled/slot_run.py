@@ -31,7 +31,7 @@ from netkf.engines.compiled.slot_messages import (
     draw_messages,
     make_rows,
 )
-from netkf.engines.compiled.slot_setup import PlacedSensor, SlotSetup, slot_setup
+from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
 from netkf.rng.draws import StreamBatch
@@ -121,7 +121,7 @@ class SlotRuns:
             states = StreamBatch(streams, "regressor", [(s.node, s.place.ordinal)]).states
             self._regressors.append((path, states))
         scenario, first = self._scenario, streams.per_replica[0]
-        self._recorded: list[tuple[PlacedSensor, Any]] = [
+        self._recorded: list[tuple[AssignedSensor, Any]] = [
             (s, scenario.slot_path(first, s.node, s.place)) for s in setup.recorded
         ]
 

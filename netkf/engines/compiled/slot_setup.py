@@ -26,7 +26,8 @@ from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.slot_paths import SlotSensors
 from netkf.plants.transitions import frame_slots
-from netkf.scenario.scenario import Placed, Scenario
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.scenario import Scenario
 
 _known: WeakKeyDictionary[Scenario, SlotSetup] = WeakKeyDictionary()
 
@@ -38,13 +39,13 @@ def slot_setup(scenario: Scenario) -> SlotSetup:
     return _known[scenario]
 
 
-class PlacedSensor(NamedTuple):
+class AssignedSensor(NamedTuple):
     """A sensor of ``node``: which filter reads it (``host``) and its first ``row`` there; ``root``
     (p, p) is the Cholesky factor of R as the filters believe it.
     """
 
     node: int
-    place: Placed
+    place: PlacedSensor
     host: int
     row: int
     root: FloatArray
@@ -117,13 +118,13 @@ class SlotSetup:
         self.hosts = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.hosts, dtype=np.int64)
         self.sensing = np.array(scenario.sensing, dtype=np.int64)
-        self.placed: list[PlacedSensor] = []
+        self.placed: list[AssignedSensor] = []
         for node in scenario.sensing:
             host = 0 if pooled else scenario.topology.index[node]
             for place in scenario.placed[node]:
                 R = scenario.noise(place.entry, believed=True)
                 root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
-                self.placed.append(PlacedSensor(node, place, host, int(rows[host]), root))
+                self.placed.append(AssignedSensor(node, place, host, int(rows[host]), root))
                 rows[host] += len(root)
         self.rows, self.p = rows, int(rows.max(initial=1))
         kinds = [type(scenario.sensors[s.place.entry]) for s in self.placed]

@@ -12,7 +12,8 @@ from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
 from netkf.plants.sensors import LinearSensor, SensorPath
 from netkf.rng.streams import Streams
-from netkf.scenario.scenario import Placed, Scenario
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
@@ -82,7 +83,7 @@ def _sampling(
 
 
 def increment_sensors(
-    scenario: Scenario, streams: Streams, placed: list[tuple[int, Placed]]
+    scenario: Scenario, streams: Streams, placed: list[tuple[int, PlacedSensor]]
 ) -> list[SensorPath]:
     """The readings of these increment sensors in one run."""
     paths = []

@@ -12,13 +12,12 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
+from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import (
-    increment_sensors,
     sample_path,
     sample_times,
-    sampled_sensors,
 )
-from netkf.scenario.scenario import Placed, Scenario
+from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.updates import Observation, stack_observations
 from netkf.trace.run import Run
 
@@ -33,14 +32,14 @@ def nodes_by_host(scenario: Scenario) -> list[tuple[int, ...]]:
     return [(node,) for node in scenario.nodes]
 
 
-def _observation(scenario: Scenario, sensor: Placed, H: FloatArray) -> Observation:
+def _observation(scenario: Scenario, sensor: PlacedSensor, H: FloatArray) -> Observation:
     R, true = (scenario.noise(sensor.entry, believed) for believed in (True, False))
     return Observation(H, R, np.asarray(np.linalg.cholesky(true), dtype=np.float64))
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
     """Return the continuous readings of each host; p is 0 for hosts without any."""
-    placed, n = increment_sensors(scenario), scenario.plant.n
+    placed, n = scenario.increment_sensors, scenario.plant.n
     found = []
     for nodes in nodes_by_host(scenario):
         sensors = [sensor for node in nodes for sensor in placed.get(node, ())]
@@ -81,7 +80,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservat
     Samples that one filter gets at one instant are one observation.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
-    by_node = sampled_sensors(scenario)
+    by_node = scenario.sampled_sensors
     times = sample_times(scenario, streams)
     found: dict[float, dict[int, list[Observation]]] = {}
     for host, nodes in enumerate(nodes_by_host(scenario)):

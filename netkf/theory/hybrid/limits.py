@@ -9,7 +9,6 @@ from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.scenario.registry import name_of, spoken
-from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import (
     CoupledRiccati,
@@ -40,7 +39,7 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     _require_limit(scenario)
     w = left_weights(scenario)
     G = np.tensordot(w, increment_informations(scenario), 1)
-    if not sampled_sensors(scenario):
+    if not scenario.sampled_sensors:
         return algebraic_riccati(A, Q, G)
     require_bound(scenario)
     if sample_jumps(scenario):
@@ -90,7 +89,7 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
     does not exist.
     """
     A, _ = scenario.belief
-    if sampled_sensors(scenario):
+    if scenario.sampled_sensors:
         raise TheoryError("sampled sensors: P stays random, and the errors have no known limit")
     if not np.array_equal(A, scenario.truth.A):
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
@@ -113,7 +112,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
     """
     if scenario.slotted:
         return _central_slot_covariance(scenario)
-    if sampled_sensors(scenario):
+    if scenario.sampled_sensors:
         raise TheoryError(
             "sampled sensors: the central covariance goes up and down with the samples"
         )

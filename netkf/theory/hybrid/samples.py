@@ -18,8 +18,9 @@ from netkf.network.clocks import LinkClock, Periodic
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
-from netkf.scenario.sampling import sample_path, sample_times, sampled_sensors
-from netkf.scenario.scenario import Placed, Scenario
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.sampling import sample_path, sample_times
+from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.updates import Observation, stack_observations
 
 
@@ -91,11 +92,11 @@ def has_known_times(sensor: Sensor) -> bool:
     return type(clock) is Periodic and clock.jitter == 0.0 and not isinstance(clock.phase, str)
 
 
-def randomly_sampled_sensors(scenario: Scenario) -> list[tuple[int, Placed]]:
+def randomly_sampled_sensors(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
     """Return (node, sensor) for each sampled sensor whose times are not known beforehand."""
     return [
         (node, place)
-        for node, places in sampled_sensors(scenario).items()
+        for node, places in scenario.sampled_sensors.items()
         for place in places
         if not has_known_times(scenario.sensors[place.entry])
     ]
@@ -160,7 +161,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     """Return the samples at known times below the horizon, in the order of time."""
     places = {
         (node, place.ordinal): place
-        for node, some in sampled_sensors(scenario).items()
+        for node, some in scenario.sampled_sensors.items()
         for place in some
         if has_known_times(scenario.sensors[place.entry])
     }

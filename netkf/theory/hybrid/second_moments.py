@@ -15,7 +15,6 @@ import scipy.sparse.linalg
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import Poisson
-from netkf.scenario.sampling import sampled_sensors
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.steady import steady_covariance_bound
 
@@ -31,7 +30,7 @@ def second_moment_rate(scenario: Scenario) -> float:
     channel = scenario.network.channel
     if not isinstance(scenario.network.activation, Poisson):
         raise TheoryError("the second moments of P are known for Poisson clocks only")
-    if scenario.network.activation.at != "links" or sampled_sensors(scenario):
+    if scenario.network.activation.at != "links" or scenario.sampled_sensors:
         raise TheoryError("the second moments of P are known for clocks of links and increments")
     if not channel.loss.independent or channel.delay.fixed != 0.0:
         raise TheoryError("the second moments of P are known without bursts and delays only")

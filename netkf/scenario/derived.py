@@ -1,0 +1,288 @@
+"""Functions of a scenario: the models and weights of its nodes, and the truth of one run."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from netkf.algorithms.filter import NodeInfo, commutes
+from netkf.algorithms.kernels.gains import longest_interval
+from netkf.algorithms.models import FlowModel, SlotModel
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
+from netkf.network.clocks import LinkClock
+from netkf.network.graphs import Link
+from netkf.plants.diffusion import Diffusion, default_sensing_period
+from netkf.plants.linear import LinearPlant, Readings
+from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
+from netkf.plants.sampling import Samples
+from netkf.plants.transitions import frame_period, frame_slots
+from netkf.rng.streams import Streams
+from netkf.scenario.model import PlacedSensor, ScenarioModel
+from netkf.scenario.sampling import (
+    all_sample_times,
+    demand_states,
+    sample_path,
+    sample_rate,
+    sample_times,
+    uses_grid,
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DerivedScenario(ScenarioModel):
+    """A scenario with everything that engines and theory compute from its fields."""
+
+    @cached_property
+    def slot_belief(self) -> tuple[FloatArray, FloatArray]:
+        """``F`` and ``Q`` (n, n) as the filters have them."""
+        plant, model = self.slot_plant, self.filter.model
+        return (
+            plant.F if model.F is None else model.F,
+            plant.Q if model.Q is None else model.Q,
+        )
+
+    @cached_property
+    def slot_models(self) -> tuple[SlotModel, ...]:
+        """What each node believes, in the order of ``nodes``; H of slot 0 where H is random."""
+        return tuple(
+            self._slot_model(self._stacked(self.placed.get(node, ()), believed=True))
+            for node in self.nodes
+        )
+
+    def _slot_model(self, observation: tuple[FloatArray, FloatArray]) -> SlotModel:
+        return SlotModel(*self.slot_belief, *observation, self.slot_plant.period)
+
+    @cached_property
+    def node_infos(self) -> tuple[NodeInfo, ...]:
+        """What each node may know about itself and the network, in the order of ``nodes``."""
+        information = np.zeros((self.plant.n, self.plant.n))
+        for node in self.nodes:
+            H, R = self._stacked(self.placed.get(node, ()), believed=True)
+            information = information + symmetric(H.T @ np.linalg.solve(R, H))
+        degrees, own, size = self.topology.degrees, self.own_weights, len(self.nodes)
+        receivers = dict.fromkeys(self.nodes, 0)
+        for sender, _ in self.topology.directions:
+            receivers[sender] += 1
+        delay = 0.0 if self.slotted else self.network.channel.delay.longest
+        return tuple(
+            NodeInfo(node, degrees[node], receivers[node], size, own[node], information, delay)
+            for node in self.nodes
+        )
+
+    @property
+    def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:
+        """What each node believes, in the order of ``nodes``."""
+        return self.slot_models if self.slotted else self.models
+
+    @property
+    def believed_pooled_model(self) -> SlotModel | FlowModel:
+        """The model of a filter that reads the sensors of all nodes at once."""
+        return self.pooled_slot_model if self.slotted else self.pooled_model
+
+    @cached_property
+    def pooled_slot_model(self) -> SlotModel:
+        """The model of a filter that reads the sensors of all nodes at once."""
+        return self._slot_model(self._stacked(self._everywhere, believed=True))
+
+    @cached_property
+    def truth(self) -> Diffusion:
+        """The diffusion with every default filled in; raises TheoryError for a plant in slots."""
+        plant = self.plant
+        if not isinstance(plant, Diffusion):
+            raise TheoryError("this is about scenarios in continuous time, and this one has slots")
+        filled = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
+        if filled.sensing_period is not None or not uses_grid(self):
+            return filled
+        seen = (self.observation(node) for node in self.increment_sensors)
+        distinct = {(H.tobytes(), R.tobytes()): (H, R) for H, R in seen}.values()
+        informations = [H.T @ np.linalg.solve(R, H) for H, R in distinct]
+        everything = self._stacked(self._everywhere, believed=False)
+        longest = longest_interval(plant.A, plant.Q, *everything)
+        period = default_sensing_period(filled, informations, longest)
+        return dataclasses.replace(filled, sensing_period=period)
+
+    def continuous_truth(self, streams: Streams, frames: bool | None = None) -> Any:
+        """Return the state of one run in continuous time.
+
+        It can be asked, in increasing order, for sample times, probe times and frame times. Its
+        class is ``DiffusionPath`` with increments, else ``SampledTruth`` or ``RecordedTruth``
+        (plants.truth.ContinuousTruth). ``frames`` are used by default where errors are exact.
+        Raises ScenarioError if a recorded truth has no row for one of the times.
+        """
+        frames = self.exact_errors if frames is None else frames
+        times = sample_times(self, streams)
+        plant, horizon = self.truth, self.horizon
+        if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
+            demand_states(self, times)
+            return plant.recorded_truth
+        sampled = all_sample_times(times)
+        random, probing = streams.generator("plant"), streams.generator("probe")
+        if not uses_grid(self):
+            return plant.sampled_truth(random, probing, sampled, self.times, horizon, frames)
+        sample_random = streams.generator("samples") if len(sampled) else None
+        return plant.path(random, probing, self.times, sample_random, sampled, horizon, frames)
+
+    def slot_truth(self, streams: Streams) -> Any:
+        """The state of one run in slots, in frames where they are used."""
+        return self.slot_plant.truth(streams.generator("plant"), self.exact_errors)
+
+    @cached_property
+    def exact_errors(self) -> bool:
+        """True if errors are simulated in frames, so that they keep their digits.
+
+        This needs an unstable plant whose state and readings are all drawn, and filters that have
+        its A (in slots F) and commute with a shift of the state; see plants.truth.
+        """
+        if not self.is_random or not commutes(self.hosted):
+            return False
+        plant = self.plant
+        if isinstance(plant, LinearPlant):
+            same = np.array_equal(self.slot_belief[0], plant.F)
+            return same and frame_slots(plant.F) is not None
+        same = np.array_equal(self.belief[0], self.truth.A)
+        return same and frame_period(self.truth.A) is not None
+
+    def moved_back(self, offset: FloatArray, age: float) -> FloatArray:
+        """The state (n,) from which the plant alone would come to ``offset`` in ``age`` seconds."""
+        if self.slotted:
+            return offset
+        return np.asarray(scipy.linalg.expm(-age * self.truth.A) @ offset)
+
+    def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
+        """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together, over a diffusion of
+        those that give increments; p may be 0. With ``believed``, R is what the filter takes it to
+        be. Raises TheoryError where H differs from slot to slot.
+        """
+        placed = (self.placed if self.slotted else self.increment_sensors).get(node, ())
+        if any(self.sensors[place.entry].varying for place in placed):
+            raise TheoryError(f"node {node} has a regressor sensor, whose H is random")
+        return self._stacked(placed, believed)
+
+    def _stacked(
+        self, placed: tuple[PlacedSensor, ...], believed: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        H = [self.sensors[place.entry].H for place in placed]
+        R = [self.noise(place.entry, believed) for place in placed]
+        empty = np.zeros((0, self.plant.n))
+        return np.concatenate([empty, *H]), block_diagonal(R)
+
+    def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
+        """The increasing times below the horizon at which each sensor (node, ordinal) samples."""
+        return sample_times(self, streams)
+
+    def sample_path(self, streams: Streams, node: int, place: PlacedSensor) -> Samples:
+        """The samples of one sensor of a node in one run in continuous time."""
+        return sample_path(self, streams, node, place)
+
+    def slot_path(self, streams: Streams, node: int, place: PlacedSensor) -> Readings:
+        """The readings of one sensor of a node in one run in slots."""
+        sensor, period = self.sensors[place.entry], self.slot_plant.period
+        return sensor.slot_path(
+            node, period, lambda purpose: streams.generator(purpose, node, place.ordinal)
+        )
+
+    @cached_property
+    def belief(self) -> tuple[FloatArray, FloatArray]:
+        """``A`` and ``Q = B B'`` (n, n) as the filters have them."""
+        model = self.filter.model
+        plant = self.truth
+        A = plant.A if model.A is None else model.A
+        B = plant.B if model.B is None else model.B
+        return A, np.asarray(B @ B.T)
+
+    @property
+    def filters_know_the_truth(self) -> bool:
+        """Whether the filters have the plant's matrices and the sensors' R."""
+        plant = self.plant
+        if not self.is_random:
+            return False
+        if isinstance(plant, LinearPlant):
+            pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
+        else:
+            pairs = [*zip(self.belief, (self.truth.A, self.truth.Q), strict=True)]
+        pairs += [(self.noise(k, True), self.noise(k, False)) for k in range(len(self.sensors))]
+        return all(np.array_equal(believed, true) for believed, true in pairs)
+
+    @cached_property
+    def models(self) -> tuple[FlowModel, ...]:
+        """What each node believes, in the order of ``nodes``; equal models are one object."""
+        made: dict[bytes, FlowModel] = {}
+        return tuple(
+            self._model(self.observation(node, believed=True), made) for node in self.nodes
+        )
+
+    @cached_property
+    def pooled_model(self) -> FlowModel:
+        """The model of a filter that reads the sensors of all nodes at once."""
+        return self._model(self._stacked(self._everywhere, believed=True), {})
+
+    @property
+    def _everywhere(self) -> tuple[PlacedSensor, ...]:
+        placed = self.placed if self.slotted else self.increment_sensors
+        return tuple(place for places in placed.values() for place in places)
+
+    def _model(
+        self, observation: tuple[FloatArray, FloatArray], made: dict[bytes, FlowModel]
+    ) -> FlowModel:
+        H, R = observation
+        key = b"".join((H.tobytes(), b"|", R.tobytes()))
+        if key not in made:
+            interval = self.truth.sensing_period or 0.0
+            made[key] = FlowModel(*self.belief, H, R, self.horizon, min(interval, self.horizon))
+        return made[key]
+
+    def start(self, node: int) -> tuple[FloatArray, FloatArray]:
+        """``xhat`` (n,) and ``P`` (n, n) of a node at time 0."""
+        index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
+        first = self.plant.start_mean if mean is None else mean
+        spread = self.plant.start_cov if cov is None else cov
+        return (
+            first[index] if isinstance(first, tuple) else first,
+            spread[index] if isinstance(spread, tuple) else spread,
+        )
+
+    def weight(self, receiver: int, sender: int) -> float:
+        """The weight a node gives to a message: pi_ij of H (7), a_ji of D (8)."""
+        algorithm, topology = self.hosted, self.topology
+        given = algorithm.pair_weights
+        if given is not None:
+            return float(given[topology.index[sender], topology.index[receiver]])
+        return algorithm.weight(topology.degrees[receiver], topology.degrees[sender])
+
+    @cached_property
+    def own_weights(self) -> dict[int, float]:
+        """What is left to each node when the messages of all its neighbours arrive together."""
+        own = dict.fromkeys(self.nodes, 1.0)
+        for sender, receiver in self.topology.directions:
+            own[receiver] -= self.weight(receiver, sender)
+        return {node: max(value, 0.0) for node, value in own.items()}
+
+    def effective_rates(self) -> dict[Link, float]:
+        """Messages per second that arrive on each direction (sender, receiver) in the long run;
+        nan where that is not known beforehand.
+        """
+        clock, loss = self.network.activation, self.network.channel.loss
+        if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
+            return {}
+        return {
+            link: self._send_rate(clock, link)
+            * loss.mean_delivery(link, self.table_probability(link))
+            for link in self.topology.directions
+        }
+
+    def _send_rate(self, clock: LinkClock, direction: Link) -> float:
+        sender, receiver = direction
+        if clock.at == "readings":
+            return sample_rate(self, sender)
+        entities = {
+            "links": (min(sender, receiver), max(sender, receiver)),
+            "directions": direction,
+            "nodes": (sender,),
+        }
+        return clock.mean_rate(entities[clock.at])

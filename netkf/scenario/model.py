@@ -1,0 +1,244 @@
+"""The parts of a scenario as dataclasses: network, filter, sensors on nodes, and all fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.adapters import AnyFilter, adapt
+from netkf.algorithms.filter import Filter
+from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.slot import SlotFilter
+from netkf.core.errors import ScenarioError, TheoryError
+from netkf.core.fields import (
+    Component,
+    array,
+    covariance,
+    definite_covariance,
+    either,
+    field,
+    instance,
+    integer,
+    line,
+    matrix,
+    nested,
+    positive,
+    several,
+    square,
+    text,
+    vector,
+)
+from netkf.linalg.arrays import FloatArray
+from netkf.network.channels import Channel
+from netkf.network.clocks import LinkClock
+from netkf.network.graphs import Graph, Link, Topology
+from netkf.network.matchings import SlotActivation
+from netkf.plants.linear import LinearPlant
+from netkf.plants.plant import Plant
+from netkf.plants.recorded import RecordedSensor
+from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sensors import LinearSensor, Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Network(Component):
+    """Who can talk to whom, when, and what becomes of a message."""
+
+    graph: Graph = field(instance(Graph))
+    activation: LinkClock | SlotActivation | None = field(
+        instance(LinkClock, SlotActivation), default=None
+    )
+    channel: Channel = field(instance(Channel), default=Channel())
+
+
+@dataclass(frozen=True, eq=False)
+class Belief(Component):
+    """What the filters believe where it differs from the truth.
+
+    ``A`` (n, n) and ``B`` (n, m) of a diffusion, ``F`` and ``Q`` (n, n) of a linear plant, ``R`` of
+    the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry.
+    """
+
+    A: FloatArray | None = field(square, default=None)
+    B: FloatArray | None = field(matrix, default=None)
+    F: FloatArray | None = field(square, default=None)
+    Q: FloatArray | None = field(covariance, default=None)
+    R: FloatArray | tuple[FloatArray, ...] | None = field(
+        either(definite_covariance, several(definite_covariance, "covariance matrices"), nested(3)),
+        default=None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Filtering(Component):
+    """The filter of every node: its ``algorithm``, its start and what it believes.
+
+    ``mean`` (n,) and ``cov`` (n, n) are one for all nodes or a tuple with one per node in the
+    order of node ids; both default to the plant's.
+    """
+
+    algorithm: AnyFilter = field(instance(Filter, FlowFilter, SlotFilter))
+    mean: FloatArray | tuple[FloatArray, ...] | None = field(
+        either(vector, several(vector, "vectors, one per node"), nested(2)), default=None
+    )
+    cov: FloatArray | tuple[FloatArray, ...] | None = field(
+        either(covariance, several(covariance, "covariance matrices, one per node"), nested(3)),
+        default=None,
+    )
+    model: Belief = field(instance(Belief), default=Belief())
+
+
+class PlacedSensor(NamedTuple):
+    """One sensor on one node.
+
+    ``entry`` is its index in ``Scenario.sensors``, ``ordinal`` its number among the sensors of the
+    node.
+    """
+
+    entry: int
+    ordinal: int
+
+
+def takes_samples(sensor: Sensor) -> bool:
+    """Return True if a sensor over a diffusion samples it, False if it gives increments."""
+    return isinstance(sensor, RecordedSensor) or (
+        isinstance(sensor, LinearSensor) and sensor.sampling is not None
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ScenarioModel(Component):
+    """The fields of a scenario, and what follows from them without any mathematics.
+
+    ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
+    samples or a tuple of increasing times.
+    """
+
+    name: str = field(text)
+    horizon: float = field(positive)
+    plant: Plant = field(instance(Plant))
+    sensors: tuple[LinearSensor | RegressorSensor | RecordedSensor, ...] = field(
+        several(instance(Sensor), "sensors", least=0)
+    )
+    network: Network = field(instance(Network))
+    filter: Filtering = field(instance(Filtering))
+    probe: float | FloatArray = field(either(positive, array(1, "list of times"), nested(1)))
+    claim: str = field(line, default="")
+    seed: int = field(integer(low=0), default=0)
+
+    @cached_property
+    def topology(self) -> Topology:
+        """The nodes and links; raises ScenarioError if the graph cannot be built."""
+        try:
+            return self.network.graph.build(self.seed)
+        except ScenarioError as error:
+            raise error.under("network.graph") from None
+
+    @cached_property
+    def nodes(self) -> tuple[int, ...]:
+        """Node ids in increasing order."""
+        return self.topology.nodes
+
+    @cached_property
+    def times(self) -> FloatArray:
+        """(T,) times of the state samples in seconds."""
+        if isinstance(self.probe, np.ndarray):
+            return self.probe
+        count = int(np.floor(self.horizon / self.probe * (1.0 + 1e-12)))
+        digits = 12 - min(0, int(np.floor(np.log10(self.probe))))
+        return np.minimum(np.round(self.probe * np.arange(count + 1), digits), self.horizon)
+
+    @property
+    def slotted(self) -> bool:
+        """Whether the scenario runs in slots, else in continuous time."""
+        return isinstance(self.plant, LinearPlant)
+
+    @property
+    def slot_plant(self) -> LinearPlant:
+        """The plant of a scenario in slots; raises TheoryError for one in continuous time."""
+        if not isinstance(self.plant, LinearPlant):
+            raise TheoryError("this is about scenarios in slots, and the plant is a diffusion")
+        return self.plant
+
+    @cached_property
+    def slots(self) -> tuple[int, ...]:
+        """Numbers of the slots that are sampled."""
+        period = self.slot_plant.period
+        return tuple(round(t / period) for t in self.times.tolist())
+
+    @cached_property
+    def hosted(self) -> Filter:
+        """The filter of every node, as engines call it."""
+        return adapt(self.filter.algorithm)
+
+    @property
+    def ends(self) -> float:
+        """When the last thing may happen: the horizon, or the end of the slot that begins there
+        where a sample shows what is known after the exchanges of its slot.
+        """
+        if not self.slotted or self.hosted.predicts:
+            return self.horizon
+        return self.horizon + self.slot_plant.period
+
+    @property
+    def phase_length(self) -> float:
+        """Seconds that an exchange of a slot lasts; its steps share them evenly."""
+        activation = self.network.activation
+        assert isinstance(activation, SlotActivation)
+        if activation.phase is not None:
+            return activation.phase
+        return 0.5 * self.slot_plant.period / max(1, (self.hosted.schedule or ()).count("exchange"))
+
+    @cached_property
+    def placed(self) -> dict[int, tuple[PlacedSensor, ...]]:
+        """The sensors of each node that has any."""
+        found: dict[int, list[PlacedSensor]] = {}
+        for entry, sensor in enumerate(self.sensors):
+            for node in sensor.nodes:
+                here = found.setdefault(node, [])
+                here.append(PlacedSensor(entry, len(here)))
+        return {node: tuple(found[node]) for node in sorted(found)}
+
+    @property
+    def sensing(self) -> tuple[int, ...]:
+        """Ids of the nodes that have a sensor."""
+        return tuple(self.placed)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether runs draw the state and all readings; else nobody knows their law."""
+        return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
+
+    def noise(self, entry: int, believed: bool) -> FloatArray:
+        """R (p, p) of a ``[[sensors]]`` entry, as it is or as the filters believe it."""
+        R = self.filter.model.R
+        if not believed or R is None:
+            return self.sensors[entry].R
+        return R[entry] if isinstance(R, tuple) else R
+
+    def table_probability(self, link: Link) -> float:
+        """The delivery probability of a direction in the graph's table, 1 where it has none."""
+        delivery = self.topology.delivery
+        return 1.0 if delivery is None else delivery.get(link, 0.0)
+
+    @cached_property
+    def increment_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
+        """The sensors of each node that give increments of a diffusion; empty in slots."""
+        return self._sensors_over_diffusion(sampled=False)
+
+    @cached_property
+    def sampled_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
+        """The sensors of each node that sample a diffusion; empty in slots."""
+        return self._sensors_over_diffusion(sampled=True)
+
+    def _sensors_over_diffusion(self, sampled: bool) -> dict[int, tuple[PlacedSensor, ...]]:
+        if self.slotted:
+            return {}
+        chosen = {
+            node: tuple(p for p in placed if takes_samples(self.sensors[p.entry]) == sampled)
+            for node, placed in self.placed.items()
+        }
+        return {node: placed for node, placed in chosen.items() if placed}

@@ -1,0 +1,71 @@
+"""Check the states of a filter and the estimates that it makes from them."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.testing.watching import Watched, demand, difference, leaves
+
+SYMMETRY, SEMIDEFINITE = 1e-9, 1e-9
+
+
+def check_estimate(
+    watched: Watched, state: Any, n: int, after: str
+) -> tuple[FloatArray, FloatArray | None]:
+    """``estimate`` after a method: shapes, finite; P None, or symmetric, positive semidefinite."""
+    where = f"{watched.name}.estimate after {watched.spoken(after)}"
+    pair = watched.call("estimate", state)
+    demand(isinstance(pair, tuple) and len(pair) == 2, where, "must be (xhat, P)", pair)
+    xhat = np.asarray(pair[0])
+    _check_array(where, "xhat", xhat, (n,))
+    if pair[1] is None:
+        return xhat, None
+    P = np.asarray(pair[1])
+    _check_array(where, "P", P, (n, n))
+    _check_covariance(where, P)
+    return xhat, P
+
+
+def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
+    demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
+    demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
+    remedy = "return None where the filter has no P" if name == "P" else ""
+    demand(np.isfinite(array).all(), where, f"{name} must be finite", array, remedy)
+
+
+def _check_covariance(where: str, P: FloatArray) -> None:
+    size = max(float(np.abs(P).max()), np.finfo(float).tiny)
+    skew = float(np.abs(P - P.T).max())
+    demand(
+        skew <= SYMMETRY * size,
+        where,
+        "P must be symmetric",
+        f"P - P' of up to {skew:.3g}",
+        "return 0.5 * (P + P.T)",
+    )
+    least = float(np.linalg.eigvalsh(P)[0])
+    demand(
+        least >= -SEMIDEFINITE * size,
+        where,
+        "P must be positive semidefinite",
+        f"least eigenvalue {least:.4g}",
+        "look for a sign, or for weights that sum to more than 1",
+    )
+
+
+def check_state_pickles(watched: Watched, state: Any) -> None:
+    """A state that went through pickle shows the same estimate."""
+    where = f"{watched.name}.init"
+    try:
+        copy = pickle.loads(pickle.dumps(state))
+    except Exception as error:
+        raise AssertionError(
+            f"{where}: states must be picklable; got {type(error).__name__}: {error}; make the "
+            "state a NamedTuple of arrays at the top level of a module"
+        ) from error
+    one, other = (dict(leaves(watched.part.estimate(s))) for s in (state, copy))
+    demand(difference(one, other) is None, where, "states must be themselves after pickling")
