@@ -171,15 +171,15 @@ RING = [[k, (k + 1) % 10] for k in range(10)]
 def test_the_methods_for_large_networks_agree_with_dense_ones(settings, monkeypatch):
     made = planar(**settings)
     radius, P = theory.push_sum_radius(made), theory.push_sum_error_covariance(made)
-    monkeypatch.setattr(averaging, "FEW_NODES", 1)
+    monkeypatch.setattr(averaging, "MAX_KRONECKER", 1)
     assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
-    monkeypatch.setattr(mean_square, "FEW", 1)
-    monkeypatch.setattr(push_sum_covariance, "FEW", 1)
+    monkeypatch.setattr(mean_square, "MAX_DENSE_FALLBACK", 1)
+    monkeypatch.setattr(push_sum_covariance, "MAX_DENSE_FALLBACK", 1)
     assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7, atol=1e-12)
     monkeypatch.undo()
-    monkeypatch.setattr(mean_square, "TINY", 40)
-    monkeypatch.setattr(push_sum_covariance, "TINY", 40)
+    monkeypatch.setattr(mean_square, "MAX_DENSE", 40)
+    monkeypatch.setattr(push_sum_covariance, "MAX_DENSE", 40)
     assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7, atol=1e-12)
 
@@ -297,7 +297,7 @@ def test_close_to_the_threshold_the_errors_are_still_exact(monkeypatch):
     radius = theory.push_sum_radius(made)
     assert 0.9999 < radius < 1.0
     P = theory.push_sum_error_covariance(made)
-    monkeypatch.setattr(push_sum_covariance, "TINY", 40)
+    monkeypatch.setattr(push_sum_covariance, "MAX_DENSE", 40)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7)
 
 

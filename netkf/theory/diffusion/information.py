@@ -1,9 +1,9 @@
-"""The cooperative information condition of D: how much the regressors to come will excite.
+"""The cooperative information condition of D: the excitation by future regressors.
 
 Given the states s of the regressors at the start of a window, phi is Gaussian in each of its slots,
 and ``E[phi phi' / (1 + |phi|^2)]`` is one integral over u > 0 of the Gaussian moments of
-``phi phi' exp(-u |phi|^2)`` times exp(-u). In log u the trapezoidal rule gives it to rounding, so
-that only the pasts are sampled.
+``phi phi' exp(-u |phi|^2)`` times exp(-u). In log u the trapezoidal rule computes it to rounding
+errors, so that only the pasts are sampled.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from netkf.theory.numerics.matrices import as_whole
 if TYPE_CHECKING:
     import pandas as pd
 
+# Trapezoidal rule in log u for the integral of f(u) exp(-u) over u > 0.
 _STEP = 0.25
 _U = np.exp(np.arange(-40.0, 4.0, _STEP))
 _WEIGHTS = _STEP * _U * np.exp(-_U)
-NOTHING = 1e-12  # an eigenvalue that small, relative to the trace, is 0
-MAX_SEARCHED = 30  # numbers in a past that the search for the worst one can handle
-MAX_TRIES = 300
-QUANTILE = 2.576
+EIGENVALUE_TOLERANCE = 1e-12  # relative to the trace; smaller eigenvalues count as 0
+MAX_SEARCHED = 30  # entries of a past up to which the worst one is searched for
+MAX_EVALUATIONS = 300
+QUANTILE = 2.576  # of the standard normal law, for 99 % intervals
 MAX_REGRESSORS = 500  # sensors whose H varies
-TOGETHER = 20  # sensors of one kind whose pasts are looked at in one array
-ACCURACY = 1e-9
-"""Relative error of the integral, with room to spare."""
+MAX_STACKED = 20  # sensors of one kind whose pasts are evaluated in one array
+INTEGRAL_TOLERANCE = 1e-9  # safe bound on the relative error of the integral
 
 
 def information_level(
     scenario: Scenario, runs: int = 400, seed: int = 0, window: int | None = None
 ) -> pd.DataFrame:
-    """The conditional least eigenvalue lambda_k of D (19), and of D (5) for each sensor alone.
+    """Return the conditional least eigenvalue lambda_k of D (19), and of D (5) for each sensor.
 
-    A row for the network (node -1) and for each sensor, with the columns
+    A table with a row for the network (node -1) and for each sensor, and the columns
 
     window           h in slots; by default the shortest of up to 2 n for which the network's level
                      is positive, else 2 n
-    level, low, high the least lambda_k over the past, on which it depends through the regressors'
-                     states: over ``runs`` pasts from their law at random slots of the horizon, the
-                     one in which all states are 0, and what a search within the range of these
-                     found; the interval is that of the integral at that past. D (19) holds where
-                     it is positive
-    mean, mean_low, mean_high   lambda_k in the mean over the pasts drawn, with its 99 % interval
+    level, low, high the least lambda_k over pasts, that is over states of the regressors:
+                     ``runs`` pasts drawn from their law at random slots of the horizon, the one in
+                     which all states are 0, and the result of a search within the range of these;
+                     the interval is that of the integral at that past. D (19) holds if it is
+                     positive
+    mean, mean_low, mean_high   mean of lambda_k over the pasts drawn, with its 99 % interval
 
-    As printed, h terms are divided by h + 1. Raises TheoryError for sensors that are records.
+    As printed in D, h terms are divided by h + 1. Raises TheoryError for recorded sensors.
     """
     import pandas as pd
 
@@ -67,17 +67,20 @@ def information_level(
         longest = 2 * scenario.plant.n
         window = next((h for h in range(1, longest) if _row(*whole, h)[2] > 0.0), longest)
     rows = [_row(*whole, window)]
-    rows += _each_alone(sources, past, window)
+    rows += _sensor_rows(sources, past, window)
     names = ["node", "window", "level", "low", "high", "mean", "mean_low", "mean_high"]
     return pd.DataFrame(rows, columns=names)
 
 
-Row = tuple[int, int, float, float, float, float, float, float]
+LevelRow = tuple[int, int, float, float, float, float, float, float]
 """node, window, level, low, high, mean, mean_low, mean_high."""
 
 
 class _Source(NamedTuple):
-    """One scalar reading: the node and phi = C s with s <- A s + noise of covariance ``drive``."""
+    """A scalar reading of a node: phi = C s with s <- A s + noise of covariance ``drive``.
+
+    A (m, m), C (n, m), start (m,) and drive (m, m), which is empty for a fixed regressor.
+    """
 
     node: int
     A: FloatArray
@@ -87,13 +90,14 @@ class _Source(NamedTuple):
 
 
 def few_regressors(scenario: Scenario) -> bool:
-    """Whether the levels take seconds: pasts are drawn for each sensor whose H varies."""
+    """Return True if the levels take seconds: pasts are drawn for each sensor whose H varies."""
     varying = [k for k, sensor in enumerate(scenario.sensors) if sensor.varying]
     placed = itertools.chain.from_iterable(scenario.placed.values())
     return sum(place.entry in varying for place in placed) <= MAX_REGRESSORS
 
 
 def _sources(scenario: Scenario) -> list[_Source]:
+    """Return the scalar readings of all nodes; raises TheoryError for recorded sensors."""
     found = []
     for node in scenario.sensing:
         for place in scenario.placed[node]:
@@ -114,29 +118,30 @@ def _sources(scenario: Scenario) -> list[_Source]:
 def _pasts(
     scenario: Scenario, sources: list[_Source], runs: int, random: np.random.Generator
 ) -> list[FloatArray]:
-    """For each source (runs, m) states at random slots, the same slots for all."""
+    """Return for each source (runs, m) states at random slots, the same slots for all sources."""
     last = max(1, int(scenario.horizon / scenario.slot_plant.period))
     slots = random.integers(last, size=runs)
-    return [_law(source, slots, random) for source in sources]
+    return [_draw_states(source, slots, random) for source in sources]
 
 
-def _law(source: _Source, slots: np.ndarray, random: np.random.Generator) -> FloatArray:
+def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator) -> FloatArray:
+    """Return the states (K, m) of a source at K slots, drawn from their Gaussian law."""
     drawn = random.standard_normal((len(slots), len(source.start)))
     if not source.drive.size:
         return np.ones((len(slots), 1))
     states, mean, cov = np.empty_like(drawn), source.start, np.zeros_like(source.A)
     for slot in range(int(slots.max()) + 1):
-        here = slots == slot
-        if here.any():
-            states[here] = mean + drawn[here] @ square_root(cov).T
+        chosen = slots == slot
+        if chosen.any():
+            states[chosen] = mean + drawn[chosen] @ square_root(cov).T
         mean, cov = source.A @ mean, source.A @ cov @ source.A.T + source.drive
     return states
 
 
-def _each_alone(sources: list[_Source], past: list[FloatArray], window: int) -> list[Row]:
-    """A row for each sensor; fixed sensors of one kind share theirs."""
-    rows: list[Row | None] = [None] * len(sources)
-    for group in _alike(sources):
+def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) -> list[LevelRow]:
+    """Return a row for each sensor alone; fixed sensors of one kind share its numbers."""
+    rows: list[LevelRow | None] = [None] * len(sources)
+    for group in _group_by_kind(sources):
         for k in group:
             same = rows[group[0]] if not sources[k].drive.size else None
             found = same or _row(sources[k].node, [sources[k]], [past[k]], window)
@@ -144,66 +149,78 @@ def _each_alone(sources: list[_Source], past: list[FloatArray], window: int) -> 
     return [row for row in rows if row is not None]
 
 
-def _row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> Row:
+def _row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:
+    """Return the row of the given sources, as a network or a single sensor."""
     values = _levels(sources, past, window)
     mean = float(values.mean())
     error = QUANTILE * float(values.std(ddof=1)) / np.sqrt(len(values))
     level = _least(sources, past, values, window)
-    interval = level * (1.0 - ACCURACY), level * (1.0 + ACCURACY)
+    interval = level * (1.0 - INTEGRAL_TOLERANCE), level * (1.0 + INTEGRAL_TOLERANCE)
     return node, window, level, *interval, mean, mean - error, mean + error
 
 
 def _least(
     sources: list[_Source], past: list[FloatArray], values: FloatArray, window: int
 ) -> float:
+    """Return the least level found: by drawing, at states 0, and by a search from both."""
     best = int(np.argmin(values))
-    starts = [[p[best] for p in past], [np.zeros_like(s.start) for s in sources]]
-    for k, source in enumerate(sources):
-        if not source.drive.size:  # what is fixed is no past
-            starts[1][k] = source.start
-    moving = [k for k, source in enumerate(sources) if source.drive.size]
+    # A fixed regressor has no state that could differ.
+    resting = [np.zeros_like(s.start) if s.drive.size else s.start for s in sources]
     found = [float(values[best])]
-    low = [np.minimum(past[k].min(axis=0), 0.0) for k in moving]
-    high = [np.maximum(past[k].max(axis=0), 0.0) for k in moving]
-    bounds = list(zip(np.concatenate([[], *low]), np.concatenate([[], *high]), strict=True))
-    sizes = np.cumsum([0, *(len(sources[k].start) for k in moving)])
-    for start in starts:
-
-        def level(x: FloatArray, start: list[FloatArray] = start) -> float:
-            states = [s[None] for s in start]
-            for place, k in enumerate(moving):
-                states[k] = x[None, sizes[place] : sizes[place + 1]]
-            return float(_levels(sources, states, window)[0])
-
-        x = np.concatenate([np.zeros(0), *(start[k] for k in moving)])
-        found.append(level(x))
-        if 0 < len(x) <= MAX_SEARCHED and found[-1] > 0.0:
-            search = scipy.optimize.minimize(
-                level, x, method="Nelder-Mead", bounds=bounds, options={"maxfev": MAX_TRIES}
-            )
-            found.append(float(search.fun))
+    for start in ([p[best] for p in past], resting):
+        found += _search(sources, past, start, window)
     return min(found)
 
 
+def _search(
+    sources: list[_Source], past: list[FloatArray], start: list[FloatArray], window: int
+) -> list[float]:
+    """Return the level at a past, and that found from it by the simplex method of Nelder and Mead.
+
+    The search stays within the range of the pasts drawn, and is left out for a level of 0 and for
+    pasts of more than MAX_SEARCHED numbers.
+    """
+    moving = [k for k, source in enumerate(sources) if source.drive.size]
+    low = [np.minimum(past[k].min(axis=0), 0.0) for k in moving]
+    high = [np.maximum(past[k].max(axis=0), 0.0) for k in moving]
+    bounds = list(zip(np.concatenate([[], *low]), np.concatenate([[], *high]), strict=True))
+    ends = np.cumsum([0, *(len(sources[k].start) for k in moving)])
+
+    def level(x: FloatArray) -> float:
+        states = [s[None] for s in start]
+        for place, k in enumerate(moving):
+            states[k] = x[None, ends[place] : ends[place + 1]]
+        return float(_levels(sources, states, window)[0])
+
+    x = np.concatenate([np.zeros(0), *(start[k] for k in moving)])
+    found = [level(x)]
+    if 0 < len(x) <= MAX_SEARCHED and found[0] > 0.0:
+        search = scipy.optimize.minimize(
+            level, x, method="Nelder-Mead", bounds=bounds, options={"maxfev": MAX_EVALUATIONS}
+        )
+        found.append(float(search.fun))
+    return found
+
+
 def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> FloatArray:
-    """lambda_k (k,) for each of k pasts."""
+    """Return lambda_k (K,) for each of K pasts, one array of states (K, m) per source."""
     n = len(sources[0].C)
     total = np.zeros((len(past[0]), n, n))
-    for group in _alike(sources):
+    for group in _group_by_kind(sources):
         source, fixed = sources[group[0]], not sources[group[0]].drive.size
-        for start in range(0, 1 if fixed else len(group), TOGETHER):
+        for start in range(0, 1 if fixed else len(group), MAX_STACKED):
             # Fixed sensors of one kind have one past, which counts as often as there are sensors.
-            some = group[:1] if fixed else group[start : start + TOGETHER]
+            some = group[:1] if fixed else group[start : start + MAX_STACKED]
             states = np.concatenate([past[k][:1] if fixed else past[k] for k in some])
-            found = _excited(source, states, window).reshape(len(some), -1, n, n)
+            found = _window_excitation(source, states, window).reshape(len(some), -1, n, n)
             total = total + found.sum(axis=0) * (len(group) if fixed else 1)
     values = np.linalg.eigvalsh(symmetric(total))
     least = values[:, 0] / (len(sources) * (window + 1))
-    return np.where(values[:, 0] > NOTHING * values.sum(axis=1), least, 0.0)
+    return np.where(values[:, 0] > EIGENVALUE_TOLERANCE * values.sum(axis=1), least, 0.0)
 
 
-def _alike(sources: list[_Source]) -> list[list[int]]:
-    """Places of the sources of each kind; sources of one kind differ in their pasts only."""
+def _group_by_kind(sources: list[_Source]) -> list[list[int]]:
+    """Return the indices of the sources of each kind, which differ in their pasts only."""
     groups: dict[tuple[bytes, ...], list[int]] = {}
     for k, source in enumerate(sources):
         key = tuple(part.tobytes() for part in (source.A, source.C, source.drive))
@@ -211,11 +228,11 @@ def _alike(sources: list[_Source]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _excited(source: _Source, states: FloatArray, window: int) -> FloatArray:
-    """(k, n, n): the sum of the normalised outer products over a window, for each of k pasts."""
+def _window_excitation(source: _Source, states: FloatArray, window: int) -> FloatArray:
+    """Return the sum (K, n, n) of the normalised outer products over a window, for K pasts."""
     mean, cov, n = states, np.zeros_like(source.A), len(source.C)
     total = np.zeros((len(states), n, n))
-    for _ in range(window):
+    for _ in range(window):  # mean and covariance of s in each slot
         mean = mean @ source.A.T
         cov = source.A @ cov @ source.A.T + (source.drive if source.drive.size else 0.0)
         total = total + normalised_outer(mean @ source.C.T, source.C @ cov @ source.C.T)
@@ -223,12 +240,15 @@ def _excited(source: _Source, states: FloatArray, window: int) -> FloatArray:
 
 
 def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
-    """(k, n, n): ``E[phi phi' / (1 + |phi|^2)]`` for phi Gaussian with k means (k, n) and one
-    covariance (n, n).
+    """Return ``E[phi phi' / (1 + |phi|^2)]`` (k, n, n) for Gaussian phi.
+
+    phi has k means (k, n) and one covariance (n, n). 1 / (1 + r) is the integral of exp(-u (1 + r))
+    over u > 0, so that only Gaussian integrals remain.
     """
     spread, axes = np.linalg.eigh(cov)
     spread = np.maximum(spread, 0.0)
     m = mean @ axes
+    # In the axes of cov, exp(-u |phi|^2) divides means and variances by D.
     D = 1.0 + 2.0 * _U[:, None] * spread
     decay = np.exp(-_U * np.einsum("ka,ua->ku", m * m, 1.0 / D))
     weights = _WEIGHTS / np.sqrt(D.prod(axis=1)) * decay

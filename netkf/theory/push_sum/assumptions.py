@@ -1,4 +1,4 @@
-"""The assumptions and theorems of P about a scenario with the push-sum filter."""
+"""Assumptions and theorems of P on a scenario with the push-sum filter."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from netkf.theory.push_sum.estimation_steps import averaging_law, estimation_ste
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_filter
 from netkf.theory.push_sum.mean_square import mean_radius, push_sum_radius
 
-HEAVY = 0.885
+HEAVY_TAIL_RADIUS = 0.885  # above it mean squares over runs have no useful interval
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """(assumption, source, holds, evidence) of each."""
+    """Return the rows of P: plant, links, consensus gain, freezing of gains and moments."""
     return [
-        *_plant(scenario),
-        *_links(scenario),
-        *_gain(scenario),
-        _stop(scenario),
-        *_moments(scenario),
+        *_plant_rows(scenario),
+        *_link_rows(scenario),
+        *_gain_rows(scenario),
+        _stop_row(scenario),
+        *_moment_rows(scenario),
     ]
 
 
-def _plant(scenario: Scenario) -> list[AssumptionRow]:
+def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
     F, Q = scenario.slot_belief
     idle = unobservable_mode(F.T, Q)
     rows: list[AssumptionRow] = [
@@ -48,72 +48,91 @@ def _plant(scenario: Scenario) -> list[AssumptionRow]:
         )
     ]
     if not any(sensor.varying for sensor in scenario.sensors):
-        rows.append(_sight(scenario))
+        rows.append(_observability_row(scenario))
     return [*rows, true_model_row(scenario, "P (7), (8)", "same F, Q and R")]
 
 
-def _sight(scenario: Scenario) -> AssumptionRow:
+def _observability_row(scenario: Scenario) -> AssumptionRow:
     F, _ = scenario.slot_belief
     informations = [model.information for model in scenario.slot_models]
     hidden = unobservable_mode(F, np.sum(informations, axis=0))
     alone = sum(unobservable_mode(F, G) is None for G in informations)
-    words = f"every mode is seen; {alone} of {len(informations)} nodes see all alone"
+    evidence = f"every mode is seen; {alone} of {len(informations)} nodes see all alone"
     if hidden is not None:
-        words = (
+        evidence = (
             f"the mode with eigenvalue {hidden:.6g} is not seen; a mode that decays does no harm"
         )
-    return "(F, H) is observable, all sensors together", "P Assumption 2", hidden is None, words
+    return "(F, H) is observable, all sensors together", "P Assumption 2", hidden is None, evidence
 
 
-def _links(scenario: Scenario) -> list[AssumptionRow]:
-    topology, channel = scenario.topology, scenario.network.channel
-    parts = len(topology.components)
-    filter_ = push_sum_filter(scenario)
-    rows: list[AssumptionRow] = [
-        (
-            "the graph is undirected and connected",
-            "P Assumption 1",
-            parts == 1 and not topology.directed,
-            f"{len(topology.nodes)} nodes, {len(topology.links)} links, {parts} part"
-            + ("" if parts == 1 else "s"),
-        )
-    ]
-    held = filter_.links == "held" and filter_.gamma > 1
+def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
     law: Averaging | None
-    independent: bool | None
     try:
-        law, independent, words = averaging_law(scenario), not held, "each link, slot and step anew"
+        law, reason = averaging_law(scenario), ""
     except TheoryError as error:
-        law, independent, words = None, None, str(error)
-    if held and law is not None:
-        words = (
+        law, reason = None, str(error)
+    return [
+        _graph_row(scenario),
+        _fresh_links_row(scenario, law, reason),
+        _joint_failure_row(scenario, law),
+        _connection_row(scenario),
+    ]
+
+
+def _graph_row(scenario: Scenario) -> AssumptionRow:
+    topology = scenario.topology
+    components = len(topology.components)
+    return (
+        "the graph is undirected and connected",
+        "P Assumption 1",
+        components == 1 and not topology.directed,
+        f"{len(topology.nodes)} nodes, {len(topology.links)} links, {components} part"
+        + ("" if components == 1 else "s"),
+    )
+
+
+def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> AssumptionRow:
+    """Return the row on independent draws; ``reason`` says why the links have no such law."""
+    name, source = "links fail anew in each averaging step", "P Assumption 3"
+    filter_ = push_sum_filter(scenario)
+    if law is None:
+        return name, source, None, reason
+    if filter_.links == "held" and filter_.gamma > 1:
+        evidence = (
             "one draw holds for all steps of a slot: nodes that are cut off stay so, and Theorems "
             "4 to 6 do not apply"
         )
-    rows.append(("links fail anew in each averaging step", "P Assumption 3", independent, words))
-    together = channel.symmetric
+        return name, source, False, evidence
+    return name, source, True, "each link, slot and step anew"
+
+
+def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionRow:
+    joint = scenario.network.channel.symmetric
     if law is not None:
-        together = bool(np.array_equal(law.hears[:, 0], law.hears[:, 1])) and bool(
+        # Both directions have one probability, and each is up exactly if both are.
+        joint = bool(np.array_equal(law.hears[:, 0], law.hears[:, 1])) and bool(
             np.allclose(law.both, law.hears[:, 0])
         )
-    words = (
+    evidence = (
         "one fate for both"
-        if together
+        if joint
         else ("mass is lost or copied, so that the numbers N^(i) are random in the limit")
     )
-    rows.append(("both directions of a link fail together", "P Assumption 3", together, words))
+    return "both directions of a link fail together", "P Assumption 3", joint, evidence
+
+
+def _connection_row(scenario: Scenario) -> AssumptionRow:
+    name, source = "p_d < 1: the network is whole at times", "P Assumption 3"
     try:
         cut = disconnection_probability(scenario)
     except TheoryError as error:
-        return [
-            *rows,
-            ("p_d < 1: the network is whole at times", "P Assumption 3", None, str(error)),
-        ]
-    words = f"p_d = {float(cut):.6g}" if cut.exact else f"p_d in [{cut.low:.4g}, {cut.high:.4g}]"
-    return [*rows, ("p_d < 1: the network is whole at times", "P Assumption 3", cut < 1.0, words)]
+        return name, source, None, str(error)
+    interval = f"[{cut.low:.4g}, {cut.high:.4g}]"
+    evidence = f"p_d = {float(cut):.6g}" if cut.exact else f"p_d in {interval}"
+    return name, source, cut < 1.0, evidence
 
 
-def _gain(scenario: Scenario) -> list[AssumptionRow]:
+def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
     delta, bound = push_sum_filter(scenario).delta, consensus_gain_bound(scenario)
     local = f"nodes can tell from degrees that rho(L) <= {min(bound.local, bound.nodes)}"
     return [
@@ -132,7 +151,7 @@ def _gain(scenario: Scenario) -> list[AssumptionRow]:
     ]
 
 
-def _stop(scenario: Scenario) -> AssumptionRow:
+def _stop_row(scenario: Scenario) -> AssumptionRow:
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
         loss.mean_delivery(way, scenario.table_probability(way)) == 1.0
@@ -140,55 +159,60 @@ def _stop(scenario: Scenario) -> AssumptionRow:
         for way in ((i, j), (j, i))
     )
     safe = filter_.stop != "paper" or filter_.asymptotic or lossless
-    words = {
+    evidence = {
         "never": "mass is exchanged for ever",
         "safe": "gains freeze only after all own links were up and nothing moved",
         "paper": "nothing fails",
     }[filter_.stop]
     if not safe:
-        words = "it fires when all links of a node fail in one slot, and its gain stays wrong"
+        evidence = "it fires when all links of a node fail in one slot, and its gain stays wrong"
     elif filter_.asymptotic:
-        words = "the gains are the asymptotic ones from the start"
-    return "no gain is frozen before its time", "P step 2.3", safe, words
+        evidence = "the gains are the asymptotic ones from the start"
+    return "no gain is frozen before its time", "P step 2.3", safe, evidence
 
 
-def _moments(scenario: Scenario) -> list[AssumptionRow]:
+def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
     return [
-        _exact(
+        _exact_row(
             ("the estimates become unbiased", "P (30), derived"),
             lambda: mean_radius(estimation_steps(scenario)),
         ),
-        _certified(scenario, "mean", "P Theorem 5"),
-        _exact(
+        _certified_row(scenario, "mean", "P Theorem 5"),
+        _exact_row(
             ("the errors stay bounded in the mean square", "P Lemma 10, derived"),
             lambda: push_sum_radius(scenario),
             heavy=True,
         ),
-        _certified(scenario, "mean-square", "P Theorem 6"),
+        _certified_row(scenario, "mean-square", "P Theorem 6"),
     ]
 
 
-def _exact(
+def _exact_row(
     name: tuple[str, str], measure: Callable[[], float], heavy: bool = False
 ) -> AssumptionRow:
+    """Return a row that holds if the radius that ``measure`` computes is below 1.
+
+    ``heavy``: mention heavy tails of averages over runs.
+    """
     try:
         found = measure()
     except TheoryError as error:
         return *name, None, f"not decided: {error}"
-    words = f"exact radius {found:.6g} at the asymptotic gains; necessary and sufficient"
+    evidence = f"exact radius {found:.6g} at the asymptotic gains; necessary and sufficient"
     if heavy and found >= 1.0:
-        words += "; single paths may still stay bounded in probability"
-    elif heavy and found > HEAVY:
-        words += f"; above {HEAVY} averages over runs have heavy tails and no honest interval"
-    return *name, found < 1.0, words
+        evidence += "; single paths may still stay bounded in probability"
+    elif heavy and found > HEAVY_TAIL_RADIUS:
+        evidence += f"; above {HEAVY_TAIL_RADIUS} averages over runs have heavy tails "
+        evidence += "and no honest interval"
+    return *name, found < 1.0, evidence
 
 
-def _certified(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
+def _certified_row(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
     gamma = push_sum_filter(scenario).gamma
     name = f"gamma is certified for the {moment.replace('-', ' ')}"
     try:
         least = minimum_gamma(scenario, moment)
     except TheoryError as error:
         return name, source, False, str(error)
-    words = f"gamma {gamma}, certified from {least:,} on; sufficient, by far not necessary"
-    return name, source, gamma >= least, words
+    evidence = f"gamma {gamma}, certified from {least:,} on; sufficient, by far not necessary"
+    return name, source, gamma >= least, evidence

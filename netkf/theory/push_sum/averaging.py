@@ -1,13 +1,13 @@
-"""Moments of the averaging of P step 5, z_i <- z_i + 1/delta sum_j b_ij (z_j - z_i), gamma times.
+"""Moments of P step 5: gamma averaging steps z_i <- z_i + 1/delta sum_j b_ij (z_j - z_i).
 
 One step is ``M = I - 1/delta sum of b_ij e_i (e_i - e_j)' + b_ji e_j (e_j - e_i)'`` over links,
 which are independent. So with ``d = Y_ii - Y_ij - Y_ji + Y_jj`` of each link
 
     E[M Y M'] = E[M] Y E[M]' + 1/delta^2 sum over links of +-cov(b, b) d,
 
-which touches only the link's own four blocks: a step costs two sparse products, and gamma of them
-with a draw each are gamma such steps. One draw held over the slot makes M^gamma a polynomial in the
-same b; its outcomes are then enumerated.
+which touches only the link's own four blocks: a step costs two sparse products. If each step has a
+draw of its own, the moments of M^gamma are gamma such steps; if one draw is held over the slot,
+M^gamma is a polynomial in the same b, and its outcomes are enumerated.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
 
 MAX_NODES, MAX_OUTCOMES = 60, 2**20
-FEW_NODES = 16  # up to which the Kronecker square is cheap
-MAX_WORK = 1e12  # multiplications to enumerate
-CHUNK = 8192  # outcomes at a time
+MAX_KRONECKER = 16  # nodes up to which the Kronecker square is cheap
+MAX_WORK = 1e12  # multiplications of an enumeration
+MAX_OUTCOMES_AT_ONCE = 8192
 
 
 @dataclass(frozen=True, eq=False)
 class Averaging:
     """The law of gamma averaging steps on ``nodes`` nodes with consensus gain ``delta``.
 
-    links  : (E, 2) places of the two ends
+    links  : (E, 2) indices of the two ends
     hears  : (E, 2) probabilities that the first end hears the second, and that the second the first
     both   : (E,) probability that both hear each other in one step
-    held   : whether one draw of the links serves all steps of a slot, else each step has its own
+    held   : True if one draw of the links serves all steps of a slot, else each step has its own
     """
 
     nodes: int
@@ -48,7 +48,7 @@ class Averaging:
 
     @cached_property
     def mean_step(self) -> scipy.sparse.csr_array:
-        """(N, N) E[M] of one step."""
+        """E[M] (N, N) of one step, sparse."""
         i, j = self.links.T
         first, second = self.hears.T / self.delta
         rows = np.concatenate([np.arange(self.nodes), i, i, j, j])
@@ -58,33 +58,35 @@ class Averaging:
 
     @cached_property
     def mean(self) -> FloatArray:
-        """(N, N) E[M^gamma], P (28) for fresh links."""
+        """E[M^gamma] (N, N), P (28) for fresh links."""
         if self.enumerated:
             return self._moments[0]
         return np.linalg.matrix_power(self.mean_step.toarray(), self.gamma)
 
     @cached_property
     def kron(self) -> FloatArray:
-        """(N^2, N^2) E[M^gamma (x) M^gamma]."""
+        """E[M^gamma (x) M^gamma] (N^2, N^2)."""
         if self.enumerated:
             return self._moments[1]
         N, (i, j) = self.nodes, self.links.T
         step = self.mean_step.toarray()
-        one = np.kron(step, step)
+        expected = np.kron(step, step)
+        # Each link adds cov(b, b) to the Kronecker square: d is read at four entries (difference)
+        # and written to the same four (spread).
         four = (i * N + i, i * N + j, j * N + i, j * N + j)
         spread = np.zeros((N * N, len(i)))
-        differ = np.zeros((len(i), N * N))
+        difference = np.zeros((len(i), N * N))
         each = np.arange(len(i))
-        parts = zip(four, self._covariances, (1.0, -1.0, -1.0, 1.0), strict=True)
-        for place, covariance, sign in parts:
+        entries = zip(four, self._covariances, (1.0, -1.0, -1.0, 1.0), strict=True)
+        for place, covariance, sign in entries:
             spread[place, each] = sign * covariance
-            differ[each, place] = sign
-        return np.linalg.matrix_power(one + spread @ differ, self.gamma)
+            difference[each, place] = sign
+        return np.linalg.matrix_power(expected + spread @ difference, self.gamma)
 
     def second_moment(self, Y: FloatArray) -> FloatArray:
-        """(N n, N n) E[(M^gamma (x) I) Y (M^gamma (x) I)'] for one Y of that shape."""
+        """Return E[(M^gamma (x) I) Y (M^gamma (x) I)'] (N n, N n) for Y (N n, N n)."""
         N, n = self.nodes, len(Y) // self.nodes
-        if self.enumerated or N <= FEW_NODES:
+        if self.enumerated or N <= MAX_KRONECKER:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)
             four = (self.kron @ pairs).reshape(N, N, n, n).transpose(0, 2, 1, 3)
             return np.asarray(four.reshape(N * n, N * n))
@@ -94,7 +96,8 @@ class Averaging:
         for _ in range(self.gamma):
             Z = Y.reshape(N, n, N, n)
             d = Z[i, :, i] - Z[i, :, j] - Z[j, :, i] + Z[j, :, j]
-            Y = self._left(self._left(Y).T).T.copy()
+            # E[M] Y E[M]', then the covariances of each link in its four blocks
+            Y = self._multiply(self._multiply(Y).T).T.copy()
             Z = Y.reshape(N, n, N, n)
             at_node = np.zeros((N, n, n))
             np.add.at(at_node, i, own * d)
@@ -104,23 +107,24 @@ class Averaging:
             Z[j, :, i] -= cross * d
         return Y
 
-    def _left(self, Y: FloatArray) -> FloatArray:
+    def _multiply(self, Y: FloatArray) -> FloatArray:
+        """Return (E[M] (x) I) Y of one step."""
         product = self.mean_step @ np.ascontiguousarray(Y).reshape(self.nodes, -1)
         return np.asarray(product).reshape(Y.shape)
 
     @property
-    def certain(self) -> bool:
-        """Whether every link is always up or always down."""
+    def deterministic(self) -> bool:
+        """True if every link is always up or always down."""
         return bool(np.isin(self.hears, (0.0, 1.0)).all())
 
     @property
     def enumerated(self) -> bool:
-        """Whether moments need all outcomes of the links, because one draw serves all steps."""
-        return self.held and self.gamma > 1 and not self.certain  # else one draw either way
+        """True if moments need all outcomes of the links, because one draw serves all steps."""
+        return self.held and self.gamma > 1 and not self.deterministic
 
     @cached_property
     def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """(E,) covariances of the pairs from (b_ij, b_ji), row by row, over delta^2."""
+        """Covariance matrix of (b_ij, b_ji) over delta^2, row by row, (E,) each."""
         first, second = self.hears.T
         cross = (self.both - first * second) / self.delta**2
         own, other = (p * (1.0 - p) / self.delta**2 for p in (first, second))
@@ -128,51 +132,58 @@ class Averaging:
 
     @cached_property
     def _moments(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and mean Kronecker square of M^gamma over all outcomes of one draw."""
+        """Mean (N, N) and mean Kronecker square (N^2, N^2) of M^gamma over all outcomes of a draw.
+
+        Raises TheoryError if there are too many.
+        """
         N = self.nodes
-        fates = self._fates
-        count = math.prod(len(chance) for chance, _ in fates)
+        outcomes = self._link_outcomes
+        count = math.prod(len(probability) for probability, _ in outcomes)
         if N > MAX_NODES or count > MAX_OUTCOMES or count * (N**4 + N**3) > MAX_WORK:
             raise TheoryError(
                 "the outcomes of links held over gamma > 1 steps are enumerated, and there are too "
                 f"many: 2^{math.log2(count):.0f} on {N} nodes; take a smaller graph or fresh links"
             )
-        half = len(fates) // 2
-        one, other = (_together(part, N * N) for part in (fates[:half], fates[half:]))
+        # Outcomes of two halves of the links are tabulated, and combined block by block.
+        half = len(outcomes) // 2
+        one, other = (_tabulate(part, N * N) for part in (outcomes[:half], outcomes[half:]))
         mean, square = np.zeros(N * N), np.zeros((N * N, N * N))
-        rows = max(1, CHUNK // len(other[0]))
+        rows = max(1, MAX_OUTCOMES_AT_ONCE // len(other[0]))
         for start in range(0, len(one[0]), rows):
-            chance, piece = (table[start : start + rows, None] for table in one)
-            M = np.eye(N).reshape(-1) - piece - other[1]
+            probability, term = (table[start : start + rows, None] for table in one)
+            M = np.eye(N).reshape(-1) - term - other[1]
             power = np.linalg.matrix_power(M.reshape(-1, N, N), self.gamma).reshape(-1, N * N)
-            weighted = (chance * other[0]).reshape(-1, 1) * power
+            weighted = (probability * other[0]).reshape(-1, 1) * power
             mean += weighted.sum(axis=0)
             square += weighted.T @ power
-        # entry ((i, j), (k, l)) of the sum is M_ij M_kl, of the Kronecker square M_ik M_jl
+        # Entry ((i, j), (k, l)) of the sum is M_ij M_kl, that of the Kronecker square M_ik M_jl.
         kron = square.reshape(N, N, N, N).transpose(0, 2, 1, 3).reshape(N * N, N * N)
         return mean.reshape(N, N), kron
 
     @cached_property
-    def _fates(self) -> list[tuple[FloatArray, FloatArray]]:
-        """For each link the probabilities of its outcomes and (outcomes, N^2) what each subtracts
-        from M; impossible outcomes are left out.
+    def _link_outcomes(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Probabilities (K,) and terms (K, N^2) of M of the K possible outcomes of each link.
+
+        M is the identity less one term of each link.
         """
         N, found = self.nodes, []
         for (i, j), (first, second), both in zip(self.links, self.hears, self.both, strict=True):
-            chances = np.array([both, first - both, second - both, 1.0 - first - second + both])
-            pieces = np.zeros((4, N, N))
-            pieces[[[0], [1]], i, [i, j]] = pieces[[[0], [2]], j, [j, i]] = [1.0, -1.0]
-            possible = chances > 1e-15
-            found.append((chances[possible], pieces[possible].reshape(-1, N * N) / self.delta))
+            probabilities = np.array(
+                [both, first - both, second - both, 1.0 - first - second + both]
+            )
+            terms = np.zeros((4, N, N))
+            terms[[[0], [1]], i, [i, j]] = terms[[[0], [2]], j, [j, i]] = [1.0, -1.0]
+            possible = probabilities > 1e-15
+            found.append((probabilities[possible], terms[possible].reshape(-1, N * N) / self.delta))
         return found
 
 
-def _together(
-    fates: list[tuple[FloatArray, FloatArray]], size: int
+def _tabulate(
+    outcomes: list[tuple[FloatArray, FloatArray]], size: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Probabilities and sums of pieces of all outcomes of several links."""
-    chances, sums = np.ones(1), np.zeros((1, size))
-    for chance, pieces in fates:
-        chances = np.outer(chances, chance).reshape(-1)
-        sums = (sums[:, None] + pieces).reshape(-1, size)
-    return chances, sums
+    """Return probabilities (K,) and sums of terms (K, size) of all outcomes of several links."""
+    probabilities, sums = np.ones(1), np.zeros((1, size))
+    for probability, terms in outcomes:
+        probabilities = np.outer(probabilities, probability).reshape(-1)
+        sums = (sums[:, None] + terms).reshape(-1, size)
+    return probabilities, sums

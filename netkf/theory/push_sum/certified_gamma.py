@@ -1,8 +1,8 @@
-"""How many averaging steps the push-sum filter needs: what P Theorems 5 and 6 certify, and exactly.
+"""The number of averaging steps that the push-sum filter needs: certified by P and exact.
 
-The theorems bound error dynamics by small matrices of norms. Their constant c_B must be at least
-``max_i |A_i'|_P``; the one printed in P (37) need not be (its |A| lacks a transpose), so the larger
-of the two is used here. Corollary 2 does not follow from Theorem 5 and is not used.
+P Theorems 5 and 6 bound error dynamics by small matrices of norms. Their constant c_B must be at
+least ``max_i |A_i'|_P``; the one printed in P (37) can be smaller (its |A| lacks a transpose), so
+the larger of the two is used here. Corollary 2 does not follow from Theorem 5 and is not used.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from netkf.theory.push_sum.mean_square import mean_radius, radius
 Moment = Literal["mean", "mean-square"]
 MAX_STEPS = 10**7
 MAX_EXACT = 1000
-MAX_SEARCHED = 120  # states of all nodes together; beyond it a search over gamma takes minutes
+MAX_SEARCHED = 120  # states of all nodes, beyond which a search over gamma takes minutes
 
 
 class GammaConstants(NamedTuple):
@@ -47,24 +47,26 @@ class GammaConstants(NamedTuple):
 
 
 def gamma_constants(scenario: Scenario) -> GammaConstants:
-    """The constants; raises TheoryError where a condition of the theorems fails: delta at or below
-    rho(L), a singular P_inf, links held over the steps or failing in one direction.
+    """Return the constants of P Theorems 5 and 6.
+
+    Raises TheoryError if a condition of the theorems fails: delta at or below rho(L), a singular
+    P_inf, links held over the steps or failing in one direction.
     """
     return _constants(scenario)
 
 
 @lru_cache(maxsize=8)
 def _constants(scenario: Scenario) -> GammaConstants:
-    """Kept, because both theorems need them and the disconnection probability takes time."""
+    """Return the constants, cached: both theorems use them, and p_d takes time."""
     steps = estimation_steps(scenario)
     law, P, N = steps.averaging, steps.limits.P, steps.limits.N
-    _conditions(scenario, law, P)
+    _require_conditions(scenario, law, P)
     F, G = scenario.slot_belief[0], steps.limits.G
     size = float(np.linalg.norm(P, 2))
     joint = steps.closed.mean(axis=0)
     gap = (1.0 - np.cos(np.pi / N)) / law.delta
     theta = 1.0 - float(law.hears.min(initial=1.0)) * gap
-    cut = _cut(scenario, law)
+    cut = _disconnection_bound(scenario, law)
     return GammaConstants(
         contraction=_norm(joint.T, P) ** 2,
         printed=(1.0 + N * size * _norm(G, P)) * _norm(F, P),
@@ -74,7 +76,8 @@ def _constants(scenario: Scenario) -> GammaConstants:
     )
 
 
-def _conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
+def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
+    """Raise TheoryError if a condition of P Theorems 5 and 6 fails."""
     least = consensus_gain_bound(scenario).radius
     if not law.delta > least:
         raise TheoryError(
@@ -88,25 +91,26 @@ def _conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
         raise TheoryError("P_inf is singular, so the norms of P (35) do not exist")
 
 
-def _cut(scenario: Scenario, law: Averaging) -> float:
-    """The disconnection probability, or the upper end of its interval."""
-    places, nodes = law.links, scenario.nodes
-    chances = {(nodes[i], nodes[j]): float(p) for (i, j), p in zip(places, law.both, strict=True)}
-    return disconnection_probability(scenario.topology, chances).high
+def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
+    """Return the disconnection probability p_d, or the upper end of its interval."""
+    links, nodes = law.links, scenario.nodes
+    up = {(nodes[i], nodes[j]): float(p) for (i, j), p in zip(links, law.both, strict=True)}
+    return disconnection_probability(scenario.topology, up).high
 
 
 def _norm(A: FloatArray, P: FloatArray) -> float:
-    """|A|_P = sup over z of sqrt(z' A' P A z / z' P z), P (35)."""
+    """Return |A|_P = sup over z of sqrt(z' A' P A z / z' P z), P (35)."""
+    # The largest generalised eigenvalue of (A' P A, P).
     return float(np.sqrt(scipy.linalg.eigh(A.T @ P @ A, P, eigvals_only=True)[-1]))
 
 
 def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = False) -> int:
-    """The smallest gamma that P Theorem 5 ("mean": asymptotically unbiased) or Theorem 6
-    ("mean-square": bounded) certifies, whatever gamma the scenario has.
+    """Return the smallest gamma that P Theorem 5 or 6 certifies; the scenario's own is ignored.
 
-    With c_B as printed in P (37), or ``max_i |A_i'|_P`` where that is larger; ``sharp`` uses the
-    latter alone. Sufficient by far: see ``exact_minimum_gamma``. Raises TheoryError where no gamma
-    is certified.
+    Theorem 5 for ``moment`` "mean" (asymptotically unbiased), Theorem 6 for "mean-square"
+    (bounded). c_B is that printed in P (37), or ``max_i |A_i'|_P`` if that is larger; ``sharp``
+    uses the latter alone. The result is far from necessary: see ``exact_minimum_gamma``. Raises
+    TheoryError if no gamma is certified.
     """
     constants = gamma_constants(scenario)
     bound = constants.sharp if sharp else max(constants.printed, constants.sharp)
@@ -115,7 +119,7 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
     def certified(gamma: int) -> bool:
         return test(constants, bound, gamma) < 1.0
 
-    return _first(certified, constants)
+    return _least_certified(certified, constants)
 
 
 def _moment(moment: str) -> Moment:
@@ -124,8 +128,8 @@ def _moment(moment: str) -> Moment:
     return "mean" if moment == "mean" else "mean-square"
 
 
-def _first(certified: Callable[[int], bool], constants: GammaConstants) -> int:
-    """The bounds fall with gamma, so its first value is found by bisection."""
+def _least_certified(certified: Callable[[int], bool], constants: GammaConstants) -> int:
+    """Return the first certified gamma by bisection, since the bounds decrease with gamma."""
     high = 1
     while not certified(high):
         high *= 2
@@ -142,13 +146,13 @@ def _first(certified: Callable[[int], bool], constants: GammaConstants) -> int:
 
 
 def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
-    """rho(A_R(gamma)) of P (36) with c_B = ``bound``."""
+    """Return rho(A_R(gamma)) of P (36) with c_B = ``bound``; below 1 it certifies gamma."""
     far = constants.mean**gamma * bound
     return _rho([[constants.contraction**0.5, far], [bound, far]])
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
-    """rho(A_S(gamma)) of P (45) with c_B = ``bound``."""
+    """Return rho(A_S(gamma)) of P (45) with c_B = ``bound``; below 1 it certifies gamma."""
     near, square = constants.contraction**0.5, bound * bound
     one, both = constants.mean**gamma, constants.mean_square**gamma
     return _rho(
@@ -166,26 +170,26 @@ def _rho(matrix: list[list[float]]) -> float:
 
 
 def searches_gamma(scenario: Scenario) -> bool:
-    """Whether a search for the exact smallest gamma takes seconds."""
+    """Return True if a search for the exact smallest gamma takes seconds."""
     return len(scenario.nodes) * scenario.plant.n <= MAX_SEARCHED
 
 
 def exact_minimum_gamma(
     scenario: Scenario, moment: Moment = "mean-square", most: int = MAX_EXACT
 ) -> int:
-    """The smallest gamma for which the exact radius of the moment's dynamics is below 1, whatever
-    gamma the scenario has: ``push_sum_radius`` for "mean-square".
+    """Return the smallest gamma for which the exact radius of the moment's dynamics is below 1.
 
-    Raises TheoryError where there is none up to ``most``.
+    The radius is ``push_sum_radius`` for "mean-square"; the scenario's own gamma is ignored. Raises
+    TheoryError if there is none up to ``most``.
     """
     steps, measure = estimation_steps(scenario), mean_radius
     if _moment(moment) == "mean-square":
         measure = radius
     for gamma in range(1, most + 1):
-        if measure(_with(steps, gamma)) < 1.0:
+        if measure(_with_gamma(steps, gamma)) < 1.0:
             return gamma
     raise TheoryError(f"no gamma up to {most} has a {moment} radius below 1")
 
 
-def _with(steps: EstimationSteps, gamma: int) -> EstimationSteps:
+def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
     return replace(steps, averaging=replace(steps.averaging, gamma=gamma))

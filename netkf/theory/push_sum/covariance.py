@@ -1,4 +1,4 @@
-"""The exact steady error covariance of the push-sum filter at every node, without a simulation."""
+"""The exact steady error covariance of the push-sum filter at every node."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.estimation_steps import estimation_steps
 from netkf.theory.push_sum.mean_square import (
-    BASIS,
-    FEW,
-    TINY,
+    KRYLOV_VECTORS,
+    MAX_DENSE,
+    MAX_DENSE_FALLBACK,
+    dense_mapping,
     mapping,
     push_sum_radius,
-    written_out,
 )
 
 MAX_ROUNDS = 20
@@ -26,12 +26,12 @@ RESIDUAL = 1e-10
 
 
 def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
-    """(N, n, n): exact steady covariance of x - xhat at every node, in the order of the nodes.
+    """Return the exact steady covariance (N, n, n) of x - xhat, in the order of the nodes.
 
-    Of P steps 4-5 at the asymptotic gains, over noises and links: those that the filter comes to
-    where links fail in both directions together and no gain is frozen early (P Theorem 2). The
-    filters' Q and R may differ from the truth. Raises TheoryError where ``push_sum_radius`` is not
-    below 1 or does not exist.
+    The mean is over noises and links, for P steps 4-5 at the asymptotic gains. The filter's gains
+    converge to these if links fail in both directions together and no gain is frozen early (P
+    Theorem 2). The filters' Q and R may differ from the truth. Raises TheoryError if
+    ``push_sum_radius`` is not below 1 or does not exist.
     """
     found, steps = push_sum_radius(scenario), estimation_steps(scenario)
     if not found < 1.0:
@@ -43,7 +43,7 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
     scale = steps.scale
     every = np.tile(scale, N)
     noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(every, every)))
-    # what is left over grows by 1 / (1 - radius) in the solution
+    # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - found, 1e-3)
     X = _fixed_point(steps.averaging, steps.scaled, noise, tolerance)
     each = np.arange(N)
@@ -54,7 +54,11 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
 def _fixed_point(
     law: Averaging, closed: FloatArray, noise: FloatArray, tolerance: float
 ) -> FloatArray:
-    """X = T(X) + noise; its residual is small beside the variances of the row and the column."""
+    """Return the solution X (N n, N n) of X = T(X) + noise.
+
+    Its residual is at most ``tolerance``, relative to the standard deviations of row and column.
+    Raises TheoryError if that is not reached.
+    """
     T, X = mapping(law, closed), noise
     for _ in range(MAX_ROUNDS):
         rest = noise + T(X) - X
@@ -62,22 +66,23 @@ def _fixed_point(
         allowed = np.outer(deviations, deviations) + 1e-6 * deviations.max(initial=0.0) ** 2
         if (np.abs(rest) <= tolerance * allowed).all():
             return X
-        X = _dense(law, closed, noise) if len(noise) <= TINY else X + _krylov(T, rest)
-    if len(noise) <= FEW:
+        X = _dense(law, closed, noise) if len(noise) <= MAX_DENSE else X + _krylov(T, rest)
+    if len(noise) <= MAX_DENSE_FALLBACK:
         return _dense(law, closed, noise)
     raise TheoryError(f"the steady covariance was solved to {np.abs(rest).max():.1e} only")
 
 
 def _dense(law: Averaging, closed: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return the solution of X = T(X) + noise by elimination on upper triangles."""
     rows, columns = np.triu_indices(len(noise))
-    matrix = np.eye(len(rows)) - written_out(law, closed)
+    matrix = np.eye(len(rows)) - dense_mapping(law, closed)
     X = np.zeros_like(noise)
     X[rows, columns] = X[columns, rows] = np.linalg.solve(matrix, noise[rows, columns])
     return X
 
 
 def _krylov(T: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
-    """An approximate solution of X - T(X) = right by generalised minimal residuals."""
+    """Return an approximate solution (N n, N n) of X - T(X) = right by GMRES."""
     size = len(right)
 
     def matvec(x: FloatArray) -> FloatArray:
@@ -88,6 +93,6 @@ def _krylov(T: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatAr
         (size**2, size**2), matvec=matvec, dtype=np.float64
     )
     x, _ = scipy.sparse.linalg.gmres(
-        operator, right.ravel(), rtol=1e-8, atol=0.0, restart=BASIS, maxiter=10
+        operator, right.ravel(), rtol=1e-8, atol=0.0, restart=KRYLOV_VECTORS, maxiter=10
     )
     return symmetric(np.asarray(x).reshape(size, size))

@@ -1,9 +1,10 @@
-"""The probability that failing links cut a network in two: p_d of P Assumption 3.
+"""The probability that link failures disconnect a network: p_d of P Assumption 3.
 
-Links are taken in an order in which few nodes are open, that is, touched by links before and after.
-What matters of the links before is only which open nodes they join, so the probability of each such
-partition is carried from link to link; a part that closes away from the rest is a cut. Exact, and
-quick while few nodes are open at a time, however many links there are.
+Links are processed in an order in which few nodes are open, that is, have processed links and links
+still to come. Only the partition of the open nodes by the links so far matters, so that the
+probability of each partition is carried from link to link; a part that closes apart from the rest
+disconnects the network. Exact, and fast as long as few nodes are open at a time, for any number of
+links.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 
 MAX_PARTITIONS = 120_000
-MAX_ROOTS = 12
-MAX_OPEN = 40  # nodes open at a time, from which on partitions are far too many
-SAMPLES, MIN_SAMPLES, NODE_SAMPLES = 200_000, 2_000, 2e7
-BATCH = 2_000_000  # link draws
+MAX_ROOTS = 12  # first nodes that are tried
+MAX_OPEN = 40  # open nodes at a time; beyond, there are far too many partitions
+MAX_SAMPLES, MIN_SAMPLES, NODE_SAMPLES = 200_000, 2_000, 2e7  # the last: samples times nodes
+MAX_DRAWS = 2_000_000  # of links in one array
 CONFIDENCE = 0.99
 
 Edge = tuple[Any, Any]
 
 
 class Probability(float):
-    """A probability that says how well it is known.
+    """A probability with its accuracy.
 
-    low, high : equal to it where ``exact``, else an interval of 99 % confidence by simulation
-    exact     : whether it was computed, not estimated
+    low, high : equal to it if ``exact``, else an interval of 99 % confidence by simulation
+    exact     : True if it was computed, not estimated
     """
 
     low: float
@@ -47,7 +48,7 @@ class Probability(float):
     exact: bool
 
     def __new__(cls, value: float, low: float, high: float, exact: bool) -> Probability:
-        """The value with its interval."""
+        """Return the value with its interval."""
         made = super().__new__(cls, value)
         made.low, made.high, made.exact = low, high, exact
         return made
@@ -67,61 +68,74 @@ def disconnection_probability(
     seed: int = 0,
     samples: int | None = None,
 ) -> Probability:
-    """The probability that the links which are up leave the network unconnected, p_d.
+    """Return the probability p_d that the links which are up do not connect all nodes.
 
     ``graph``: undirected; a networkx graph, a Topology, pairs of nodes or a Scenario.
     ``delivery``: the probability that a link is up, one for all or one for each pair; by default
     that of the scenario's channel. Links fail independently, in both directions together.
 
-    A float with ``low``, ``high`` and ``exact``: exact while at most 120,000 partitions of open
-    nodes occur (any graph of ten nodes, grids ten wide), else the estimate of ``samples`` draws
-    (default: 200,000, and fewer in networks of more than 100 nodes, so that it takes seconds).
-    Raises TheoryError for directed graphs, and for links without a probability or with one outside
-    [0, 1].
+    The result is a float with ``low``, ``high`` and ``exact``: exact if at most 120,000 partitions
+    of open nodes occur (any graph of ten nodes, grids ten wide), else an estimate from ``samples``
+    draws (default: 200,000, and fewer in networks of more than 100 nodes, so that it takes
+    seconds). Raises TheoryError for directed graphs, and for links without a probability or with
+    one outside [0, 1].
     """
     if isinstance(graph, Scenario) and delivery is None:
-        return _of_scenario(graph, seed, samples)
-    return _computed(*_network(graph, delivery), seed, samples)
+        return _scenario_probability(graph, seed, samples)
+    return _probability(*_link_probabilities(graph, delivery), seed, samples)
 
 
 @lru_cache(maxsize=8)
-def _of_scenario(scenario: Scenario, seed: int, samples: int | None) -> Probability:
-    """Kept, because assumptions and promises both ask for it."""
-    return _computed(*_network(scenario, None), seed, samples)
+def _scenario_probability(scenario: Scenario, seed: int, samples: int | None) -> Probability:
+    """Return p_d of a scenario, cached: assumptions and promises both use it."""
+    return _probability(*_link_probabilities(scenario, None), seed, samples)
 
 
-def _computed(
-    nodes: int, chances: dict[tuple[int, int], float], seed: int, samples: int | None
+def _probability(
+    nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int | None
 ) -> Probability:
-    """Exact where that is within reach, else simulated."""
+    """Return the exact probability if it has few enough partitions, else an estimate."""
     neighbours: list[dict[int, float]] = [{} for _ in range(nodes)]
-    for (i, j), p in chances.items():
+    for (i, j), p in probabilities.items():
         if p > 0.0:
             neighbours[i][j] = neighbours[j][i] = p
-    if not _reaches_all(neighbours):
+    if not _is_connected(neighbours):
         return Probability(1.0, 1.0, 1.0, True)
     order = _order(neighbours)
     cut = None if order is None else _cut(neighbours, order)
     if cut is not None:
         return Probability(cut, cut, cut, True)
     if samples is None:
-        samples = int(np.clip(NODE_SAMPLES / nodes, MIN_SAMPLES, SAMPLES))
-    return _simulated(nodes, chances, seed, samples)
+        samples = int(np.clip(NODE_SAMPLES / nodes, MIN_SAMPLES, MAX_SAMPLES))
+    return _estimate(nodes, probabilities, seed, samples)
 
 
-def _network(
+def _link_probabilities(
     graph: Any, delivery: float | Mapping[Edge, float] | None
 ) -> tuple[int, dict[tuple[int, int], float]]:
-    """The number of nodes and the probability of each link between two of their places."""
+    """Return the number of nodes and the probability of each link, by the indices of its ends."""
     if isinstance(graph, Scenario):
         if delivery is None:
-            delivery = _of_channel(graph)
+            delivery = _channel_probabilities(graph)
         graph = graph.topology
-    directed = graph.is_directed() if isinstance(graph, networkx.Graph) else False
+    names, links = _nodes_and_links(graph)
+    index = {name: k for k, name in enumerate(names)}
+    found = {}
+    for link in links:
+        i, j = sorted(index[end] for end in link)
+        if i != j:
+            found[i, j] = _link_probability(link, delivery)
+    return len(names), found
+
+
+def _nodes_and_links(graph: Any) -> tuple[list[Any], list[Edge]]:
+    """Return the nodes and links of a graph; raises TheoryError if it is directed or empty."""
+    directed = False
     if isinstance(graph, Topology):
         names, links, directed = list(graph.nodes), list(graph.links), graph.directed
     elif isinstance(graph, networkx.Graph):
         names, links = list(graph.nodes), [(i, j) for i, j in graph.edges()]
+        directed = graph.is_directed()
     else:
         links = [(i, j) for i, j in graph]
         names = list(dict.fromkeys(node for link in links for node in link))
@@ -129,16 +143,11 @@ def _network(
         raise TheoryError("the graph must be undirected")
     if not names:
         raise TheoryError("the graph must have a node")
-    place = {name: k for k, name in enumerate(names)}
-    found = {}
-    for link in links:
-        i, j = sorted(place[end] for end in link)
-        if i != j:
-            found[i, j] = _chance(link, delivery)
-    return len(names), found
+    return names, links
 
 
-def _chance(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
+def _link_probability(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
+    """Return the probability that a link is up; raises TheoryError if there is none in [0, 1]."""
     p: Any = None
     if isinstance(delivery, Mapping):
         p = delivery.get(link, delivery.get(link[::-1]))
@@ -147,18 +156,21 @@ def _chance(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
     if p is None:
         raise TheoryError(f"delivery must be given for link {link}")
     try:
-        chance = float(p)
+        probability = float(p)
     except (TypeError, ValueError):
-        words = "delivery must be a number, or a mapping from links to numbers"
-        raise TheoryError(f"{words}, got {p!r}") from None
-    if not 0.0 <= chance <= 1.0:
+        message = "delivery must be a number, or a mapping from links to numbers"
+        raise TheoryError(f"{message}, got {p!r}") from None
+    if not 0.0 <= probability <= 1.0:
         raise TheoryError(f"delivery must lie in [0, 1], got {p!r} for link {link}")
-    return chance
+    return probability
 
 
-def _of_channel(scenario: Scenario) -> dict[Edge, float]:
-    """The probability that a link is up in both directions, where these fail together."""
-    channel, chances = scenario.network.channel, {}
+def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
+    """Return the probability that each link is up, in both directions together.
+
+    Raises TheoryError if the directions of a link fail independently, and for recorded losses.
+    """
+    channel, probabilities = scenario.network.channel, {}
     for i, j in scenario.topology.links:
         one, other = (
             channel.loss.mean_delivery(way, scenario.table_probability(way))
@@ -168,11 +180,12 @@ def _of_channel(scenario: Scenario) -> dict[Edge, float]:
             raise TheoryError("the channel is a record, not a law: give delivery")
         if one != other or (not channel.symmetric and 0.0 < one < 1.0):
             raise TheoryError("the two directions of a link fail apart: give delivery")
-        chances[i, j] = one
-    return chances
+        probabilities[i, j] = one
+    return probabilities
 
 
-def _reaches_all(neighbours: list[dict[int, float]]) -> bool:
+def _is_connected(neighbours: list[dict[int, float]]) -> bool:
+    """Return True if the links connect all nodes."""
     seen, waiting = {0}, [0]
     while waiting:
         for node in neighbours[waiting.pop()].keys() - seen:
@@ -182,8 +195,9 @@ def _reaches_all(neighbours: list[dict[int, float]]) -> bool:
 
 
 def _order(neighbours: list[dict[int, float]]) -> list[int] | None:
-    """All nodes, so that few are open at a time: greedy, from several first nodes; None where too
-    many are open in every order found.
+    """Return all nodes in an order in which few are open at a time.
+
+    The best of greedy orders from several first nodes; None if too many are open in each.
     """
     nodes = range(len(neighbours))
     fewest = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
@@ -192,10 +206,10 @@ def _order(neighbours: list[dict[int, float]]) -> list[int] | None:
 
 
 def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
-    """A guess of how many partitions there will be, and the order that was found; None as soon as
-    more than MAX_OPEN nodes are open.
+    """Return an estimate of the number of partitions and a greedy order of the nodes.
 
-    Next comes the node that closes most open ones and then opens fewest further ones.
+    The next node is the one that closes most open nodes and then opens fewest new ones. None as
+    soon as more than MAX_OPEN nodes are open.
     """
     waiting = [set(links) for links in neighbours]
     effort, order, opened, taken = 0.0, [], set[int](), set[int]()
@@ -222,9 +236,9 @@ def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[
 
 
 def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
-    """The probability of a cut; None where too many partitions occur.
+    """Return the probability that the network is disconnected, None for too many partitions.
 
-    A partition is the tuple of the labels of the open nodes, numbered as they first appear.
+    A partition is the tuple of the labels of the open nodes, numbered in order of appearance.
     """
     place = {node: k for k, node in enumerate(order)}
     last = [max((place[k] for k in links), default=0) for links in neighbours]
@@ -235,22 +249,23 @@ def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
         open_.append(node)
         states = {(*labels, len(labels)): p for labels, p in states.items()}
         for other in [x for x in open_ if x in neighbours[node]]:
-            states = _joined(states, open_.index(other), neighbours[node][other])
+            states = _apply_link(states, open_.index(other), neighbours[node][other])
             if len(states) > MAX_PARTITIONS:
                 return None
+        # A node stays open as long as some neighbour is still to come.
         keep = [x for x, other in enumerate(open_) if max(last[other], place[other]) > k]
         if k + 1 < len(order):
-            states, lost = _closed(states, keep)
+            states, lost = _close_nodes(states, keep)
             cuts.append(lost)
             open_ = [open_[x] for x in keep]
     cuts.append(math.fsum(p for labels, p in states.items() if max(labels) > 0))
     return math.fsum(cuts)
 
 
-def _joined(
+def _apply_link(
     states: dict[tuple[int, ...], float], place: int, up: float
 ) -> dict[tuple[int, ...], float]:
-    """Partitions after the link between the open node at ``place`` and the last one."""
+    """Return the partitions after the link between open node ``place`` and the last open node."""
     found: defaultdict[tuple[int, ...], float] = defaultdict(float)
     for labels, p in states.items():
         one, other = labels[place], labels[-1]
@@ -259,14 +274,17 @@ def _joined(
             continue
         if up < 1.0:
             found[labels] += p * (1.0 - up)
-        found[_numbered([one if x == other else x for x in labels])] += p * up
+        found[_renumber([one if x == other else x for x in labels])] += p * up
     return dict(found)
 
 
-def _closed(
+def _close_nodes(
     states: dict[tuple[int, ...], float], keep: list[int]
 ) -> tuple[dict[tuple[int, ...], float], float]:
-    """Partitions of the nodes that stay open, and the probability that some part had none."""
+    """Return the partitions of the nodes that stay open, and the probability of a cut.
+
+    It is that of the partitions with a part none of whose nodes stays open.
+    """
     found: defaultdict[tuple[int, ...], float] = defaultdict(float)
     lost = []
     for labels, p in states.items():
@@ -274,23 +292,25 @@ def _closed(
         if len(set(rest)) < len(set(labels)):
             lost.append(p)
         else:
-            found[_numbered(rest)] += p
+            found[_renumber(rest)] += p
     return dict(found), math.fsum(lost)
 
 
-def _numbered(labels: list[int]) -> tuple[int, ...]:
+def _renumber(labels: list[int]) -> tuple[int, ...]:
+    """Return the labels numbered in order of appearance, so that equal partitions are equal."""
     names: dict[int, int] = {}
     return tuple([names.setdefault(x, len(names)) for x in labels])
 
 
-def _simulated(
-    nodes: int, chances: dict[tuple[int, int], float], seed: int, samples: int
+def _estimate(
+    nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int
 ) -> Probability:
-    """The share of cut networks among draws, with its Clopper-Pearson interval."""
-    ends, up = np.array(list(chances)), np.array(list(chances.values()))
+    """Return the fraction of disconnected draws, with its Clopper-Pearson interval."""
+    ends, up = np.array(list(probabilities)), np.array(list(probabilities.values()))
     random, cut, done = Streams(seed).generator("links"), 0, 0
     while done < samples:
-        count = min(samples - done, max(1, BATCH // len(ends)))
+        count = min(samples - done, max(1, MAX_DRAWS // len(ends)))
+        # All draws are one graph with a copy of the nodes for each.
         which, link = np.nonzero(random.random((count, len(ends))) < up)
         rows, columns = (which * nodes + ends[link, end] for end in (0, 1))
         matrix = scipy.sparse.coo_array(

@@ -1,4 +1,4 @@
-"""The results of ``netkf theory`` for the push-sum filter: P section 4, exact mean squares."""
+"""Results that ``netkf theory`` prints for the push-sum filter: P section 4, exact mean squares."""
 
 from __future__ import annotations
 
@@ -21,13 +21,16 @@ from netkf.theory.push_sum.disconnection import disconnection_probability
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
 from netkf.theory.push_sum.mean_square import push_sum_radius
 
-MAX_STEPS = 20
+MAX_STEPS = 20  # gamma up to which the exact one is searched for
 
 
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
-    """Values by name, each ``{"value", "reason"}``; plain JSON values."""
+    """Return the results by name, each ``{"value", "reason"}`` with JSON values.
 
-    def p_inf() -> float:
+    One of the two is None; the reason says why there is no value.
+    """
+
+    def limit() -> float:
         return float(np.trace(push_sum_limits(scenario).P))
 
     def central() -> float:
@@ -50,7 +53,7 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return [found.low, found.high]
 
     functions: dict[str, Callable[[], Any]] = {
-        "limit_trace": p_inf,
+        "limit_trace": limit,
         "central_trace": central,
         "error_traces": by_node,
         "radius": lambda: push_sum_radius(scenario),
@@ -71,9 +74,9 @@ def _value(function: Callable[[], Any]) -> dict[str, Any]:
 
 
 def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]:
-    """The promises as lines for a terminal; ``number`` formats a value."""
+    """Return the results as lines for a terminal; ``number`` formats a value."""
 
-    def shown(name: str, make: Callable[[Any], str] = number) -> str:
+    def text(name: str, make: Callable[[Any], str] = number) -> str:
         value = found[name]
         return value["reason"] or make(value["value"])
 
@@ -87,13 +90,13 @@ def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]
         return number(low) if low == high else f"{number(low)} .. {number(high)} (simulated)"
 
     return [
-        f"trace of P_inf, what every node takes its covariance to be: {shown('limit_trace')}",
-        f"trace of the central filter's covariance: {shown('central_trace')}",
-        f"trace of the steady error covariance, exact: {shown('error_traces', errors)}",
-        f"mean-square radius, exact: {shown('radius')}",
-        f"smallest gamma with a radius below 1: {shown('exact_minimum_gamma', str)}",
-        f"smallest gamma by P Theorem 5 (mean): {shown('minimum_gamma_mean', str)}",
-        f"smallest gamma by P Theorem 6 (mean square): {shown('minimum_gamma_mean_square', str)}",
-        f"rho(L): {shown('laplacian_radius')}",
-        f"disconnection probability: {shown('disconnection_probability', interval)}",
+        f"trace of P_inf, what every node takes its covariance to be: {text('limit_trace')}",
+        f"trace of the central filter's covariance: {text('central_trace')}",
+        f"trace of the steady error covariance, exact: {text('error_traces', errors)}",
+        f"mean-square radius, exact: {text('radius')}",
+        f"smallest gamma with a radius below 1: {text('exact_minimum_gamma', str)}",
+        f"smallest gamma by P Theorem 5 (mean): {text('minimum_gamma_mean', str)}",
+        f"smallest gamma by P Theorem 6 (mean square): {text('minimum_gamma_mean_square', str)}",
+        f"rho(L): {text('laplacian_radius')}",
+        f"disconnection probability: {text('disconnection_probability', interval)}",
     ]
