@@ -83,7 +83,7 @@ def intersect_covariances(
     return triangular_root(root), [w * P @ V.T @ V for w, V in zip(used, inverses, strict=True)]
 
 
-def add_information(root: FloatArray, U: FloatArray) -> FloatArray:
+def add_information_to_root(root: FloatArray, U: FloatArray) -> FloatArray:
     """Return a root (n, n) of ``(P^-1 + U)^-1`` for a positive semidefinite U (n, n)."""
     # (P^-1 + U)^-1 = S (I + S' U S)^-1 S' with P = S S'; P itself is never inverted.
     inner = np.eye(len(root)) + root.T @ (0.5 * (U + U.T)) @ root

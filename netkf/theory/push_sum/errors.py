@@ -25,7 +25,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import HostObservations
 from netkf.theory.common.stacked_errors import StackedErrors
-from netkf.theory.numerics.updates import add_information
+from netkf.theory.numerics.updates import add_information_to_root
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -104,7 +104,7 @@ class AveragingRule(ErrorRule):
         number = np.where(heard, self._z[:, 1] / weight, 1.0)
         columns = errors.reading_noises(observations)
         for host in range(self._N):
-            root = add_information(errors.roots[host], G[host])
+            root = add_information_to_root(errors.roots[host], G[host])
             if host not in observations:
                 errors.roots[host] = root
                 continue
@@ -241,7 +241,7 @@ class RunningTotalsRule(ErrorRule):
         share = errors.hosts / after
         # Information adds up: (w+ / N) P+^-1 = (w / N) P^-1 + U.
         scaled = np.sqrt(after / self._weights[host]) * errors.roots[host]
-        root = add_information(scaled, share * U)
+        root = add_information_to_root(scaled, share * U)
         gain = share * root @ root.T
         errors.stack.put(host, (np.eye(n) - gain @ U) @ errors.stack.form(host) - gain @ form)
         errors.roots[host] = root
