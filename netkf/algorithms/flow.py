@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Increments
 from netkf.algorithms.kernels.gains import gain_update
-from netkf.algorithms.kernels.riccati import riccati_step
+from netkf.algorithms.kernels.riccati import propagate_riccati
 from netkf.algorithms.models import FlowModel, usable
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
@@ -64,7 +64,7 @@ class FlowFilter(Component):
         """Return the state ``gap`` > 0 seconds later. Its covariance counts the readings of the gap
         already, its estimate does not yet.
         """
-        P, xhat = riccati_step(state.model.riccati, state.P, state.xhat, gap)
+        P, xhat = propagate_riccati(state.model.riccati, state.P, state.xhat, gap)
         return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
@@ -117,5 +117,5 @@ def predict(model: FlowModel, payload: Payload, age: float) -> Payload:
     """Return a payload predicted ``age`` seconds ahead by the model, without readings."""
     if age <= 0.0:
         return payload
-    P, xhat = riccati_step(model.prediction, payload.P, payload.xhat, age)
+    P, xhat = propagate_riccati(model.prediction, payload.P, payload.xhat, age)
     return Payload(xhat, P)

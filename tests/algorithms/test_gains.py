@@ -7,7 +7,7 @@ import scipy.linalg
 from netkf.algorithms.filter import Estimate, Exchange, Increments, Message, State
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.kernels.gains import gain_table, gain_update, longest_interval
-from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from netkf.algorithms.models import FlowModel
 from tests import reference
 
@@ -28,7 +28,7 @@ def test_gains_are_the_projections_of_the_exact_weight(seed):
     g, G = 0.05, H.T @ np.linalg.solve(R, H)
     table = riccati_table(A, Q, G, g)
     model = FlowModel(A, Q, H, R, 1.0, g)
-    flow = lambda s: riccati_step(table, P0, np.zeros(3), s)[0]  # noqa: E731
+    flow = lambda s: propagate_riccati(table, P0, np.zeros(3), s)[0]  # noqa: E731
     steps = 2000
 
     def transition(s):  # product of midpoint exponentials from s to g

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import netkf
-from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from tests import reference
 
 WALK = np.array([[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
@@ -59,7 +59,7 @@ def test_the_kernel_is_the_formula(seed, n, reads):
             triple = reference.flow_triple(*reference.exactly(A, Q, G), gap)
             exact = reference.flow(*reference.exactly(P, x), triple)
         expected, moved = (reference.rounded(part) for part in exact)
-        found, seen = riccati_step(table, P, x, gap)
+        found, seen = propagate_riccati(table, P, x, gap)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
         np.testing.assert_allclose(seen, moved, rtol=0, atol=1e-10 * np.abs(moved).max())
 
@@ -73,9 +73,9 @@ def test_flow_composes_over_gaps_and_keeps_covariances(seed, n, first, second):
     Q, G, P = B @ B.T, C @ C.T, S @ S.T
     table = riccati_table(A, Q, G, 10.0)
     x = random.normal(size=n)
-    once, moved = riccati_step(table, P, x, first + second)
-    part, halfway = riccati_step(table, P, x, first)
-    twice, moved_twice = riccati_step(table, part, halfway, second)
+    once, moved = propagate_riccati(table, P, x, first + second)
+    part, halfway = propagate_riccati(table, P, x, first)
+    twice, moved_twice = propagate_riccati(table, part, halfway, second)
     scale = np.abs(once).max() + 1e-12
     assert np.abs(once - twice).max() <= 1e-10 * scale
     assert np.abs(moved - moved_twice).max() <= 1e-10 * (np.abs(moved).max() + 1e-12)
@@ -92,7 +92,7 @@ def test_tables_reach_as_far_as_numbers_do():
     A = 60.0 * np.eye(2)
     table = riccati_table(A, Q, G, 20.0)
     assert np.isnan(table.F[-1]).all()
-    P, _ = riccati_step(table, np.eye(2), np.zeros(2), 0.05)
+    P, _ = propagate_riccati(table, np.eye(2), np.zeros(2), 0.05)
     np.testing.assert_allclose(P, exact(np.eye(2), A, Q, G, 0.05), rtol=1e-9)
 
 

@@ -144,7 +144,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 def substep(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what ``riccati_step`` does, for a gap of at most one unit."""
+    """Return what ``propagate_riccati`` does, for a gap of at most one unit."""
     n = table.n
     if len(table.unobserved):
         values = polynomial(table.unobserved, gap)
@@ -160,7 +160,7 @@ def substep(
 
 
 @kernel(allocates=True)
-def riccati_step(
+def propagate_riccati(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return P (n, n) moved by the flow over ``gap`` seconds and x (n,) by ``exp(A gap)``."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.integrate
 
-from netkf.algorithms.kernels.riccati import RiccatiTable, riccati_step, riccati_table
+from netkf.algorithms.kernels.riccati import RiccatiTable, propagate_riccati, riccati_table
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -92,7 +92,7 @@ def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray
                 longest = max(float(times[-1]), 1e-9)
                 tables[key] = riccati_table(equations.A, equations.Q, G, longest)
             for k, t in enumerate(times):
-                P[k, i] = riccati_step(tables[key], start, mean, float(t))[0] if t else start
+                P[k, i] = propagate_riccati(tables[key], start, mean, float(t))[0] if t else start
     return P
 
 

@@ -17,7 +17,7 @@ import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.sparse.linalg
 
-from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
@@ -166,8 +166,8 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
     if delay > 0.0:
         # Without readings (G = 0) the Riccati flow is the prediction; T from its unit vectors.
         table = riccati_table(A, Q, np.zeros((n, n)), delay)
-        q, _ = riccati_step(table, q, np.zeros(n), delay)
-        T = np.column_stack([riccati_step(table, q, e, delay)[1] for e in np.eye(n)])
+        q, _ = propagate_riccati(table, q, np.zeros(n), delay)
+        T = np.column_stack([propagate_riccati(table, q, e, delay)[1] for e in np.eye(n)])
     start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
     return CoupledRiccati(
         A,

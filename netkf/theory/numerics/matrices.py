@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.kernels.riccati import riccati_step, riccati_table
+from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, is_semidefinite, square_root, symmetric
 
@@ -75,7 +75,7 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
         return start
     with np.errstate(over="ignore", invalid="ignore"):
         table = riccati_table(drift, noise, information, float(gap))
-        end, _ = riccati_step(table, start, np.zeros(n), float(gap))
+        end, _ = propagate_riccati(table, start, np.zeros(n), float(gap))
     if not np.isfinite(end).all():
         raise TheoryError(f"the solution overflows before {gap:g} s: an undetectable mode grows")
     return end
