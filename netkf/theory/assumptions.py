@@ -57,6 +57,7 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on the graph and on the weights of the filter."""
     topology = scenario.topology
     components = len(topology.components)
     rows: list[AssumptionRow] = [
@@ -74,6 +75,7 @@ def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on controllability, observability, the filters' model and sampling."""
     plant = scenario.truth
     # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
     idle = unobservable_mode(plant.A.T, plant.Q)
@@ -99,6 +101,7 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
     if any(sensor.varying for sensor in scenario.sensors):
         return None, "H differs from reading to reading"
     A, n = scenario.truth.A, scenario.plant.n
+    # (A, H) is observable if and only if (A, sum H' R^-1 H) is: both hide the same modes.
     information = np.zeros((n, n))
     for node in scenario.sensing:
         information += _node_information(scenario, node)
@@ -139,6 +142,7 @@ def _node_information(scenario: Scenario, node: int) -> np.ndarray:
 
 
 def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on rates and laws of the link clocks."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if transmits_at_samples(scenario):
@@ -146,6 +150,7 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
         return [("nodes transmit at independent Poisson processes", "H II-B b", None, evidence)]
     entities, what = clock.entities(scenario.topology), clock.at
     rates = np.array([clock.mean_rate(entity) for entity in entities])
+    # A recorded clock has no rates beforehand: mean_rate is then nan.
     known = rates[np.isfinite(rates)]
     unknown = len(known) < len(rates)
     positive = None if unknown else bool((known > 0.0).all())
@@ -177,7 +182,10 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on losses, delays and the symmetry of arrivals."""
     channel = scenario.network.channel
+    # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
+    # fixed delay only shifts it; a random delay or dependent losses do neither.
     fixed, symmetric = channel.delay.fixed, has_balanced_rates(scenario)
     return [
         (

@@ -77,6 +77,7 @@ class EstimateExchangeRule(ErrorRule):
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Combine each receiver's estimate with the newest message of each sender."""
         inboxes: dict[int, dict[int, SentMessage]] = {}
+        # Messages of one sender can overtake each other: the last one sent counts.
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
             inboxes.setdefault(message.receiver, {})[message.sender] = message
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {
@@ -90,6 +91,7 @@ class EstimateExchangeRule(ErrorRule):
     def _combine_inbox(
         self, receiver: int, inbox: list[SentMessage]
     ) -> tuple[FloatArray, list[tuple[Hashable, FloatArray]]]:
+        # An instantaneous message needs no copy: its content is the sender's present estimate.
         sources: list[Hashable] = [receiver]
         sources += [message if message.late else message.sender for message in inbox]
         nodes, scenario = self.scenario.nodes, self.scenario

@@ -34,6 +34,7 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
 def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
     """Return the diagonal blocks (T, N, n, n) of stacked covariances (T, N n, N n)."""
     n = stacked.shape[-1] // nodes
+    # Entry (t, i, a, j, b) is the covariance of entry a of e_i and entry b of e_j.
     blocks = stacked.reshape(len(stacked), nodes, n, nodes, n)
     return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
 

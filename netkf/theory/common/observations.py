@@ -34,6 +34,7 @@ def nodes_by_host(scenario: Scenario) -> list[tuple[int, ...]]:
 
 def _observation(scenario: Scenario, sensor: PlacedSensor, H: FloatArray) -> Observation:
     R, true = (scenario.noise(sensor.entry, believed) for believed in (True, False))
+    # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
     return Observation(H, R, np.asarray(np.linalg.cholesky(true), dtype=np.float64))
 
 
@@ -87,6 +88,8 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservat
         for node in nodes:
             for place in by_node.get(node, ()):
                 sensor = scenario.sensors[place.entry]
+                # A varying H is drawn with the run's own streams, so that it is the one that the
+                # engine used.
                 path = sample_path(scenario, streams, node, place) if sensor.varying else None
                 for k, time in enumerate(times[node, place.ordinal].tolist()):
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H

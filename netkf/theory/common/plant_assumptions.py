@@ -39,6 +39,7 @@ def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
     plant, worst = scenario.plant, np.inf
     for node in scenario.nodes:
         mean, cov = scenario.start(node)
+        # E[(x - xhat)(x - xhat)'] = cov of x(0) + the square of the difference of the means
         offset = plant.start_mean - mean
         gap = cov - plant.start_cov - np.outer(offset, offset)
         worst = min(worst, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))

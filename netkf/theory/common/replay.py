@@ -37,6 +37,7 @@ def replay_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]
     require_known_filter(scenario)
     errors = StackedErrors(scenario, len(nodes_by_host(scenario)))
     replay = _replay_slots if scenario.slotted else _replay_instants
+    # The generator stops at each sample, when the errors have their values of that time.
     pairs = [(errors.covariance(), errors.covariances()) for _ in replay(scenario, run, errors)]
     if not pairs:
         n = errors.n
@@ -109,6 +110,7 @@ def _exchanged_messages(scenario: Scenario, run: Run) -> dict[tuple[int, int], l
     found: dict[tuple[int, int], list[SentMessage]] = {}
     columns = (slots, *(rows[c] for c in ("phase", "node", "peer", "message")))
     for slot, phase, node, peer, message in zip(*(c.tolist() for c in columns), strict=True):
+        # Within a slot the order of phases decides, and not the time of arrival.
         sent = SentMessage(index[peer], index[node], message, slot, slot)
         found.setdefault((slot, max(phase, 0)), []).append(sent)
     return found
@@ -137,6 +139,7 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
     """
     phases, plant = scenario.hosted.schedule or (), scenario.slot_plant
     F, Q = scenario.slot_belief
+    # In slots all predictions are the same: x+ = F x + w, e+ = F_f e + (F - F_f) x + w.
     noise = square_root(plant.Q)
     prediction = Prediction(plant.F, F, plant.F - F, noise, noise, square_root(Q))
     rule = _rule(scenario, errors, run, [])

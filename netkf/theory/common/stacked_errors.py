@@ -65,6 +65,7 @@ class StackedErrors:
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the hosts."""
+        # P = S S'
         S = np.stack([self.roots[host] for host in range(self.hosts)])
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
@@ -124,6 +125,7 @@ class StackedErrors:
         """Predict all estimates, and the state; return the columns of the plant's inputs."""
         columns = self.stack.inputs(step.error_noise.shape[1])
         names = list(self.roots)
+        # e+ = F e + D x + w for all estimates, and x+ = F x + w for the state
         moved = step.error @ self.stack.forms(names)
         if self.follows:
             x = self.stack.form(STATE)
@@ -150,6 +152,7 @@ def _errors_follow_state(scenario: Scenario) -> bool:
 
 
 def _predict_root(S: FloatArray, step: Prediction) -> FloatArray:
+    # F P F' + Q = [F S, Q^1/2] [F S, Q^1/2]'
     return triangular_root(np.concatenate([step.error @ S, step.root], axis=1))
 
 

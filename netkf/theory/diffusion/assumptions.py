@@ -45,6 +45,7 @@ def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
     size, directions = len(scenario.nodes), scenario.topology.directions
     rows = [*range(size), *(index[sender] for sender, _ in directions)]
     columns = [*range(size), *(index[receiver] for _, receiver in directions)]
+    # Columns sum to 1: a node divides one unit of weight among itself and its neighbours.
     values = [own[node] for node in scenario.nodes]
     values += [scenario.weight(receiver, sender) for sender, receiver in directions]
     matrix = scipy.sparse.coo_array((values, (rows, columns)), shape=(size, size))
@@ -52,6 +53,7 @@ def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
 
 
 def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on balanced weights and on strong connection."""
     W = sparse_weights(scenario)
     W.eliminate_zeros()
     unbalanced = float(np.abs(W.sum(axis=1) - 1.0).max())
@@ -83,6 +85,7 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
             else (None, evidence)
         )
     distances = scipy.sparse.csgraph.shortest_path(W, method="D", unweighted=True)
+    # D needs W^l > 0 for some l; with positive own weights the diameter suffices.
     diameter = int(distances.max())
     least = float(np.linalg.matrix_power(W.toarray(), max(diameter, 1)).min())
     evidence = f"diameter {diameter}; least entry of the weights to that power {least:.3g}"
@@ -92,6 +95,7 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on the random walk and on Q and r of the filters."""
     plant = scenario.slot_plant
     F, Q = scenario.slot_belief
     least = float(np.linalg.eigvalsh(Q)[0])
@@ -124,6 +128,7 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _information_row(scenario: Scenario) -> AssumptionRow:
+    """Return the row on the cooperative information condition D (19)."""
     name = "the sensors together excite every direction (sufficient)"
     if not few_regressors(scenario):
         evidence = f"not computed beyond {MAX_REGRESSORS} sensors whose H varies"
@@ -146,12 +151,14 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
+    """Return the row on messages that arrive in time."""
     channel = scenario.network.channel
     rates = [
         channel.loss.mean_delivery(link, scenario.table_probability(link))
         for link in scenario.topology.directions
     ]
     fixed = channel.delay.fixed
+    # A message that takes a whole phase comes after its exchange and is not used.
     in_time = fixed is not None and fixed < scenario.phase_length
     if is_recorded(channel):
         return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)

@@ -106,6 +106,7 @@ def _sources(scenario: Scenario) -> list[_Source]:
                 drive = sensor.B @ sensor.xi_cov @ sensor.B.T
                 found.append(_Source(node, sensor.A, sensor.C, sensor.start, drive))
             elif isinstance(sensor, LinearSensor):
+                # A fixed row H is a regressor with the constant state 1 and no noise.
                 still = (np.ones(1), np.zeros((0, 0)))
                 found += [_Source(node, np.eye(1), row[:, None], *still) for row in sensor.H]
             else:
@@ -163,6 +164,7 @@ def _least(
     sources: list[_Source], past: list[FloatArray], values: FloatArray, window: int
 ) -> float:
     """Return the least level found: by drawing, at states 0, and by a search from both."""
+    # The least level may be attained far from all pasts drawn.
     best = int(np.argmin(values))
     # A fixed regressor has no state that could differ.
     resting = [np.zeros_like(s.start) if s.drive.size else s.start for s in sources]
@@ -215,6 +217,7 @@ def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> Floa
             found = _window_excitation(source, states, window).reshape(len(some), -1, n, n)
             total = total + found.sum(axis=0) * (len(group) if fixed else 1)
     values = np.linalg.eigvalsh(symmetric(total))
+    # D (19): the mean over sensors, and h terms over h + 1.
     least = values[:, 0] / (len(sources) * (window + 1))
     return np.where(values[:, 0] > EIGENVALUE_TOLERANCE * values.sum(axis=1), least, 0.0)
 
@@ -247,6 +250,7 @@ def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
     """
     spread, axes = np.linalg.eigh(cov)
     spread = np.maximum(spread, 0.0)
+    # In the axes of the covariance the entries of phi are independent.
     m = mean @ axes
     # In the axes of cov, exp(-u |phi|^2) divides means and variances by D.
     D = 1.0 + 2.0 * _U[:, None] * spread

@@ -14,7 +14,7 @@ from netkf.theory.gossip.matchings import (
     primitive,
 )
 
-MAX_SHOWN = 12
+MAX_LISTED = 12
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -29,11 +29,13 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the row on the mean matching, G C.1."""
     name = "the mean matching is irreducible and aperiodic"
     try:
         mean = _mean_swaps(scenario)
     except TheoryError as error:
         return [(name, "G C.1", None, f"not decided: {error}")]
+    # Irreducible and aperiodic together mean that some power of the matrix is positive (C.1).
     irreducible, aperiodic, period = primitive(mean)
     if not irreducible:
         evidence = "some nodes are never reached from others"
@@ -56,6 +58,7 @@ def _mean_swaps(scenario: Scenario) -> FloatArray:
 
 
 def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the row on weak detectability, G D.1."""
     name = "some walk on the network detects the state (weak detectability)"
     try:
         walk = detecting_walk(scenario)
@@ -71,12 +74,14 @@ def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
                 "sufficient, not necessary: a mode that decays by itself need not be seen",
             )
         ]
-    listed = ", ".join(map(str, walk[:MAX_SHOWN])) + (", ..." if len(walk) > MAX_SHOWN else "")
+    listed = ", ".join(map(str, walk[:MAX_LISTED])) + (", ..." if len(walk) > MAX_LISTED else "")
     return [(name, "G D.1", True, f"the Gramian of the walk ({listed}) is invertible")]
 
 
 def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the row on exchanges that are swaps."""
     channel = scenario.network.channel
+    # A swap needs both messages: if one is lost, its pair exists twice and the other is gone.
     lossless = type(channel.loss).__name__ == "NoLoss"
     holds = lossless or channel.symmetric
     evidence = (

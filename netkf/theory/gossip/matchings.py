@@ -48,6 +48,7 @@ def effective_matching(scenario: Scenario) -> FloatArray:
         raise TheoryError("losses come in bursts or recorded")
     if delay is None or delay > scenario.phase_length:
         raise TheoryError("messages may be late")
+    # The losses must not depend on the matching: then probabilities multiply.
     mean, index = mean_matching(scenario), scenario.topology.index
     for i, j in scenario.topology.links:
         forth, back = (
@@ -65,6 +66,7 @@ def effective_matching(scenario: Scenario) -> FloatArray:
 
 def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
     period, index = scenario.slot_plant.period, scenario.topology.index
+    # Slot 0 holds the start: the first exchange is in slot 1.
     slots = range(1, max(2, int(np.ceil(scenario.horizon / period - 1e-9))))
     mean = np.zeros((len(index), len(index)))
     for slot in slots:
@@ -129,5 +131,6 @@ def _extend_basis(known: FloatArray, rows: FloatArray) -> FloatArray:
     size = np.abs(rows).max(initial=0.0)
     if size == 0.0:
         return known
+    # Scaled rows, so that the threshold for the rank does not depend on units.
     _, values, vectors = np.linalg.svd(np.concatenate([known, rows / size]))
     return np.asarray(vectors[: int((values > 1e-9).sum())])

@@ -319,6 +319,7 @@ def _check_defect(slope: Slope, output: Any) -> None:
     steps = np.unique(np.linspace(0, len(times) - 2, MAX_CHECKED_STEPS).astype(int))
     for k in steps:
         a, b = times[k], times[k + 1]
+        # Y(b) - Y(a) against the integral of the right-hand side, by five Gauss-Legendre nodes
         middle, half = 0.5 * (a + b), 0.5 * (b - a)
         change = output(b) - output(a)
         integral = half * sum(

@@ -145,6 +145,7 @@ def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     """Return c (N, N), sparse: rate (per second) of arrivals from j at i, times their weight."""
     index, size = scenario.topology.index, len(scenario.nodes)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
+    # Losses thin the Poisson process of arrivals: the effective rate counts what arrives.
     heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
     values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
     places = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
@@ -211,6 +212,8 @@ def left_weights(scenario: Scenario) -> FloatArray:
         raise TheoryError(f"the {spoken(algorithm)} filter does not talk, links mean nothing to it")
     if has_balanced_rates(scenario) is None:
         raise TheoryError("how often messages arrive is not known beforehand (a recorded table?)")
+    # The coupling has the left null vector w of its Laplacian D - C: w_j = share of node j's
+    # information in the common estimate.
     c = coupling(scenario)
     if not c.nnz:
         raise TheoryError("no message ever arrives")
@@ -232,6 +235,7 @@ def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
     count, part = scipy.sparse.csgraph.connected_components(c, connection="strong")
     hears, heard = c.nonzero()
     outside = part[hears] != part[heard]
+    # Components without arrivals from other components.
     closed = np.setdiff1d(np.arange(count), part[hears[outside]])
     return np.flatnonzero(part == closed[0]) if len(closed) == 1 else None
 

@@ -44,6 +44,7 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
     require_bound(scenario)
     if sample_jumps(scenario):
         raise TheoryError("samples at known times lead to a cycle, not to a limit S")
+    # With Poisson samples S obeys H(12) of one node instead of an algebraic Riccati equation.
     S = steady_state(_shared_equation(scenario, A, Q, G, w))
     if S is None:
         raise TheoryError("S does not exist: the sensors sample too rarely for it")
@@ -94,6 +95,7 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
     if not np.array_equal(A, scenario.truth.A):
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
     S, w = limit_covariance(scenario), left_weights(scenario)
+    # All nodes have the error e with de = (A - S Gw) e dt + B dw - sum_i w_i S H_i' R_i^-1 dv_i.
     closed = A - S @ np.tensordot(w, increment_informations(scenario), 1)
     noise = scenario.truth.Q.copy()  # plus the true noise of each sensor through the gains w_i S
     for weight, node in zip(w, scenario.nodes, strict=True):

@@ -35,6 +35,7 @@ def solve_linearised(packed: PackedRiccati, P: FloatArray, right: FloatArray) ->
 def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
+        # A singular map yields nan, which the caller takes as unstable.
         X = scipy.sparse.linalg.spsolve(linear.matrix(), -right.reshape(-1))
     return np.asarray(X).reshape(right.shape)
 
@@ -68,6 +69,7 @@ def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray 
     preconditioner = scipy.sparse.linalg.LinearOperator(
         shape, matvec=precondition, dtype=np.float64
     )
+    # Iterative refinement: each round solves for the residual that the last one left.
     x, left, size = np.zeros(right.size), -right.reshape(-1), float(np.linalg.norm(right))
     for _ in range(ROUNDS):
         step, failed = scipy.sparse.linalg.gmres(

@@ -34,9 +34,11 @@ class PackedRiccati:
         n = len(equations.A)
         self._i, self._j = np.triu_indices(n)
         self.m = len(self._i)
+        # Entry (i, j) of a symmetric matrix is at places[i, j] of its row.
         places = np.zeros((n, n), dtype=np.int64)
         places[self._i, self._j] = places[self._j, self._i] = np.arange(self.m)
         self._places = places.reshape(-1)
+        # The symmetric unit matrices: a linear map on rows is known from its values on these.
         self._basis = np.zeros((self.m, n, n))
         self._basis[np.arange(self.m), self._i, self._j] = 1.0
         self._basis[np.arange(self.m), self._j, self._i] = 1.0
@@ -44,6 +46,7 @@ class PackedRiccati:
         self._predicted = self.pack(equations.T @ self._basis @ equations.T.T)
         self.start = self.pack(equations.start)
         self._q = self.pack(equations.q)
+        # P_i leaves at the rate of all arrivals: - sum_j c_ij P_i.
         flows = [equations.coupling, *(s.heard for s in equations.samples)]
         self.leaving = np.asarray(sum(flow.sum(axis=1) for flow in flows)).reshape(-1)
         leave = scipy.sparse.diags_array(self.leaving)
@@ -164,6 +167,7 @@ class PackedRiccati:
 
         P minimises the right-hand side over gains, so that their change has no first-order effect.
         """
+        # (A - P G) X + X (A - P G)' without the arrivals, as a matrix on rows
         K = P @ self.equations.G
         change = -(K[:, None] @ self._basis)
         blocks = self.pack(change + np.swapaxes(change, -1, -2)) + self._own
@@ -172,6 +176,7 @@ class PackedRiccati:
         for group in self.equations.samples:
             _, closed = group.update_gains(P)
             closed = closed[:, None]
+            # A sample maps X to (I - K H) X (I - K H)'.
             maps = self.pack(closed @ self._basis @ np.swapaxes(closed, -1, -2))
             np.add.at(blocks, group.nodes, group.rate[:, None, None] * (maps - np.eye(self.m)))
             if group.heard.nnz:
@@ -232,6 +237,7 @@ class LinearisedRiccati(NamedTuple):
             if rates is self.packed.equations.coupling:
                 whole = whole + self.packed.arriving_matrix
                 continue
+            # Each rate multiplies a map (m, m) of its own, at the block (receiver, sender).
             entries = scipy.sparse.coo_array(rates)
             turned = np.swapaxes(maps, 1, 2)[entries.col] * entries.data[:, None, None]
             rows = entries.row[:, None, None] * m + np.arange(m)[None, :, None]

@@ -42,6 +42,7 @@ class PoissonSamples(NamedTuple):
 
     def update_gains(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return K (S, n, p) and ``I - K H`` (S, n, n) at covariances P (N, n, n)."""
+        # C = P H' and K = C (H C + R)^-1
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         K = np.swapaxes(np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)), 1, 2)
         return K, np.eye(P.shape[-1]) - K @ self.H
@@ -89,6 +90,7 @@ def has_known_times(sensor: Sensor) -> bool:
     clock = sampling_clock(sensor)
     if clock is None or isinstance(clock, RecordedSampling):
         return True
+    # A periodic clock without jitter and with a given phase ticks at known times.
     return type(clock) is Periodic and clock.jitter == 0.0 and not isinstance(clock.phase, str)
 
 
@@ -167,6 +169,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     }
     if not places:
         return ()
+    # Known times do not depend on the seed; a varying H does, and is that of the scenario's seed.
     streams, n = Streams(scenario.seed), scenario.plant.n
     times, index = sample_times(scenario, streams), scenario.topology.index
     by_time: dict[float, dict[int, list[Observation]]] = {}

@@ -43,6 +43,7 @@ def second_moment_rate(scenario: Scenario) -> float:
     if size == 1:
         return float(equation(np.ones(1))[0])
     operator = scipy.sparse.linalg.LinearOperator((size**2, size**2), equation, dtype=float)
+    # The equation preserves positive semidefinite Y: start inside that cone.
     start = np.tile(np.eye(n).reshape(-1), nodes)
     first = np.outer(start, start).reshape(-1)
     if size < 3:
@@ -76,12 +77,14 @@ class _SecondMomentEquation:
             self._add_link(scenario, i, j, index[i], index[j])
 
     def _add_link(self, scenario: Scenario, i: int, j: int, a: int, b: int) -> None:
+        """Add the outcomes of an activation of link (i, j) between the nodes of index a and b."""
         clock, channel = scenario.network.activation, scenario.network.channel
         assert isinstance(clock, Poisson)
         rate, loss = clock.mean_rate((i, j)), channel.loss
         # One activation has three outcomes with an effect: either message arrives alone, or both.
         to_j = loss.mean_delivery((i, j), scenario.table_probability((i, j)))
         to_i = loss.mean_delivery((j, i), scenario.table_probability((j, i)))
+        # Symmetric losses are lost together, others independently.
         both = min(to_i, to_j) if channel.symmetric else to_i * to_j
         at_i, at_j = scenario.weight(i, j), scenario.weight(j, i)
         for x, y, chance, weight in ((a, b, to_i, at_i), (b, a, to_j, at_j)):

@@ -95,6 +95,7 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
     Y = packed.pack(P)
     residual = np.abs(packed.slope(Y, Y)).max()
     sizes = [np.abs(x).max() for x in (equations.Q, P @ equations.G @ P, equations.A @ P)]
+    # Newton's method stalls if a mode is neither driven nor damped.
     if not residual <= RESIDUAL * sum(sizes):
         raise TheoryError(
             f"the steady state of H(12) was solved to {residual:.1e} only: "
@@ -140,6 +141,7 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
         if not _is_stabilised(implicit, P):
             step *= 0.5
             continue
+        # Three Newton steps solve the implicit step closely enough to follow H(12).
         for _ in range(3):
             P = _newton(implicit, P)
         if not np.abs(P).max() < MAX_GROWTH * size:
@@ -243,6 +245,7 @@ def _necessary_factor(equations: CoupledRiccati) -> float | None:
     """
     if not equations.coupling.nnz:
         return None
+    # Without readings P grows like exp(2 a t) in the direction of the fastest mode.
     growth = 2.0 * float(np.linalg.eigvals(equations.A).real.max())
     unobserved = np.abs(equations.G).max(axis=(1, 2)) == 0.0
     for group in equations.samples:

@@ -47,6 +47,7 @@ def solve_by_taylor_series(
             raise StiffError
         left = float(times[-1]) - now
         span = min(span, left)
+        # Coefficients in powers of t / span, so that they neither overflow nor underflow.
         series = packed.series(Y, span, ORDER)
         step = min(_step_length(series, np.abs(Y).max(axis=1) + FLOOR * scale), left / span)
         for _ in range(MAX_TRIES):  # until the polynomial satisfies the equation at the end
@@ -75,6 +76,7 @@ def _step_length(series: FloatArray, sizes: FloatArray) -> float:
     """Return the step, in spans, at which the last two terms are TERM_TOLERANCE of ``sizes``."""
     length = np.inf
     for k in (ORDER - 1, ORDER):
+        # |c_k| s^k = TERM_TOLERANCE sizes
         share = float((np.abs(series[k]).max(axis=1) / sizes).max())
         if share > 0.0:
             length = min(length, (TERM_TOLERANCE / share) ** (1.0 / k))

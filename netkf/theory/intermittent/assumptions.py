@@ -17,7 +17,7 @@ from netkf.theory.intermittent.riccati import (
     undetectable_slot_mode,
 )
 
-MAX_SHOWN, MAX_HEARD = 12, 8
+MAX_LISTED, MAX_HEARD = 12, 8
 BOUNDED_MEAN = "readings arrive often enough for a bounded mean (sufficient)"
 
 
@@ -33,6 +33,7 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
     """Return by node the stacked H (p, n) of all readings that can reach it."""
+    # Readings travel one link only: R relays nothing.
     near: dict[int, set[int]] = {node: {node} for node in scenario.nodes}
     for i, j in scenario.topology.directions:
         near[j].add(i)
@@ -43,22 +44,25 @@ def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
 
 
 def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the row on detectability from the readings that reach each node."""
     F = scenario.slot_plant.F
     name = "(F, H) is detectable at every node"
     try:
         reachable = _reachable_readings(scenario)
     except TheoryError as error:
         return [(name, "R Theorem 9", None, f"not decided: {error}")]
-    blind = [node for node, H in reachable.items() if undetectable_slot_mode(F, H) is not None]
+    failing = [node for node, H in reachable.items() if undetectable_slot_mode(F, H) is not None]
     evidence = "its own readings and its neighbours' see every mode that does not decay"
-    if blind:
-        several, listed = "s" if len(blind) > 1 else "", ", ".join(map(str, blind[:MAX_SHOWN]))
+    if failing:
+        several, listed = "s" if len(failing) > 1 else "", ", ".join(map(str, failing[:MAX_LISTED]))
         evidence = f"not at node{several} {listed}"
-    return [(name, "R Theorem 9", not blind, evidence)]
+    return [(name, "R Theorem 9", not failing, evidence)]
 
 
 def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on independent and on sufficiently frequent arrivals."""
     loss = scenario.network.channel.loss
+    # R (12) needs independent arrivals of positive probability.
     rates = [
         loss.mean_delivery(link, scenario.table_probability(link))
         for link in scenario.topology.directions
@@ -130,6 +134,7 @@ def _arrival_sets(
 ) -> list[tuple[float, FloatArray]]:
     """Return the probability and the stacked H of every set of readings that may arrive."""
     found, probabilities = [], _deliveries(scenario, heard)
+    # All 2^k outcomes of the k links, which fail independently.
     for arrived in itertools.product((False, True), repeat=len(heard)):
         p = np.prod([g if up else 1.0 - g for g, up in zip(probabilities, arrived, strict=True)])
         parts = [

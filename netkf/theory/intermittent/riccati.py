@@ -42,6 +42,7 @@ def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Slot
     n = len(F_)
     H_ = _observation(H, n)
     R_ = as_covariance("R", R, len(H_))
+    # R (16) inverts H P H' + R also where P is singular.
     if len(R_) and not np.linalg.eigvalsh(R_)[0] > 0.0:
         raise TheoryError("R must be positive definite")
     return SlotSystem(F_, as_covariance("Q", Q, n), H_, R_)
@@ -104,6 +105,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
         P = symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(F - K @ H, Q + K @ R @ K.T)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising fixed point of f_1: {error}") from None
+    # The solver does not report inaccuracy: check that P is a fixed point and stabilises.
     residual = np.abs(riccati_step(P, F, Q, H, R) - P).max()
     if not residual <= RESIDUAL * np.abs(P).max():
         raise TheoryError(f"P* was solved to {residual:.1e} only")
@@ -130,6 +132,7 @@ def undetectable_slot_mode(F: FloatArray, H: FloatArray) -> complex | None:
     size = max(float(np.linalg.norm(F, 2)), 1e-300)
     scaled = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
     for value in np.linalg.eigvals(F):
+        # A mode that decays needs no reading.
         if abs(value) < 1.0 - 1e-12:
             continue
         pencil = np.concatenate([F - value * np.eye(len(F)), scaled])
@@ -196,6 +199,7 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
     def radius(g: float) -> float:
         return search.best((1.0 - g, g))[0]
 
+    # Without an unstable mode the mean is bounded for every probability.
     if alpha <= 1.0:
         return lower, lower
     if np.linalg.matrix_rank(H) == 1:
@@ -280,6 +284,7 @@ class _GainSearch:
         n, operator = len(self._F), self._operator(probabilities, gains)
         identity = np.eye(n).reshape(-1)[self._pick]
         try:
+            # (s - L) X = I on upper triangles
             X = self._expand @ np.linalg.solve(s * np.eye(len(operator)) - operator, identity)
         except np.linalg.LinAlgError:
             return None
@@ -360,6 +365,7 @@ def invariant_samples(
     n, P = len(F), steady_covariance(F, Q, H, R)
     random = Streams(seed).generator("arrivals")
     modes = alphabet([(H[:0], R[:0, :0]), (H, R)], n)
+    # f_0 and f_1 are monotone: every start between these two ends between their ends.
     starts = np.stack([_root(P), 1e3 * _root(P + np.trace(P) * np.eye(n))])
     drawn = np.empty((samples, n, n))
     for first in range(0, samples, MAX_SAMPLES_AT_ONCE):
@@ -396,6 +402,7 @@ def _couple_from_the_past(
         if not np.isfinite(pair).all():
             break
         apart = np.abs(pair[0] - pair[1]).max(axis=(-1, -2))
+        # Chains that met are finished; the others need a longer past.
         met = apart <= COALESCENCE_TOLERANCE * np.abs(pair[0]).max(axis=(-1, -2))
         out[left[met]] = symmetric(pair[0, met])
         left, arrivals = left[~met], arrivals[~met]

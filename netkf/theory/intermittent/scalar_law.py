@@ -66,6 +66,7 @@ class ScalarLaw:
             share = share * np.where(above, 1.0 - self.delivery, self.delivery)
             with np.errstate(divide="ignore", invalid="ignore"):
                 reduced = (point - self.Q) / self.F**2
+                # f_1^-1: R y / (R - H^2 y) with y = (x - Q) / F^2
                 before = reduced * self.R / (self.R - self.H**2 * reduced)
             point = np.where(above, reduced, before)
         return total
@@ -83,11 +84,14 @@ class ScalarLaw:
         for _ in range(MAX_MAPS):
             outage = level > self.delivery
             outages.append(outage)
+            # Below the hole u = g v, above it u = g + (1 - g) v, with v the level in the slot
+            # before.
             level = np.where(
                 outage, (level - self.delivery) / (1.0 - self.delivery), level / self.delivery
             )
             if len(outages) >= MIN_MAPS and not outage.any():
                 break
+        # Apply the maps in the order of time, from any start: the oldest no longer matter.
         P = np.full_like(level, self.least)
         for outage in reversed(outages):
             P = np.where(outage, self.without(P), self.with_reading(P))
@@ -104,6 +108,7 @@ class ScalarLaw:
         if growth >= 1.0:
             return float("inf")
         low, high = np.array([self.least]), np.array([np.inf])
+        # All compositions at once: both maps applied to every value, with their probabilities.
         weight = np.ones(1)
         for _ in range(DEPTH):
             low = np.concatenate([self.without(low), self.with_reading(low)])

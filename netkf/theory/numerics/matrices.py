@@ -100,6 +100,7 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
     # 0 = (A - S G) S+ + S+ (A - S G)' + Q + S G S.
     closed = A - S @ G
     S = _solve_lyapunov(closed, Q + S @ G @ S)
+    # The solver does not report an inaccurate or a wrong solution: check residual and stability.
     residual = A @ S + S @ A.T + Q - S @ G @ S
     size = np.abs(A @ S).max() + np.abs(Q).max() + np.abs(S @ G @ S).max()
     if not np.abs(residual).max() <= RESIDUAL * size:

@@ -111,6 +111,7 @@ class _LinearSDE:
 
     def discretise(self, gap: float) -> tuple[FloatArray, FloatArray]:
         """Return ``exp(A gap)`` (d, d) and a root (d, d) of the covariance that the noise adds."""
+        # The series holds up to one unit: discretise a short step, then double it.
         doublings = max(0, math.ceil(math.log2(max(gap / self._exp.unit, 1e-300))))
         short = gap / 2.0**doublings
         E = self._exp(np.append(short * (1.0 - NODES), short))
@@ -205,6 +206,7 @@ class ErrorFlow:
         own = _side_by_side(at * gains)
         if own.shape[2] > self._n:
             own = triangular_root(own)
+        # P at the end: the start through the closed loop, and the noise on the way.
         root = self._root(F, F @ SZ, T11[:-1], T21[:-1], at)
         return FlowTransition(FJ, follow, _side_by_side(at * response), own, root)
 
@@ -219,6 +221,8 @@ class ErrorFlow:
         eye = np.broadcast_to(np.eye(n), roots.shape)
         if not len(Gamma):
             return eye, roots @ np.swapaxes(roots, 1, 2), roots
+        # [I; Gamma S] = Z U gives U'U = I + S' G S, so that J = (I + P G)^-1 = I - S (U'U)^-1 S' G
+        # = I - (S Z_1)(Z_2' Gamma).
         Z, _ = np.linalg.qr(np.concatenate([eye, Gamma @ roots], axis=1))
         SZ = roots @ Z[:, :n]  # Z_1 = U^-1 whatever the signs of U
         J = eye - SZ @ (np.swapaxes(Z[:, n:], 1, 2) @ Gamma)

@@ -48,6 +48,7 @@ class GaussianStack:
 
     def _reduce(self, count: int) -> None:
         """Rotate the inputs so that few are left, and make space for ``count`` more."""
+        # Only T T' matters, so that T may be multiplied by any orthogonal matrix from the right.
         rows = sorted(self._place.values())
         stacked = self._forms[rows, :, : self._used].reshape(len(rows) * self._n, self._used)
         if stacked.shape[1] > stacked.shape[0]:
@@ -75,6 +76,7 @@ class GaussianStack:
         if place is None:
             place = self._place[name] = self._free.pop() if self._free else self._grow()
         self._forms[place, :, : form.shape[1]] = form
+        # The place may hold columns of an earlier vector.
         self._forms[place, :, form.shape[1] :] = 0.0
 
     def put_all(self, forms: Mapping[Hashable, FloatArray]) -> None:

@@ -62,6 +62,7 @@ def average_covariances(
 
     The estimate is the convex combination, so that each error is multiplied by its weight.
     """
+    # sum w P = [w^1/2 S, ...] [w^1/2 S, ...]', a triangular root of which has n columns
     scaled = [np.sqrt(max(w, 0.0)) * S for w, S in zip(weights, roots, strict=True)]
     eye = np.eye(len(roots[0]))
     return triangular_root(np.concatenate(scaled, axis=1)), [w * eye for w in weights]

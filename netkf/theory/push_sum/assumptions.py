@@ -34,7 +34,9 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on controllability, observability and the filters' model."""
     F, Q = scenario.slot_belief
+    # (F, Q^1/2) is controllable if and only if (F', Q) is observable.
     idle = unobservable_mode(F.T, Q)
     rows: list[AssumptionRow] = [
         (
@@ -107,6 +109,7 @@ def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> 
 
 
 def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionRow:
+    """Return the row on the symmetry of failures."""
     joint = scenario.network.channel.symmetric
     if law is not None:
         # Both directions have one probability, and each is up exactly if both are.
@@ -133,6 +136,8 @@ def _connection_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows on the consensus gain delta."""
+    # One step multiplies disagreement by I - L / delta, of norm below 1 for delta > rho(L) / 2.
     delta, bound = push_sum_filter(scenario).delta, consensus_gain_bound(scenario)
     local = f"nodes can tell from degrees that rho(L) <= {min(bound.local, bound.nodes)}"
     return [
@@ -152,12 +157,14 @@ def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _stop_row(scenario: Scenario) -> AssumptionRow:
+    """Return the row on gains that freeze too early."""
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
         loss.mean_delivery(way, scenario.table_probability(way)) == 1.0
         for i, j in scenario.topology.links
         for way in ((i, j), (j, i))
     )
+    # P step 2.3 stops when masses no longer move, which also happens when all links are down.
     safe = filter_.stop != "paper" or filter_.asymptotic or lossless
     evidence = {
         "never": "mass is exchanged for ever",
@@ -172,6 +179,7 @@ def _stop_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the exact and the certified conditions on means and mean squares."""
     return [
         _exact_row(
             ("the estimates become unbiased", "P (30), derived"),

@@ -49,6 +49,7 @@ class Averaging:
     @cached_property
     def mean_step(self) -> scipy.sparse.csr_array:
         """E[M] (N, N) of one step, sparse."""
+        # Each link has E[b_ij] (z_j - z_i) in row i and E[b_ji] (z_i - z_j) in row j, over delta.
         i, j = self.links.T
         first, second = self.hears.T / self.delta
         rows = np.concatenate([np.arange(self.nodes), i, i, j, j])
@@ -126,6 +127,7 @@ class Averaging:
     def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Covariance matrix of (b_ij, b_ji) over delta^2, row by row, (E,) each."""
         first, second = self.hears.T
+        # cov(b_ij, b_ji) = P(both) - p q; variances p (1 - p) and q (1 - q)
         cross = (self.both - first * second) / self.delta**2
         own, other = (p * (1.0 - p) / self.delta**2 for p in (first, second))
         return own, cross, cross, other

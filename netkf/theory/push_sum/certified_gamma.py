@@ -63,7 +63,9 @@ def _constants(scenario: Scenario) -> GammaConstants:
     _require_conditions(scenario, law, P)
     F, G = scenario.slot_belief[0], steps.limits.G
     size = float(np.linalg.norm(P, 2))
+    # The mean of all A_i is (I - P_inf G) F, the error dynamics of the central filter, P (34).
     joint = steps.closed.mean(axis=0)
+    # P (54), from the path, which has the least algebraic connectivity of all connected graphs.
     gap = (1.0 - np.cos(np.pi / N)) / law.delta
     theta = 1.0 - float(law.hears.min(initial=1.0)) * gap
     cut = _disconnection_bound(scenario, law)
@@ -72,6 +74,7 @@ def _constants(scenario: Scenario) -> GammaConstants:
         printed=(1.0 + N * size * _norm(G, P)) * _norm(F, P),
         sharp=max(_norm(closed.T, P) for closed in steps.closed),
         mean=theta,
+        # P (59): a step contracts by theta if the network is connected.
         mean_square=(1.0 - cut) * theta**2 + cut,
     )
 
@@ -130,6 +133,7 @@ def _moment(moment: str) -> Moment:
 
 def _least_certified(certified: Callable[[int], bool], constants: GammaConstants) -> int:
     """Return the first certified gamma by bisection, since the bounds decrease with gamma."""
+    # Doubling finds a certified gamma, bisection the first one.
     high = 1
     while not certified(high):
         high *= 2
@@ -147,6 +151,7 @@ def _least_certified(certified: Callable[[int], bool], constants: GammaConstants
 
 def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
     """Return rho(A_R(gamma)) of P (36) with c_B = ``bound``; below 1 it certifies gamma."""
+    # Rows: deviation of the mean, and disagreement, which gamma steps reduce by theta^gamma.
     far = constants.mean**gamma * bound
     return _rho([[constants.contraction**0.5, far], [bound, far]])
 

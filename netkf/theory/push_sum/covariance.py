@@ -42,6 +42,7 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
     N, n, _ = steps.closed.shape
     scale = steps.scale
     every = np.tile(scale, N)
+    # E[(M (x) I) cov(h) (M (x) I)'], the constant term of the equation
     noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(every, every)))
     # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - found, 1e-3)
@@ -63,6 +64,7 @@ def _fixed_point(
     for _ in range(MAX_ROUNDS):
         rest = noise + T(X) - X
         deviations = np.sqrt(np.abs(np.diagonal(X)))
+        # Small variances must be accurate too, beside large ones of other states.
         allowed = np.outer(deviations, deviations) + 1e-6 * deviations.max(initial=0.0) ** 2
         if (np.abs(rest) <= tolerance * allowed).all():
             return X

@@ -123,6 +123,7 @@ def _link_probabilities(
     found = {}
     for link in links:
         i, j = sorted(index[end] for end in link)
+        # Loops connect nothing.
         if i != j:
             found[i, j] = _link_probability(link, delivery)
     return len(names), found
@@ -186,12 +187,12 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
 
 def _is_connected(neighbours: list[dict[int, float]]) -> bool:
     """Return True if the links connect all nodes."""
-    seen, waiting = {0}, [0]
+    reached, waiting = {0}, [0]
     while waiting:
-        for node in neighbours[waiting.pop()].keys() - seen:
-            seen.add(node)
+        for node in neighbours[waiting.pop()].keys() - reached:
+            reached.add(node)
             waiting.append(node)
-    return len(seen) == len(neighbours)
+    return len(reached) == len(neighbours)
 
 
 def _order(neighbours: list[dict[int, float]]) -> list[int] | None:
@@ -247,6 +248,7 @@ def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
     cuts = []
     for k, node in enumerate(order):
         open_.append(node)
+        # A new node starts as a part of its own.
         states = {(*labels, len(labels)): p for labels, p in states.items()}
         for other in [x for x in open_ if x in neighbours[node]]:
             states = _apply_link(states, open_.index(other), neighbours[node][other])
@@ -269,6 +271,7 @@ def _apply_link(
     found: defaultdict[tuple[int, ...], float] = defaultdict(float)
     for labels, p in states.items():
         one, other = labels[place], labels[-1]
+        # The link joins nodes that are connected already: its state does not matter.
         if one == other:
             found[labels] += p
             continue
@@ -289,6 +292,7 @@ def _close_nodes(
     lost = []
     for labels, p in states.items():
         rest = [labels[k] for k in keep]
+        # Some part has no open node left: later links cannot reach it.
         if len(set(rest)) < len(set(labels)):
             lost.append(p)
         else:
@@ -320,6 +324,7 @@ def _estimate(
         parts = label.reshape(count, nodes)
         cut += int((parts != parts[:, :1]).any(axis=1).sum())
         done += count
+    # The bounds of Clopper and Pearson are quantiles of beta distributions.
     tail = 0.5 * (1.0 - CONFIDENCE)
     low = scipy.special.betaincinv(cut, samples - cut + 1, tail) if cut else 0.0
     high = scipy.special.betaincinv(cut + 1, samples - cut, 1.0 - tail) if cut < samples else 1.0

@@ -120,6 +120,7 @@ def _arrivals_by_step(scenario: Scenario, run: Run, gamma: int) -> ArrivalsBySte
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     sent, length = rows["t"] - rows["age"], scenario.phase_length
     slot = scenario.slot_plant.slots_of(sent)
+    # A message belongs to the averaging step in which it was sent.
     since = sent - slot * period - rows["phase"] * length
     step = np.where(rows["phase"] == 0, 0, np.round(since / (length / gamma))).astype(int)
     up: ArrivalsByStep = {}
@@ -170,6 +171,8 @@ class RunningTotalsRule(ErrorRule):
         """Predict all totals by ``gap`` seconds; the plant's noise is in the inputs ``columns``."""
         if gap <= 0.0 or columns is None or noise is None:
             return
+        # F^-1 with F = exp(A gap), and s = exp(-2 r gap), r the rate of the fastest decaying mode,
+        # so that old totals never grow.
         inverse = np.asarray(scipy.linalg.expm(-gap * self._A))
         fading = math.exp(-2.0 * self._rate * gap)
         for name, total in self._totals.items():
@@ -203,6 +206,7 @@ class RunningTotalsRule(ErrorRule):
         before = self._totals[name]
         sent = Total(before.weight + share * weight, before.U + U)
         self._put(name, sent, stack.form(name) - U @ stack.form(host))
+        # One share stays with the node, the others are on their way to its receivers.
         self._weights[host] = weight - count * (sent.weight - before.weight)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
@@ -221,6 +225,7 @@ class RunningTotalsRule(ErrorRule):
         self.errors.stack.drop(messages)
 
     def _receive(self, host: int, messages: Sequence[SentMessage]) -> None:
+        """Add the growth of the received totals to a node's mass, and update its estimate."""
         errors, n = self.errors, self.errors.n
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
         for message in messages:
@@ -242,6 +247,7 @@ class RunningTotalsRule(ErrorRule):
         # Information adds up: (w+ / N) P+^-1 = (w / N) P^-1 + U.
         scaled = np.sqrt(after / self._weights[host]) * errors.roots[host]
         root = add_information_to_root(scaled, share * U)
+        # e+ = e - (N / w+) P+ (U e + u - U x)
         gain = share * root @ root.T
         errors.stack.put(host, (np.eye(n) - gain @ U) @ errors.stack.form(host) - gain @ form)
         errors.roots[host] = root

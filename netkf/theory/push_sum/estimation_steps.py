@@ -71,6 +71,7 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
         raise TheoryError("the filters' F differs from the plant's: the error follows the state")
     truth = [scenario.observation(node) for node in scenario.nodes]
     pairs = list(zip(limits.gains, truth, strict=True))
+    # e+ = (I - K H)(F e + w) - K v at each node, before averaging, P (27)
     process = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in pairs])
     own = np.stack([K @ R @ K.T for K, (_, R) in pairs])
     law = averaging_law(scenario) if averaging is None else averaging
@@ -92,6 +93,7 @@ def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averagin
         raise TheoryError(
             f"messages may come after their step of {step:.3g} s: give a fixed, shorter delay"
         )
+    # With symmetric losses both directions share one draw, else they are independent.
     places = [[topology.index[i], topology.index[j]] for i, j in topology.links]
     hears = _probabilities(scenario, delivery)
     return Averaging(
@@ -115,6 +117,7 @@ def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
     if not loss.independent:
         name = type(loss).__name__
         raise TheoryError(f"the draws of {name} depend on each other: no mean square is known")
+    # The first end hears the second by the direction (j, i).
     ways = [[(j, i), (i, j)] for i, j in links]
     hears = [[loss.mean_delivery(w, scenario.table_probability(w)) for w in both] for both in ways]
     return np.array(hears, dtype=np.float64).reshape(-1, 2)

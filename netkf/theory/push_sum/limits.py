@@ -56,10 +56,12 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     # Node i has degree + 1 shares, so that the stationary weight is proportional to that, P (18).
     share = np.array([degrees[node] + 1.0 for node in scenario.nodes])
     share /= share.sum()
+    # H_i' R_i^-1, whose products with H_i sum to G, P (10)
     each = [np.linalg.solve(m.R, m.H).T for m in models]
     G = symmetric(np.sum([e @ m.H for e, m in zip(each, models, strict=True)], axis=0))
     pooled, N = scenario.pooled_slot_model, len(models)
     P = filtered_covariance(pooled.F, pooled.Q, pooled.H, pooled.R)
+    # P (13)
     gains = tuple(N * P @ e for e in each)
     return PushSumLimits(share[:, None, None] * G, share * N, share, G, N, P, gains)
 

@@ -85,6 +85,7 @@ def _mean_radius(law: Averaging, closed: FloatArray) -> float:
     N, n, _ = closed.shape
     if N * n > DENSE_ROWS and not law.enumerated:
         return _mean_radius_by_arnoldi(law, closed)
+    # (E[M^gamma] (x) I) diag(A_j)
     whole = np.einsum("ij,jab->iajb", law.mean, closed).reshape(N * n, N * n)
     return float(np.abs(np.linalg.eigvals(whole)).max())
 
@@ -122,6 +123,7 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
     The cross covariance of two groups grows no faster than the geometric mean of their own.
     """
     size = np.abs(closed).max(axis=0)
+    # Two states mix if some A_i has an entry between them.
     linked = size > 1e-13 * size.max()
     _, label = scipy.sparse.csgraph.connected_components(linked, directed=False)
     groups = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
@@ -129,6 +131,7 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
 
 
 def _radius(law: Averaging, closed: FloatArray) -> float:
+    """Return the spectral radius of T for one group of states; raises TheoryError."""
     if law.deterministic:  # M is fixed, so that T is the square of the mean dynamics
         return _mean_radius(law, closed) ** 2
     size = closed.shape[0] * closed.shape[1]
@@ -180,6 +183,7 @@ def _arnoldi(law: Averaging, closed: FloatArray) -> tuple[float, bool]:
     proved = _least_factor(T, X) <= value * (1.0 + PROOF_TOLERANCE)
     if proved or size <= MAX_DENSE_FALLBACK:
         return value, proved
+    # A different search, for the largest modulus from another start, must agree.
     again, _ = _rightmost(T, X + np.diag(np.linspace(0.5, 1.5, size)) * np.trace(X), "LM")
     if not abs(again - value) <= 1e-8 * value:
         raise TheoryError(f"the radius is not certain: searches found {value:.8g} and {again:.8g}")

@@ -81,6 +81,7 @@ def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]
         return value["reason"] or make(value["value"])
 
     def errors(traces: list[float]) -> str:
+        # The central trace is None where the central filter has no steady covariance.
         mean, central = float(np.mean(traces)), found["central_trace"]["value"]
         ratio = f", {mean / central:.4g} times the central one" if central else ""
         return f"mean {number(mean)}, from {number(min(traces))} to {number(max(traces))}{ratio}"
