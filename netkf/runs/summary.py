@@ -22,6 +22,9 @@ from netkf.trace.run import carried, rounding_from
 from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95
+MAX_BOUND_BYTES, SERIES_TERMS = 1.5 * 2**30, 30
+MAX_STEADY_ENTRIES = 400_000
+"""Entries of the covariances of all nodes up to which a run looks for the steady state."""
 
 
 class SummarySink(Sink):
@@ -144,6 +147,7 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     bound, reason = None, ""
     try:
         if len(times):
+            _require_small_bound(scenario, len(times))
             bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
     except TheoryError as error:
         reason = str(error)
@@ -158,8 +162,30 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     )
 
 
+def _require_small_bound(scenario: Scenario, samples: int) -> None:
+    """Raise TheoryError if H(12) at all samples would take more memory than a large run itself."""
+    if reason_without_bound(scenario):
+        return
+    n = scenario.plant.n
+    entries = (samples * (1.5 * n * n + n) + SERIES_TERMS * n * (n + 1)) * len(scenario.nodes)
+    if 8.0 * entries > MAX_BOUND_BYTES:
+        raise TheoryError(
+            f"not computed: H(12) of {len(scenario.nodes):,} nodes at {samples:,} samples takes "
+            f"{8.0 * entries / 2**30:.1f} GiB; sample less often (probe), or call "
+            "netkf.theory.covariance_bound"
+        )
+
+
 def _steady_note(scenario: Scenario) -> str:
-    if scenario.slotted or reason_without_bound(scenario) or has_steady_state(scenario):
+    if scenario.slotted or reason_without_bound(scenario):
+        return ""
+    if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:
+        size = MAX_STEADY_ENTRIES // scenario.plant.n**2
+        return (
+            f"whether the bound has a steady state is not looked into beyond {size:,} nodes; see "
+            "netkf theory"
+        )
+    if has_steady_state(scenario):
         return ""
     if not scenario.filter.algorithm.talks:
         return "at some nodes P has no steady state, it grows without end; see netkf theory"

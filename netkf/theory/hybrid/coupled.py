@@ -10,6 +10,7 @@ terms and jumps, see theory/hybrid/samples.py.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -141,8 +142,12 @@ def increment_informations(scenario: Scenario) -> FloatArray:
     return np.stack(found)
 
 
+@lru_cache(maxsize=4)
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return c (N, N), sparse: rate (per second) of arrivals from j at i, times their weight."""
+    """Return c (N, N), sparse: rate (per second) of arrivals from j at i, times their weight.
+
+    The same array for each call: not to be changed.
+    """
     index, size = scenario.topology.index, len(scenario.nodes)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
     # Losses thin the Poisson process of arrivals: the effective rate counts what arrives.

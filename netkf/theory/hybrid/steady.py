@@ -81,6 +81,10 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
     """
     if equations.jumps:
         raise TheoryError("samples at known times lead to a cycle, not to a steady state")
+    if equations.coupling.nnz:
+        least = _necessary_factor(equations)
+        if least is None or least > 1.0 + 1e-9:
+            return None
     packed = PackedRiccati(equations)
     P = _find_stabilising(packed)
     if P is None:
