@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 from netkf.cli.options import (
     FAILED,
+    Command,
     add_json,
     add_pool,
-    add_scenario_command,
     add_seed,
-    count,
     load_scenario,
+    parse_count,
     print_json,
     print_notes,
 )
 from netkf.cli.progress import ProgressLine
 
 
-def add_parser(commands: Any) -> None:
-    """Add the options of ``netkf check``."""
-    text = "compare simulations with theory, one row per promise"
-    parser = add_scenario_command(commands, "check", run, text)
-    parser.add_argument("--runs", type=count, default=500, help="number of runs (default: 500)")
+def _declare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--runs", type=parse_count, default=500, help="number of runs (default: 500)"
+    )
     add_seed(parser)
     parser.add_argument(
         "--confidence",
@@ -35,8 +33,8 @@ def add_parser(commands: Any) -> None:
     add_json(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command and return the exit status: 1 if a promise is broken."""
+def _run(options: argparse.Namespace) -> int:
+    """Return the exit status: 1 if a promise is broken."""
     from netkf.checks.check import check, verdict_json, verdict_text
     from netkf.checks.mode_sequences import watched_note
 
@@ -56,3 +54,6 @@ def run(options: argparse.Namespace) -> int:
     else:
         print(verdict_text(verdict, scenario.claim))
     return 0 if verdict else FAILED
+
+
+COMMAND = Command("check", "compare simulations with theory, one row per promise", _declare, _run)

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from netkf.cli.options import add_command, add_json, print_json
+from netkf.cli.options import Command, add_json, print_json
 
 
-def add_parser(commands: Any) -> None:
-    """Add the options of ``netkf compare``."""
-    text = "compare finished runs side by side and mark significant differences"
-    parser = add_command(commands, "compare", run, text)
+def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
     parser.add_argument(
         "--confidence",
@@ -23,8 +19,7 @@ def add_parser(commands: Any) -> None:
     add_json(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command and return the exit status."""
+def _run(options: argparse.Namespace) -> int:
     from netkf.studies.compare import compare
     from netkf.studies.tables import comparison_text
 
@@ -34,3 +29,12 @@ def run(options: argparse.Namespace) -> int:
     else:
         print(comparison_text(comparison))
     return 0
+
+
+COMMAND = Command(
+    "compare",
+    "compare finished runs side by side and mark significant differences",
+    _declare,
+    _run,
+    takes_scenario=False,
+)

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
 
 from netkf.cli.options import (
     FAILED,
+    Command,
     add_engine,
     add_json,
     add_pool,
-    add_scenario_command,
     add_seed,
-    count,
     load_scenario,
+    parse_count,
     print_json,
 )
 
 
-def add_parser(commands: Any) -> None:
-    """Add the options of ``netkf consistency``."""
-    text = "test if P describes the errors: NEES and NIS against their expected values"
-    parser = add_scenario_command(commands, "consistency", run, text)
-    parser.add_argument("--runs", type=count, default=50, help="number of runs (default: 50)")
+def _declare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--runs", type=parse_count, default=50, help="number of runs (default: 50)")
     parser.add_argument(
         "--confidence",
         type=float,
@@ -36,8 +32,8 @@ def add_parser(commands: Any) -> None:
     add_json(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command and return the exit status: 1 if the errors of a node are inconsistent."""
+def _run(options: argparse.Namespace) -> int:
+    """Return the exit status: 1 if the errors of a node are inconsistent."""
     from netkf.studies.consistency import consistency
     from netkf.studies.tables import consistency_text
 
@@ -57,3 +53,11 @@ def run(options: argparse.Namespace) -> int:
         nodes = ", ".join(str(row.node) for row in found.rows if row.verdict.startswith("BROKEN"))
         print(f"netkf: errors are not what they should be at node {nodes}", file=sys.stderr)
     return 0 if found else FAILED
+
+
+COMMAND = Command(
+    "consistency",
+    "test if P describes the errors: NEES and NIS against their expected values",
+    _declare,
+    _run,
+)

@@ -14,7 +14,9 @@ from netkf.cli import check, compare, consistency, run, size, sweep, theory
 from netkf.core.errors import NetkfError
 
 BAD_USAGE, INTERRUPTED = 2, 130
-COMMANDS = (run, check, theory, sweep, size, consistency, compare)
+COMMANDS = tuple(
+    module.COMMAND for module in (run, check, theory, sweep, size, consistency, compare)
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = make_parser().parse_args(arguments)
     try:
-        status: int = options.command(options)
+        status: int = options.run(options)
         # A full disk or a closed pipe must show here, where it can be reported in one line.
         sys.stdout.flush()
     except NetkfError as error:
@@ -46,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser; each command stores its function as ``command`` in the namespace."""
+    """Return the parser; each command puts its function ``run`` into the namespace."""
     parser = _Parser(
         prog="netkf",
         description="Simulate distributed Kalman filters on random networks and compare them with "
@@ -55,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"netkf {netkf.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
     for command in COMMANDS:
-        command.add_parser(commands)
+        command.add_to(commands)
     return parser
 
 

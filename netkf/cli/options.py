@@ -10,6 +10,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,21 +22,30 @@ if TYPE_CHECKING:
 FAILED = 1
 """Exit status of a command that ran and whose answer is no."""
 ENGINES = ("auto", "simpy", "processes", "compiled")
-Command = Callable[[argparse.Namespace], int]
 
 
-def add_command(commands: Any, name: str, command: Command, text: str) -> argparse.ArgumentParser:
-    """Return the parser of a new command; ``text`` is its help and its description."""
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
-    parser.set_defaults(command=command)
-    return parser
+@dataclass(frozen=True)
+class Command:
+    """A command of ``netkf``: its name and help, and the functions that declare its options and run
+    it. ``run`` returns the exit status. ``takes_scenario`` adds the scenario file and ``--set``.
+    """
+
+    name: str
+    help: str
+    declare: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+    takes_scenario: bool = True
+
+    def add_to(self, commands: Any) -> None:
+        """Add the parser of the command; the namespace gets its ``run`` function."""
+        parser = commands.add_parser(self.name, help=self.help, description=self.help)
+        if self.takes_scenario:
+            _add_scenario(parser)
+        self.declare(parser)
+        parser.set_defaults(run=self.run)
 
 
-def add_scenario_command(
-    commands: Any, name: str, command: Command, text: str
-) -> argparse.ArgumentParser:
-    """Return the parser of a new command that takes a scenario file and ``--set``."""
-    parser = add_command(commands, name, command, text)
+def _add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", type=Path, help="scenario file (TOML)")
     parser.add_argument(
         "--set",
@@ -44,12 +54,11 @@ def add_scenario_command(
         metavar="KEY.PATH=VALUE",
         help="override a key of the scenario; VALUE is written as in TOML",
     )
-    return parser
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add ``--seed``."""
-    parser.add_argument("--seed", type=seed, help="root seed (default: the scenario's)")
+    parser.add_argument("--seed", type=parse_seed, help="root seed (default: the scenario's)")
 
 
 def add_engine(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +74,9 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
 def add_pool(parser: argparse.ArgumentParser) -> None:
     """Add ``--workers`` and ``--scheduler``, of which one may be given."""
     pool = parser.add_mutually_exclusive_group()
-    pool.add_argument("--workers", type=count, help="number of processes (default: one per core)")
+    pool.add_argument(
+        "--workers", type=parse_count, help="number of processes (default: one per core)"
+    )
     pool.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
 
 
@@ -84,7 +95,7 @@ def add_vary(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
     parser.add_argument("--vary", action="append", required=True, metavar=metavar, help=text)
 
 
-def seed(text: str) -> int:
+def parse_seed(text: str) -> int:
     """Return the integer of ``--seed``; raises ArgumentTypeError."""
     if not text.isdecimal() or len(text) > 30:
         rule = "must be a non-negative integer of at most 30 digits"
@@ -92,7 +103,7 @@ def seed(text: str) -> int:
     return int(text)
 
 
-def replica(text: str) -> int:
+def parse_replica(text: str) -> int:
     """Return the integer of ``--replica``; raises ArgumentTypeError."""
     if not text.isdecimal() or len(text) > 12:
         rule = "must be an integer of at least 0"
@@ -100,7 +111,7 @@ def replica(text: str) -> int:
     return int(text)
 
 
-def count(text: str) -> int:
+def parse_count(text: str) -> int:
     """Return the positive integer of ``--runs`` or ``--workers``; raises ArgumentTypeError."""
     if not text.isdecimal() or len(text) > 12 or int(text) < 1:
         rule = "must be an integer of at least 1"

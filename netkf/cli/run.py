@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 from netkf.cli import pictures
 from netkf.cli.options import (
+    Command,
     add_engine,
     add_no_plot,
     add_pool,
-    add_scenario_command,
     add_seed,
-    count,
     load_scenario,
+    parse_count,
+    parse_replica,
     print_notes,
     print_title,
-    replica,
 )
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
@@ -33,13 +33,10 @@ if TYPE_CHECKING:
 MAX_LISTED_NODES = 12
 
 
-def add_parser(commands: Any) -> None:
-    """Add the options of ``netkf run``."""
-    text = "simulate a scenario and keep the results"
-    parser = add_scenario_command(commands, "run", run, text)
-    parser.add_argument("--runs", type=count, help="number of independent runs (default: 1)")
+def _declare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--runs", type=parse_count, help="number of independent runs (default: 1)")
     parser.add_argument(
-        "--replica", type=replica, help="run this replica of an ensemble (default: 0)"
+        "--replica", type=parse_replica, help="run this replica of an ensemble (default: 0)"
     )
     add_seed(parser)
     add_engine(parser)
@@ -56,8 +53,7 @@ def add_parser(commands: Any) -> None:
     add_no_plot(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command and return the exit status."""
+def _run(options: argparse.Namespace) -> int:
     many = (options.runs or 1) > 1
     if many and options.replica is not None:
         remedy = "leave out --runs or --replica"
@@ -184,3 +180,6 @@ def _describe_divergence(completed: CompletedRun) -> str:
         f"{completed.status}, the {problem} at {samples.times[-1]:g} s and the run ended "
         f"there{left_out}"
     )
+
+
+COMMAND = Command("run", "simulate a scenario and keep the results", _declare, _run)

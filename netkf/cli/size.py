@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
 
 from netkf.cli.options import (
     FAILED,
+    Command,
     add_engine,
     add_json,
     add_pool,
-    add_scenario_command,
     add_seed,
     add_vary,
-    count,
     load_scenario,
+    parse_count,
     print_json,
 )
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 
 
-def add_parser(commands: Any) -> None:
-    """Add the options of ``netkf size``."""
-    text = "find the smallest (or largest) value of a key that meets a target"
-    parser = add_scenario_command(commands, "size", run, text)
+def _declare(parser: argparse.ArgumentParser) -> None:
     add_vary(parser, "KEY.PATH=LOW:HIGH", "the key to search and its range")
     parser.add_argument(
         "--target",
@@ -39,7 +35,10 @@ def add_parser(commands: Any) -> None:
         help="decide by theory or by simulation (default: theory if it has an answer)",
     )
     parser.add_argument(
-        "--runs", type=count, default=1000, help="at most this many runs per value (default: 1000)"
+        "--runs",
+        type=parse_count,
+        default=1000,
+        help="at most this many runs per value (default: 1000)",
     )
     parser.add_argument(
         "--confidence",
@@ -53,8 +52,8 @@ def add_parser(commands: Any) -> None:
     add_json(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command and return the exit status: 1 if no value meets the target."""
+def _run(options: argparse.Namespace) -> int:
+    """Return the exit status: 1 if no value meets the target."""
     from netkf.studies.parameter_grid import parse_interval
     from netkf.studies.size import size
     from netkf.studies.tables import answer, sizing_text
@@ -87,3 +86,8 @@ def run(options: argparse.Namespace) -> int:
     if not sizing:
         print(f"netkf: {answer(sizing)}", file=sys.stderr)
     return 0 if sizing else FAILED
+
+
+COMMAND = Command(
+    "size", "find the smallest (or largest) value of a key that meets a target", _declare, _run
+)

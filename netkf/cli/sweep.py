@@ -6,19 +6,19 @@ import argparse
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
 from netkf.cli.options import (
+    Command,
     add_engine,
     add_json,
     add_no_plot,
     add_pool,
-    add_scenario_command,
     add_seed,
     add_vary,
-    count,
     load_scenario,
+    parse_count,
     print_json,
     print_title,
 )
@@ -29,16 +29,15 @@ if TYPE_CHECKING:
     from netkf.studies.sweep import CompletedSweep
 
 
-def add_parser(commands: Any) -> None:
-    """Add the options of ``netkf sweep``."""
-    text = "simulate every point of a grid of parameters, one row per point"
-    parser = add_scenario_command(commands, "sweep", run, text)
+def _declare(parser: argparse.ArgumentParser) -> None:
     add_vary(
         parser,
         "KEY.PATH=V1,V2,...",
         "values of a key, or START:STOP:COUNT; repeat it for a grid over several keys",
     )
-    parser.add_argument("--runs", type=count, default=1, help="runs at each point (default: 1)")
+    parser.add_argument(
+        "--runs", type=parse_count, default=1, help="runs at each point (default: 1)"
+    )
     parser.add_argument("--out", type=Path, help="directory (default: runs/NAME-sweep-k)")
     add_no_plot(parser)
     add_seed(parser)
@@ -47,8 +46,7 @@ def add_parser(commands: Any) -> None:
     add_json(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command and return the exit status."""
+def _run(options: argparse.Namespace) -> int:
     from netkf.studies.parameter_grid import parse_grid
     from netkf.studies.sweep import sweep_to_directory
 
@@ -92,3 +90,8 @@ def _draw(scenario: Scenario, completed: CompletedSweep) -> None:
     elif not draw(scenario.name, completed):
         reason = "it shows one or two keys, the second with few values"
         print(f"no picture: {reason}", file=sys.stderr)
+
+
+COMMAND = Command(
+    "sweep", "simulate every point of a grid of parameters, one row per point", _declare, _run
+)

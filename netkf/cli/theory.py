@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-from netkf.cli.options import add_json, add_scenario_command, load_scenario, print_json, print_notes
-
-
-def add_parser(commands: Any) -> None:
-    """Add the options of ``netkf theory``."""
-    text = "check assumptions and compute bounds and limits; no simulation"
-    add_json(add_scenario_command(commands, "theory", run, text))
+from netkf.cli.options import Command, add_json, load_scenario, print_json, print_notes
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command and return the exit status."""
+def _declare(parser: argparse.ArgumentParser) -> None:
+    add_json(parser)
+
+
+def _run(options: argparse.Namespace) -> int:
     from netkf.runs.failures import explain_failures
-    from netkf.runs.promises import promises, promises_text
+    from netkf.runs.promises import compute_promises, promises_text
 
     scenario = load_scenario(options)
     with explain_failures(scenario):
-        found = promises(scenario)
+        found = compute_promises(scenario)
     print_notes(scenario.notes)
     if options.json:
         print_json(found)
     else:
         print(promises_text(scenario, found))
     return 0
+
+
+COMMAND = Command(
+    "theory", "check assumptions and compute bounds and limits; no simulation", _declare, _run
+)

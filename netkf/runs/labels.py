@@ -1,4 +1,4 @@
-"""What promises are called, in `netkf theory`, in tables and in pictures alike."""
+"""Names of limits and notes on covariances, the same in `netkf theory`, tables and pictures."""
 
 from __future__ import annotations
 
@@ -7,35 +7,34 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import has_balanced_rates
 
 
-def limit_words(scenario: Scenario) -> str:
-    """What the limit of the bound as links tick ever faster is for this scenario."""
+def limit_label(scenario: Scenario) -> str:
+    """Return the name of the limit of the bound as the rates of the links grow."""
     balanced = has_balanced_rates(scenario)
-    words = "limit S of H(13)" if balanced else "weighted limit (not S of H(13))"
-    return words + without_delay(scenario)
+    name = "limit S of H(13)" if balanced else "weighted limit (not S of H(13))"
+    return name + delay_suffix(scenario)
 
 
-def without_delay(scenario: Scenario) -> str:
-    """The limits leave delays out, and say so where there are any."""
+def delay_suffix(scenario: Scenario) -> str:
+    """Return the condition under which a limit holds if messages are delayed; empty otherwise."""
     delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
     return ", if messages took no time" if delayed else ""
 
 
-def by_design(scenario: Scenario) -> str:
-    """Whether the design of the filter makes P "larger" or "smaller" than the covariance of its
-    error; empty if neither is known.
+def covariance_bias(scenario: Scenario) -> str:
+    """Return "larger" or "smaller" if the filter's design makes P so, compared with the covariance
+    of its error; empty if neither is known.
     """
     algorithm = scenario.filter.algorithm
     design = scenario.hosted.P_by_design[0 if scenario.slotted else 1]
+    # The statement is about the steps of the built-in class; one without links does not combine.
     if overridden(algorithm) or not scenario.topology.links:
         return ""
     return "" if design == "larger" and not scenario.filters_know_the_truth else design
 
 
-def nees_words(scenario: Scenario) -> str:
-    """What NEES should be where P is not the covariance of the error by design; empty where it
-    should be near n.
-    """
-    n, design = scenario.plant.n, by_design(scenario)
+def nees_note(scenario: Scenario) -> str:
+    """Return a note on NEES if P is not the covariance of the error by design; else empty."""
+    n, design = scenario.plant.n, covariance_bias(scenario)
     if design == "smaller":
         return (
             "until others hear of its samples a node counts them as if all nodes had taken them: "
@@ -50,8 +49,8 @@ def nees_words(scenario: Scenario) -> str:
     return ""
 
 
-def mismatch_words(scenario: Scenario) -> str:
-    """What P and its bound are worth where the filters believe another model; empty where not."""
+def mismatch_note(scenario: Scenario) -> str:
+    """Return a note on P and its bound if the filters have a wrong model; else empty."""
     if scenario.filters_know_the_truth:
         return ""
     if not scenario.is_random:

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology
 from netkf.runs.files import write_atomically
-from netkf.runs.labels import by_design
+from netkf.runs.labels import covariance_bias
 from netkf.runs.run import CompletedRun
 from netkf.runs.summary import CONFIDENCE, NO_COVARIANCE, PromisedTraces, nees_bounds
 from netkf.scenario.scenario import Scenario
@@ -162,7 +162,7 @@ def draw_nees(axes: Any, times: FloatArray, nees: Any, scenario: Scenario, runs:
     axes.plot(times, values.mean(axis=1), color=PROMISE, lw=1.6, label="mean of all", zorder=3)
     low, high = nees_bounds(scenario.plant.n, runs)
     axes.axhspan(low, high, color=EXACT, alpha=0.15, label=f"{CONFIDENCE:.0%} where P is exact")
-    design = by_design(scenario)
+    design = covariance_bias(scenario)
     label = f"n = {scenario.plant.n}" + (f", P is {design} by design" if design else "")
     axes.axhline(scenario.plant.n, color=EXACT, lw=1.1, label=label)
     set_scale(axes, np.append(values, high))

@@ -1,4 +1,4 @@
-"""``netkf theory``: what is promised for a scenario, without running it."""
+"""``netkf theory``: assumptions, bounds and limits of a scenario, without a simulation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import finite
-from netkf.runs.labels import limit_words, mismatch_words, without_delay
+from netkf.runs.labels import delay_suffix, limit_label, mismatch_note
 from netkf.runs.tables import MAX_NODES, number, table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
@@ -35,9 +35,10 @@ LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
 }
 
 
-def promises(scenario: Scenario) -> dict[str, Any]:
-    """Assumptions, bound at the horizon and in the steady state, limits; a text says why where a
-    number does not exist. Plain JSON values.
+def compute_promises(scenario: Scenario) -> dict[str, Any]:
+    """Return assumptions, the bound at the horizon and in the steady state, and limits.
+
+    The values are plain JSON; if a number does not exist, ``reason`` says why.
     """
     rows = assumptions(scenario)
     found: dict[str, Any] = {
@@ -67,7 +68,7 @@ def promises(scenario: Scenario) -> dict[str, Any]:
 
 
 def _slot_central(scenario: Scenario) -> FloatArray:
-    """P*: the prediction covariance of a filter that gets every reading in every slot."""
+    """Return P* (n, n), the prediction covariance of a filter with all readings in every slot."""
     for node in scenario.sensing:
         scenario.observation(node)  # raises where H is not fixed
     model = scenario.pooled_slot_model
@@ -75,7 +76,7 @@ def _slot_central(scenario: Scenario) -> FloatArray:
 
 
 def _steady(scenario: Scenario) -> dict[str, Any]:
-    """Where filters do not talk, some nodes may have a steady state and others none."""
+    """Return the steady bound; without messages some nodes may have one and others not."""
     found = _value(lambda: steady_covariance_bound(scenario))
     if found["reason"] and not scenario.filter.algorithm.talks:
         found = {**_value(lambda: steady_by_node(scenario)), "reason": found["reason"]}
@@ -92,48 +93,58 @@ def _value(function: Callable[[], FloatArray]) -> dict[str, Any]:
 
 
 def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
-    """The same for a terminal."""
-    lines = [
-        f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name,
-        "",
-        "assumptions",
-    ]
-    for row in found["assumptions"]:
-        mark = MARKS[row["holds"]]
-        lines.append(f"  {mark:7}  {row['assumption']}  [{row['source']}]")
-        lines += textwrap.wrap(
-            row["evidence"], 94, initial_indent=" " * 11, subsequent_indent=" " * 11
-        )
+    """Return the result of :func:`compute_promises` as text for a terminal."""
+    title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
+    lines = [title, "", "assumptions", *_assumption_lines(found["assumptions"])]
     paper = scenario.hosted.paper
     if paper and paper in found:
         own_lines = paper_function(scenario, "promises", "slot_lines")(found[paper], number)
         return "\n".join([*lines, "", *own_lines])
     if scenario.slotted:
-        value = found["slot_central_covariance"]
-        words = value["reason"] or number(value["trace"])
-        lines += ["", f"trace of P*, the prediction covariance with all readings: {words}"]
+        central = found["slot_central_covariance"]
+        trace = central["reason"] or number(central["trace"])
+        lines += ["", f"trace of P*, the prediction covariance with all readings: {trace}"]
         return "\n".join(lines)
-    lines += ["", "trace of the bound on E[P_i]"]
-    columns = [found["bound_at_horizon"], found["steady_bound"]]
-    for words, column in zip((f"at {scenario.horizon:g} s", "steady state"), columns, strict=True):
+    return "\n".join([*lines, *_bound_lines(scenario, found), *_limit_lines(scenario, found)])
+
+
+def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
+    lines = []
+    for row in rows:
+        lines.append(f"  {MARKS[row['holds']]:7}  {row['assumption']}  [{row['source']}]")
+        indent = " " * 11
+        lines += textwrap.wrap(row["evidence"], 94, initial_indent=indent, subsequent_indent=indent)
+    return lines
+
+
+def _bound_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
+    lines = ["", "trace of the bound on E[P_i]"]
+    columns = {
+        f"at {scenario.horizon:g} s": found["bound_at_horizon"],
+        "steady state": found["steady_bound"],
+    }
+    for label, column in columns.items():
         if column["reason"]:
             lines += textwrap.wrap(
-                f"{words}: {column['reason']}", 98, initial_indent="  ", subsequent_indent="    "
+                f"{label}: {column['reason']}", 98, initial_indent="  ", subsequent_indent="    "
             )
-    if any(column["trace"] for column in columns):
-        lines.append(textwrap.indent(_by_node(scenario, columns), "  "))
-    lines += ["", "traces to compare"]
-    names = {
-        "limit_covariance": f"{limit_words(scenario)}, as links tick ever faster",
-        "true_limit_covariance": "limit of the true error covariance (derived)"
-        + without_delay(scenario),
+    if any(column["trace"] for column in columns.values()):
+        lines.append(textwrap.indent(_by_node(scenario, list(columns.values())), "  "))
+    return lines
+
+
+def _limit_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
+    error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)
+    labels = {
+        "limit_covariance": f"{limit_label(scenario)}, as links tick ever faster",
+        "true_limit_covariance": error_limit,
         "central_covariance": "centralised filter with all readings",
     }
-    for name, words in names.items():
-        lines.append(f"  {words}: {found[name]['reason'] or number(found[name]['trace'])}")
-    if mismatch_words(scenario):
-        lines.append(f"note: {mismatch_words(scenario)}")
-    return "\n".join(lines)
+    lines = ["", "traces to compare"]
+    for name, label in labels.items():
+        lines.append(f"  {label}: {found[name]['reason'] or number(found[name]['trace'])}")
+    note = mismatch_note(scenario)
+    return [*lines, f"note: {note}"] if note else lines
 
 
 def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:

@@ -10,7 +10,7 @@ from scipy.special import gammaincinv
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.labels import limit_words, mismatch_words, nees_words
+from netkf.runs.labels import limit_label, mismatch_note, nees_note
 from netkf.runs.transmissions import Transmissions
 from netkf.scenario.scenario import Scenario
 from netkf.theory import central_covariance, covariance_bound, limit_covariance
@@ -151,13 +151,13 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
             bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
     except TheoryError as error:
         reason = str(error)
-    notes = (_steady_note(scenario), mismatch_words(scenario), nees_words(scenario))
+    notes = (_steady_note(scenario), mismatch_note(scenario), nees_note(scenario))
     return PromisedTraces(
         bound,
         _trace(limit_covariance, scenario),
         _trace(central_covariance, scenario),
         reason or reason_without_bound(scenario) or "",
-        limit_words(scenario),
+        limit_label(scenario),
         tuple(filter(None, notes)),
     )
 

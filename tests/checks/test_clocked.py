@@ -4,8 +4,8 @@ import pytest
 
 import netkf
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.runs.labels import by_design, nees_words
-from netkf.runs.promises import promises, promises_text
+from netkf.runs.labels import covariance_bias, nees_note
+from netkf.runs.promises import compute_promises, promises_text
 
 SENSOR = {"H": [[1.0]], "R": [[0.5]], "sampling": {"kind": "periodic", "period": 0.4}}
 LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.7}, "symmetric": False}
@@ -62,7 +62,7 @@ def test_theory_sees_what_sensors_that_sample_see(kind, clocked):
     row = rows.loc["(A, H) is observable, all sensors together"]
     assert row.holds
     assert row.evidence == "every mode is seen; 2 of 3 nodes see all alone"
-    shown = promises_text(scenario, promises(scenario))
+    shown = promises_text(scenario, compute_promises(scenario))
     assert f"H(12) is about the hybrid filter in continuous time, not about {kind}" in shown
     assert f"H(13) is about the hybrid filter, not about {kind}" in shown
     assert "slot" not in shown
@@ -70,10 +70,10 @@ def test_theory_sees_what_sensors_that_sample_see(kind, clocked):
 
 def test_push_sum_says_where_its_covariance_is_too_small(clocked):
     scenario = clocked("push-sum")
-    assert by_design(scenario) == "smaller"
-    assert "NEES above n = 1 is right" in nees_words(scenario)
+    assert covariance_bias(scenario) == "smaller"
+    assert "NEES above n = 1 is right" in nees_note(scenario)
     found = netkf.consistency(scenario, runs=20, workers=1)
     assert found
     said = [row.verdict for row in found.rows]
     assert "as it should be: the design of the filter makes P too small" in said
-    assert nees_words(clocked("gossip")) == ""
+    assert nees_note(clocked("gossip")) == ""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.runs.promises import promises, promises_text
+from netkf.runs.promises import compute_promises, promises_text
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
 
@@ -16,7 +16,7 @@ def said(scenario, folder):
     """What `netkf theory` says about a scenario, and what the table of its run does."""
     done = run_to_directory(scenario, folder / "out")
     table = summary_table(done.summary, done.promised.limit_label, done.promised.notes)
-    return promises_text(scenario, promises(scenario)), table
+    return promises_text(scenario, compute_promises(scenario)), table
 
 
 def weighted(build, folder):
@@ -77,7 +77,7 @@ def test_a_missing_steady_state_is_named_by_the_run(build, tmp_path):
 
 def test_a_node_that_sees_nothing_does_not_hide_the_steady_state_of_another(build, tmp_path):
     scenario = build(plant=UNSTABLE, filter={"kind": "local"})
-    found = promises(scenario)
+    found = compute_promises(scenario)
     # 0 = 2 a P + 1 - P^2 / R with a = R = 0.5
 
     P = np.roots([-2.0, 1.0, 1.0]).max()
@@ -101,7 +101,7 @@ def test_what_a_record_does_not_tell_is_unknown_not_wrong(build, tmp_path):
         assert "does not tell its rates" in rows.evidence[name]
     assert not rows.holds["the link clocks are independent Poisson processes"]
     assert not rows.evidence.str.contains("RecordedClock").any()
-    text = promises_text(scenario, promises(scenario))
+    text = promises_text(scenario, compute_promises(scenario))
     assert "  unknown  the rates of all links are positive" in text
     with pytest.raises(netkf.TheoryError, match="not known beforehand"):
         netkf.theory.limit_covariance(scenario)

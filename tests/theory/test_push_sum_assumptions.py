@@ -8,7 +8,7 @@ import scipy.linalg
 
 from netkf import theory
 from netkf.cli.main import main
-from netkf.runs.promises import promises
+from netkf.runs.promises import compute_promises
 from netkf.scenario.writing import resolved, to_toml
 from tests.theory.push_sum_systems import RHO_T1, planar, scenario
 
@@ -124,7 +124,7 @@ def test_netkf_theory_shows_both_kinds_of_gamma(tmp_path, capsys):
 
 
 def test_what_does_not_exist_has_a_reason():
-    found = promises(planar(1, 0.5))["push_sum"]
+    found = compute_promises(planar(1, 0.5))["push_sum"]
     assert found["error_traces"]["value"] is None
     assert "not below 1" in found["error_traces"]["reason"]
     assert "rho(L)" in found["minimum_gamma_mean"]["reason"]
