@@ -1,4 +1,4 @@
-"""What a promise comes to: a margin with its interval, and a verdict."""
+"""Verdicts on promises: a margin with its interval, and what follows from it."""
 
 from __future__ import annotations
 
@@ -7,23 +7,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-
 HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not promised"
-MOST_RUNS = 1e9
 VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
+MAX_RUNS = 1e9
+"""Number of runs beyond which ``Evidence.needed`` gives none."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One promise held against simulation.
+    """The verdict on one promise.
 
-    margin, low, high : how far the promise is from being broken, negative where it is, with an
-        interval that covers all comparisons of the row at once
-    tolerance : how far below 0 the interval may reach for the verdict ``holds``
-    verdict   : broken where the whole interval is below 0, holds where it stays above
-        ``-tolerance``, undecided where it is too wide, not promised where an assumption fails
-    needed    : about how many runs an undecided promise takes
+    margin, low, high : distance of the promise from being broken (negative if it is broken), with
+        an interval that covers all comparisons of the row at once
+    tolerance : distance below 0 that the interval may reach for the verdict ``holds``
+    verdict   : broken if the whole interval is below 0, holds if it stays above ``-tolerance``,
+        undecided if it is too wide, not promised if an assumption fails
+    needed    : estimated number of runs that would decide an undecided promise, or None
     """
 
     promise: str
@@ -39,35 +38,38 @@ class Evidence:
 
 
 class Finding(NamedTuple):
-    """A margin (value, low, high), how much below 0 is tolerable, and words about it; ``early``
-    where the promise is about a limit and the horizon is too short to tell; ``blurred`` where
-    rounding of a large state has left no errors to judge by.
+    """The result of a test: a margin (value, low, high), the distance below 0 that is tolerable,
+    and a sentence about it.
+
+    early   : the promise is about a limit and the horizon is too short to tell
+    blurred : rounding of a large state has left no errors to judge by
     """
 
     margin: tuple[float, float, float]
     tolerance: float
-    words: str
+    message: str
     early: bool = False
     blurred: bool = False
 
 
 @dataclass(frozen=True)
 class Promise:
-    """Words, source (paper, number), what it needs of the table of assumptions, and its test.
+    """A statement with its source (paper, number), the assumptions that it needs, and its test.
 
-    A test takes what was seen of all runs and a level, and returns a Finding whose interval misses
-    with at most that probability. ``exact`` tests compare paths, not laws, and spend no level.
+    ``needs`` are parts of the names or sources of rows in the table of assumptions. A test takes
+    the samples of all runs and a level; the interval of its Finding misses with at most that
+    probability. ``exact`` tests compare paths, not laws, and spend none of the level.
     """
 
-    words: str
+    statement: str
     source: str
     needs: tuple[str, ...]
     test: Callable[[Any, float], Finding]
     exact: bool = False
 
 
-class Row(NamedTuple):
-    """A row of the table of assumptions."""
+class Assumption(NamedTuple):
+    """A row of the table of assumptions; ``holds`` is None if it is not known."""
 
     assumption: str
     source: str
@@ -76,44 +78,53 @@ class Row(NamedTuple):
 
 
 def judge(
-    promises: Sequence[Promise], seen: Any, assumptions: Sequence[Row], runs: int, level: float
+    promises: Sequence[Promise],
+    samples: Any,
+    assumptions: Sequence[Assumption],
+    runs: int,
+    level: float,
 ) -> list[Evidence]:
-    """Evidence for each promise; all intervals together miss with at most ``level``."""
-    failing = [[row for row in assumptions if _needed(p, row) and not row.holds] for p in promises]
+    """Return the evidence for each promise; all intervals together miss with at most ``level``."""
+    failing = [
+        [row for row in assumptions if _is_needed(promise, row) and not row.holds]
+        for promise in promises
+    ]
+    # Bonferroni: the statistical tests share the level, exact ones and void promises need none.
     statistical = sum(not p.exact and not rows for p, rows in zip(promises, failing, strict=True))
     found = []
     for promise, rows in zip(promises, failing, strict=True):
         if rows:
             why = "; ".join(f"{row.assumption} [{row.source}]: {row.evidence}" for row in rows)
-            found.append(_not_promised(promise, why))
+            found.append(_reject(promise, why))
         else:
-            finding = promise.test(seen, level / max(statistical, 1))
-            found.append(_weighed(promise, finding, runs))
+            finding = promise.test(samples, level / max(statistical, 1))
+            found.append(_weigh(promise, finding, runs))
     return found
 
 
-def _needed(promise: Promise, row: Row) -> bool:
+def _is_needed(promise: Promise, row: Assumption) -> bool:
     return any(need in f"{row.assumption} [{row.source}]" for need in promise.needs)
 
 
-def _weighed(promise: Promise, finding: Finding, runs: int) -> Evidence:
-    (margin, low, high), tolerance, words, early, blurred = finding
+def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
+    """Return the verdict that follows from the interval of a finding."""
+    (margin, low, high), tolerance, message, early, blurred = finding
     needed = None
     if blurred:
         verdict = UNDECIDED
     elif early:
-        verdict, words = UNDECIDED, f"{words}; the horizon is too short to tell, lengthen it"
-    elif not high >= 0.0:  # also where nothing but nan was seen
+        verdict, message = UNDECIDED, f"{message}; the horizon is too short to tell, lengthen it"
+    elif not high >= 0.0:  # also if all values are nan
         verdict = BROKEN
     elif low >= -tolerance:
         verdict = HOLDS
     else:
         verdict = UNDECIDED
-        # Where the promise holds, what is seen below 0 is chance and shrinks as 1 / sqrt(runs).
+        # If the promise holds, a negative ``low`` is chance and shrinks as 1 / sqrt(runs).
         wanted = 1.1 * runs * (-low / tolerance) ** 2 if tolerance > 0.0 else math.inf
-        needed = math.ceil(wanted) if wanted < MOST_RUNS else None
+        needed = math.ceil(wanted) if wanted < MAX_RUNS else None
     return Evidence(
-        promise.words,
+        promise.statement,
         promise.source,
         "hold",
         margin,
@@ -122,34 +133,32 @@ def _weighed(promise: Promise, finding: Finding, runs: int) -> Evidence:
         tolerance,
         verdict,
         needed,
-        words,
+        message,
     )
 
 
-def _not_promised(promise: Promise, why: str) -> Evidence:
+def _reject(promise: Promise, why: str) -> Evidence:
     nan = math.nan
-    return Evidence(promise.words, promise.source, why, nan, nan, nan, nan, NOT_PROMISED, None, "")
+    return Evidence(
+        promise.statement, promise.source, why, nan, nan, nan, nan, NOT_PROMISED, None, ""
+    )
 
 
-def left_out(seen: Any) -> str:
-    """Words about the times at which some errors of ``seen.runs.e`` (R, K, N, n) are left out."""
-    lost = np.isnan(seen.runs.e).any(axis=(0, 2, 3))
-    times = ", ".join(time for time, none in zip(seen.moments, lost, strict=True) if none)
-    return f"; errors that rounding blurs are left out ({times})" if times else ""
+def find_identity(deviation: float, allowed: float, message: str) -> Finding:
+    """Return the finding on paths that should be equal up to rounding.
+
+    ``deviation`` is their largest relative deviation, ``allowed`` what rounding explains.
+    """
+    margin = allowed - deviation
+    text = f"largest relative deviation {deviation:.1e}, rounding explains {allowed:.0e}; {message}"
+    return Finding((margin, margin, margin), 0.0, text)
 
 
-def rounded_away(tolerance: float) -> Finding:
-    """Where errors have lost their digits at every sample that a promise is about."""
+def find_nothing(tolerance: float) -> Finding:
+    """Return the finding of a test whose errors are all blurred by rounding."""
     nan = math.nan
-    words = (
+    message = (
         "the state is so large that rounding blurs the errors wherever they are looked at; shorten "
         "the horizon"
     )
-    return Finding((nan, nan, nan), tolerance, words, blurred=True)
-
-
-def identity(deviation: float, allowed: float, words: str) -> Finding:
-    """From the largest relative deviation of paths that should be equal but for rounding."""
-    margin = allowed - deviation
-    text = f"largest relative deviation {deviation:.1e}, rounding explains {allowed:.0e}; {words}"
-    return Finding((margin, margin, margin), 0.0, text)
+    return Finding((nan, nan, nan), tolerance, message, blurred=True)

@@ -1,34 +1,40 @@
-"""What G promises of the gossip filter, held against runs."""
+"""Promises of G about the gossip filter."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import Finding, Promise, Row, identity
-from netkf.checks.exact import all_watched, as_computed, exact, within_reach
+from netkf.checks.evidence import Assumption, Finding, Promise, find_identity
+from netkf.checks.exact import check_error_covariance, few_errors, summarise_exactly
 from netkf.checks.laws import (
     Pair,
-    distances,
+    compare_laws,
+    diagonal_distances,
     exact_start,
-    same_laws,
-    worst,
+    find_largest,
 )
 from netkf.checks.mode_sequences import (
-    gossip_book,
-    handed_over,
-    lineage,
-    look_at,
-    reference_size,
-    start_roots,
-    token_places,
-    watched_places,
+    gossip_modes,
+    initial_roots,
+    pair_sources,
+    reference_count,
+    token_positions,
+    trace_tokens,
 )
-from netkf.checks.samples import Seen, bounded, nees_is_chi_squared, replay
-from netkf.checks.statistics import off_by, share
+from netkf.checks.paper import PaperChecks
+from netkf.checks.points import all_sampled, check_slots, sampled_indices
+from netkf.checks.samples import (
+    ReplicaSummary,
+    RunSamples,
+    check_growth,
+    check_nees,
+    check_replay,
+)
+from netkf.checks.statistics import deviation_interval, probability_interval
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.rng.streams import Streams
@@ -36,79 +42,67 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.gossip.matchings import effective_matching
 from netkf.trace.run import Run
 
-SLOTS_ONLY = True
-"""Whether the paper speaks about slots alone; under clocks those of ``clocked`` are checked."""
-
 WINDOW = 40
-HUGE = 1e9  # root of a covariance that every other one is below
-FAR = 30.0  # factor of the other start's root
-ROUNDING = 1e-8
-SHARE = 0.05  # tolerance of probabilities
+"""Last readings of a pair from which its bound is computed."""
+UNKNOWN = 1e9
+"""Root of a covariance that is above all others: nothing is known of the state."""
+FAR_START = 30.0
+"""Factor of the roots of P(0) in the other start, about a thousand times the covariance."""
+BOUND_TOLERANCE = 1e-8
+PROBABILITY_TOLERANCE = 0.05
 
 
-class Witness(NamedTuple):
-    """What one run says; K slots are looked at.
+@dataclass(frozen=True, eq=False)
+class GossipSummary(ReplicaSummary):
+    """Adds values at the K slots and at the last one; ``replayed`` is what G (10) makes of the
+    swaps.
 
-    P, nees  : (K, N, n, n), (K, N) at the slots
-    e, Sigma, whole : as in :class:`Exact`
-    replayed : (K, N, n, n) what G (10) makes of the run's swaps
-    restarted: (N, n, n) the same at the last slot from another start
-    bounds   : (K, N, n, n) what the last readings of each pair allow, whatever was before
-    tokens   : (N, n, n) the pair of each token at the last slot; anything where pairs were copied
-    pairs    : number of slots in which j handed its pair to i, from slot 1 on, for all ``handing``
-    slots    : their number
+    restarted : (N, n, n) P at the last slot by G (10) from another start
+    bounds    : (K, N, n, n) bounds by the last readings of each pair, for any state before them
+    tokens    : (N, n, n) covariance of each token at the last slot; arbitrary if pairs were copied
+    moves     : number of slots, from slot 1 on, in which j handed its pair to i, for each pair of
+                ``_counted_pairs``
+    slots     : number of slots counted in ``moves``
     """
 
-    P: FloatArray
-    nees: FloatArray
-    e: FloatArray
-    Sigma: FloatArray
-    whole: FloatArray
-    replayed: FloatArray
     restarted: FloatArray
     bounds: FloatArray
     tokens: FloatArray
-    pairs: np.ndarray
+    moves: np.ndarray
     slots: int
 
 
-def witness(scenario: Scenario, run: Run) -> Witness:
-    """Reduce a run whose samples are those of ``look_at``."""
-    slots = list(look_at(scenario))
-    came, book = handed_over(scenario, run, slots[-1]), gossip_book(scenario)
-    starts, n, watched = start_roots(scenario), scenario.plant.n, watched_places(scenario)
+def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
+    slots = list(check_slots(scenario))
+    sources, table = pair_sources(scenario, run, slots[-1]), gossip_modes(scenario)
+    starts, n, sampled = initial_roots(scenario), scenario.plant.n, sampled_indices(scenario)
     replayed, bounds = [], []
     for slot in slots:
-        line = lineage(came, slot)
-        origin, path = line.origin[watched], line.path[watched]
-        replayed.append(book.along(starts[origin], path, [slot])[0])
+        history = trace_tokens(sources, slot)
+        origin, path = history.origin[sampled], history.path[sampled]
+        replayed.append(table.covariances(starts[origin], path, [slot])[0])
         recent = path[:, -WINDOW:]
-        everything = np.repeat(HUGE * np.eye(n)[None], len(recent), axis=0)
-        bounds.append(book.along(everything, recent, [recent.shape[1]])[0])
-    token = token_places(came, slots[-1])
-    held = np.full(len(starts), -1) if token is None else token
-    restarted = book.along(FAR * starts[origin] + np.eye(n), path, [slots[-1]])[0]
-    seen = exact(scenario, run)
-    return Witness(
-        seen.P,
-        seen.nees,
-        seen.e,
-        seen.Sigma,
-        seen.whole,
-        np.array(replayed),
-        restarted,
-        np.array(bounds),
-        run.P[-1, held[watched]],
-        _handed(scenario, came[1 : slots[-1]]),
-        slots[-1] - 1,
+        unknown = np.repeat(UNKNOWN * np.eye(n)[None], len(recent), axis=0)
+        bounds.append(table.covariances(unknown, recent, [recent.shape[1]])[0])
+    positions = token_positions(sources, slots[-1])
+    holders = np.full(len(starts), -1) if positions is None else positions
+    far = FAR_START * starts[origin] + np.eye(n)
+    exact = vars(summarise_exactly(scenario, run)) | {"replayed": np.array(replayed)}
+    return GossipSummary(
+        **exact,
+        restarted=table.covariances(far, path, [slots[-1]])[0],
+        bounds=np.array(bounds),
+        tokens=run.P[-1, holders[sampled]],
+        moves=_count_moves(scenario, sources[1 : slots[-1]]),
+        slots=slots[-1] - 1,
     )
 
 
-def handing(scenario: Scenario) -> tuple[IntArray, IntArray]:
-    """Places i and j of the pairs whose swaps are counted: all in a network without unwatched
-    nodes, else the ends of links, in both directions.
+def _counted_pairs(scenario: Scenario) -> tuple[IntArray, IntArray]:
+    """Return the indices i and j of the pairs of nodes whose moves are counted: all pairs, or in a
+    large network the ends of links, in both directions.
     """
-    if len(watched_places(scenario)) == len(scenario.nodes):
+    if len(sampled_indices(scenario)) == len(scenario.nodes):
         i, j = np.nonzero(~np.eye(len(scenario.nodes), dtype=bool))
         return i, j
     index = scenario.topology.index
@@ -117,151 +111,147 @@ def handing(scenario: Scenario) -> tuple[IntArray, IntArray]:
     return i, j
 
 
-def _handed(scenario: Scenario, came: np.ndarray) -> np.ndarray:
-    """Counts of the slots (rows of ``came``) in which j handed its pair to i."""
+def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
+    """Return the number of slots (rows of ``sources``) in which j handed its pair to i."""
     size = len(scenario.nodes)
-    codes, counts = np.unique(np.arange(size) * size + came, return_counts=True)
-    i, j = handing(scenario)
+    codes, counts = np.unique(np.arange(size) * size + sources, return_counts=True)
+    i, j = _counted_pairs(scenario)
     if not len(codes):
         return np.zeros(len(i), dtype=int)
-    place = np.minimum(np.searchsorted(codes, i * size + j), len(codes) - 1)
-    return np.where(codes[place] == i * size + j, counts[place], 0)
+    found = np.minimum(np.searchsorted(codes, i * size + j), len(codes) - 1)
+    return np.where(codes[found] == i * size + j, counts[found], 0)
 
 
-class Reference(NamedTuple):
-    """S switched chains: ``P`` (K, S, n, n), at the last slot from another start ``restarted``
-    (S, n, n), ``places`` (S, slots).
+class ChainSamples(NamedTuple):
+    """S switched chains of G (20).
+
+    P         : (K, S, n, n) covariances at the K slots
+    restarted : (S, n, n) covariances at the last slot from another start
+    positions : (S, slots) node of each chain in each slot
     """
 
     P: FloatArray
     restarted: FloatArray
-    places: np.ndarray
+    positions: np.ndarray
 
 
 @dataclass(frozen=True)
-class Observed(Seen):
-    """Witnesses of many runs, stacked, with what they are held against."""
+class GossipSamples(RunSamples):
+    """Adds samples of the switched chain, with which the laws of the runs are compared."""
 
     @cached_property
     def matching(self) -> FloatArray:
-        """(N, N) Abar with the losses of the channel."""
+        """Abar (N, N) with the losses of the channel."""
         return effective_matching(self.scenario)
 
     @cached_property
-    def reference(self) -> Reference:
-        """The switched chain of G (20)."""
-        slots, starts = list(look_at(self.scenario)), start_roots(self.scenario)
+    def reference(self) -> ChainSamples:
+        """Samples of the switched chain of G (20)."""
+        slots, starts = list(check_slots(self.scenario)), initial_roots(self.scenario)
         random = Streams(self.seed).generator("switched chain")
-        places = switched_chain(self.matching, slots[-1], reference_size(self.scenario, 1), random)
-        book, first = gossip_book(self.scenario), starts[places[:, 0]]
-        restarted = book.along(FAR * first + np.eye(first.shape[-1]), places, slots[-1:])[0]
-        return Reference(book.along(first, places, slots), restarted, places)
+        count = reference_count(self.scenario, 1)
+        positions = _draw_chains(self.matching, slots[-1], count, random)
+        table, first = gossip_modes(self.scenario), starts[positions[:, 0]]
+        far = FAR_START * first + np.eye(first.shape[-1])
+        restarted = table.covariances(far, positions, slots[-1:])[0]
+        return ChainSamples(table.covariances(first, positions, slots), restarted, positions)
 
 
-def switched_chain(
-    mean: FloatArray, slots: int, samples: int, random: np.random.Generator
+def _draw_chains(
+    matching: FloatArray, slots: int, count: int, random: np.random.Generator
 ) -> np.ndarray:
-    """(samples, slots) places of stationary Markov chains with transition matrix Abar, G (20)."""
-    rows = np.cumsum(mean, axis=1)
-    places = np.empty((samples, slots), dtype=int)
-    places[:, 0] = random.integers(len(mean), size=samples)
+    """Return positions (count, slots) of stationary Markov chains with transition matrix Abar."""
+    rows = np.cumsum(matching, axis=1)
+    positions = np.empty((count, slots), dtype=int)
+    # Abar is doubly stochastic, so the uniform law is stationary.
+    positions[:, 0] = random.integers(len(matching), size=count)
     for t in range(1, slots):
-        luck = random.random(samples)[:, None]
-        places[:, t] = np.minimum((luck >= rows[places[:, t - 1]]).sum(axis=1), len(mean) - 1)
-    return places
+        draws = random.random(count)[:, None]
+        after = (draws >= rows[positions[:, t - 1]]).sum(axis=1)
+        positions[:, t] = np.minimum(after, len(matching) - 1)
+    return positions
 
 
-def rows(scenario: Scenario) -> list[Row]:
-    """What the tests need beyond the paper's own assumptions."""
-    try:
-        effective_matching(scenario)
-        known, words = True, "drawn afresh in each slot, and lost with a known probability"
-    except TheoryError as error:
-        known, words = False, str(error)
-    return [
-        Row("slots are independent and Abar is known", "G II-A", known, words),
-        exact_start(scenario),
-        within_reach(scenario),
-        all_watched(scenario),
-    ]
-
-
-def walks(seen: Observed, level: float) -> Finding:
-    """The last readings of a pair bound it, whatever was before."""
-    P, bound = seen.runs.P, seen.runs.bounds
+def _walks_bound(samples: GossipSamples, level: float) -> Finding:
+    """Compare P with its bound by the last readings of the pair, G Lemma 14."""
+    P, bound = samples.runs.P, samples.runs.bounds
     size = np.trace(bound, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(P), bound - P, -np.inf)
         finite = np.isfinite(gap).all(axis=(-1, -2))
     least = np.full(finite.shape, -np.inf)
     least[finite] = np.linalg.eigvalsh(gap[finite])[..., 0] / size[finite]
-    detected = size < HUGE
+    detected = size < UNKNOWN
     largest = f"{size[detected].max():.4g}" if detected.any() else "none"
-    words = (
+    message = (
         f"in {detected.mean():.0%} of all cases the last {WINDOW} readings detect the state; "
         f"largest trace of the bounds that they give: {largest}"
     )
-    return identity(float(max(0.0, -least.min())), ROUNDING, words)
+    return find_identity(float(max(0.0, -least.min())), BOUND_TOLERANCE, message)
 
 
-def pairings(seen: Observed, level: float) -> Finding:
-    """Tokens move by the mean matching; slots are independent, so counts are binomial."""
-    i, j = handing(seen.scenario)
-    trials, totals = int(np.sum(seen.runs.slots)), seen.runs.pairs.sum(axis=0)
-    nodes = seen.scenario.nodes
-    found = [
-        (
-            off_by(seen.matching[a, b], share(int(total), trials, level / len(i))),
-            f"from node {nodes[b]} to {nodes[a]}",
+def _tokens_move(samples: GossipSamples, level: float) -> Finding:
+    """Compare counts of moves with Abar; slots are independent, so counts are binomial."""
+    i, j = _counted_pairs(samples.scenario)
+    trials, totals = int(np.sum(samples.runs.slots)), samples.runs.moves.sum(axis=0)
+    nodes = samples.scenario.nodes
+    found = []
+    for a, b, total in zip(i.tolist(), j.tolist(), totals, strict=True):
+        moved = probability_interval(int(total), trials, level / len(i))
+        deviation = deviation_interval(samples.matching[a, b], moved)
+        found.append((deviation, f"from node {nodes[b]} to {nodes[a]}"))
+    message = f"largest difference from Abar over {trials:,} slots"
+    return find_largest(found, PROBABILITY_TOLERANCE, message)
+
+
+def _random_sensor(samples: GossipSamples, level: float) -> Finding:
+    """Compare a sensor of each run, drawn for each slot, with the switched chain, G (67)."""
+    random = Streams(samples.seed).generator("random sensor")
+    runs, nodes = np.arange(samples.count), len(samples.scenario.nodes)
+    picks = random.integers(nodes, size=(len(check_slots(samples.scenario)), samples.count))
+    pairs = [
+        Pair(f"slot {slot}", samples.runs.P[runs, k, picks[k]], samples.reference.P[k])
+        for k, slot in enumerate(check_slots(samples.scenario))
+    ]
+    return compare_laws(pairs, level)
+
+
+def _each_sensor(samples: GossipSamples, level: float) -> Finding:
+    """Compare law(Phat_n(t)) with law(Ptilde(t) given ptilde(t - 1) = n), from G (19)."""
+    P, _, positions = samples.reference
+    pairs = [
+        Pair(
+            f"slot {slot}, node {node}", samples.runs.P[:, k, i], P[k, positions[:, slot - 1] == i]
         )
-        for a, b, total in zip(i.tolist(), j.tolist(), totals, strict=True)
+        for k, slot in enumerate(check_slots(samples.scenario))
+        for i, node in enumerate(samples.nodes)
     ]
-    return worst(found, SHARE, f"largest difference from Abar over {trials:,} slots")
+    return compare_laws(pairs, level)
 
 
-def random_sensor(seen: Observed, level: float) -> Finding:
-    """One sensor a run, drawn at random for each slot."""
-    random = Streams(seen.seed).generator("random sensor")
-    runs, nodes = np.arange(seen.count), len(seen.scenario.nodes)
-    picks = random.integers(nodes, size=(len(look_at(seen.scenario)), seen.count))
-    pairs = [
-        Pair(f"slot {slot}", seen.runs.P[runs, k, picks[k]], seen.reference.P[k])
-        for k, slot in enumerate(look_at(seen.scenario))
-    ]
-    return same_laws(pairs, level)
+def _tokens(samples: GossipSamples, level: float) -> Finding:
+    """Compare each token at the end with the stationary switched chain.
 
-
-def each_sensor(seen: Observed, level: float) -> Finding:
-    """law(Phat_n(t)) = law(Ptilde(t) given ptilde(t - 1) = n)."""
-    P, _, places = seen.reference
-    pairs = [
-        Pair(f"slot {slot}, node {node}", seen.runs.P[:, k, i], P[k, places[:, slot - 1] == i])
-        for k, slot in enumerate(look_at(seen.scenario))
-        for i, node in enumerate(seen.nodes)
-    ]
-    return same_laws(pairs, level)
-
-
-def tokens(seen: Observed, level: float) -> Finding:
-    """Each token at the end against the stationary switched chain, which may not be there yet."""
-    last, pairs = len(look_at(seen.scenario)) - 1, []
-    everywhere, origin = seen.reference.P[last], seen.reference.places[:, 0]
-    for i, node in enumerate(seen.nodes):
-        own = seen.runs.tokens[:, i]
-        known = distances(everywhere[origin == i], everywhere)
+    Both may still depend on the start; the distance that the chain shows for it is subtracted.
+    """
+    last, pairs = len(check_slots(samples.scenario)) - 1, []
+    everywhere, origin = samples.reference.P[last], samples.reference.positions[:, 0]
+    for i, node in enumerate(samples.nodes):
+        own = samples.runs.tokens[:, i]
+        known = diagonal_distances(everywhere[origin == i], everywhere)
         pairs.append(Pair(f"token {node}", own, everywhere, known))
-    return same_laws(pairs, level)
+    return compare_laws(pairs, level)
 
 
-def forgotten(seen: Observed, level: float) -> Finding:
-    """The runs against their own swaps from a start a thousand times larger."""
-    runs, (P, restarted, places) = seen.runs, seen.reference
+def _initial_condition_forgotten(samples: GossipSamples, level: float) -> Finding:
+    """Compare the runs with their own swaps from a start a thousand times larger."""
+    runs, (P, restarted, positions) = samples.runs, samples.reference
     pairs = []
-    for i, node in enumerate(seen.nodes):
-        here = places[:, -1] == i
-        known = distances(P[-1, here], restarted[here])
+    for i, node in enumerate(samples.nodes):
+        here = positions[:, -1] == i
+        known = diagonal_distances(P[-1, here], restarted[here])
         pairs.append(Pair(f"node {node}", runs.P[:, -1, i], runs.restarted[:, i], known))
-    return same_laws(pairs, level)
+    return compare_laws(pairs, level)
 
 
 CHAIN = ("every exchange is a swap", "slots are independent")
@@ -273,62 +263,97 @@ PROMISES = (
         "pairs are swapped first and updated after: P_n(t+1) = f_{p_n(t)}(P_n(t))",
         "G (10), (19), Proposition 7",
         (),
-        replay,
+        check_replay,
         exact=True,
     ),
     Promise(
         "a walk that detects bounds the covariance that passes through it",
         "G Lemma 14",
         ("G D.1",),
-        walks,
+        _walks_bound,
         exact=True,
     ),
     Promise(
         "tokens are Markov chains with transition matrix Abar",
         "G Proposition 6",
         CHAIN,
-        pairings,
+        _tokens_move,
     ),
     Promise(
         "a random sensor has the law of the switched chain, at every time",
         "G (67), Theorems 8 and 10 [i]",
         LAWS,
-        random_sensor,
+        _random_sensor,
     ),
     Promise(
         "each sensor has the law of the switched chain that is there",
         "derived from G (19)",
         LAWS,
-        each_sensor,
+        _each_sensor,
     ),
     Promise(
         "every token has the same law in the end",
         "G Theorem 10 [ii], (25), (28)",
         ERGODIC,
-        tokens,
+        _tokens,
     ),
     Promise(
         "covariances are stochastically bounded: their laws do not grow any more",
         "G Theorem 10 [iii], (26)",
         STABLE,
-        bounded,
+        check_growth,
     ),
-    Promise("the law in the end does not depend on the start", "G Theorem 8", ERGODIC, forgotten),
+    Promise(
+        "the law in the end does not depend on the start",
+        "G Theorem 8",
+        ERGODIC,
+        _initial_condition_forgotten,
+    ),
     Promise(
         "errors have the covariance that swaps and readings give them",
         "G (8), (10), derived",
         ("the filters start", "exact errors are within reach"),
-        as_computed,
+        check_error_covariance,
     ),
     Promise(
         "errors are as large as P says: the mean NEES is n",
         "G (9)",
         ("the filters know", "the filters start"),
-        nees_is_chi_squared,
+        check_nees,
     ),
 )
 
 
-def promises(scenario: Scenario) -> tuple[Promise, ...]:
-    """Those of the scenario."""
-    return PROMISES
+class GossipChecks(PaperChecks):
+    """Promises of G, Propositions 6, 7, Theorems 8, 10."""
+
+    slots_only = True
+
+    def summarise(self, scenario: Scenario, run: Run) -> GossipSummary:
+        """Return the summary of a run whose samples are at ``check_slots``."""
+        return _summarise(scenario, run)
+
+    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> GossipSamples:
+        """Return the samples that the tests take, from stacked summaries."""
+        return GossipSamples(scenario, stacked, seed)
+
+    def assumptions(self, scenario: Scenario) -> list[Assumption]:
+        """Return the assumptions of the tests beyond those of G."""
+        try:
+            effective_matching(scenario)
+            known, why = True, "drawn afresh in each slot, and lost with a known probability"
+        except TheoryError as error:
+            known, why = False, str(error)
+        return [
+            Assumption("slots are independent and Abar is known", "G II-A", known, why),
+            exact_start(scenario),
+            few_errors(scenario),
+            all_sampled(scenario),
+        ]
+
+    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
+        """Return the promises about a scenario."""
+        return PROMISES
+
+
+CHECKS = GossipChecks()

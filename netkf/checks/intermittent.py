@@ -1,43 +1,50 @@
-"""What R promises of the filter with intermittent observations, held against runs."""
+"""Promises of R about the filter with intermittent observations."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import Finding, Promise, Row, identity
-from netkf.checks.exact import as_computed, exact, within_reach
+from netkf.checks.evidence import Assumption, Finding, Promise, find_identity
+from netkf.checks.exact import check_error_covariance, few_errors, summarise_exactly
 from netkf.checks.laws import (
+    LAW_TOLERANCE,
     Pair,
-    distances,
+    compare_laws,
+    diagonal_distances,
     exact_start,
-    same_laws,
-    worst,
+    find_largest,
 )
 from netkf.checks.mode_sequences import (
-    arrivals,
-    everything,
-    intermittent_book,
-    look_at,
-    peers_of,
-    reference_size,
-    start_roots,
-    watched_nodes,
-    watched_places,
+    all_arrivals,
+    find_arrivals,
+    initial_roots,
+    intermittent_modes,
+    reference_count,
+    sensing_neighbours,
 )
-from netkf.checks.samples import Seen, bounded, nees_is_chi_squared, replay
+from netkf.checks.paper import PaperChecks
+from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
+from netkf.checks.samples import (
+    ReplicaSummary,
+    RunSamples,
+    check_growth,
+    check_nees,
+    check_replay,
+)
 from netkf.checks.statistics import (
-    chi_square,
-    distance_to,
-    off_by,
-    share,
+    deviation_interval,
+    distance_to_law,
+    pearson_test,
+    probability_interval,
 )
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.network.matchings import Broadcast
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.intermittent.riccati import steady_covariance
@@ -45,55 +52,49 @@ from netkf.theory.intermittent.scalar_law import ScalarLaw, scalar_law
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-SLOTS_ONLY = True
-"""Whether the paper speaks about slots alone; under clocks those of ``clocked`` are checked."""
-
-FAR = 30.0  # factor of the other start's root
-ROUNDING = 1e-8
-SHARE, LAW = 0.05, 0.2  # tolerances: of probabilities, of distances of laws
+FAR_START = 30.0
+"""Factor of the roots of P(0) in the other start, about a thousand times the covariance."""
+BOUND_TOLERANCE, SUPPORT_TOLERANCE = 1e-8, 1e-6
+PROBABILITY_TOLERANCE = 0.05
 CELLS = 12
+"""Cells between the holes of the scalar law that are counted; longer outages are one cell."""
+Direction = tuple[int, int]
 
 
-class Witness(NamedTuple):
-    """What one run says; K slots are looked at, D directions can carry readings.
+@dataclass(frozen=True, eq=False)
+class IntermittentSummary(ReplicaSummary):
+    """Adds values at the last slot and counts of the D directions that can carry readings;
+    ``replayed`` is what R (15)-(18) makes of the arrivals.
 
-    P, nees  : (K, N, n, n), (K, N) at the slots
-    e, Sigma, whole : as in :class:`Exact`
-    replayed : (K, N, n, n) what R (15)-(18) makes of the run's arrivals
-    restarted: (N, n, n) the same at the last slot from another start
-    in_support: (N, n, n) the same at the last slot from P* of each node
-    sent, got: (D,) readings sent and delivered in time
+    restarted  : (N, n, n) P by the same arrivals from another start
+    in_support : (N, n, n) P by the same arrivals from P* of each node
+    sent, arrived : (D,) readings sent and delivered in time
     """
 
-    P: FloatArray
-    nees: FloatArray
-    e: FloatArray
-    Sigma: FloatArray
-    whole: FloatArray
-    replayed: FloatArray
     restarted: FloatArray
     in_support: FloatArray
     sent: np.ndarray
-    got: np.ndarray
+    arrived: np.ndarray
 
 
-def directions(scenario: Scenario) -> list[tuple[int, int]]:
-    """(sender, receiver) of all that can carry readings."""
-    peers = peers_of(scenario)
-    return [(peer, node) for node in scenario.nodes for peer in peers[node]]
+def _directions(scenario: Scenario) -> list[Direction]:
+    """Return (sender, receiver) of all directed links that can carry readings."""
+    senders = sensing_neighbours(scenario)
+    return [(sender, node) for node in scenario.nodes for sender in senders[node]]
 
 
 @lru_cache(maxsize=8)
-def least_roots(scenario: Scenario) -> FloatArray:
-    """(W, n, n) roots of P* of each watched node, with all readings that can reach it; nan where it
-    has none.
+def _least_roots(scenario: Scenario) -> FloatArray:
+    """Return the roots (W, n, n) of P* of each sampled node, with all readings that can reach it;
+    nan if it does not exist.
     """
-    full, n = everything(scenario, 1), scenario.plant.n
+    arrivals, n = all_arrivals(scenario, 1), scenario.plant.n
     F, Q = scenario.slot_belief
-    roots = np.full((len(full.words), n, n), np.nan)
-    for k, letter in enumerate(full.words[:, 0].tolist()):
-        p = int(full.book.letters.rows[letter])
-        H, root = full.book.letters.H[letter, :p], full.book.letters.root_R[letter, :p, :p]
+    modes = arrivals.table.modes
+    roots = np.full((len(arrivals.sequences), n, n), np.nan)
+    for k, mode in enumerate(arrivals.sequences[:, 0].tolist()):
+        p = int(modes.rows[mode])
+        H, root = modes.H[mode, :p], modes.root_R[mode, :p, :p]
         try:
             roots[k] = np.linalg.cholesky(steady_covariance(F, Q, H, root @ root.T))
         except (TheoryError, np.linalg.LinAlgError):
@@ -101,45 +102,34 @@ def least_roots(scenario: Scenario) -> FloatArray:
     return roots
 
 
-def witness(scenario: Scenario, run: Run) -> Witness:
-    """Reduce a run whose samples are those of ``look_at``."""
-    slots = list(look_at(scenario))
-    seen = arrivals(scenario, run, slots[-1])
-    starts = start_roots(scenario)[watched_places(scenario)]
-    replayed = seen.book.along(starts, seen.words, slots)
-    far = FAR * starts + np.eye(scenario.plant.n)
-    restarted = seen.book.along(far, seen.words, slots[-1:])[0]
-    in_support = seen.book.along(least_roots(scenario), seen.words, slots[-1:])[0]
-    counts = {
-        kind: _count(scenario, run, kind, "node" if kind == "send" else "peer", slots[-1])
-        for kind in ("send", "deliver")
-    }
-    errors = exact(scenario, run)
-    return Witness(
-        errors.P,
-        errors.nees,
-        errors.e,
-        errors.Sigma,
-        errors.whole,
-        replayed,
-        restarted,
-        in_support,
-        counts["send"],
-        counts["deliver"],
+def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
+    slots = list(check_slots(scenario))
+    starts = initial_roots(scenario)[sampled_indices(scenario)]
+    table, sequences, _ = find_arrivals(scenario, run, slots[-1])
+    far = FAR_START * starts + np.eye(scenario.plant.n)
+    replayed = table.covariances(starts, sequences, slots)
+    return IntermittentSummary(
+        **vars(summarise_exactly(scenario, run)) | {"replayed": replayed},
+        restarted=table.covariances(far, sequences, slots[-1:])[0],
+        in_support=table.covariances(_least_roots(scenario), sequences, slots[-1:])[0],
+        sent=_count(scenario, run, "send", slots[-1]),
+        arrived=_count(scenario, run, "deliver", slots[-1]),
     )
 
 
-def _count(scenario: Scenario, run: Run, kind: str, sender: str, slots: int) -> np.ndarray:
-    receiver = "peer" if sender == "node" else "node"
+def _count(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
+    """Return the number of events of a kind in each direction, (D,)."""
+    # A message is sent by the node of its row, and delivered to it.
+    sender, receiver = ("node", "peer") if kind == "send" else ("peer", "node")
     rows = run.log[run.log["kind"] == CODES[kind]]
     rows = rows[scenario.slot_plant.slots_of(rows["t"]) < slots]
     counts = Counter(zip(rows[sender].tolist(), rows[receiver].tolist(), strict=True))
-    return np.array([counts[pair] for pair in directions(scenario)], dtype=int)
+    return np.array([counts[pair] for pair in _directions(scenario)], dtype=int)
 
 
-class Reference(NamedTuple):
+class ArrivalSamples(NamedTuple):
     """S filters of each node with arrivals drawn by the stated probabilities: ``P`` (N, K, S, n, n)
-    and at the last slot from another start ``restarted`` (N, S, n, n).
+    and ``restarted`` (N, S, n, n) at the last slot from another start.
     """
 
     P: FloatArray
@@ -147,183 +137,167 @@ class Reference(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Observed(Seen):
-    """Witnesses of many runs, stacked, with what they are held against."""
+class IntermittentSamples(RunSamples):
+    """Adds filters with independent arrivals, with which the laws of the runs are compared."""
 
     @cached_property
-    def reference(self) -> Reference:
-        """Independent arrivals, R (12)."""
-        scenario, slots = self.scenario, list(look_at(self.scenario))
-        starts, peers = start_roots(scenario), peers_of(scenario)
-        found, again = [], []
-        watched = watched_places(scenario).tolist()
-        samples = reference_size(scenario, len(watched))
-        for k in watched:
-            node = scenario.nodes[k]
-            random = Streams(self.seed).generator("arrivals", node)
-            own = (node,) if node in scenario.placed else ()
-            chances = np.array([delivered(scenario, (peer, node)) for peer in peers[node]])
-            came = random.random((samples, slots[-1], len(chances))) < chances
-            codes = came @ (1 << np.arange(len(chances)))
-            used, words = np.unique(codes, return_inverse=True)
-            sets = [
-                (*own, *(peer for bit, peer in enumerate(peers[node]) if code >> bit & 1))
-                for code in used.tolist()
-            ]
-            book = intermittent_book(scenario, sets)
-            words = words.reshape(codes.shape)
-            first = np.repeat(starts[k : k + 1], samples, axis=0)
-            found.append(book.along(first, words, slots))
-            far = FAR * first + np.eye(first.shape[-1])
-            again.append(book.along(far, words, slots[-1:])[0])
-        return Reference(np.array(found), np.array(again))
+    def reference(self) -> ArrivalSamples:
+        """Samples of filters with independent arrivals, R (12)."""
+        found = [self._reference_of(k) for k in sampled_indices(self.scenario).tolist()]
+        return ArrivalSamples(*(np.array(values) for values in zip(*found, strict=True)))
+
+    def _reference_of(self, k: int) -> ArrivalSamples:
+        """Return samples (K, S, n, n) and (S, n, n) of the k-th node."""
+        scenario, slots = self.scenario, list(check_slots(self.scenario))
+        node = scenario.nodes[k]
+        samples = reference_count(scenario, len(self.nodes))
+        senders = sensing_neighbours(scenario)[node]
+        random = Streams(self.seed).generator("arrivals", node)
+        probabilities = np.array([_delivery(scenario, (sender, node)) for sender in senders])
+        arrived = random.random((samples, slots[-1], len(senders))) < probabilities
+        # Only the sets of readings that occur become modes: there may be 2^len(senders).
+        codes = arrived @ (1 << np.arange(len(senders)))
+        used, sequences = np.unique(codes, return_inverse=True)
+        own = (node,) if node in scenario.placed else ()
+        sets = [
+            (*own, *(sender for bit, sender in enumerate(senders) if code >> bit & 1))
+            for code in used.tolist()
+        ]
+        table, sequences = intermittent_modes(scenario, sets), sequences.reshape(codes.shape)
+        first = np.repeat(initial_roots(scenario)[k : k + 1], samples, axis=0)
+        far = FAR_START * first + np.eye(first.shape[-1])
+        restarted = table.covariances(far, sequences, slots[-1:])[0]
+        return ArrivalSamples(table.covariances(first, sequences, slots), restarted)
 
 
-def delivered(scenario: Scenario, direction: tuple[int, int]) -> float:
-    """Probability that a reading arrives in time; raises TheoryError where that is not known."""
+def _delivery(scenario: Scenario, direction: Direction) -> float:
+    """Return the probability that a reading arrives in time; raises TheoryError if unknown."""
     channel = scenario.network.channel
     if not channel.loss.independent:
         raise TheoryError("losses come in bursts or recorded")
     delay = channel.delay.fixed
     if delay is None:
         raise TheoryError("random delays make some readings late")
-    chance = channel.loss.mean_delivery(direction, scenario.table_probability(direction))
-    return chance if delay <= scenario.phase_length else 0.0
+    delivery = channel.loss.mean_delivery(direction, scenario.table_probability(direction))
+    return delivery if delay <= scenario.phase_length else 0.0
 
 
-def rows(scenario: Scenario) -> list[Row]:
-    """What the tests need beyond the paper's own assumptions."""
-    try:
-        known, words = True, "a known probability for each direction"
-        for direction in directions(scenario):
-            delivered(scenario, direction)
-    except TheoryError as error:
-        known, words = False, str(error)
-    if type(scenario.network.activation).__name__ != "Broadcast":
-        known, words = False, "links are up as recorded"
-    return [
-        Row("readings arrive independently, as often as stated", "R (12)", known, words),
-        exact_start(scenario),
-        within_reach(scenario),
-    ]
-
-
-def above_least(seen: Observed, level: float) -> Finding:
-    """No path is below the one on which every reading arrives; that one converges to P*."""
-    slots = list(look_at(seen.scenario))
-    full = everything(seen.scenario, slots[-1])
-    starts = start_roots(seen.scenario)[watched_places(seen.scenario)]
-    least = full.book.along(starts, full.words, slots)
-    size = np.trace(seen.runs.P, axis1=-2, axis2=-1)
+def _above_least(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare P with the path without losses, which converges to P*: no path is below it."""
+    slots = list(check_slots(samples.scenario))
+    table, sequences, _ = all_arrivals(samples.scenario, slots[-1])
+    starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
+    least = table.covariances(starts, sequences, slots)
+    size = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
-        gap = np.linalg.eigvalsh(np.nan_to_num(seen.runs.P - least, nan=-np.inf, posinf=-1e300))
+        gap = np.linalg.eigvalsh(np.nan_to_num(samples.runs.P - least, nan=-np.inf, posinf=-1e300))
     below = float(np.max(-gap[..., 0] / size))
-    words = f"{size.size:,} covariances against the path without losses"
-    return identity(max(0.0, below), ROUNDING, words)
+    message = f"{size.size:,} covariances against the path without losses"
+    return find_identity(max(0.0, below), BOUND_TOLERANCE, message)
 
 
-def in_support(seen: Observed, level: float) -> Finding:
-    """At the end P is the point of the support that its own arrivals spell, up to what the word has
-    not yet forgotten of the start.
+def _in_support(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare P at the end with the point of the support that its own arrivals lead to, where the
+    arrivals have made P independent of its start.
     """
-    P, point, other = seen.runs.P[:, -1], seen.runs.in_support, seen.runs.restarted
-    kept = np.isfinite(point).all(axis=(0, -1, -2))
+    P, point, other = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.restarted
+    known = np.isfinite(point).all(axis=(0, -1, -2))
     size = np.trace(point, axis1=-2, axis2=-1)
     spread = np.abs(other - point).max(axis=(-1, -2)) / size
     apart = np.abs(P - point).max(axis=(-1, -2)) / size
-    settled = (spread < 1e-6) & kept
-    largest = float(apart[settled].max()) if settled.any() else 0.0
-    words = (
-        f"{settled.mean():.0%} of the covariances at the end have forgotten their start and are "
+    forgotten = (spread < SUPPORT_TOLERANCE) & known
+    largest = float(apart[forgotten].max()) if forgotten.any() else 0.0
+    message = (
+        f"{forgotten.mean():.0%} of the covariances at the end have forgotten their start and are "
         "points of the support"
     )
-    return identity(largest, 1e-6, words)
+    return find_identity(largest, SUPPORT_TOLERANCE, message)
 
 
-def arriving(seen: Observed, level: float) -> Finding:
-    """Slots are independent, so counts of arrivals are binomial."""
-    pairs = directions(seen.scenario)
-    sent, got = seen.runs.sent.sum(axis=0), seen.runs.got.sum(axis=0)
-    found = [
-        (
-            off_by(
-                delivered(seen.scenario, pair), share(int(got[k]), int(sent[k]), level / len(pairs))
-            ),
-            f"from node {pair[0]} to {pair[1]}",
-        )
-        for k, pair in enumerate(pairs)
-    ]
-    return worst(found, SHARE, f"largest difference in {int(sent.sum()):,} messages")
+def _arrivals_counted(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare counts of arrivals with R (12); slots are independent, so counts are binomial."""
+    pairs = _directions(samples.scenario)
+    sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
+    found = []
+    for k, pair in enumerate(pairs):
+        share = probability_interval(int(arrived[k]), int(sent[k]), level / len(pairs))
+        deviation = deviation_interval(_delivery(samples.scenario, pair), share)
+        found.append((deviation, f"from node {pair[0]} to {pair[1]}"))
+    message = f"largest difference in {int(sent.sum()):,} messages"
+    return find_largest(found, PROBABILITY_TOLERANCE, message)
 
 
-def law(seen: Observed, level: float) -> Finding:
-    """Each node at each time against filters with independent arrivals."""
+def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare each node at each time with filters that have independent arrivals."""
     pairs = [
-        Pair(f"slot {slot}, node {node}", seen.runs.P[:, k, i], seen.reference.P[i, k])
-        for k, slot in enumerate(look_at(seen.scenario))
-        for i, node in enumerate(seen.nodes)
+        Pair(f"slot {slot}, node {node}", samples.runs.P[:, k, i], samples.reference.P[i, k])
+        for k, slot in enumerate(check_slots(samples.scenario))
+        for i, node in enumerate(samples.nodes)
     ]
-    return same_laws(pairs, level)
+    return compare_laws(pairs, level)
 
 
-def forgotten(seen: Observed, level: float) -> Finding:
-    """The runs against their own arrivals from a start a thousand times larger."""
-    P, restarted = seen.reference
+def _initial_condition_forgotten(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare the runs with their own arrivals from a start a thousand times larger."""
+    P, restarted = samples.reference
     pairs = [
         Pair(
             f"node {node}",
-            seen.runs.P[:, -1, i],
-            seen.runs.restarted[:, i],
-            distances(P[i, -1], restarted[i]),
+            samples.runs.P[:, -1, i],
+            samples.runs.restarted[:, i],
+            diagonal_distances(P[i, -1], restarted[i]),
         )
-        for i, node in enumerate(seen.nodes)
+        for i, node in enumerate(samples.nodes)
     ]
-    return same_laws(pairs, level)
+    return compare_laws(pairs, level)
 
 
-def listeners(scenario: Scenario) -> dict[int, ScalarLaw]:
-    """Exact laws of the watched nodes (by their number among these) of a scalar scenario whose only
-    reading comes over one link.
+def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
+    """Return the exact law of P for each sampled node of a scalar scenario that gets its only
+    reading over one link, by the number of the node among the sampled ones.
     """
-    laws, everyone = {}, peers_of(scenario)
-    for k, node in enumerate(watched_nodes(scenario)):
-        peers = everyone[node]
+    laws, neighbours = {}, sensing_neighbours(scenario)
+    for k, node in enumerate(sampled_nodes(scenario)):
+        peers = neighbours[node]
         if scenario.plant.n != 1 or node in scenario.placed or len(peers) != 1:
             continue
         model = scenario.slot_models[scenario.topology.index[peers[0]]]
         F, Q = scenario.slot_belief
         try:
-            chance = delivered(scenario, (peers[0], node))
-            laws[k] = scalar_law(F, Q, model.H, model.R, chance)
+            delivery = _delivery(scenario, (peers[0], node))
+            laws[k] = scalar_law(F, Q, model.H, model.R, delivery)
         except TheoryError:
             continue
     return laws
 
 
-def cells(seen: Observed, level: float) -> Finding:
-    """Counts of P between the holes of the support; an outage of k slots has g (1 - g)^k."""
-    laws, found = listeners(seen.scenario), []
-    for k, known in laws.items():
-        edges = outage_edges(known)
-        seen_cells = np.searchsorted(edges, seen.runs.P[:, -1, k, 0, 0])
-        counts = np.bincount(seen_cells, minlength=CELLS + 1)
-        g = known.delivery
-        chances = np.append(g * (1.0 - g) ** np.arange(CELLS), (1.0 - g) ** CELLS)
-        p, used = chi_square(counts, chances)
-        found.append((p, used, counts, chances, seen.nodes[k]))
-    p, used, counts, chances, node = min(found, key=lambda item: item[0])
+def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare counts of P between the holes of the support with the probabilities of outages.
+
+    An outage of k slots has probability g (1 - g)^k, R Proposition 24.
+    """
+    laws, found = _scalar_laws(samples.scenario), []
+    for k, law in laws.items():
+        cells = np.searchsorted(_outage_edges(law), samples.runs.P[:, -1, k, 0, 0])
+        counts = np.bincount(cells, minlength=CELLS + 1)
+        g = law.delivery
+        probabilities = np.append(g * (1.0 - g) ** np.arange(CELLS), (1.0 - g) ** CELLS)
+        p, used = pearson_test(counts, probabilities)
+        found.append((p, used, counts, probabilities, samples.nodes[k]))
+    p, used, counts, probabilities, node = min(found, key=lambda item: item[0])
+    share = level / len(probabilities)
     off = [
-        off_by(chance, share(int(count), int(counts.sum()), level / len(chances)))
-        for count, chance in zip(counts, chances, strict=True)
+        deviation_interval(probability, probability_interval(int(count), int(counts.sum()), share))
+        for count, probability in zip(counts, probabilities, strict=True)
     ]
     largest, widest = max(o.value for o in off), max(o.high for o in off)
     low = -largest if p < level / len(laws) else 0.0
-    words = f"chi-square of {used} cells between holes at node {node}: p = {p:.3g}"
-    return Finding((-largest, -widest, low), SHARE * 2, words)
+    message = f"chi-square of {used} cells between holes at node {node}: p = {p:.3g}"
+    return Finding((-largest, -widest, low), PROBABILITY_TOLERANCE * 2, message)
 
 
-def outage_edges(law: ScalarLaw) -> FloatArray:
-    """(CELLS,) the middles of the holes above outages of 0, 1, 2, ... slots."""
+def _outage_edges(law: ScalarLaw) -> FloatArray:
+    """Return the middles (CELLS,) of the holes above outages of 0, 1, 2, ... slots."""
     edge = np.array(0.5 * sum(law.hole))
     edges = []
     for _ in range(CELLS):
@@ -332,69 +306,115 @@ def outage_edges(law: ScalarLaw) -> FloatArray:
     return np.array(edges)
 
 
-def scalar(seen: Observed, level: float) -> Finding:
-    """P at the end against the exact distribution function."""
-    laws = listeners(seen.scenario)
+def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare P at the end with its exact distribution function."""
+    laws = _scalar_laws(samples.scenario)
     found = [
         (
-            distance_to(known.cdf, seen.runs.P[:, -1, k, 0, 0], level / len(laws)),
-            f"at node {seen.nodes[k]}",
+            distance_to_law(known.cdf, samples.runs.P[:, -1, k, 0, 0], level / len(laws)),
+            f"at node {samples.nodes[k]}",
         )
         for k, known in laws.items()
     ]
-    return worst(found, LAW, "distance from the exact distribution function")
+    return find_largest(found, LAW_TOLERANCE, "distance from the exact distribution function")
 
 
 FRESH, KNOWN = ("readings arrive independently",), ("the filters know", "the filters start")
 LIMIT = (*FRESH, "stabilisable", "positive definite", "detectable at every node", "(12), Theorem 9")
 PROMISES = (
     Promise(
-        "P(t+1) = f(P(t)) with the readings that arrived", "R (15)-(18)", (), replay, exact=True
+        "P(t+1) = f(P(t)) with the readings that arrived",
+        "R (15)-(18)",
+        (),
+        check_replay,
+        exact=True,
     ),
     Promise(
         "P is at least what it is without losses, which converges to P*",
         "R Theorem 10, mu({P >= P*}) = 1",
         (),
-        above_least,
+        _above_least,
         exact=True,
     ),
     Promise(
         "in the end P is a point of the support",
         "R Theorem 10",
         ("stabilisable", "positive definite", "detectable at every node"),
-        in_support,
+        _in_support,
         exact=True,
     ),
-    Promise("readings arrive with the stated probability", "R (12)", FRESH, arriving),
-    Promise("the law of P is that of independent arrivals, at every time", "R (18)", FRESH, law),
+    Promise("readings arrive with the stated probability", "R (12)", FRESH, _arrivals_counted),
+    Promise(
+        "the law of P is that of independent arrivals, at every time",
+        "R (18)",
+        FRESH,
+        _law_of_arrivals,
+    ),
     Promise(
         "P is stochastically bounded: its law does not grow any more",
         "R Proposition 8, Theorem 9 [i]",
         LIMIT,
-        bounded,
+        check_growth,
     ),
-    Promise("the law in the end does not depend on the start", "R Theorem 9 [i]", LIMIT, forgotten),
+    Promise(
+        "the law in the end does not depend on the start",
+        "R Theorem 9 [i]",
+        LIMIT,
+        _initial_condition_forgotten,
+    ),
     Promise(
         "errors have the covariance that the readings give them",
         "R (15)-(18), derived",
         ("the filters start", "exact errors are within reach"),
-        as_computed,
+        check_error_covariance,
     ),
-    Promise(
-        "errors are as large as P says: the mean NEES is n", "R (15)", KNOWN, nees_is_chi_squared
-    ),
+    Promise("errors are as large as P says: the mean NEES is n", "R (15)", KNOWN, check_nees),
 )
 SCALAR = (
     Promise(
         "between the holes of the support lies g (1 - g)^k of the mass",
         "R Proposition 24, derived",
         LIMIT,
-        cells,
+        _outage_counts,
     ),
-    Promise("the law of P is the exact one", "R Theorem 9, derived", LIMIT, scalar),
+    Promise("the law of P is the exact one", "R Theorem 9, derived", LIMIT, _scalar_law_exact),
 )
 
 
-def promises(scenario: Scenario) -> tuple[Promise, ...]:
-    """Those of the scenario; more where the exact law is known."""
-    return PROMISES + (SCALAR if listeners(scenario) else ())
+class IntermittentChecks(PaperChecks):
+    """Promises of R, Theorems 9, 10 and Propositions 8, 24."""
+
+    slots_only = True
+
+    def summarise(self, scenario: Scenario, run: Run) -> IntermittentSummary:
+        """Return the summary of a run whose samples are at ``check_slots``."""
+        return _summarise(scenario, run)
+
+    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> IntermittentSamples:
+        """Return the samples that the tests take, from stacked summaries."""
+        return IntermittentSamples(scenario, stacked, seed)
+
+    def assumptions(self, scenario: Scenario) -> list[Assumption]:
+        """Return the assumptions of the tests beyond those of R."""
+        try:
+            known, why = True, "a known probability for each direction"
+            for direction in _directions(scenario):
+                _delivery(scenario, direction)
+        except TheoryError as error:
+            known, why = False, str(error)
+        # A derived class may choose its broadcasts in any way.
+        if type(scenario.network.activation) is not Broadcast:
+            known, why = False, "links are up as recorded"
+        stated = "readings arrive independently, as often as stated"
+        return [
+            Assumption(stated, "R (12)", known, why),
+            exact_start(scenario),
+            few_errors(scenario),
+        ]
+
+    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
+        """Return the promises about a scenario; more if the exact law of a node is known."""
+        return PROMISES + (SCALAR if _scalar_laws(scenario) else ())
+
+
+CHECKS = IntermittentChecks()

@@ -1,20 +1,26 @@
-"""What P promises of the push-sum filter, held against runs."""
+"""Promises of P about the push-sum filter."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.special
 
-from netkf.checks.evidence import Finding, Promise, Row, identity, rounded_away
-from netkf.checks.exact import as_computed, exact, stand_in, within_reach
-from netkf.checks.laws import exact_start, worst
-from netkf.checks.mode_sequences import watched_places
-from netkf.checks.samples import Seen, relative, replay
-from netkf.checks.statistics import Interval, mean_of, off_by
+from netkf.checks.evidence import Assumption, Finding, Promise, find_identity, find_nothing
+from netkf.checks.exact import (
+    check_error_covariance,
+    few_errors,
+    summarise_exactly,
+    with_promised_filter,
+)
+from netkf.checks.laws import exact_start, find_largest
+from netkf.checks.paper import PaperChecks
+from netkf.checks.points import sampled_indices
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay, relative_difference
+from netkf.checks.statistics import Interval, deviation_interval, mean_interval
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -28,133 +34,105 @@ from netkf.theory import (
 from netkf.theory.push_sum.certified_gamma import searches_gamma
 from netkf.trace.run import Run
 
-SLOTS_ONLY = True
-"""Whether the paper speaks about slots alone; under clocks those of ``clocked`` are checked."""
+MASS_TOLERANCE, STEADY_TOLERANCE = 1e-9, 0.01
+SQUARE_TOLERANCE, BIAS_TOLERANCE = 0.3, 0.2
+"""Tolerated relative difference of mean squares, and squared bias in units of the covariance."""
+HEAVY_TAILS = 0.885
+"""Mean-square radius from which the sample mean of squares has no useful variance."""
+MAX_CERTIFIED = 20
 
-MASS, CLOSE = 1e-9, 0.01
-SQUARE, BIAS = 0.3, 0.2  # tolerances: relative mean square, squared bias
-HEAVY = 0.885  # mean-square radius from which the sample mean has no variance worth the name
-MOST_CERTIFIED = 20
 
+@dataclass(frozen=True, eq=False)
+class PushSumSummary(ReplicaSummary):
+    """Adds ``drift`` (2,): the relative drift of the totals of weight and number."""
 
-class Witness(NamedTuple):
-    """What one run says at K slots: as :class:`Exact`, and ``drift`` (2,), the relative drift of
-    the totals of weight and number.
-    """
-
-    P: FloatArray
-    e: FloatArray
-    nees: FloatArray
-    replayed: FloatArray
-    Sigma: FloatArray
-    whole: FloatArray
     drift: FloatArray
 
 
-def witness(scenario: Scenario, run: Run) -> Witness:
-    """Reduce a run whose samples are those of ``look_at``."""
-    drift = np.array([(total - exact) / exact for exact, total in run.sums.values()])
-    return Witness(*exact(scenario, run), drift if len(drift) else np.full(2, np.nan))
-
-
 @dataclass(frozen=True)
-class Observed(Seen):
-    """Witnesses of many runs, stacked, with what they are held against."""
+class PushSumSamples(RunSamples):
+    """Adds errors in units of their exact steady covariance."""
 
     @cached_property
     def whitened(self) -> FloatArray:
-        """(runs, N, n) errors at the end, by the exact steady covariance."""
-        Sigma = push_sum_error_covariance(stand_in(self.scenario))
+        """Errors (R, N, n) at the end, whitened by the exact steady covariance."""
+        Sigma = push_sum_error_covariance(with_promised_filter(self.scenario))
         values, vectors = np.linalg.eigh(Sigma)
         roots = vectors / np.sqrt(values)[:, None, :]
-        kept = roots[watched_places(self.scenario)]
-        return np.asarray(np.einsum("iab,ria->rib", kept, self.runs.e[:, -1]))
+        roots = roots[sampled_indices(self.scenario)]
+        return np.asarray(np.einsum("iab,ria->rib", roots, self.runs.e[:, -1]))
 
 
-def rows(scenario: Scenario) -> list[Row]:
-    """What the tests need beyond the paper's own assumptions."""
-    algorithm = stand_in(scenario).filter.algorithm
-    plain = algorithm.stop == "never" and not algorithm.asymptotic  # type: ignore[union-attr]
-    words = "exchanged for ever" if plain else "gains are frozen or taken from the limit"
-    plant = scenario.slot_plant
-    if not np.array_equal(scenario.slot_belief[0], plant.F):
-        plain, words = False, "exchanged, but the filters' F is not the plant's"
-    if any(sensor.varying for sensor in scenario.sensors):
-        plain, words = False, "exchanged, but H differs from slot to slot"
-    try:
-        radius = push_sum_radius(stand_in(scenario))
-        light, why = radius <= HEAVY, f"mean-square radius {radius:.4g}, light tails below {HEAVY}"
-    except TheoryError as error:
-        light, why = False, str(error)
-    return [
-        Row("mass is exchanged in every slot", "P step 2", plain, words),
-        Row("mean squares have a variance", "derived", light, why),
-        exact_start(scenario),
-        within_reach(scenario),
-    ]
+def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
+    """Compare the totals of weight and number at the end with 1 and N."""
+    drift = float(np.nan_to_num(np.abs(samples.runs.drift), nan=np.inf).max())
+    message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
+    return find_identity(drift, MASS_TOLERANCE, message)
 
 
-def conserved(seen: Observed, level: float) -> Finding:
-    """The totals at the end against 1 and N."""
-    drift = float(np.nan_to_num(np.abs(seen.runs.drift), nan=np.inf).max())
-    words = f"drift of the totals of weight and number in {len(seen.runs.P)} runs"
-    return identity(drift, MASS, words)
-
-
-def settled(seen: Observed, level: float) -> Finding:
-    """P of every node comes to P_inf, once the mass has arrived."""
-    limit = push_sum_limits(stand_in(seen.scenario)).P
+def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
+    """Compare P of every node at the end with P_inf."""
+    limit = push_sum_limits(with_promised_filter(samples.scenario)).P
     last, expected = (
-        float(np.nan_to_num(relative(P[:, -1], limit), nan=np.inf).max())
-        for P in (seen.runs.P, seen.runs.replayed[~np.isnan(seen.runs.replayed[:, -1, 0, 0, 0])])
+        float(np.nan_to_num(relative_difference(P[:, -1], limit), nan=np.inf).max())
+        for P in (
+            samples.runs.P,
+            samples.runs.replayed[~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])],
+        )
     )
-    margin = CLOSE - last
-    words = f"largest relative distance at the end {last:.1e}"
-    return Finding((margin, margin, margin), 0.0, words, early=margin < 0.0 and expected > CLOSE)
+    # If the equations are not there yet either, the horizon is too short for a verdict.
+    early = last > STEADY_TOLERANCE and expected > STEADY_TOLERANCE
+    margin = STEADY_TOLERANCE - last
+    message = f"largest relative distance at the end {last:.1e}"
+    return Finding((margin, margin, margin), 0.0, message, early=early)
 
 
-def unbiased(seen: Observed, level: float) -> Finding:
-    """The mean of the whitened errors at the end is 0 in all directions at once."""
-    nodes = seen.nodes
-    if not np.isfinite(seen.whitened).all():
-        return rounded_away(BIAS)
+def _unbiased(samples: PushSumSamples, level: float) -> Finding:
+    """Test that the mean of the whitened errors at the end is 0, in all directions at once."""
+    nodes = samples.nodes
+    if not np.isfinite(samples.whitened).all():
+        return find_nothing(BIAS_TOLERANCE)
     found = []
     for i, node in enumerate(nodes):
-        e = seen.whitened[:, i]
-        # a mean m has outer product m m' with one eigenvalue |m|^2; its sampling error is ~ 1 / R
+        e = samples.whitened[:, i]
+        # A mean m has outer product m m' with one eigenvalue |m|^2; its sampling error is ~ 1 / R.
         mean = e.mean(axis=0)
         error = np.cov(e, rowvar=False).reshape(e.shape[1], -1) / len(e)
-        reach = _normal_reach(level / len(nodes), e.shape[1])
+        reach = _gaussian_radius(level / len(nodes), e.shape[1])
         size = float(np.linalg.norm(mean))
         wide = reach * float(np.sqrt(np.linalg.eigvalsh(error)[-1]))
         distance = Interval(size**2, max(0.0, size - wide) ** 2, (size + wide) ** 2)
         found.append((distance, f"at node {node}"))
-    return worst(found, BIAS, "largest squared bias, in units of the exact covariance,")
+    return find_largest(
+        found, BIAS_TOLERANCE, "largest squared bias, in units of the exact covariance,"
+    )
 
 
-def _normal_reach(level: float, n: int) -> float:
+def _gaussian_radius(level: float, n: int) -> float:
+    """Return the radius that a standard Gaussian vector (n,) exceeds with probability ``level``."""
     return float(np.sqrt(2.0 * scipy.special.gammainccinv(n / 2.0, level)))
 
 
-def mean_square(seen: Observed, level: float) -> Finding:
-    """The mean square of the whitened errors at the end is 1 on average over directions."""
-    nodes, n = seen.nodes, seen.scenario.plant.n
-    if not np.isfinite(seen.whitened).all():
-        return rounded_away(SQUARE)
+def _mean_square(samples: PushSumSamples, level: float) -> Finding:
+    """Test that the mean square of whitened errors at the end is 1, averaged over directions."""
+    nodes, n = samples.nodes, samples.scenario.plant.n
+    if not np.isfinite(samples.whitened).all():
+        return find_nothing(SQUARE_TOLERANCE)
     found = []
     for i, node in enumerate(nodes):
-        ratio = mean_of((seen.whitened[:, i] ** 2).sum(axis=1) / n, level / len(nodes))
-        found.append((off_by(1.0, ratio), f"at node {node}"))
-    return worst(found, SQUARE, "largest relative difference of mean squares from the exact ones")
+        ratio = mean_interval((samples.whitened[:, i] ** 2).sum(axis=1) / n, level / len(nodes))
+        found.append((deviation_interval(1.0, ratio), f"at node {node}"))
+    message = "largest relative difference of mean squares from the exact ones"
+    return find_largest(found, SQUARE_TOLERANCE, message)
 
 
-def certified(seen: Observed, level: float) -> Finding:
-    """The gamma that Theorem 6 certifies is at least the exact one; by far more than is needed."""
-    scenario = stand_in(seen.scenario)
+def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
+    """Compare the gamma that Theorem 6 certifies with the exact one, which is far smaller."""
+    scenario = with_promised_filter(samples.scenario)
     gamma, needed = minimum_gamma(scenario, "mean-square"), exact_minimum_gamma(scenario)
     margin = float(gamma - needed)
-    words = f"computed, not simulated: Theorem 6 certifies gamma {gamma}, {needed} is enough"
-    return Finding((margin, margin, margin), 0.0, words)
+    message = f"computed, not simulated: Theorem 6 certifies gamma {gamma}, {needed} is enough"
+    return Finding((margin, margin, margin), 0.0, message)
 
 
 LAWS = ("P Assumption 2", "P Assumption 1", "P Assumption 3", "no gain is frozen")
@@ -163,14 +141,14 @@ PROMISES = (
         "mass is conserved",
         "P Lemma 1, (3)-(5) corrected",
         ("both directions of a link",),
-        conserved,
+        _mass_conserved,
         exact=True,
     ),
     Promise(
         "P follows steps 2 and 3 with the links that were up",
         "P (3)-(7)",
         ("mass is exchanged in every slot", "exact errors are within reach"),
-        replay,
+        check_replay,
         exact=True,
     ),
     Promise(
@@ -182,44 +160,90 @@ PROMISES = (
             "the filters start",
             "exact errors are within reach",
         ),
-        as_computed,
+        check_error_covariance,
     ),
     Promise(
         "every node comes to the covariance P_inf",
         "P Lemmas 3, 4, Theorems 1, 2",
         (*LAWS, "mass is exchanged in every slot", "exact errors are within reach"),
-        settled,
+        _at_steady_state,
         exact=True,
     ),
     Promise(
         "the estimates become unbiased",
         "P Theorem 5, (30)",
         (*LAWS, "P (30)", "mean squares have a variance", "the filters know"),
-        unbiased,
+        _unbiased,
     ),
     Promise(
         "mean squares become the exact steady ones",
         "P Theorem 6, Lemma 10, Figs. 4, 5, derived",
         (*LAWS, "P Lemma 10", "mean squares have a variance", "the filters know"),
-        mean_square,
+        _mean_square,
     ),
 )
 CERTIFIED = Promise(
     "the gamma that Theorem 6 certifies keeps mean squares bounded",
     "P Theorem 6, Corollaries 1, 2",
     ("P Assumption 3",),
-    certified,
+    _gamma_certified,
     exact=True,
 )
 
 
-def promises(scenario: Scenario) -> tuple[Promise, ...]:
-    """Those of the scenario; a certified gamma where there is one."""
-    if not searches_gamma(stand_in(scenario)):
-        return PROMISES
-    try:
-        minimum_gamma(stand_in(scenario), "mean-square")
-        exact_minimum_gamma(stand_in(scenario), most=MOST_CERTIFIED)
-    except TheoryError:
-        return PROMISES
-    return (*PROMISES, CERTIFIED)
+class PushSumChecks(PaperChecks):
+    """Promises of P, Lemmas 1, 3, 4, 10 and Theorems 1, 2, 5, 6."""
+
+    slots_only = True
+
+    def summarise(self, scenario: Scenario, run: Run) -> PushSumSummary:
+        """Return the summary of a run whose samples are at ``check_slots``."""
+        drift = np.array([(total - exact) / exact for exact, total in run.sums.values()])
+        drift = drift if len(drift) else np.full(2, np.nan)
+        return PushSumSummary(**vars(summarise_exactly(scenario, run)), drift=drift)
+
+    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> PushSumSamples:
+        """Return the samples that the tests take, from stacked summaries."""
+        return PushSumSamples(scenario, stacked, seed)
+
+    def assumptions(self, scenario: Scenario) -> list[Assumption]:
+        """Return the assumptions of the tests beyond those of P."""
+        try:
+            radius = push_sum_radius(with_promised_filter(scenario))
+            light = radius <= HEAVY_TAILS
+            why = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAILS}"
+        except TheoryError as error:
+            light, why = False, str(error)
+        return [
+            _every_slot(scenario),
+            Assumption("mean squares have a variance", "derived", light, why),
+            exact_start(scenario),
+            few_errors(scenario),
+        ]
+
+    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
+        """Return the promises about a scenario; one on the certified gamma if it exists."""
+        promised = with_promised_filter(scenario)
+        if not searches_gamma(promised):
+            return PROMISES
+        try:
+            minimum_gamma(promised, "mean-square")
+            exact_minimum_gamma(promised, most=MAX_CERTIFIED)
+        except TheoryError:
+            return PROMISES
+        return (*PROMISES, CERTIFIED)
+
+
+def _every_slot(scenario: Scenario) -> Assumption:
+    """Return the assumption that the run follows steps 2 and 3 of P in every slot."""
+    algorithm = with_promised_filter(scenario).filter.algorithm
+    holds = algorithm.stop == "never" and not algorithm.asymptotic  # type: ignore[union-attr]
+    why = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
+    if not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F):
+        holds, why = False, "exchanged, but the filters' F is not the plant's"
+    if any(sensor.varying for sensor in scenario.sensors):
+        holds, why = False, "exchanged, but H differs from slot to slot"
+    return Assumption("mass is exchanged in every slot", "P step 2", holds, why)
+
+
+CHECKS = PushSumChecks()

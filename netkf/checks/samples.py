@@ -1,33 +1,59 @@
-"""What was seen of many runs, and tests that several papers share."""
+"""Samples of many runs at the times where promises are checked, and tests that papers share."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from netkf.checks.evidence import Finding, identity, left_out, rounded_away
-from netkf.checks.laws import NEES, Pair, chi_squared, not_growing
-from netkf.checks.mode_sequences import look_at, watched_nodes
+from netkf.checks.evidence import Finding, find_identity, find_nothing
+from netkf.checks.laws import NEES_TOLERANCE, Pair, compare_chi_square, compare_growth
+from netkf.checks.points import check_slots, check_times, sampled_nodes
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
-ROUNDING = 1e-7
+REPLAY_TOLERANCE = 1e-7
 
 
-def times(scenario: Scenario) -> list[float]:
-    """Where promises look, in seconds: the slots of ``look_at``, or an eighth, a quarter, half and
-    all of the horizon.
+@dataclass(frozen=True, eq=False)
+class ReplicaSummary:
+    """One run reduced to its values at K times and N sampled nodes; nan if it was not replayed.
+
+    P, e       : (K, N, n, n), (K, N, n) covariances and errors, nan if rounding blurs them
+    nees       : (K, N) e' P^-1 e
+    replayed   : (K, N, n, n) P by the equations of the filter, from the events of the run
+    Sigma      : (K, N, n, n) covariance of the errors given the events
+    whole      : (K, 2) squared errors of all nodes together, whitened by their covariance given the
+                 events, and their degrees of freedom
+
+    Papers add fields of their own. Summaries of R runs are stacked: every field gets a first axis
+    of length R.
     """
-    if scenario.slotted:
-        return [round(scenario.slot_plant.period * slot, 12) for slot in look_at(scenario)]
-    return [scenario.horizon * share for share in (0.125, 0.25, 0.5, 1.0)]
+
+    P: FloatArray
+    e: FloatArray
+    nees: FloatArray
+    replayed: FloatArray
+    Sigma: FloatArray
+    whole: FloatArray
+
+
+Summary = TypeVar("Summary", bound=ReplicaSummary)
+
+
+def stack_summaries(summaries: Sequence[Summary]) -> Summary:
+    """Return one summary whose fields have a first axis over the replicas."""
+    names = [field.name for field in dataclasses.fields(summaries[0])]
+    columns = {name: np.array([getattr(one, name) for one in summaries]) for name in names}
+    return type(summaries[0])(**columns)
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Witnesses of many runs: each field of ``runs`` is stacked, replicas first."""
+class RunSamples:
+    """The stacked summaries ``runs`` of many replicas of a scenario; tests take one of these."""
 
     scenario: Scenario
     runs: Any
@@ -35,61 +61,68 @@ class Seen:
 
     @property
     def count(self) -> int:
-        """Number of runs."""
+        """Number of runs R."""
         return len(self.runs.P)
 
     @property
     def nodes(self) -> list[int]:
-        """Ids of the W nodes whose samples were kept."""
-        return watched_nodes(self.scenario)
+        """Ids of the N sampled nodes."""
+        return sampled_nodes(self.scenario)
 
     @property
-    def moments(self) -> list[str]:
-        """Words for each of the K times."""
+    def time_labels(self) -> list[str]:
+        """Labels of the K times."""
         if self.scenario.slotted:
-            return [f"slot {slot}" for slot in look_at(self.scenario)]
-        return [f"{t:g} s" for t in times(self.scenario)]
+            return [f"slot {slot}" for slot in check_slots(self.scenario)]
+        return [f"{t:g} s" for t in check_times(self.scenario)]
 
     @property
-    def places(self) -> list[str]:
-        """Words for each of the (K, N) places, time by time."""
-        return [f"{t}, node {node}" for t in self.moments for node in self.nodes]
+    def point_labels(self) -> list[str]:
+        """Labels of the K N points (time, node), time by time."""
+        return [f"{t}, node {node}" for t in self.time_labels for node in self.nodes]
+
+    @property
+    def blurred_note(self) -> str:
+        """Text on the times at which rounding blurs some errors, or empty."""
+        lost = np.isnan(self.runs.e).any(axis=(0, 2, 3))
+        times = ", ".join(t for t, some in zip(self.time_labels, lost, strict=True) if some)
+        return f"; errors that rounding blurs are left out ({times})" if times else ""
 
 
-def replay(seen: Seen, level: float) -> Finding:
-    """Every covariance is what the equations make of its run's events; runs whose equations were
-    not carried out are nan in ``replayed``.
-    """
-    kept = ~np.isnan(seen.runs.replayed).all(axis=(1, 2, 3, 4))
-    P, expected = seen.runs.P[kept], seen.runs.replayed[kept]
-    apart = relative(P, expected).max(axis=(-1, -2))
+def check_replay(samples: RunSamples, level: float) -> Finding:
+    """Compare every covariance with the one that the equations give for the events of its run."""
+    replayed = ~np.isnan(samples.runs.replayed).all(axis=(1, 2, 3, 4))
+    P, expected = samples.runs.P[replayed], samples.runs.replayed[replayed]
+    apart = relative_difference(P, expected).max(axis=(-1, -2))
     run, time, node = np.unravel_index(int(np.argmax(apart)), apart.shape)
-    place = seen.places[int(time) * len(seen.nodes) + int(node)]
-    words = (
+    label = samples.point_labels[int(time) * len(samples.nodes) + int(node)]
+    message = (
         f"{apart.size:,} covariances replayed from the events of their runs; the worst in run "
-        f"{np.flatnonzero(kept)[run]} at {place}"
+        f"{np.flatnonzero(replayed)[run]} at {label}"
     )
-    return identity(float(apart.max()), ROUNDING, words)
+    return find_identity(float(apart.max()), REPLAY_TOLERANCE, message)
 
 
-def relative(P: FloatArray, expected: FloatArray) -> FloatArray:
-    """Differences over the largest entry of each expected matrix; what is not finite differs."""
+def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
+    """Return |P - expected| over the largest entry of each expected matrix; inf if not finite."""
     size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.nan_to_num(np.abs(P - expected) / size, nan=np.inf))
 
 
-def bounded(seen: Seen, level: float) -> Finding:
-    """The end against half of the time."""
-    P = seen.runs.P
-    nodes = enumerate(seen.nodes)
-    return not_growing([Pair(f"node {node}", P[:, -2, i], P[:, -1, i]) for i, node in nodes], level)
+def check_growth(samples: RunSamples, level: float) -> Finding:
+    """Compare the law of P at the end with that at half of the horizon."""
+    P = samples.runs.P
+    nodes = enumerate(samples.nodes)
+    pairs = [Pair(f"node {node}", P[:, -2, i], P[:, -1, i]) for i, node in nodes]
+    return compare_growth(pairs, level)
 
 
-def nees_is_chi_squared(seen: Seen, level: float) -> Finding:
-    """Given the exchanges, errors are Gaussian with covariance P at every node and time."""
-    n, nees = seen.scenario.plant.n, seen.runs.nees.reshape(seen.count, -1)
-    if np.isnan(seen.runs.e).all():
-        return rounded_away(NEES)
-    found = chi_squared(nees / n, [n * len(nees)] * nees.shape[1], seen.places, level, "NEES")
-    return found._replace(words=found.words + left_out(seen))
+def check_nees(samples: RunSamples, level: float) -> Finding:
+    """Test NEES / n for mean 1: given the exchanges, errors are Gaussian with covariance P."""
+    n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
+    if np.isnan(samples.runs.e).all():
+        return find_nothing(NEES_TOLERANCE)
+    freedom = [n * len(nees)] * nees.shape[1]
+    found = compare_chi_square(nees / n, freedom, samples.point_labels, level, "NEES")
+    return found._replace(message=found.message + samples.blurred_note)

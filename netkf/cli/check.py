@@ -35,8 +35,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Return the exit status: 1 if a promise is broken."""
-    from netkf.checks.check import check, verdict_json, verdict_text
-    from netkf.checks.mode_sequences import watched_note
+    from netkf.checks.check import check
+    from netkf.checks.points import sampling_note
+    from netkf.checks.report import verdict_json, verdict_text
 
     scenario = load_scenario(options)
     with ProgressLine() as line:
@@ -48,7 +49,7 @@ def _run(options: argparse.Namespace) -> int:
             scheduler=options.scheduler,
             progress=line.counter("runs"),
         )
-    print_notes((*scenario.notes, *filter(None, [watched_note(scenario)])))
+    print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
     if options.json:
         print_json(verdict_json(verdict))
     else:

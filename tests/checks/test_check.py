@@ -8,7 +8,7 @@ import scipy.stats
 
 import netkf
 from netkf.checks import statistics
-from netkf.checks.check import check, verdict, watched, witness
+from netkf.checks.check import check, judge_replicas, run_replica, with_check_times
 from netkf.checks.evidence import BROKEN, NOT_PROMISED, Finding, Promise, judge
 from netkf.core.errors import TheoryError
 from netkf.scenario.reading import from_table
@@ -113,12 +113,12 @@ def rows_of(found):
 
 def alarms(table, folder, seeds, replicas, levels):
     """Number of seeds with any false alarm, for each level."""
-    scenario = watched(scenario_of(table, folder))
+    scenario = with_check_times(scenario_of(table, folder))
     count = dict.fromkeys(levels, 0)
     for seed in range(seeds):
-        seen = [witness(scenario, seed, replica) for replica in range(replicas)]
+        seen = [run_replica(scenario, seed, replica) for replica in range(replicas)]
         for level in levels:
-            count[level] += not verdict(scenario, seen, seed, 1.0 - level)
+            count[level] += not judge_replicas(scenario, seen, seed, 1.0 - level)
     return count
 
 
@@ -308,16 +308,16 @@ def test_undecided_says_how_many_runs_would_do(tmp_path):
 
 
 def test_a_verdict_does_not_depend_on_the_order_of_runs(tmp_path):
-    scenario = watched(scenario_of(SCALAR, tmp_path))
-    seen = [witness(scenario, 0, replica) for replica in range(12)]
-    one, other = (verdict(scenario, runs, 0, 0.99) for runs in (seen, seen[::-1]))
+    scenario = with_check_times(scenario_of(SCALAR, tmp_path))
+    seen = [run_replica(scenario, 0, replica) for replica in range(12)]
+    one, other = (judge_replicas(scenario, runs, 0, 0.99) for runs in (seen, seen[::-1]))
     assert [row.margin for row in one.rows] == pytest.approx([row.margin for row in other.rows])
 
 
 def test_share_covers():
     """Clopper-Pearson against its definition by scipy."""
     for successes, trials in ((0, 10), (3, 10), (10, 10), (470, 1000)):
-        low, high = statistics.share(successes, trials, 0.05)[1:]
+        low, high = statistics.probability_interval(successes, trials, 0.05)[1:]
         expected = scipy.stats.binomtest(successes, trials).proportion_ci(0.95, "exact")
         assert (low, high) == pytest.approx((expected.low, expected.high), abs=1e-9)
 
@@ -329,9 +329,9 @@ def test_bands_cover_laws_with_atoms():
     for _ in range(400):
         values = random.integers(1, 4, 60) / 3.0
         cdf = lambda x: np.floor(3.0 * x).clip(0, 3) / 3.0  # noqa: E731
-        missed += statistics.distance_to(cdf, values, 0.1).low > 0.0
+        missed += statistics.distance_to_law(cdf, values, 0.1).low > 0.0
     assert missed <= scipy.stats.binom.ppf(0.999, 400, 0.1)
-    far = statistics.distance_to(lambda x: np.clip(x, 0, 1) ** 8, random.random(200), 0.01)
+    far = statistics.distance_to_law(lambda x: np.clip(x, 0, 1) ** 8, random.random(200), 0.01)
     assert far.low > 0.2
 
 
@@ -340,14 +340,14 @@ def test_mean_ratio_covers():
     totals = random.chisquare(30, size=2000)
     missed = 0
     for total in totals:
-        low, high = statistics.mean_ratio(float(total), 30, 0.1)[1:]
+        low, high = statistics.scale_interval(float(total), 30, 0.1)[1:]
         missed += not low <= 1.0 <= high
     assert 0.07 < missed / 2000 < 0.13
 
 
 def test_chi_square_is_pearsons():
     counts, chances = np.array([30, 18, 9, 2, 1]), np.array([0.5, 0.25, 0.125, 0.0625, 0.0625])
-    p, cells = statistics.chi_square(counts, chances)
+    p, cells = statistics.pearson_test(counts, chances)
     pooled = scipy.stats.chisquare([30, 18, 12], [30, 15, 15])  # cells below 5 go to the last one
     assert cells == 3
     assert p == pytest.approx(pooled.pvalue)

@@ -8,7 +8,7 @@ import pytest
 
 import netkf
 from netkf import testing
-from netkf.checks.check import paper_of
+from netkf.checks.check import find_checks
 from netkf.core.errors import ScenarioError, TheoryError
 from tests.checks.broken import Overconfident
 from tests.conftest import ROOT, SCENARIOS
@@ -32,7 +32,7 @@ def promising():
     """The files with a filter of which something is promised that check knows."""
     for path in testing.scenario_files(SCENARIOS):
         try:
-            paper_of(netkf.load(path))
+            find_checks(netkf.load(path))
         except TheoryError:
             continue
         yield path
