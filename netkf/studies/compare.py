@@ -16,7 +16,7 @@ import scipy.special
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import number
-from netkf.studies.metrics import over_runs
+from netkf.studies.metrics import mean_over_runs
 
 AVERAGES = ("rms_error", "mean_trace", "mean_nees")
 MESSAGES = ("sent", "delivered", "lost")
@@ -215,7 +215,7 @@ def _paired(
     gaps = np.asarray((two - one).dropna(), dtype=np.float64)
     if len(gaps) < 2:
         return None
-    mean, error = over_runs(gaps)
+    mean, error = mean_over_runs(gaps)
     ends = _around(mean, error, len(gaps) - 1, level)
     words = "paired" if quantity != "rms_error" else "paired, mean squares"
     return entry._replace(

@@ -1,16 +1,16 @@
-"""``netkf.consistency``: whether P says what the errors are, and whether it should.
+"""``netkf.consistency``: compare NEES and NIS with their expected values.
 
-NEES e' P^-1 e and NIS v' S^-1 v are held against what they should be: given the events of a run the
-error covariance Sigma of each node is known exactly, so E[NEES] = tr(P^-1 Sigma) and E[NIS] =
-tr(S^-1 (H Sigma H' + R)). That is n, or the number p of readings, for filters whose P is exact, and
-less for those that are conservative by design, which are then not called wrong.
+Given the events of a run the error covariance Sigma of each node is known exactly, so the NEES
+e' P^-1 e and the NIS v' S^-1 v have the means E[NEES] = tr(P^-1 Sigma) and E[NIS] =
+tr(S^-1 (H Sigma H' + R)). They are n, and the number p of readings, for filters whose P is exact,
+and less for those that are conservative by design, which are then not called inconsistent.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +25,7 @@ from netkf.engines.base import Engine
 from netkf.ensembles.replicas import replicate
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.rng.streams import Streams
+from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, simulate
 from netkf.runs.summary import NO_COVARIANCE
 from netkf.scenario.scenario import Scenario
@@ -36,17 +37,20 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LOAD = "load it first: netkf.consistency(netkf.load(path))"
-FEWEST = 10
+MIN_RUNS = 10
 UNDECIDED = "undecided: rounding blurs the errors of too many samples"
-DESIGN = 0.02
-"""Relative distance of the expected value from n that counts as by design."""
+BIAS_TOLERANCE = 0.02
+"""Relative distance of the expected value from n that is worth a remark in the verdict."""
 
 
-class Seen(NamedTuple):
-    """Of one run: ``samples`` (T, N) of NEES after time 0, nan where rounding blurs the errors;
-    means over the others (N,) of NEES, of its expected value, of NIS and of its expected value, nan
-    where they do not exist; ``blurred_from`` (1,): the first time at which some are left out, inf
-    without one; ``given`` (1,): whether the filter gives a covariance.
+class RunConsistency(NamedTuple):
+    """NEES and NIS of one run.
+
+    samples      : (T, N) NEES after time 0, nan if rounding blurs the error
+    nees, expected : (N,) means over time of NEES and of its expected value, nan if unknown
+    nis, expected_nis : (N,) means over time of NIS and of its expected value, nan if unknown
+    blurred_from : (1,) first time at which an error is left out, inf without one
+    covariance_given : (1,) True if the filter gives a covariance
     """
 
     samples: FloatArray
@@ -55,26 +59,28 @@ class Seen(NamedTuple):
     nis: FloatArray
     expected_nis: FloatArray
     blurred_from: FloatArray
-    given: np.ndarray
+    covariance_given: np.ndarray
 
 
-def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto") -> Seen:
-    """What one replica says, for ``replicate``."""
+def run_consistency(
+    scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
+) -> RunConsistency:
+    """Simulate one replica and return its NEES and NIS."""
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
-    kept = np.flatnonzero(run.times > 0.0)
+    after = np.flatnonzero(run.times > 0.0)
     try:
         sigma = error_covariance(scenario, run)
     except TheoryError:
         sigma = None
     lost = blurred(run, run.P)
     lost |= False if sigma is None else blurred(run, sigma)
-    nis, expected_nis = _innovations(scenario, run, sigma, lost)
+    nis, expected_nis = _mean_nis(scenario, run, sigma, lost)
     times = run.times[lost.any(axis=1) & (run.times > 0.0)]
-    return Seen(
-        np.where(lost, np.nan, nees)[kept],
-        _mean(nees[kept], lost[kept]),
-        _mean(_ratio(run.P, sigma)[kept], lost[kept]),
+    return RunConsistency(
+        np.where(lost, np.nan, nees)[after],
+        _mean(nees[after], lost[after]),
+        _mean(_expected_nees(run.P, sigma)[after], lost[after]),
         nis,
         expected_nis,
         times[:1] if len(times) else np.full(1, np.inf),
@@ -83,103 +89,123 @@ def one_run(scenario: Scenario, seed: int, replica: int, engine: str | Engine = 
 
 
 def _mean(values: FloatArray, lost: np.ndarray) -> FloatArray:
-    """(N,) over the samples (T, N) that are not lost; nan where there is none."""
+    """Return the means (N,) over the samples (T, N) that are not lost; nan without any."""
     count = (~lost).sum(axis=0)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(lost, 0.0, values).sum(axis=0) / np.where(count, count, np.nan))
 
 
-def _ratio(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
-    """tr(P^-1 Sigma), (T, N); nan where Sigma is not known or P is singular."""
+def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
+    """Return tr(P^-1 Sigma) (T, N); nan if Sigma is unknown or P is singular."""
+    expected = np.full(P.shape[:2], np.nan)
     if sigma is None:
-        return np.full(P.shape[:2], np.nan)
-    found = np.full(P.shape[:2], np.nan)
-    for place in np.ndindex(*found.shape):
-        if np.isfinite(P[place]).all() and np.linalg.matrix_rank(P[place]) == P.shape[-1]:
-            found[place] = np.trace(np.linalg.solve(P[place], sigma[place]))
-    return found
+        return expected
+    for k in np.ndindex(*expected.shape):
+        if np.isfinite(P[k]).all() and np.linalg.matrix_rank(P[k]) == P.shape[-1]:
+            expected[k] = np.trace(np.linalg.solve(P[k], sigma[k]))
+    return expected
 
 
-def _innovations(
+def _mean_nis(
     scenario: Scenario, run: Run, sigma: FloatArray | None, lost: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean NIS of each node's own readings and its expected value, (N,); in slots only, at slots
-    whose prediction is a sample or follows from the one before. An innovation is the reading that
-    the sensor would give of the error, so large states cost it no digits.
+    """Return the mean NIS (N,) of each node's own readings and its expected value; nan under
+    clocks, where predictions are no samples.
     """
-    nothing = np.full(len(run.nodes), np.nan)
+    unknown = np.full(len(run.nodes), np.nan)
     if not scenario.slotted:
-        return nothing, nothing
-    streams, found, should = Streams(run.seed, run.replica), nothing.copy(), nothing.copy()
-    steps = 0 if scenario.hosted.predicts else 1
-    slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
-    places = [k for k in range(steps, len(slots)) if slots[k] - slots[k - steps] == steps]
-    places = [k for k in places if run.times[k] > 0.0]
-    noise = _plant_noise(scenario, streams, [slots[k] for k in places])
-    for i, node in enumerate(run.nodes):
-        sensors = [scenario.slot_path(streams, node, p) for p in scenario.placed.get(node, ())]
-        if not sensors or not places:
-            continue
-        believed, true = (
-            block_diagonal([scenario.noise(p.entry, b) for p in scenario.placed[node]])
-            for b in (True, False)
+        return unknown, unknown.copy()
+    innovations = _Innovations(scenario, run, sigma, lost)
+    pairs = [np.array(list(innovations.of_node(i))) for i in range(len(run.nodes))]
+    means = np.array([p.mean(axis=0) if len(p) else (np.nan, np.nan) for p in pairs])
+    return means[:, 0], means[:, 1]
+
+
+class _Innovations:
+    """Innovations of a run in slots whose prediction is a sample or follows from the one before.
+
+    An innovation is the reading that the sensor would give of the error, so that large states cost
+    it no digits.
+    """
+
+    def __init__(
+        self, scenario: Scenario, run: Run, sigma: FloatArray | None, lost: np.ndarray
+    ) -> None:
+        self._scenario, self._run, self._sigma, self._lost = scenario, run, sigma, lost
+        self._streams = Streams(run.seed, run.replica)
+        # Samples of a filter that predicts are predictions; others have to be moved one slot on.
+        self._steps = 0 if scenario.hosted.predicts else 1
+        slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
+        self._samples = [
+            k
+            for k in range(self._steps, len(slots))
+            if slots[k] - slots[k - self._steps] == self._steps and run.times[k] > 0.0
+        ]
+        self._slots = [slots[k] for k in self._samples]
+        self._noise = _plant_noise(scenario, self._streams, self._slots)
+
+    def of_node(self, i: int) -> Iterator[tuple[float, float]]:
+        """Yield the NIS and its expected value (nan if unknown) in each slot of the i-th node."""
+        placed = self._scenario.placed.get(self._run.nodes[i], ())
+        if not placed:
+            return
+        sensors = [self._scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
+        believed_R, true_R = (
+            block_diagonal([self._scenario.noise(p.entry, believed) for p in placed])
+            for believed in (True, False)
         )
-        pairs = []
-        for k, w in zip(places, noise, strict=True):
-            if lost[k, i] or lost[k - steps, i]:
+        for k, slot, noise in zip(self._samples, self._slots, self._noise, strict=True):
+            before = k - self._steps
+            if self._lost[k, i] or self._lost[before, i]:
                 continue
-            H = np.concatenate([sensor.matrix(slots[k]) for sensor in sensors])
-            e, P, error = _predicted(scenario, run, sigma, k - steps, i, w if steps else None)
-            v = np.concatenate([sensor.reading(slots[k], e) for sensor in sensors])
-            S = H @ P @ H.T + believed
-            truly = (
-                np.nan if error is None else np.trace(np.linalg.solve(S, H @ error @ H.T + true))
-            )
-            pairs.append((v @ np.linalg.solve(S, v), truly))
-        if pairs:
-            found[i], should[i] = np.array(pairs).mean(axis=0)
-    return found, should
+            H = np.concatenate([sensor.matrix(slot) for sensor in sensors])
+            e, P, Sigma = self._prediction(before, i, noise if self._steps else None)
+            v = np.concatenate([sensor.reading(slot, e) for sensor in sensors])
+            S = H @ P @ H.T + believed_R
+            expected = np.nan
+            if Sigma is not None:
+                expected = float(np.trace(np.linalg.solve(S, H @ Sigma @ H.T + true_R)))
+            yield float(v @ np.linalg.solve(S, v)), expected
+
+    def _prediction(
+        self, k: int, i: int, noise: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Return the error (n,) of a prediction, its P and its exact covariance (None if unknown).
+
+        They are those of sample k or, with the plant's ``noise`` (n,) of the step, one slot on.
+        """
+        run, plant = self._run, self._scenario.slot_plant
+        e, P = run.error[k, i], run.P[k, i]
+        Sigma = None if self._sigma is None else self._sigma[k, i]
+        if noise is None:
+            return e, P, Sigma
+        F, Q = self._scenario.slot_belief
+        same = np.array_equal(F, plant.F)
+        if Sigma is not None:
+            Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if same else None
+        ahead = plant.F @ e + noise
+        if not same:
+            ahead = ahead + (plant.F - F) @ run.xhat[k, i]
+        return ahead, F @ P @ F.T + Q, Sigma
 
 
 def _plant_noise(scenario: Scenario, streams: Streams, slots: list[int]) -> list[FloatArray]:
-    """W (n,) of the steps that end in these slots: the path of a plant with no memory."""
+    """Return the noise (n,) of the steps that end in ``slots``: the path of a plant with F = 0."""
     plant = scenario.slot_plant
-    forgetful = dataclasses.replace(plant, F=np.zeros_like(plant.F))
-    path = forgetful.truth(streams.generator("plant"))
+    memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
+    path = memoryless.truth(streams.generator("plant"))
     return [path.state(slot) for slot in slots]
 
 
-def _predicted(
-    scenario: Scenario,
-    run: Run,
-    sigma: FloatArray | None,
-    k: int,
-    node: int,
-    noise: FloatArray | None,
-) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Error of a prediction, its P and the covariance of its error: those of sample k or, with the
-    plant's ``noise`` (n,) of the step, one slot on.
-    """
-    e, P = run.error[k, node], run.P[k, node]
-    error = None if sigma is None else sigma[k, node]
-    if noise is None:
-        return e, P, error
-    F, Q = scenario.slot_belief
-    plant = scenario.slot_plant
-    if error is not None:
-        same = np.array_equal(F, plant.F)
-        error = plant.F @ error @ plant.F.T + plant.Q if same else None
-    ahead = plant.F @ e + noise
-    if not np.array_equal(F, plant.F):
-        ahead = ahead + (plant.F - F) @ run.xhat[k, node]
-    return ahead, F @ P @ F.T + Q, error
-
-
 @dataclass(frozen=True)
-class Row:
-    """Of one node: mean NEES over runs and samples with the half width of its interval, what it
-    should be (nan where that is not known), the share of samples whose mean over runs lies in the
-    chi-square bounds, NIS and what it should be, and the verdict in words.
+class NodeConsistency:
+    """The consistency of one node over all runs.
+
+    nees, width  : mean NEES over runs and samples, and the half width of its interval
+    expected     : expected value of NEES, nan if unknown
+    inside       : share of samples whose mean over the runs lies in the chi-square bounds
+    nis, expected_nis : mean NIS and its expected value, nan if unknown
+    verdict      : a sentence, which begins with BROKEN if the errors are not as expected
     """
 
     node: int
@@ -194,11 +220,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Rows by node; false where the errors of one are not what they should be.
+    """Rows by node; false if the errors of one are not what they should be.
 
-    ``low`` and ``high`` are the chi-square bounds on the mean NEES of one sample over the runs,
-    where P is exact, each side missing with (1 - confidence) / 2; over n they bound the ANEES.
-    ``notes`` say what was left out and why, a line each.
+    ``low`` and ``high`` are the chi-square bounds on the mean NEES of one sample over the runs if P
+    is exact, each side missing with (1 - confidence) / 2; over n they bound the ANEES. ``notes``
+    say what was left out and why, one sentence each.
     """
 
     scenario: str
@@ -207,7 +233,7 @@ class Consistency:
     confidence: float
     low: float
     high: float
-    rows: tuple[Row, ...]
+    rows: tuple[NodeConsistency, ...]
     notes: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
@@ -215,7 +241,7 @@ class Consistency:
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row a node."""
+        """One row per node."""
         import pandas as pd
 
         return pd.DataFrame([vars(row) for row in self.rows])
@@ -231,84 +257,123 @@ def consistency(
     scheduler: str | None = None,
     engine: str = "auto",
 ) -> Consistency:
-    """Hold NEES and, in slots, NIS against what they should be.
+    """Compare NEES and, in slots, NIS with their expected values.
 
     The verdicts compare the NEES of each run with its exact expected value given the events of the
-    run (run by run, Student's interval; all nodes together at ``confidence``), or with n where that
-    is not known (push-sum, a user's own filter). Raises ScenarioError for bad arguments and where
-    there is no truth.
+    run (run by run, Student's interval; all nodes together at ``confidence``), or with n if that is
+    unknown (push-sum, a user's own filter).
+
+    Raises ScenarioError for bad arguments and if there is no truth.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "consistency takes a netkf.Scenario", scenario, LOAD)
     if not scenario.is_random:
-        words = "states or readings are recorded, so the law of the errors is unknown"
-        raise ScenarioError("plant", words, None, "simulate the plant and all readings")
-    count = integer(low=FEWEST)("runs", runs)
+        rule = "states or readings are recorded, so the law of the errors is unknown"
+        raise ScenarioError("plant", rule, None, "simulate the plant and all readings")
+    count = integer(low=MIN_RUNS)("runs", runs)
     sure = number(above=0.0, below=1.0)("confidence", confidence)
-    task = partial(one_run, engine=choose_engine(engine, scenario))
-    seen = replicate(
+    task = partial(run_consistency, engine=choose_engine(engine, scenario))
+    found = replicate(
         task, scenario, count, seed, workers=workers, executor=executor, scheduler=scheduler
     )
-    return weighed(scenario, seen, sure)
+    return judge_consistency(scenario, found, sure)
 
 
-def weighed(scenario: Scenario, runs: Sequence[Seen], confidence: float) -> Consistency:
-    """The rows of what several runs say."""
+def judge_consistency(
+    scenario: Scenario, runs: Sequence[RunConsistency], confidence: float
+) -> Consistency:
+    """Return the consistency of a scenario from several of its runs."""
     n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
-    nees, expected, nis, expected_nis = (np.array([run[k] for run in runs]) for k in range(1, 5))
-    blurred_from = float(min(run.blurred_from[0] for run in runs))
-    given = any(run.given[0] for run in runs)
     low, high = (
         2.0 * float(scipy.special.gammaincinv(0.5 * count * n, q)) / count
         for q in (0.5 * level, 1.0 - 0.5 * level)
     )
-    shortest = min(len(run.samples) for run in runs)
-    means = np.mean([run.samples[:shortest] for run in runs], axis=0)
-    clear = np.isfinite(means).sum(axis=0)
-    inside = ((means >= low) & (means <= high)).sum(axis=0) / np.where(clear, clear, np.nan)
+    inside = _share_inside(runs, low, high)
+    # Bonferroni over the nodes, two-sided.
     quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))
-    right = scenario.filters_know_the_truth
-    reason = "the design of the filter" if right else "the filters' model"
-    rows = []
-    for i, node in enumerate(scenario.nodes):
-        known = bool(np.isfinite(expected[:, i]).all())
-        lost = given and np.isfinite(blurred_from) and bool(np.isnan(nees[:, i]).any())
-        gaps = nees[:, i] - (expected[:, i] if known else n)
-        width = quantile * float(gaps.std(ddof=1)) / math.sqrt(count)
-        should = float(expected[:, i].mean())
-        rows.append(
-            Row(
-                node,
-                float(nees[:, i].mean()),
-                width,
-                should,
-                float(inside[i]),
-                float(nis[:, i].mean()),
-                float(expected_nis[:, i].mean()),
-                NO_COVARIANCE
-                if not given
-                else UNDECIDED
-                if lost
-                else _verdict(float(gaps.mean()), width, should, n, known, reason),
-            )
-        )
+    rows = [
+        _judge_node(scenario, runs, i, float(inside[i]), quantile)
+        for i in range(len(scenario.nodes))
+    ]
+    given, blurred_from = _covariance_given(runs), _blurred_from(runs)
     notes = () if given else (NO_COVARIANCE,)
     if np.isfinite(blurred_from):
-        words = f"from {blurred_from:g} s on rounding of a large state blurs errors"
-        notes = (*notes, f"{words}: those samples are left out; shorten the horizon")
+        reason = f"from {blurred_from:g} s on rounding of a large state blurs errors"
+        notes = (*notes, f"{reason}: those samples are left out; shorten the horizon")
     return Consistency(scenario.name, n, count, confidence, low, high, tuple(rows), notes)
 
 
-def _verdict(gap: float, width: float, should: float, n: int, known: bool, reason: str) -> str:
+def _covariance_given(runs: Sequence[RunConsistency]) -> bool:
+    return any(run.covariance_given[0] for run in runs)
+
+
+def _blurred_from(runs: Sequence[RunConsistency]) -> float:
+    return float(min(run.blurred_from[0] for run in runs))
+
+
+def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> FloatArray:
+    """Return for each node (N,) the share of samples whose mean NEES lies in the bounds."""
+    shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
+    means = np.mean([run.samples[:shortest] for run in runs], axis=0)
+    clear = np.isfinite(means).sum(axis=0)
+    inside = ((means >= low) & (means <= high)).sum(axis=0)
+    return np.asarray(inside / np.where(clear, clear, np.nan))
+
+
+def _judge_node(
+    scenario: Scenario, runs: Sequence[RunConsistency], i: int, inside: float, quantile: float
+) -> NodeConsistency:
+    nees = np.array([run.nees[i] for run in runs])
+    expected = np.array([run.expected[i] for run in runs])
+    known = bool(np.isfinite(expected).all())
+    gaps = nees - (expected if known else scenario.plant.n)
+    width = quantile * float(gaps.std(ddof=1)) / math.sqrt(len(runs))
+    if not _covariance_given(runs):
+        verdict = NO_COVARIANCE
+    elif np.isfinite(_blurred_from(runs)) and np.isnan(nees).any():
+        verdict = UNDECIDED
+    else:
+        mean = float(expected.mean()) if known else None
+        verdict = _verdict(scenario, float(gaps.mean()), width, mean)
+    return NodeConsistency(
+        scenario.nodes[i],
+        float(nees.mean()),
+        width,
+        float(expected.mean()),
+        inside,
+        float(np.mean([run.nis[i] for run in runs])),
+        float(np.mean([run.expected_nis[i] for run in runs])),
+        verdict,
+    )
+
+
+def _verdict(scenario: Scenario, gap: float, width: float, expected: float | None) -> str:
+    """Return the verdict on NEES that is ``gap`` (+- ``width``) above its ``expected`` value, or
+    above n if that is None.
+    """
+    n = scenario.plant.n
     if not math.isfinite(gap):
         return "no NEES: P is singular or not finite"
-    if not known:
+    if expected is None:
         side = "near n" if abs(gap) <= width else "above n" if gap > 0.0 else "below n"
         return f"{side}; what it should be is not known"
     if abs(gap) > width:
         return f"BROKEN: errors are {'larger' if gap > 0.0 else 'smaller'} than they should be"
-    if should < (1.0 - DESIGN) * n:
-        return "as it should be: P is conservative by design"
-    if should > (1.0 + DESIGN) * n:
-        return f"as it should be: {reason} makes P too small"
-    return "as it should be"
+    if abs(expected / n - 1.0) <= BIAS_TOLERANCE:
+        return "as it should be"
+    return f"as it should be: {_explain_bias(scenario, expected < n)}"
+
+
+def _explain_bias(scenario: Scenario, conservative: bool) -> str:
+    """Return why P is larger (``conservative``) or smaller than the covariance of the errors.
+
+    Only the class that defines the combining step can say that this is its design; a wrong model or
+    another start explains it otherwise.
+    """
+    if not scenario.filters_know_the_truth:
+        return f"the filters' model makes P too {'large' if conservative else 'small'}"
+    bias = covariance_bias(scenario)
+    if conservative:
+        by_design = bias == "larger"
+        return "P is conservative by design" if by_design else "P is larger than the errors need"
+    return "the design of the filter makes P too small" if bias == "smaller" else "P is too small"

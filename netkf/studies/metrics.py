@@ -1,4 +1,4 @@
-"""What runs of one scenario come to: errors, covariances and messages, run by run."""
+"""Errors, covariances and messages of runs of one scenario, run by run."""
 
 from __future__ import annotations
 
@@ -20,13 +20,18 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, error_covariance, riccati_step
 from netkf.trace.schema import KINDS
 
-MOST_ERRORS = 24
+MAX_ERRORS = 24
+"""Errors of all nodes together whose exact covariance is about as cheap as a few runs."""
 
 
 class RunMetrics(NamedTuple):
-    """Of R runs: ``mean_square`` error and ``trace`` of P (R, N), averaged over the samples after
-    time 0; ``messages`` (R, 5) as MESSAGES; ``diverged`` (R, 1); ``rounding_from`` (R, 1): when it
-    begins to blur errors, which are averaged over the samples before, nan without one.
+    """Averages over time of R runs.
+
+    mean_square, trace : (R, N) squared error and trace of P, averaged over the samples after time 0
+    messages           : (R, 5) counts in the order of ``ensembles.statistics.MESSAGES``
+    diverged           : (R, 1) 1 if the run ended early
+    rounding_from      : (R, 1) time from which rounding blurs errors, which are averaged over the
+                         samples before it; not finite without one
     """
 
     mean_square: FloatArray
@@ -37,7 +42,7 @@ class RunMetrics(NamedTuple):
 
 
 def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> RunMetrics:
-    """Simulate neighbouring replicas, for ``replicate_blocks``."""
+    """Simulate consecutive replicas and return their metrics; a task of ``replicate_blocks``."""
     batches = engine.run_many(scenario, seed, replicas)
     return join_metrics(*(_batch_metrics(run_values(batch, scenario)) for batch in batches))
 
@@ -53,19 +58,20 @@ def _batch_metrics(values: RunValues) -> RunMetrics:
 
 
 def join_metrics(*parts: RunMetrics) -> RunMetrics:
-    """The metrics of several batches, one after the other."""
+    """Return the metrics of several batches as one."""
     return RunMetrics(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine) -> RunMetrics:
-    """Metrics of one replica with the expected square of the error given the events of the run,
-    which needs far fewer runs: no chance of the noise is in it.
+    """Return the metrics of one replica with the expected squared error given its events.
+
+    The expectation removes the chance of the noise, so that far fewer runs are enough.
     """
     run = simulate(scenario, seed, replica, engine)
     if run.status != "complete":
         return block_metrics(scenario, seed, range(replica, replica + 1), engine)
     square, trace = (
-        averaged(scenario, np.trace(matrices, axis1=2, axis2=3))[None]
+        time_average(scenario, np.trace(matrices, axis1=2, axis2=3))[None]
         for matrices in (error_covariance(scenario, run), run.P)
     )
     counts = np.array([[run.count(kind) for kind in KINDS]])
@@ -74,8 +80,8 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
 
 
 def expected_errors_known(scenario: Scenario) -> bool:
-    """Whether ``expected_metrics`` can be computed, and in about the time of a few runs."""
-    small = len(scenario.nodes) * scenario.plant.n <= MOST_ERRORS
+    """Return True if ``expected_metrics`` exists and takes about the time of a few runs."""
+    small = len(scenario.nodes) * scenario.plant.n <= MAX_ERRORS
     if not (scenario.slotted and small and scenario.is_random):
         return False
     try:
@@ -92,66 +98,71 @@ class Estimate(NamedTuple):
     error: float
 
 
-def over_runs(values: FloatArray) -> Estimate:
-    """Of one value a run (R,)."""
+def mean_over_runs(values: FloatArray) -> Estimate:
+    """Return the mean of one value per run, (R,)."""
     with np.errstate(over="ignore", invalid="ignore"):
         spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
     return Estimate(float(values.mean()), spread / math.sqrt(len(values)))
 
 
-def worst(values: FloatArray) -> Estimate:
-    """Of the node with the largest mean, from (R, N)."""
-    return over_runs(values[:, int(np.argmax(values.mean(axis=0)))])
+def worst_node(values: FloatArray) -> Estimate:
+    """Return the estimate (R, N) of the node with the largest mean."""
+    return mean_over_runs(values[:, int(np.argmax(values.mean(axis=0)))])
 
 
-def overall(values: FloatArray) -> Estimate:
-    """Of the mean over all nodes, from (R, N)."""
-    return over_runs(values.mean(axis=1))
+def all_nodes(values: FloatArray) -> Estimate:
+    """Return the estimate (R, N) of the mean over all nodes."""
+    return mean_over_runs(values.mean(axis=1))
 
 
-def root(estimate: Estimate) -> Estimate:
-    """Of the square root of what was estimated, by the delta method."""
+def take_root(estimate: Estimate) -> Estimate:
+    """Return the estimate of the square root, by the delta method."""
     value = math.sqrt(estimate.value)
     return Estimate(value, estimate.error / (2.0 * value) if value > 0.0 else math.nan)
 
 
-def averaged(scenario: Scenario, values: FloatArray) -> FloatArray:
-    """(N,) means over the samples after time 0 of (T, N) values, as in the table of a run."""
+def time_average(scenario: Scenario, values: FloatArray) -> FloatArray:
+    """Return the means (N,) of values (T, N) over the samples after time 0, as in summaries."""
     after = scenario.times > 0.0
     return np.asarray(values[after if after.any() else slice(None)].mean(axis=0))
 
 
 def bound_traces(scenario: Scenario) -> FloatArray:
-    """(N,) traces of the covariance bound, averaged over the samples after time 0: of H(12), or
-    where nodes do not talk of their own covariance. Raises TheoryError where there is none.
+    """Return the traces (N,) of the covariance bound, averaged over the samples after time 0.
+
+    The bound is that of H(12), or the covariance itself if nodes do not exchange anything. Raises
+    TheoryError if there is none.
     """
     if not scenario.slotted:
         bound = covariance_bound(scenario, scenario.times)
-        return averaged(scenario, np.trace(bound, axis1=2, axis2=3))
+        return time_average(scenario, np.trace(bound, axis1=2, axis2=3))
     if scenario.filter.algorithm.talks:
         raise TheoryError("H(12) is about filters in continuous time")
-    _fixed_rows(scenario)
+    _require_fixed_H(scenario)
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_slot_model] * len(scenario.nodes) if pooled else scenario.slot_models
     starts = [scenario.start(node)[1] for node in scenario.nodes]
     columns = [_slot_traces(scenario, m, P) for m, P in zip(models, starts, strict=True)]
-    return averaged(scenario, np.stack(columns, axis=1))
+    return time_average(scenario, np.stack(columns, axis=1))
 
 
 def central_trace(scenario: Scenario) -> float:
-    """The trace of the covariance of a filter that has all readings and the true model, averaged
-    over the same samples; of its prediction where the scenario's filter predicts.
+    """Return the trace of the covariance of a filter with all readings and the true model.
+
+    It is averaged over the samples after time 0, and that of the prediction if the scenario's
+    filter predicts. Raises TheoryError if readings are recorded or H is random.
     """
     algorithm = Central()
     central = dataclasses.replace(scenario, filter=Filtering(algorithm=algorithm))
     if not scenario.slotted:
         return float(bound_traces(central)[0])
-    _fixed_rows(scenario)
+    _require_fixed_H(scenario)
     traces = _slot_traces(scenario, central.pooled_slot_model, scenario.plant.start_cov)
-    return float(averaged(scenario, traces[:, None])[0])
+    return float(time_average(scenario, traces[:, None])[0])
 
 
-def _fixed_rows(scenario: Scenario) -> None:
+def _require_fixed_H(scenario: Scenario) -> None:
+    """Raise TheoryError if readings are recorded or H is random."""
     if not scenario.is_random:
         raise TheoryError("the readings are recorded: nobody knows their law")
     for node in scenario.sensing:
@@ -159,7 +170,7 @@ def _fixed_rows(scenario: Scenario) -> None:
 
 
 def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
-    """(T,) traces of the covariance of a Kalman filter with a model, as samples show it."""
+    """Return the traces (T,) of P of a Kalman filter with a model at the samples."""
     predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
     F, Q, H, R = model.F, model.Q, model.H, model.R
     P, found = start, np.empty(max(scenario.slots) + 1)

@@ -1,4 +1,4 @@
-"""``netkf.size``: the value of one key that just reaches a target."""
+"""``netkf.size``: the smallest or largest value of a key that meets a target."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from functools import partial
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import choice, integer, number
+from netkf.engines.base import Engine
 from netkf.ensembles.blocks import BlockTask, each_replica
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
@@ -18,10 +19,20 @@ from netkf.studies.metrics import (
     expected_metrics,
     join_metrics,
 )
-from netkf.studies.parameter_grid import whole_number
-from netkf.studies.pools import shared_pool
-from netkf.studies.search import DIGITS, FIRST_BATCH, MOST_PROBES, Search, Sizing
-from netkf.studies.targets import QUANTITIES, Target, by_theory, parse_target
+from netkf.studies.parameter_grid import is_integer_key
+from netkf.studies.pools import PoolOptions, shared_pool
+from netkf.studies.search import (
+    DIGITS,
+    FIRST_BATCH,
+    MAX_PROBES,
+    Search,
+    SimulationPlan,
+    Sizing,
+    SizingProblem,
+    decide_by_simulation,
+    decide_by_theory,
+)
+from netkf.studies.targets import QUANTITIES, Target, parse_target, quantity_by_theory
 
 LOAD = "load it first: netkf.size(netkf.load(path), ...)"
 
@@ -47,15 +58,15 @@ def size(
     within_central, the largest RMS error over that of a filter with all readings.
 
     ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: theory
-    where it has an answer. By simulation, runs are added at each value until an interval decides,
-    ``runs`` at most; every value meets the same draws, and all decisions together are right with
-    probability ``confidence``. Where the exact covariance of the errors given the events of a run
-    is known and cheap (small networks in slots) it stands for the squared errors, which takes far
-    fewer runs. The quantity is taken to be monotone in the key; that is checked at the values that
-    are tried.
+    if it has an answer. By simulation, runs are added at each value until an interval decides,
+    at most ``runs``; all values share the same random draws, and all decisions together are right
+    with probability ``confidence``. If the exact covariance of the errors given the events of a run
+    is known and cheap (small networks in slots) it replaces the squared errors, which takes far
+    fewer runs. The quantity is assumed to be monotone in the key; that is checked at the values
+    that are tried.
 
-    Raises ScenarioError for a key, a range or a target that is wrong, TheoryError with
-    ``by="theory"`` where theory does not tell.
+    Raises ScenarioError for a wrong key, range or target, TheoryError with ``by="theory"`` if
+    theory has no answer.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)
@@ -64,56 +75,60 @@ def size(
     wanted, sure = parse_target(target), number(above=0.0, below=1.0)("--confidence", confidence)
     integer(low=FIRST_BATCH)("--runs", runs)
     if wanted.of_errors and not scenario.plant.truth_known:
-        remedy = "ask for mean_trace or worst_trace"
-        raise ScenarioError(
-            "--target", "is about errors, and there is no ground truth", target, remedy
-        )
+        rule = "is about errors, and there is no ground truth"
+        raise ScenarioError("--target", rule, target, "ask for mean_trace or worst_trace")
     base = scenario if seed is None else scenario.replace({"seed": seed})
-    whole = _checked_range(base, key, low, high)
+    whole = _check_range(base, key, low, high)
     used = choose_engine(engine, base.replace({key: low}))
-    chosen = by or ("theory" if _theory_tells(base, key, (low, high), wanted) else "simulation")
+    chosen = by or _choose_method(base, key, (low, high), wanted)
+    problem = SizingProblem(base, key, whole, wanted, chosen)
     if chosen == "theory":
-        search = Search(base, key, wanted, whole, "theory")
-        words = by_theory(base.replace({key: low}), wanted)[1]
-        return search.found(low, high, search.theory, 1.0, words)
-    with shared_pool(runs, workers, executor, scheduler) as handed:
-        search = Search(base, key, wanted, whole, "simulation", progress)
-        level = (1.0 - sure) / (MOST_PROBES["simulation"] * _looks(runs))
-        exact = wanted.of_errors and expected_errors_known(base.replace({key: low}))
-        task: BlockTask = partial(block_metrics, engine=used)
-        if exact:
-            one = partial(expected_metrics, engine=used)
-            task = partial(each_replica, one, join_metrics)
-        decide = partial(search.simulation, task=task, runs=runs, level=level, handed=handed)
-        words = f"{QUANTITIES[wanted.quantity]}, over the runs"
-        if exact:
-            words += ", each with its exact expected squared error given its events"
-        return search.found(low, high, decide, sure, words)
+        quantity = quantity_by_theory(problem.at(low), wanted)[1]
+        return Search(problem, partial(decide_by_theory, problem)).run(low, high, 1.0, quantity)
+    task, quantity = _choose_task(problem, low, used)
+    # Bonferroni over all values and all interim looks at each of them.
+    level = (1.0 - sure) / (MAX_PROBES["simulation"] * _count_looks(runs))
+    with shared_pool(runs, PoolOptions(workers, executor, scheduler)) as pool:
+        plan = SimulationPlan(task, runs, level, pool, progress)
+        decide = partial(decide_by_simulation, problem, plan)
+        return Search(problem, decide).run(low, high, sure, quantity)
 
 
-def _looks(runs: int) -> int:
+def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str]:
+    """Return the task that simulates, and a description of the quantity."""
+    quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
+    if problem.target.of_errors and expected_errors_known(problem.at(low)):
+        one = partial(expected_metrics, engine=engine)
+        exact = ", each with its exact expected squared error given its events"
+        return partial(each_replica, one, join_metrics), quantity + exact
+    return partial(block_metrics, engine=engine), quantity
+
+
+def _count_looks(runs: int) -> int:
+    """Return how often a value is looked at while its runs are doubled."""
     return 1 + math.ceil(math.log2(max(1.0, runs / FIRST_BATCH)))
 
 
-def _checked_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
-    """Whether the key is an integer; raises ScenarioError for a range or a key that is wrong."""
-    whole = whole_number(scenario, key)
+def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
+    """Return True if the key is an integer; raises ScenarioError for a wrong range or key."""
+    whole = is_integer_key(scenario, key)
     for end in (low, high):
         if whole and not isinstance(end, int):
-            words = f"{key} is an integer, so LOW:HIGH must be integers"
-            raise ScenarioError("--vary", words, f"{low}:{high}", "leave out the decimals")
+            rule = f"{key} is an integer, so LOW:HIGH must be integers"
+            raise ScenarioError("--vary", rule, f"{low}:{high}", "leave out the decimals")
     if not low < high:
-        words = f"range of {key} must go from a lower to a higher number"
-        raise ScenarioError("--vary", words, f"{low}:{high}", "swap or mend the ends")
+        rule = f"range of {key} must go from a lower to a higher number"
+        raise ScenarioError("--vary", rule, f"{low}:{high}", "swap or mend the ends")
     for end in (low, high):
         scenario.replace({key: end})
     return whole
 
 
-def _theory_tells(scenario: Scenario, key: str, ends: tuple[float, float], target: Target) -> bool:
+def _choose_method(scenario: Scenario, key: str, ends: tuple[float, float], target: Target) -> str:
+    """Return theory if it has an answer at both ends, else simulation."""
     try:
         for end in ends:
-            by_theory(scenario.replace({key: end}), target)
+            quantity_by_theory(scenario.replace({key: end}), target)
     except TheoryError:
-        return False
-    return True
+        return "simulation"
+    return "theory"

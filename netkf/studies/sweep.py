@@ -1,4 +1,4 @@
-"""``netkf.sweep``: one row for every place of a grid, all on the same draws."""
+"""``netkf.sweep``: one row for every point of a grid, all with the same random draws."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
     Estimate,
     RunMetrics,
+    all_nodes,
     block_metrics,
     bound_traces,
     central_trace,
     join_metrics,
-    overall,
-    root,
-    worst,
+    take_root,
+    worst_node,
 )
-from netkf.studies.parameter_grid import Cell, cells, shown
-from netkf.studies.pools import shared_pool
+from netkf.studies.parameter_grid import GridPoint, expand_grid, table_value
+from netkf.studies.pools import PoolOptions, shared_pool
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,89 +61,98 @@ def sweep(
     engine: str = "auto",
     progress: Progress | None = None,
 ) -> pd.DataFrame:
-    """Simulate every place of a grid of key paths, ``{"network.activation.rate": [1.0, 2.0]}``.
+    """Simulate every point of a grid of key paths, ``{"network.activation.rate": [1.0, 2.0]}``.
 
-    All places use the same seed, so the same truth, readings and luck: differences between rows are
-    due to the keys. A row holds the varied keys, ``runs``; ``worst_rms`` (of the node with the
-    largest), ``mean_rms`` (of all nodes together), ``mean_trace`` and ``worst_trace`` of P, each
-    with its standard error ``_se`` over runs; ``bound`` and ``central``, mean traces of H(12) and
-    of the covariance of the centralised filter where they exist; messages ``sent``, ``delivered``
-    and ``lost`` a run; ``status``, complete or diverged. All but messages are averages over the
+    All points use the same seed, so the same truth, readings and channel draws: differences between
+    rows are due to the keys. A row has the varied keys, ``runs``; ``worst_rms`` (of the node with
+    the largest), ``mean_rms`` (of all nodes together), ``mean_trace`` and ``worst_trace`` of P,
+    each with its standard error ``_se`` over runs; ``bound`` and ``central``, mean traces of H(12)
+    and of the covariance of the centralised filter if they exist; messages ``sent``, ``delivered``
+    and ``lost`` per run; ``status``, complete or diverged. All but messages are averages over the
     samples after time 0.
 
-    Raises ScenarioError, before anything runs, for a key or a value that is wrong.
+    Raises ScenarioError, before anything runs, for a wrong key or value.
     """
     import pandas as pd
 
-    places = _checked(scenario, vary, runs, seed, engine)
-    pool = (workers, executor, scheduler)
-    return pd.DataFrame(_rows(places, runs, engine, pool, progress))
+    plan = _make_plan(scenario, vary, runs, seed, engine)
+    rows = _simulate_points(plan, PoolOptions(workers, executor, scheduler), progress)
+    return pd.DataFrame(rows)
 
 
-def _checked(
+@dataclass(frozen=True)
+class _Plan:
+    """The points of a sweep, the runs at each of them and the engine."""
+
+    points: list[GridPoint]
+    runs: int
+    engine: str
+
+
+def _make_plan(
     scenario: Scenario, vary: Mapping[str, Sequence[Any]], runs: int, seed: int | None, engine: str
-) -> list[Cell]:
+) -> _Plan:
+    """Return a plan whose points can all be run; raises ScenarioError or EngineError."""
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "sweep takes a netkf.Scenario", scenario, LOAD)
     integer(low=1)("runs", runs)
     base = scenario if seed is None else scenario.replace({"seed": seed})
-    places = cells(base, vary)
-    for place in places:
-        choose_engine(engine, place.scenario)
-    return places
+    points = expand_grid(base, vary)
+    for point in points:
+        choose_engine(engine, point.scenario)
+    return _Plan(points, runs, engine)
 
 
-def _rows(
-    places: Sequence[Cell],
-    runs: int,
-    engine: str,
-    pool: tuple[int | None, Executor | None, str | None],
-    progress: Progress | None,
-) -> Iterator[Row]:
-    with shared_pool(runs, *pool) as handed:
-        for k, place in enumerate(places):
-            with explain_failures(place.scenario):
-                task = partial(block_metrics, engine=choose_engine(engine, place.scenario))
-                found = replicate_blocks(task, join_metrics, place.scenario, runs, **handed)
-            yield _row(place, found)
+def _simulate_points(plan: _Plan, options: PoolOptions, progress: Progress | None) -> Iterator[Row]:
+    """Yield the row of each point as it is done."""
+    with shared_pool(plan.runs, options) as pool:
+        for k, point in enumerate(plan.points):
+            with explain_failures(point.scenario):
+                task = partial(block_metrics, engine=choose_engine(plan.engine, point.scenario))
+                metrics = replicate_blocks(task, join_metrics, point.scenario, plan.runs, pool=pool)
+            yield _make_row(point, metrics)
             if progress is not None:
-                progress(k + 1, len(places))
+                progress(k + 1, len(plan.points))
 
 
-def _row(place: Cell, found: RunMetrics) -> Row:
+def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
     quantities: dict[str, Estimate] = {
-        "worst_rms": root(worst(found.mean_square)),
-        "mean_rms": root(overall(found.mean_square)),
-        "mean_trace": overall(found.trace),
-        "worst_trace": worst(found.trace),
+        "worst_rms": take_root(worst_node(metrics.mean_square)),
+        "mean_rms": take_root(all_nodes(metrics.mean_square)),
+        "mean_trace": all_nodes(metrics.trace),
+        "worst_trace": worst_node(metrics.trace),
     }
-    row: Row = {key: shown(value) for key, value in place.changes.items()}
-    row["runs"] = len(found.trace)
+    row: Row = {key: table_value(value) for key, value in point.changes.items()}
+    row["runs"] = len(metrics.trace)
     for name, (value, error) in quantities.items():
         row |= {name: value, f"{name}_se": error}
-    row["bound"] = _known(lambda: float(bound_traces(place.scenario).mean()))
-    row["central"] = _known(lambda: central_trace(place.scenario))
-    sent, delivered, lost = found.messages[:, :3].mean(axis=0).tolist()
+    row["bound"] = _value_or_nan(lambda: float(bound_traces(point.scenario).mean()))
+    row["central"] = _value_or_nan(lambda: central_trace(point.scenario))
+    sent, delivered, lost = metrics.messages[:, :3].mean(axis=0).tolist()
     row |= {"sent": sent, "delivered": delivered, "lost": lost}
-    diverged = int(found.diverged.sum())
-    status = f"{diverged} diverged" if diverged else "complete"
-    blurred = float(found.rounding_from.min())
-    if np.isfinite(blurred) and place.scenario.plant.truth_known:
-        status += f"; rounding blurs errors from {blurred:g} s on, they are left out"
-    row["status"] = status
+    row["status"] = _describe_status(point.scenario, metrics)
     return row
 
 
-def _known(value: Callable[[], float]) -> float:
+def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
+    diverged = int(metrics.diverged.sum())
+    status = f"{diverged} diverged" if diverged else "complete"
+    blurred = float(metrics.rounding_from.min())
+    if np.isfinite(blurred) and scenario.plant.truth_known:
+        status += f"; rounding blurs errors from {blurred:g} s on, they are left out"
+    return status
+
+
+def _value_or_nan(function: Callable[[], float]) -> float:
     try:
-        return value()
+        return function()
     except TheoryError:
         return math.nan
 
 
 @dataclass(frozen=True, eq=False)
 class CompletedSweep:
-    """What ``sweep_to_directory`` leaves: the directory and its table."""
+    """A sweep that was written to ``directory``; ``seconds`` is its wall-clock time."""
 
     directory: Path
     table: pd.DataFrame
@@ -162,23 +171,22 @@ def sweep_to_directory(
     progress: Progress | None = None,
     finish: Callable[[CompletedSweep], None] | None = None,
 ) -> CompletedSweep:
-    """A sweep with sweep.parquet, sweep.csv, the base scenario.toml and a manifest.json; ``finish``
-    adds what else belongs to the directory. What is interrupted keeps the rows that it had.
-    """
-    import pandas as pd
+    """Sweep and write sweep.parquet, sweep.csv, the base scenario.toml and manifest.json.
 
-    places, began = _checked(scenario, vary, runs, None, engine), time.perf_counter()
+    ``finish`` adds its files to the directory before the manifest says that the sweep is complete.
+    A sweep that is interrupted keeps the rows that it had. Raises ScenarioError before anything
+    runs, InterruptedRunError when interrupted.
+    """
+    plan, began = _make_plan(scenario, vary, runs, None, engine), time.perf_counter()
     check_sources(scenario)
     directory = new_directory(out, f"{scenario.name}-sweep")
     write_scenario(directory, scenario)
-    notes = {"name": scenario.name, "versions": versions(), "seed": scenario.seed, "vary": vary}
-    notes["runs"] = {"wanted": runs * len(places), "done": 0}
     rows: list[Row] = []
     status = "interrupted"
-    write_json(directory / "manifest.json", {**notes, "status": status})
+    _write_manifest(directory, scenario, vary, plan, 0, status)
     try:
-        for row in _rows(places, runs, engine, (workers, None, scheduler), progress):
-            rows.append(row)  # noqa: PERF402 - what is interrupted keeps what it had
+        for row in _simulate_points(plan, PoolOptions(workers, None, scheduler), progress):
+            rows.append(row)  # noqa: PERF402 - an interrupted sweep keeps its rows
         status = "complete"
     except KeyboardInterrupt:
         raise InterruptedRunError(directory) from None
@@ -186,15 +194,41 @@ def sweep_to_directory(
         status = "failed"
         raise
     finally:
-        table = pd.DataFrame(rows)
-        if rows:
-            write_table(
-                directory / "sweep.parquet", {str(name): column for name, column in table.items()}
-            )
-            write_text(directory / "sweep.csv", table.to_csv(index=False))
+        table = _write_rows(directory, rows)
         completed = CompletedSweep(directory, table, tuple(vary), time.perf_counter() - began)
         if status == "complete" and finish is not None:
             finish(completed)
-        notes["runs"] = {"wanted": runs * len(places), "done": runs * len(rows)}
-        write_json(directory / "manifest.json", {**notes, "status": status})
+        _write_manifest(directory, scenario, vary, plan, len(rows), status)
     return completed
+
+
+def _write_rows(directory: Path, rows: list[Row]) -> pd.DataFrame:
+    """Write sweep.parquet and sweep.csv if there are rows, and return the table."""
+    import pandas as pd
+
+    table = pd.DataFrame(rows)
+    if rows:
+        columns = {str(name): column for name, column in table.items()}
+        write_table(directory / "sweep.parquet", columns)
+        write_text(directory / "sweep.csv", table.to_csv(index=False))
+    return table
+
+
+def _write_manifest(
+    directory: Path,
+    scenario: Scenario,
+    vary: Mapping[str, Sequence[Any]],
+    plan: _Plan,
+    done: int,
+    status: str,
+) -> None:
+    """Write manifest.json of a sweep with ``done`` points."""
+    manifest = {
+        "name": scenario.name,
+        "versions": versions(),
+        "seed": scenario.seed,
+        "vary": vary,
+        "runs": {"wanted": plan.runs * len(plan.points), "done": plan.runs * done},
+        "status": status,
+    }
+    write_json(directory / "manifest.json", manifest)

@@ -1,4 +1,4 @@
-"""Targets for sizing, by theory and by simulation."""
+"""Targets for sizing: a quantity of a scenario by theory and by simulation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 import scipy.special
 
 from netkf.core.errors import ScenarioError, TheoryError
-from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import RunMetrics, bound_traces, central_trace
 from netkf.theory import assumptions
@@ -22,7 +21,7 @@ QUANTITIES = {
     "mean_trace": "mean trace of P of all nodes",
     "within_central": "RMS error of the node with the largest over that of a centralised filter",
 }
-"""What may be asked for; all are averages over the samples after time 0."""
+"""Quantities of a target; all are averages over the samples after time 0."""
 
 
 class Target(NamedTuple):
@@ -36,17 +35,17 @@ class Target(NamedTuple):
 
     @property
     def of_errors(self) -> bool:
-        """Whether it is about errors, else about covariances."""
+        """True if it is about errors, False if about covariances."""
         return not self.quantity.endswith("_trace")
 
     @property
     def of_worst(self) -> bool:
-        """Whether it is about the worst node, else about all together."""
+        """True if it is about the worst node, False if about all nodes together."""
         return not self.quantity.startswith("mean_")
 
 
-class Interval(NamedTuple):
-    """An estimate of a quantity, and between what it lies."""
+class QuantityInterval(NamedTuple):
+    """An estimate of a quantity, and the ends of its interval."""
 
     value: float
     low: float
@@ -54,12 +53,12 @@ class Interval(NamedTuple):
 
 
 def parse_target(text: Any) -> Target:
-    """``worst_rms<=0.5`` as a target; raises ScenarioError at --target."""
+    """Return the target of a text like ``worst_rms<=0.5``; raises ScenarioError at --target."""
     found = re.fullmatch(r"\s*(\w+)\s*<=\s*(\S+)\s*", text) if isinstance(text, str) else None
     listed = ", ".join(QUANTITIES)
     if found is None or found[1] not in QUANTITIES:
-        words = f"must be QUANTITY<=LIMIT with a quantity of {listed}"
-        raise ScenarioError("--target", words, text, "write worst_rms<=0.5")
+        message = f"must be QUANTITY<=LIMIT with a quantity of {listed}"
+        raise ScenarioError("--target", message, text, "write worst_rms<=0.5")
     try:
         limit = float(found[2])
     except ValueError:
@@ -69,24 +68,25 @@ def parse_target(text: Any) -> Target:
     return Target(found[1], limit)
 
 
-def by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
-    """An upper bound on the quantity, or the quantity itself, and words that say which. Raises
-    TheoryError where theory does not tell.
+def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
+    """Return an upper bound on the quantity, or the quantity itself, and a text that says which.
+
+    Raises TheoryError if theory has no answer.
     """
     traces, algorithm = bound_traces(scenario), scenario.filter.algorithm
-    words = "exact: the covariance of filters that do not talk"
+    message = "exact: the covariance of filters that do not talk"
     if algorithm.talks:
-        words = "an upper bound: the trace of H(12), which E[P_i] stays below"
+        message = "an upper bound: the trace of H(12), which E[P_i] stays below"
     if target.of_errors:
-        words += _errors_obey(scenario)
+        message += _explain_errors(scenario)
     value = float(traces.max() if target.of_worst else traces.mean())
     if target.quantity == "within_central":
         value /= central_trace(scenario)
-    return math.sqrt(value) if target.of_errors else value, words
+    return math.sqrt(value) if target.of_errors else value, message
 
 
-def _errors_obey(scenario: Scenario) -> str:
-    """Words about errors and P; raises TheoryError where P says nothing about the errors."""
+def _explain_errors(scenario: Scenario) -> str:
+    """Return how P bounds the errors; raises TheoryError if it does not."""
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model differs from the truth: P need not bound the errors")
     rows = assumptions(scenario)
@@ -101,15 +101,18 @@ def _errors_obey(scenario: Scenario) -> str:
     return "" if exact else "; P_i in turn bounds the covariance of the error, H (10)"
 
 
-def by_simulation(
+def quantity_by_simulation(
     found: RunMetrics, target: Target, level: float, central: float | None
-) -> Interval:
-    """The quantity with an interval that misses with probability ``level``: Student's, at once for
-    all nodes where it is about the worst; ``central`` is the trace to divide by.
+) -> QuantityInterval:
+    """Return the quantity with an interval that misses with probability ``level``.
+
+    The interval is Student's, for all nodes at once if the target is about the worst. ``central``
+    is the trace of the centralised filter to divide by, or None.
     """
     values = found.mean_square if target.of_errors else found.trace
     if (np.isnan(values) & ~(found.diverged > 0)).any():
-        return Interval(math.nan, -math.inf, math.inf)  # rounding has left no errors to judge by
+        # Rounding has left no errors to judge by.
+        return QuantityInterval(math.nan, -math.inf, math.inf)
     values = np.where(found.diverged > 0, np.inf, values)
     columns = values if target.of_worst else values.mean(axis=1, keepdims=True)
     runs, count = columns.shape
@@ -121,9 +124,5 @@ def by_simulation(
     if central is not None:
         ends /= central
     ends = np.sqrt(np.maximum(ends, 0.0)) if target.of_errors else ends
-    return Interval(*map(float, _or_infinite(ends)))
-
-
-def _or_infinite(ends: FloatArray) -> FloatArray:
-    """A run that diverged has errors without end."""
-    return np.where(np.isnan(ends), np.inf, ends)
+    # inf - inf of runs that diverged: their errors are infinite.
+    return QuantityInterval(*map(float, np.where(np.isnan(ends), np.inf, ends)))

@@ -185,9 +185,9 @@ def test_size_does_not_decide_by_rounding(plugged):
     late = plugged.replace({"probe": [0.0, 50.0, 60.0]})
     from netkf.runs.simulate import choose_engine
     from netkf.studies.metrics import block_metrics
-    from netkf.studies.targets import by_simulation, parse_target
+    from netkf.studies.targets import parse_target, quantity_by_simulation
 
     figures = block_metrics(late, 1, range(3), choose_engine("auto", late))
-    interval = by_simulation(figures, parse_target("mean_rms<=3"), 0.05, None)
+    interval = quantity_by_simulation(figures, parse_target("mean_rms<=3"), 0.05, None)
     assert interval.low == -np.inf
     assert interval.high == np.inf

@@ -10,7 +10,12 @@ import scipy.stats
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
-from netkf.studies.consistency import Seen, consistency, one_run, weighed
+from netkf.studies.consistency import (
+    RunConsistency,
+    consistency,
+    judge_consistency,
+    run_consistency,
+)
 from tests.checks.broken import Overconfident
 from tests.conftest import SCENARIOS
 
@@ -68,7 +73,7 @@ def test_what_is_not_known_is_not_judged(gossip):
 def test_nis_is_the_textbook_one(gossip):
     """Local filters: the prediction from the last sample against the reading, in plain numpy."""
     local = gossip.replace({"filter": {"kind": "local"}})
-    seen, run = one_run(local, 3, 2), netkf.simulate(local, seed=3, replica=2)
+    seen, run = run_consistency(local, 3, 2), netkf.simulate(local, seed=3, replica=2)
     from netkf.rng.streams import Streams
 
     path = local.slot_path(Streams(3, 2), 0, local.placed[0][0])
@@ -90,8 +95,8 @@ def test_errors_that_are_not_what_they_should_be_are_found(gossip, factor, words
         samples = factor * random.chisquare(n, size=(10, nodes))
         nothing = np.full(nodes, np.nan)
         told = samples.mean(axis=0), np.full(nodes, 4.0), nothing, nothing
-        runs.append(Seen(samples, *told, np.array([np.inf]), np.array([True])))
-    found = weighed(gossip, runs, 0.999)
+        runs.append(RunConsistency(samples, *told, np.array([np.inf]), np.array([True])))
+    found = judge_consistency(gossip, runs, 0.999)
     assert bool(found) == (factor == 1.0)
     assert all(words in row.verdict for row in found.rows)
     if factor == 1.0:

@@ -18,18 +18,18 @@ from netkf.scenario.reading import from_table
 from netkf.studies.compare import compare
 from netkf.studies.metrics import (
     RunMetrics,
+    all_nodes,
     block_metrics,
     bound_traces,
     central_trace,
     expected_errors_known,
     expected_metrics,
     join_metrics,
-    overall,
 )
 from netkf.studies.parameter_grid import parse_grid, parse_interval
 from netkf.studies.size import size
 from netkf.studies.sweep import sweep, sweep_to_directory
-from netkf.studies.targets import Target, by_simulation, parse_target
+from netkf.studies.targets import Target, parse_target, quantity_by_simulation
 from tests.conftest import SCENARIOS
 
 RING = str(SCENARIOS / "poisson_ring.toml")
@@ -302,10 +302,10 @@ def test_exact_errors_given_the_events_have_the_mean_of_squared_ones(build):
     engine = choose_engine("auto", scenario)
     exact = join_metrics(*(expected_metrics(scenario, 0, k, engine) for k in range(60)))
     plain = block_metrics(scenario, 0, range(60), engine)
-    one, other = (overall(found.mean_square) for found in (exact, plain))
+    one, other = (all_nodes(found.mean_square) for found in (exact, plain))
     assert abs(one.value - other.value) < 4.0 * np.hypot(one.error, other.error)
     assert one.error < 0.7 * other.error
-    assert overall(exact.trace) == pytest.approx(overall(plain.trace), rel=1e-12)
+    assert all_nodes(exact.trace) == pytest.approx(all_nodes(plain.trace), rel=1e-12)
     found = size(
         scenario, "network.channel.loss.delivery", 0.1, 1.0, "worst_rms<=2.4", runs=32, workers=1
     )
@@ -348,7 +348,7 @@ def test_a_quantity_that_is_not_monotone_is_told(monkeypatch, short):
         return values.get(scenario.network.activation.rate, 0.9), "made up"
 
     for module in ("size", "search"):
-        monkeypatch.setattr(f"netkf.studies.{module}.by_theory", made_up)
+        monkeypatch.setattr(f"netkf.studies.{module}.quantity_by_theory", made_up)
     found = size(short, RATE, 1.0, 4.0, "mean_trace<=2")
     assert "NOT monotone between 1 and 2" in found.sure
 
@@ -375,7 +375,7 @@ def test_intervals_hold_as_often_as_they_say():
         figures = RunMetrics(
             square, square, np.zeros((64, 5)), np.zeros((64, 1)), np.full((64, 1), np.inf)
         )
-        interval = by_simulation(figures, Target("worst_rms", 1.0), level, None)
+        interval = quantity_by_simulation(figures, Target("worst_rms", 1.0), level, None)
         misses += not interval.low <= 1.0 <= interval.high
     assert misses <= scipy.stats.binom.ppf(0.999, 300, level)
     assert parse_target(" worst_rms <= 0.5 ") == Target("worst_rms", 0.5)
@@ -385,9 +385,9 @@ def test_a_run_that_diverges_has_errors_without_end():
     square = np.ones((20, 2))
     diverged = np.zeros((20, 1))
     figures = RunMetrics(square, square, np.zeros((20, 5)), diverged, np.full((20, 1), np.inf))
-    assert by_simulation(figures, Target("worst_rms", 2.0), 0.05, None).high == 1.0
+    assert quantity_by_simulation(figures, Target("worst_rms", 2.0), 0.05, None).high == 1.0
     diverged[3] = 1
-    interval = by_simulation(figures, Target("worst_rms", 2.0), 0.05, None)
+    interval = quantity_by_simulation(figures, Target("worst_rms", 2.0), 0.05, None)
     assert interval.low == interval.high == np.inf
 
 
