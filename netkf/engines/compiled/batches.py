@@ -7,25 +7,31 @@ alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.push_sum import PushSum
 from netkf.engines.base import batch_sink, silent
+from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace
-from netkf.engines.compiled.poisson import schedules
+from netkf.engines.compiled.poisson import all_ticks, window_of
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.state import Instants, PathBlock
+from netkf.engines.compiled.state import Filters, Instants, PathBlock
 from netkf.engines.compiled.truth import PathStates, States
+from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
-from netkf.trace.batch import RunBatch
+from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import Recorder
+from netkf.trace.schema import KINDS
 
 LARGEST_BATCH = 256
 MOST_BYTES = 1 << 24
@@ -41,21 +47,46 @@ def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[Run
 
 
 def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: range) -> RunBatch:
-    sink = batch_sink(scenario, replicas)
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
-        for draws in _draws(scenario, seed, replicas):
-            recorder = Recorder([sink], counts_only=True)
-            run = FlowRun(scenario, workspace, draws, recorder, silent)
-            sink.finish(recorder, run.to_the_end())
+        if not drawn_together(scenario):
+            sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
+            return _run_by_run(scenario, workspace, sources, replicas)
+        draws = BatchDraws(scenario, seed, replicas)
+        special = type(scenario.hosted) in (PushSum, Intermittent)
+        if len(draws.paths.frame_times) or special:
+            return _run_by_run(scenario, workspace, draws.runs(), replicas)
+        return _all_at_once(scenario, workspace, draws)
+
+
+def _run_by_run(
+    scenario: Scenario, workspace: Workspace, draws: Iterable[Draws], replicas: range
+) -> RunBatch:
+    """Simulate runs that call Python on their way: to move the origin, or for samples."""
+    sink = batch_sink(scenario, replicas)
+    for mine in draws:
+        recorder = Recorder([sink], counts_only=True)
+        run = FlowRun(scenario, workspace, mine, recorder, silent)
+        sink.finish(recorder, run.to_the_end())
     return sink.batch()
 
 
-def _draws(scenario: Scenario, seed: int, replicas: range) -> Iterator[Draws]:
-    """Yield the draws of each run, made for all at once where that can be."""
-    if len(replicas) > 1:
-        yield from BatchDraws(scenario, seed, replicas).runs
-    else:
-        yield from (Source(scenario, Streams(seed, replica)) for replica in replicas)
+def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
+    """Simulate all runs by ``simulate_batch``."""
+    arrays = draws.arrays(workspace.filters)
+    simulate_batch(workspace.begin(draws.first_run(), traced=False), arrays)
+    x = draws.sampled_states(scenario.times)
+    return RunBatch(
+        replicas=draws.replicas,
+        times=scenario.times,
+        x=x,
+        xhat=arrays.shown_xhat,
+        P=arrays.shown_P,
+        error=x[:, :, None] - arrays.shown_xhat,
+        lengths=arrays.lengths,
+        counts=arrays.counts,
+        status=np.where(arrays.diverged > 0, DIVERGED, COMPLETE),
+        exact_errors=scenario.exact_errors,
+    )
 
 
 def drawn_together(scenario: Scenario) -> bool:
@@ -88,21 +119,67 @@ def _expected_ticks(scenario: Scenario) -> float:
 
 
 class BatchDraws:
-    """Everything random of some runs, drawn up to the horizon; ``runs`` are those of each."""
+    """Everything random of some runs, drawn up to the horizon."""
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
-        windows, blocks = schedules(scenario, streams), blocks_to_the_end(scenario)
-        paths = Paths(scenario, streams, blocks)
-        ticks = max(len(window.t) for window in windows)
-        cuts = 16 + len(scenario.times) + 3 * ticks // len(scenario.nodes)
-        noise = Noise(scenario, streams, blocks * BLOCK, cuts)
-        noise.following()
-        nothing = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
-        self.runs = [
-            RunDraws(window, path, noise, run, nothing, PathStates(scenario, paths.frame_times))
-            for run, (window, path) in enumerate(zip(windows, paths.following(), strict=True))
-        ]
+        self._scenario, self.replicas, blocks = scenario, replicas, blocks_to_the_end(scenario)
+        self.ticks = all_ticks(scenario, streams)
+        self.paths = Paths(scenario, streams, blocks)
+        self._block = self.paths.of_all_runs()
+        most = int(np.diff(self.ticks.first).max())
+        cuts = 16 + len(scenario.times) + 3 * most // len(scenario.nodes)
+        self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
+        self._noise.following()
+        self._no_samples = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
+
+    def runs(self) -> Iterator[RunDraws]:
+        """Yield the draws of each run."""
+        return (self._run(window_of(self.ticks, run), run) for run in range(len(self.replicas)))
+
+    def first_run(self) -> RunDraws:
+        """The draws of the first run, in arrays with space for the ticks of any other."""
+        ticks, sent = (
+            int(np.diff(first).max()) for first in (self.ticks.first, self.ticks.first_delay)
+        )
+        entity, at = (np.zeros(ticks, dtype=np.int64) for _ in range(2))
+        return self._run(Window(math.inf, np.empty(ticks), entity, at, np.empty(sent)), 0)
+
+    def _run(self, window: Window, run: int) -> RunDraws:
+        states = PathStates(self._scenario, self.paths.frame_times)
+        path = self.paths.of_run(self._block, run)
+        return RunDraws(window, path, self._noise, run, self._no_samples, states)
+
+    def arrays(self, start: Filters) -> BatchArrays:
+        """The draws of all runs with space for their samples; ``start``: filters at time 0."""
+        (filters, n), runs = start.xhat.shape, len(self.replicas)
+        samples, block = (runs, len(self._scenario.times), filters), self._block
+        noise, cuts = self._noise.of_all_runs
+        return BatchArrays(
+            nodes=start.nodes,
+            xhat=start.xhat,
+            root=start.root,
+            x_start=np.ascontiguousarray(block.x_start),
+            x_stop=np.ascontiguousarray(block.x_end),
+            moments=np.ascontiguousarray(block.moments),
+            cubic=np.ascontiguousarray(block.cubic),
+            noise=noise,
+            cuts=cuts,
+            **self.ticks._asdict(),
+            shown_xhat=np.zeros((*samples, n)),
+            shown_P=np.zeros((*samples, n, n)),
+            lengths=np.zeros(runs, dtype=np.int64),
+            counts=np.zeros((runs, len(KINDS)), dtype=np.int64),
+            diverged=np.zeros(runs, dtype=np.int64),
+            carriers=len(self._scenario.nodes) // filters,
+        )
+
+    def sampled_states(self, times: FloatArray) -> FloatArray:
+        """(R, T, n) states at the sample times, where no origin moves."""
+        block = self._block
+        pieces = np.searchsorted(block.end, times)
+        ends = (times == block.end[pieces])[:, None]
+        return np.where(ends, block.x_end[:, pieces], block.x_start[:, pieces])
 
 
 class RunDraws:

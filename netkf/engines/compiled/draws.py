@@ -14,7 +14,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time
-from netkf.plants.paths import BLOCK
+from netkf.plants.paths import BLOCK, Block
 from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
@@ -86,26 +86,30 @@ class Paths:
 
     def following(self) -> list[PathBlock]:
         """The next steps of each run; the last ones reach beyond the horizon."""
-        block, laws = self._paths.following(self._blocks), self._paths.laws
-        ends = block.ends
-        grid = ends[ends < self._horizon] if self._senses else np.empty(0)
-        return [
-            PathBlock(
-                end=float(ends[-1]),
-                start=block.start,
-                stop=block.end,
-                x_start=np.ascontiguousarray(block.x_start[run]),
-                x_stop=np.ascontiguousarray(block.x_end[run]),
-                moments=np.ascontiguousarray(block.moments[run]),
-                cubic=np.ascontiguousarray(block.cubic[run]),
-                step=block.step,
-                last=ends[block.step],
-                grid=grid,
-                to_end=laws.to_end,
-                to_moments=laws.to_moments,
-            )
-            for run in range(len(block.x_start))
-        ]
+        block = self.of_all_runs()
+        return [self.of_run(block, run) for run in range(len(block.x_start))]
+
+    def of_all_runs(self) -> Block:
+        """The next steps of all runs together."""
+        return self._paths.following(self._blocks)
+
+    def of_run(self, block: Block, run: int) -> PathBlock:
+        """The part of one run."""
+        ends, laws = block.ends, self._paths.laws
+        return PathBlock(
+            end=float(ends[-1]),
+            start=block.start,
+            stop=block.end,
+            x_start=np.ascontiguousarray(block.x_start[run]),
+            x_stop=np.ascontiguousarray(block.x_end[run]),
+            moments=np.ascontiguousarray(block.moments[run]),
+            cubic=np.ascontiguousarray(block.cubic[run]),
+            step=block.step,
+            last=ends[block.step],
+            grid=ends[ends < self._horizon] if self._senses else np.empty(0),
+            to_end=laws.to_end,
+            to_moments=laws.to_moments,
+        )
 
 
 def no_path(n: int) -> PathBlock:
@@ -196,6 +200,13 @@ class Noise:
         fill_sensor_normals(self._noise.states, every, self._rows, normal_ziggurat(), normals)
         own.noise[:] = step_noise(own.noise, self._period)
         own.step[:] = -1
+
+    @property
+    def of_all_runs(self) -> tuple[FloatArray, np.ndarray]:
+        """Noise (R, S, steps, 2, p) of the present stretch, and the states (R S, 4) of the streams
+        of normals for cuts.
+        """
+        return self._own.noise, self._cuts.states
 
     def more_cuts(self, run: int) -> None:
         """Draw new normals where they are used up."""

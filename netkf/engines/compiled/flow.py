@@ -40,6 +40,7 @@ from netkf.engines.compiled.state import (
     CLOCKS,
     KINDS,
     SUMS,
+    Filters,
     Instants,
     PathBlock,
     Sensing,
@@ -176,6 +177,11 @@ class Workspace:
             piece=np.zeros(room, dtype=np.int64),
             terms=np.zeros((room, terms)),
         )
+
+    @property
+    def filters(self) -> Filters:
+        """The filters at time 0."""
+        return self._start
 
     def begin(self, draws: Draws, traced: bool) -> Simulation:
         """The state of a run at time 0."""

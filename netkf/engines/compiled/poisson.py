@@ -125,6 +125,52 @@ def put_in_time_order(
         t[to], entity[to], at[to] = now, which, where
 
 
+class AllTicks(NamedTuple):
+    """The ticks of R runs one after the other, those of run r from ``first[r]`` up to ``first[r +
+    1]``, as in a Window; ``at`` counts from the first outcome of the run, which is ``delay`` at
+    ``first_delay[r]``.
+    """
+
+    t: FloatArray
+    entity: np.ndarray
+    at: np.ndarray
+    delay: FloatArray
+    first: np.ndarray
+    first_delay: np.ndarray
+
+
+@kernel
+def draw_all_ticks(
+    drawing: Drawing,
+    horizon: float,
+    delay: float,
+    exponential: Ziggurat,
+    found: Found,
+    used: np.ndarray,
+    place: np.ndarray,
+    ticks: AllTicks,
+) -> bool:
+    """Draw the ticks of all runs up to the horizon, in the order of (time, entity); ``found``,
+    ``used`` (2,) and ``place`` are scratch. False where some array is too small.
+    """
+    for run in range(len(ticks.first) - 1):
+        used[0] = used[1] = 0
+        if not draw_ticks(drawing, run, horizon, delay, exponential, found, used):
+            return False
+        first, begin = ticks.first[run], ticks.first_delay[run]
+        last, end = first + used[0], begin + used[1]
+        if last > len(ticks.t) or end > len(ticks.delay):
+            return False
+        ordered = Found(
+            ticks.t[first:last], ticks.entity[first:last], ticks.at[first:last], found.delay
+        )
+        put_in_time_order(0.0, horizon, used[0], found, ordered, place)
+        for k in range(used[1]):
+            ticks.delay[begin + k] = found.delay[k]
+        ticks.first[run + 1], ticks.first_delay[run + 1] = last, end
+    return True
+
+
 def is_poisson(scenario: Scenario) -> bool:
     """Whether the schedules of a scenario can be made so."""
     network = scenario.network
@@ -176,9 +222,30 @@ class PoissonSchedules:
         self._end = end
         return self._window(0, begin, end)
 
-    def whole(self) -> list[Window]:
-        """All ticks of each run, as one window."""
-        return [self._window(run, 0.0, math.inf) for run in range(self._runs)]
+    def whole(self) -> AllTicks:
+        """All ticks of all runs."""
+        states = self._drawing.coming, self._drawing.ticks, self._drawing.luck
+        begun = [state.copy() for state in states]
+        expected, spread = self._rate * self._horizon, 8.0
+        while True:
+            most = int(expected + spread * math.sqrt(expected)) + 8
+            total = int(self._runs * expected + spread * math.sqrt(self._runs * expected)) + most
+            found, ticks = self._space(most), self._space_for_all(total)
+            scratch = found, np.zeros(2, dtype=np.int64), np.empty(most + 1, dtype=np.int64)
+            given = self._drawing, self._horizon, self._delay, ziggurat()
+            if draw_all_ticks(*given, *scratch, ticks):
+                return ticks
+            spread *= 2.0
+            for state, before in zip(states, begun, strict=True):
+                state[:] = before
+
+    def _space(self, ticks: int) -> Found:
+        return _room(ticks, int(self._sends * ticks) + self._most)
+
+    def _space_for_all(self, ticks: int) -> AllTicks:
+        t, entity, at, delay = self._space(ticks)
+        first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
+        return AllTicks(t, entity, at, delay, first, first_delay)
 
     def _window(self, run: int, begin: float, end: float) -> Window:
         last, used = min(end, self._horizon), np.zeros(2, dtype=np.int64)
@@ -211,11 +278,26 @@ def _room(ticks: int, sends: int) -> Found:
     return Found(np.empty(ticks), entity, at, np.empty(sends))
 
 
-def schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
-    """All ticks of each of several runs, as one window."""
+def all_ticks(scenario: Scenario, streams: ReplicaStreams) -> AllTicks:
+    """All ticks of several runs."""
     if is_poisson(scenario):
         return PoissonSchedules(scenario, streams).whole()
-    return whole_schedules(scenario, streams)
+    windows = whole_schedules(scenario, streams)
+    first, first_delay = (
+        np.cumsum([0, *(len(getattr(window, name)) for window in windows)])
+        for name in ("t", "delay")
+    )
+    t, entity, at, delay = (
+        np.concatenate([getattr(window, name) for window in windows])
+        for name in ("t", "entity", "at", "delay")
+    )
+    return AllTicks(t, entity, at, delay, first, first_delay)
+
+
+def window_of(ticks: AllTicks, run: int) -> Window:
+    """All ticks of one run."""
+    mine, sent = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
+    return Window(math.inf, ticks.t[mine], ticks.entity[mine], ticks.at[mine], ticks.delay[sent])
 
 
 def schedule(
