@@ -22,7 +22,7 @@ from netkf.scenario.scenario import Scenario
 AHEAD = 1024
 """Most blocks that are handed out and not yet back."""
 
-QUICK, LARGEST_HERE = 0.1, 1024
+QUICK, LARGEST_HERE = 0.2, 1024
 """Blocks done in this process grow to at most so many runs, while they take fewer seconds."""
 
 WARM, SAVING = 0.2, 2.0

@@ -195,7 +195,7 @@ class RunDraws:
         states: States,
     ) -> None:
         self._window, self._path, self._noise, self._run = window, path, noise, run
-        self.sensing, self.instants, self.states = noise.sensing[run], instants, states
+        self.sensing, self.instants, self.states = noise.sensing(run), instants, states
 
     def window(self) -> Window:
         """All ticks."""

@@ -141,8 +141,8 @@ class Own(NamedTuple):
 
 
 class Noise:
-    """The noise of all sensors in some runs: ``sensing`` of each run, filled stretch by stretch of
-    so many ``steps``, and so many normals for cuts at once.
+    """The noise of all sensors in some runs, drawn for stretches of so many ``steps``, and so many
+    normals for cuts at once.
     """
 
     def __init__(
@@ -174,23 +174,18 @@ class Noise:
             normals=np.zeros((runs, count, cuts, 2, most)),
             used=np.full((runs, count), cuts, dtype=np.int64),
         )
-        rows, host = self._rows, np.array(hosts, dtype=np.int64)
-        node = np.array(list(scenario.increment_sensors), dtype=np.int64)
-        self.sensing = [
-            Sensing(
-                rows=rows,
-                H=H,
-                root=root,
-                rest=self._own.rest[run],
-                step=self._own.step[run],
-                noise=self._own.noise[run],
-                normals=self._own.normals[run],
-                used=self._own.used[run],
-                host=host,
-                node=node,
-            )
-            for run in range(runs)
-        ]
+        self._shared = {
+            "rows": self._rows,
+            "H": H,
+            "root": root,
+            "host": np.array(hosts, dtype=np.int64),
+            "node": np.array(list(scenario.increment_sensors), dtype=np.int64),
+        }
+
+    def sensing(self, run: int) -> Sensing:
+        """The sensors of one run with their noise."""
+        own = {name: array[run] for name, array in self._own._asdict().items()}
+        return Sensing(**self._shared, **own)
 
     def following(self) -> None:
         """Draw the noise of the next stretch."""

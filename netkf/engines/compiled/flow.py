@@ -113,7 +113,7 @@ class Source:
         self._grid = uses_grid(scenario)
         blocks, cuts = sizes(scenario) if self._grid else (0, 0)
         self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
-        self.sensing = self._noise.sensing[0]
+        self.sensing = self._noise.sensing(0)
         self._read, self._n = -math.inf, scenario.plant.n
         if self._grid:
             self._paths = Paths(scenario, streams, blocks, sampled)
