@@ -7,7 +7,6 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray, symmetric, symmetric_root
 from netkf.linalg.legendre import forward_coefficients
 from netkf.linalg.series import polynomial, with_reach
-from netkf.plants.recursion import Recursion
 
 MAX_LAWS = 256  # kept laws of a state shown inside a step
 MAX_GRIDS = 256  # kept stretches of the sensing grid
@@ -34,7 +33,6 @@ class GridLaws:
         self.noise_factor = _factor(self._noise(period))
         self._conditional_laws: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
         self._grids: dict[tuple[int, int], FloatArray] = {}
-        self.steps = Recursion(self.response[0])
 
     def grid(self, first: int, count: int) -> FloatArray:
         """(count,) points of the sensing grid from number ``first`` on."""

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import in_place
+from netkf.linalg.compiling import in_place, kernel
 from netkf.linalg.series import fill_polynomial, polynomial
 from netkf.linalg.small import added, applied
 from netkf.plants.laws import GridLaws, grid_time
@@ -82,7 +82,8 @@ class DiffusionPaths:
     With ``frame_steps``, states are local: they start again from zero every so many steps, so that
     a piece may end at a state that the next one does not start from.
 
-    Each path is to the last bit what it is alone, and however many steps are drawn at once.
+    Each path is to the last bit what it is alone, and however many steps are drawn at once;
+    ``start`` is overwritten.
     """
 
     def __init__(
@@ -100,24 +101,28 @@ class DiffusionPaths:
     def following(self, blocks: int = 1) -> Block:
         """The next steps of the sensing grid, ``blocks`` times BLOCK."""
         laws, (count, n), total = self.laws, self._x.shape, blocks * BLOCK
-        # Block by block, so that no path is rounded as its neighbours happen to be.
-        size = blocks, BLOCK, 3 * n
-        normals = self._normals.draw(size)
-        noise = (normals @ laws.noise_factor.T).reshape(count * blocks, BLOCK, 3, n)
-        cubic = _cubics(laws.period, noise[:, :, 0], noise[:, :, 1:])
-        onwards = noise[:, :, 0].reshape(count, blocks, BLOCK, n)
-        before, after = self._states(onwards)
-        moments = _moved(laws.response[1:], before.reshape(count * blocks, BLOCK, n))
-        moments += noise[:, :, 1:]
+        x_start, x_end = (np.empty((count, total, n)) for _ in range(2))
+        moments, cubic = np.empty((count, total, 2, n)), np.empty((count, total, 4, n))
+        fill_steps(
+            self._normals.draw((total, 3 * n)),
+            laws.noise_factor,
+            laws.response,
+            laws.period,
+            0 if self.frame_steps is None else self.frame_steps,
+            self._drawn,
+            self._x,
+            np.empty(3 * n),
+            (x_start, x_end, moments, cubic),
+        )
         times = laws.grid(self._drawn, total + 1)
         self._drawn += total
         block = Block(
             start=times[:-1],
             end=times[1:],
-            x_start=before,
-            x_end=after,
-            moments=moments.reshape(count, total, 2, n),
-            cubic=cubic.reshape(count, total, 4, n),
+            x_start=x_start,
+            x_end=x_end,
+            moments=moments,
+            cubic=cubic,
             step=np.arange(total),
             ends=times[1:],
         )
@@ -128,31 +133,6 @@ class DiffusionPaths:
             if len(inside):
                 block = self._cut(block, inside, cuts.normals)
         return block
-
-    def _states(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(B, S, n) states at the starts and ends of the next S steps, to which the noise
-        (B, blocks, BLOCK, n) is added.
-        """
-        count, _, _, n = noise.shape
-        steps, frame = self.laws.steps, self.frame_steps
-        if frame is None:
-            x = steps.states(self._x, noise)
-            self._x = x[:, -1]
-            return x[:, :-1], x[:, 1:]
-        flat = noise.reshape(count, 1, -1, n)
-        total = flat.shape[2]
-        before, after = np.empty((count, total, n)), np.empty((count, total, n))
-        # Parts end where frames or blocks do, so that they do not depend on ``blocks``.
-        ends = set(range(BLOCK, total, BLOCK)) | {total}
-        ends |= set(range(frame - self._drawn % frame, total, frame))
-        first = 0
-        for end in sorted(ends):
-            x = steps.states(self._x, flat[:, :, first:end])
-            before[:, first:end], after[:, first:end] = x[:, :-1], x[:, 1:]
-            rebased = (self._drawn + end) % frame == 0
-            self._x = np.zeros((count, n)) if rebased else x[:, -1]
-            first = end
-        return before, after
 
     def _cut(self, block: Block, shown: FloatArray, source: Normals) -> Block:
         """The block with pieces that also end at the times ``shown``, inside its own pieces."""
@@ -221,6 +201,49 @@ class DiffusionPaths:
             after = slice(row + 1, stop)
             pieces.start[after], pieces.x_start[:, after] = times[k], middle[:, k, None]
             pieces.moments[:, after], pieces.cubic[:, after] = second[:, k, None], rest[:, k, None]
+
+
+@kernel
+def fill_steps(
+    normals: FloatArray,
+    factor: FloatArray,
+    response: FloatArray,
+    period: float,
+    frame_steps: int,
+    drawn: int,
+    x: FloatArray,
+    noise: FloatArray,
+    out: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Write S steps of B paths from standard normals (B, S, 3 n): states at their starts and ends
+    (B, S, n), moments (B, S, 2, n) and cubics (B, S, 4, n). ``x`` (B, n) is the state before the
+    steps and then after them; ``drawn`` steps were before. A frame begins every ``frame_steps``
+    steps, 0: never. ``factor`` (3 n, 3 n) and ``response`` (3, n, n) are those of GridLaws;
+    ``noise`` (3 n,) is scratch.
+    """
+    x_start, x_end, moments, cubic = out
+    runs, steps, n = x_start.shape
+    for run in range(runs):
+        for k in range(steps):
+            # What noise adds to the end of the step and to its two moments.
+            for i in range(3 * n):
+                noise[i] = 0.0
+                for j in range(i + 1):
+                    noise[i] += factor[i, j] * normals[run, k, j]
+            for i in range(n):
+                end, mean, slope = noise[i], noise[n + i] / period, 3.0 * noise[2 * n + i] / period
+                cubic[run, k, 0, i], cubic[run, k, 1, i] = mean, slope
+                cubic[run, k, 2, i], cubic[run, k, 3, i] = 0.5 * end - mean, 0.5 * end - slope
+                x_start[run, k, i] = x[run, i]
+                x_end[run, k, i] = end
+                moments[run, k, 0, i], moments[run, k, 1, i] = noise[n + i], noise[2 * n + i]
+                for j in range(n):
+                    x_end[run, k, i] += response[0, i, j] * x[run, j]
+                    moments[run, k, 0, i] += response[1, i, j] * x[run, j]
+                    moments[run, k, 1, i] += response[2, i, j] * x[run, j]
+            rebased = frame_steps > 0 and (drawn + k + 1) % frame_steps == 0
+            for i in range(n):
+                x[run, i] = 0.0 if rebased else x_end[run, k, i]
 
 
 class DiffusionPath:

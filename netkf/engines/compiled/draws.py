@@ -5,7 +5,7 @@ or for several together.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -100,10 +100,10 @@ class Paths:
             end=float(ends[-1]),
             start=block.start,
             stop=block.end,
-            x_start=np.ascontiguousarray(block.x_start[run]),
-            x_stop=np.ascontiguousarray(block.x_end[run]),
-            moments=np.ascontiguousarray(block.moments[run]),
-            cubic=np.ascontiguousarray(block.cubic[run]),
+            x_start=np.array(block.x_start[run], order="C"),
+            x_stop=np.array(block.x_end[run], order="C"),
+            moments=np.array(block.moments[run], order="C"),
+            cubic=np.array(block.cubic[run], order="C"),
             step=block.step,
             last=ends[block.step],
             grid=ends[ends < self._horizon] if self._senses else np.empty(0),
@@ -174,7 +174,7 @@ class Noise:
             normals=np.zeros((runs, count, cuts, 2, most)),
             used=np.full((runs, count), cuts, dtype=np.int64),
         )
-        self._shared = {
+        self._shared: dict[str, Any] = {
             "rows": self._rows,
             "H": H,
             "root": root,
@@ -184,7 +184,7 @@ class Noise:
 
     def sensing(self, run: int) -> Sensing:
         """The sensors of one run with their noise."""
-        own = {name: array[run] for name, array in self._own._asdict().items()}
+        own: dict[str, Any] = {name: array[run] for name, array in self._own._asdict().items()}
         return Sensing(**self._shared, **own)
 
     def following(self) -> None:
