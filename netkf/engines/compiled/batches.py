@@ -8,6 +8,7 @@ alone.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -40,10 +41,22 @@ MOST_BYTES = 1 << 24
 
 def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
     """Yield the runs of consecutive replicas, as many at a time as memory allows."""
-    workspace = Workspace(scenario)
     size = batch_size(scenario)
+    workspace = _workspace(scenario) if size > 1 else Workspace(scenario)
     for first in range(replicas.start, replicas.stop, size):
         yield _simulate(scenario, workspace, seed, range(first, min(first + size, replicas.stop)))
+
+
+_kept = threading.local()
+
+
+def _workspace(scenario: Scenario) -> Workspace:
+    """The workspace of this thread for a scenario, kept from one block of its runs to the next."""
+    known, workspace = getattr(_kept, "last", (None, None))
+    if workspace is None or known is not scenario:
+        workspace = Workspace(scenario)
+        _kept.last = scenario, workspace
+    return workspace
 
 
 def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: range) -> RunBatch:
