@@ -73,14 +73,14 @@ def test_no_draw_hangs_on_rounding(n):
     """
     A, B = np.eye(n, k=1) - 0.1 * np.eye(n, k=-1), np.eye(n)[:, n - 1 :]
     plain = GridLaws(A, B, 0.2)
-    gain, spread = plain.split(0.2, 0.1)
+    gain, spread = plain.conditional_law(0.2, 0.1)
     random = np.random.default_rng(1)
     for _ in range(20):
         laws = GridLaws(A * (1.0 + 1e-14 * random.standard_normal(A.shape)), B, 0.2)
         others = laws.conditional_law(0.6000000000000001 - 0.4, 0.1)
         np.testing.assert_allclose(others[0], gain, rtol=1e-6, atol=1e-6 * np.abs(gain).max())
         np.testing.assert_allclose(others[1], spread, rtol=0.0, atol=1e-7)
-        np.testing.assert_allclose(laws.noise_factor, plain.spread, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(laws.noise_factor, plain.noise_factor, rtol=0.0, atol=1e-12)
 
 
 def test_the_grid_does_not_depend_on_what_is_shown():
