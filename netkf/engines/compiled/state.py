@@ -267,7 +267,8 @@ def filters_at_start(scenario: Scenario) -> Filters:
     distinct = list({id(model): model for model in models}.values())
     place = {id(model): k for k, model in enumerate(distinct)}
     starts = [scenario.start(node) for node in (ids[:1] if pooled else ids)]
-    roots = {id(cov): first_root(cov) for _, cov in starts}
+    covariances = {id(cov): cov for _, cov in starts}  # nodes share them
+    roots = {key: first_root(cov) for key, cov in covariances.items()}
     counts = [len(scenario.increment_sensors.get(node, ())) for node in ids]
     after = np.array([sum(counts)] if pooled else np.cumsum(counts), dtype=np.int64)
     nodes = np.zeros(len(starts), dtype=NODE)

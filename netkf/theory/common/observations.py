@@ -41,11 +41,11 @@ def _observation(scenario: Scenario, sensor: PlacedSensor, H: FloatArray) -> Obs
 def increment_observations(scenario: Scenario) -> list[Observation]:
     """Return the continuous readings of each host; p is 0 for hosts without any."""
     placed, n = scenario.increment_sensors, scenario.plant.n
-    found = []
+    nothing, found = stack_observations([], n), []
     for nodes in nodes_by_host(scenario):
         sensors = [sensor for node in nodes for sensor in placed.get(node, ())]
         readings = [_observation(scenario, s, scenario.sensors[s.entry].H) for s in sensors]
-        found.append(stack_observations(readings, n))
+        found.append(stack_observations(readings, n) if readings else nothing)
     return found
 
 

@@ -136,7 +136,11 @@ def increment_informations(scenario: Scenario) -> FloatArray:
 
     A pooled filter has the same G, of all sensors, at every node.
     """
-    found = [one.H.T @ np.linalg.solve(one.R, one.H) for one in increment_observations(scenario)]
+    observations, n = increment_observations(scenario), scenario.plant.n
+    found = [
+        one.H.T @ np.linalg.solve(one.R, one.H) if len(one.H) else np.zeros((n, n))
+        for one in observations
+    ]
     if scenario.filter.algorithm.pooled:
         found = found * len(scenario.nodes)
     return np.stack(found)

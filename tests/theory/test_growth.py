@@ -1,0 +1,137 @@
+"""Growth of theory, checks and pictures with the network: by memory and work, never by seconds."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf import theory
+from netkf.checks.mode_sequences import MAX_NODES, watched_note, watched_places
+from netkf.core.errors import TheoryError
+from netkf.runs import plots
+from netkf.runs.promises import promises, promises_text
+from netkf.theory.hybrid import coupled, steady
+
+FLOW = """
+format = 1
+name = "ring"
+horizon = 5.0
+probe = 1.0
+seed = 1
+[plant]
+kind = "diffusion"
+A = [[0.0, 1.0], [-1.0, 0.1]]
+B = [[0.0], [1.0]]
+cov = [[1.0, 0.0], [0.0, 1.0]]
+[[sensors]]
+nodes = [0, {half}]
+H = [[1.0, 0.0]]
+R = [[0.25]]
+[network]
+graph = {{ kind = "cycle", nodes = {nodes} }}
+activation = {{ kind = "poisson", rate = {rate} }}
+[filter]
+kind = "hybrid"
+epsilon = 0.2
+"""
+
+SLOTS = """
+format = 1
+name = "averages"
+horizon = 20.0
+probe = 1.0
+seed = 1
+[plant]
+kind = "linear"
+period = 1.0
+F = [[0.9]]
+Q = [[0.1]]
+cov = [[1.0]]
+[[sensors]]
+nodes = [0]
+H = [[1.0]]
+R = [[1.0]]
+[network]
+graph = {{ kind = "cycle", nodes = {nodes} }}
+activation = {{ kind = "broadcast" }}
+channel = {{ loss = {{ kind = "bernoulli", delivery = 0.9 }} }}
+[filter]
+kind = "push-sum"
+gamma = 3
+delta = 5.0
+"""
+
+
+def of_text(text, folder):
+    path = folder / "scenario.toml"
+    path.write_text(text)
+    return netkf.load(path)
+
+
+def ring(nodes, folder, rate=2.0):
+    return of_text(FLOW.format(nodes=nodes, half=nodes // 2, rate=rate), folder)
+
+
+def peak(function):
+    """Bytes that a call takes at most."""
+    tracemalloc.start()
+    function()
+    found = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return found
+
+
+def test_the_limit_of_a_large_network_makes_no_matrix_of_all_pairs(tmp_path):
+    scenario = ring(4000, tmp_path)
+    weights = coupled.left_weights(scenario)
+    np.testing.assert_allclose(weights, 1.0 / 4000, rtol=1e-12)
+    assert coupled.has_balanced_rates(scenario)
+    assert peak(lambda: theory.limit_covariance(ring(4000, tmp_path))) < 4000**2  # an eighth of it
+
+
+def test_pictures_place_the_nodes_of_a_large_network_without_all_distances(tmp_path):
+    scenario = ring(4000, tmp_path)
+    positions = {}
+    assert peak(lambda: positions.update(plots._layout(scenario))) < 4000**2
+    radii = np.linalg.norm(np.array(list(positions.values())), axis=1)
+    assert radii.min() > 0.8 * radii.max()  # a ring is drawn as one
+
+
+def test_a_threshold_takes_few_linear_equations(tmp_path, monkeypatch):
+    """Work is bounded for a rate that is thousands of times too low."""
+    calls, newton = [], steady._newton
+    monkeypatch.setattr(steady, "_newton", lambda *given: calls.append(1) or newton(*given))
+    with pytest.raises(TheoryError, match="below the threshold"):
+        theory.steady_covariance_bound(ring(300, tmp_path))
+    assert len(calls) < 1500  # a search from the given rate on took twice as many
+
+
+def test_the_threshold_is_that_of_a_slow_search(tmp_path):
+    with pytest.raises(TheoryError, match="below the threshold") as refused:
+        theory.steady_covariance_bound(ring(30, tmp_path))
+    rate = float(str(refused.value).split()[-1])
+    assert np.isfinite(theory.steady_covariance_bound(ring(30, tmp_path, 1.001 * rate))).all()
+    with pytest.raises(TheoryError, match="below the threshold"):
+        theory.steady_covariance_bound(ring(30, tmp_path, 0.999 * rate))
+
+
+def test_tables_of_large_networks_show_some_nodes_and_say_so(tmp_path):
+    scenario = ring(60, tmp_path, 1000.0)
+    lines = promises_text(scenario, promises(scenario)).splitlines()
+    assert len(lines) < 80
+    assert any("the smallest, the middle and the largest bound of 60" in line for line in lines)
+
+
+def test_mean_squares_of_large_networks_say_what_they_would_take(tmp_path):
+    scenario = of_text(SLOTS.format(nodes=600), tmp_path)
+    with pytest.raises(TheoryError, match=r"are 600\^2 numbers.* take a smaller network"):
+        theory.push_sum_radius(scenario)
+
+
+def test_checks_of_large_networks_watch_some_nodes_and_say_so(tmp_path):
+    assert len(watched_places(ring(MAX_NODES, tmp_path))) == MAX_NODES
+    assert not watched_note(ring(MAX_NODES, tmp_path))
+    large = ring(1000, tmp_path)
+    assert len(watched_places(large)) <= MAX_NODES
+    assert "looked at 50 of 1,000 nodes" in watched_note(large)
