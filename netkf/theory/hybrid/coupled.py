@@ -150,7 +150,7 @@ def increment_informations(scenario: Scenario) -> FloatArray:
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     """Return c (N, N), sparse: rate (per second) of arrivals from j at i, times their weight.
 
-    The same array for each call: not to be changed.
+    Calls with one scenario return the same array, which must not be modified.
     """
     index, size = scenario.topology.index, len(scenario.nodes)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()

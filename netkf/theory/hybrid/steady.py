@@ -82,6 +82,7 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
     if equations.jumps:
         raise TheoryError("samples at known times lead to a cycle, not to a steady state")
     if equations.coupling.nnz:
+        # A necessary rate is cheap to compute; where the links are slower no search can succeed.
         least = _necessary_factor(equations)
         if least is None or least > 1.0 + 1e-9:
             return None
