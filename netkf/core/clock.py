@@ -1,4 +1,4 @@
-"""Clocks: the contract of anything that ticks, and all ticks of one clock up to a horizon."""
+"""The contract of clocks, and all ticks of one clock up to a horizon."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ FIRST_BLOCK, LONGEST_BLOCK = 8, 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Clock(Component):
-    """The contract of a clock: a stateless maker of increasing tick times, all above 0.
+    """The contract of a clock: a stateless generator of increasing tick times, all above 0.
 
     The caller owns the generator of each entity, so that the ticks of an entity depend on nothing
     but its own stream.
@@ -48,39 +48,46 @@ class Clock(Component):
         """
 
     def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
-        """The value drawn once for an entity at its start, such as a phase, from ``random()``."""
+        """Return a value drawn once per entity from ``random()``, such as a phase; 0 for none."""
         return 0.0
 
     def mean_rate(self, entity: Entity) -> float:
-        """Mean ticks per second in the long run; nan if it is not known beforehand."""
+        """Return the mean ticks per second in the long run; nan if unknown before a run."""
         return math.nan
 
     @property
     def memoryless(self) -> bool:
-        """Whether the ticks are a Poisson process."""
+        """True if the ticks are a Poisson process."""
         return False
+
+
+class ClockPosition(NamedTuple):
+    """The position of one entity's clock: the next tick has ``number``, after ``now``."""
+
+    origin: float
+    number: int = 0
+    now: float = 0.0
 
 
 def next_ticks(
     clock: Clock,
     entity: Entity,
-    origin: float,
-    index: int,
-    now: float,
+    position: ClockPosition,
     random: np.random.Generator,
     count: int,
     key: str = "network.activation",
 ) -> FloatArray:
-    """``clock.ticks``, checked; ``key`` names the clock in errors.
+    """Return the times of ``clock.ticks``, checked; ``key`` names the clock in errors.
 
     Raises ScenarioError if time does not advance, because the run would never end.
     """
-    t = np.asarray(clock.ticks(entity, origin, index, now, random, count), dtype=np.float64)
+    now = position.now
+    t = np.asarray(clock.ticks(entity, *position, random, count), dtype=np.float64)
     if len(t) and not (t[-1] > now and t[0] >= now and (np.diff(t) >= 0.0).all()):
         whose = {1: "node", 2: "link"}.get(len(entity), "entity")
-        words = f"{type(clock).__name__}: ticks of {whose} {list(entity)} must increase, "
+        rule = f"{type(clock).__name__}: ticks of {whose} {list(entity)} must increase, "
         raise ScenarioError(
-            key, words + f"after {now:g} s", t[:3].tolist(), "mend ticks of the class"
+            key, rule + f"after {now:g} s", t[:3].tolist(), "mend ticks of the class"
         )
     return t
 
@@ -93,17 +100,19 @@ def all_ticks(
     horizon: float,
     key: str = "network.activation",
 ) -> FloatArray:
-    """(K,) all ticks of an entity in (0, ``horizon``).
+    """Return all ticks (K,) of an entity in (0, ``horizon``), in seconds.
 
     ``phase`` makes the generator of the origin, and is called only if the clock draws one.
     """
-    origin, now, index = clock.origin(entity, phase), 0.0, 0
+    position = ClockPosition(clock.origin(entity, phase))
     found, count = [np.empty(0)], FIRST_BLOCK
-    while now < horizon:
-        block = next_ticks(clock, entity, origin, index, now, random, count, key)
+    while position.now < horizon:
+        block = next_ticks(clock, entity, position, random, count, key)
         if not len(block):
             break
         found.append(block)
-        now, index, count = float(block[-1]), index + len(block), min(2 * count, LONGEST_BLOCK)
+        number = position.number + len(block)
+        position = position._replace(number=number, now=float(block[-1]))
+        count = min(2 * count, LONGEST_BLOCK)
     times = np.concatenate(found)
     return times[: int(np.searchsorted(times, horizon))]

@@ -1,4 +1,4 @@
-"""Small CSV tables that scenarios name: read whole, checked column by column."""
+"""CSV files of scenarios, read as a whole and checked column by column."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.linalg.arrays import FloatArray
 
-LARGEST_ID = 2**53
+MAX_ID = 2**53  # larger integers are not exact as floating-point numbers
 
 
 def read_columns(
     source: SourceFile, required: tuple[str, ...], optional: tuple[str, ...] = ()
 ) -> dict[str, FloatArray]:
-    """The named columns as float arrays of equal length.
+    """Return the named columns as float arrays of equal length.
 
     Raises ScenarioError, with the file and the line, for a missing column, a row of another
     length, or an entry that is not a finite number.
@@ -31,22 +31,22 @@ def read_columns(
 
 
 def read_header(source: SourceFile) -> list[str]:
-    """The names of the columns; raises ScenarioError where the file is no table."""
+    """Return the names of the columns; raises ScenarioError if the file is not a table."""
     return read_rows(source, ())[0]
 
 
 def read_rows(
     source: SourceFile, required: tuple[str, ...]
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The names of the columns, and (line, entries) of every row that is not empty.
+    """Return the names of the columns, and (line, entries) of every row that is not empty.
 
-    Raises ScenarioError where the file is no table or lacks a required column.
+    Raises ScenarioError if the file is not a table or lacks a required column.
     """
     header, rows = _read(source)
     missing = [name for name in required if name not in header]
     if missing:
-        words = f"{source.name} must have the columns {', '.join(required)}"
-        raise ScenarioError("path", words, header, f"add the column {missing[0]}")
+        rule = f"{source.name} must have the columns {', '.join(required)}"
+        raise ScenarioError("path", rule, header, f"add the column {missing[0]}")
     return header, rows
 
 
@@ -57,15 +57,16 @@ def _read(source: SourceFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
             header = [name.strip() for name in next(reader, [])]
             return header, [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        words = f"{source.name} cannot be read as a UTF-8 table of comma-separated values"
-        raise ScenarioError("path", words, str(error), "mend the file") from None
+        rule = f"{source.name} cannot be read as a UTF-8 table of comma-separated values"
+        raise ScenarioError("path", rule, str(error), "mend the file") from None
 
 
 def finite_numbers(
     source: SourceFile, line: int, header: list[str], entries: list[str], places: list[int]
 ) -> list[float]:
-    """The numbers at some places of a row; raises ScenarioError where one is not finite or the row
-    is not as long as the header.
+    """Return the entries of a row in the columns ``places``, as numbers.
+
+    Raises ScenarioError if one is not finite or the row is not as long as the header.
     """
     where = f"{source.name} line {line}"
     if len(entries) != len(header):
@@ -90,8 +91,8 @@ def finite_numbers(
 
 
 def whole(source: SourceFile, name: str, column: FloatArray) -> list[int]:
-    """A column of node ids or counts as Python integers; raises ScenarioError for others."""
-    wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > LARGEST_ID))
+    """Return a column of ids or counts as integers; raises ScenarioError for other values."""
+    wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > MAX_ID))
     if wrong.size:
         raise ScenarioError(
             "path",

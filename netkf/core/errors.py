@@ -1,4 +1,4 @@
-"""What netkf raises when it is asked for something it cannot do."""
+"""The exceptions that netkf raises on purpose, and the texts in them."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from collections.abc import Iterable
 
 
 class NetkfError(Exception):
-    """Root of every error that netkf raises on purpose."""
+    """Base class of every error that netkf raises on purpose."""
 
 
 class TheoryError(NetkfError, ValueError):
-    """A theorem was asked for where its conditions fail; the message names the condition."""
+    """The conditions of a theorem fail; the message names the condition."""
 
 
 class EngineError(NetkfError, RuntimeError):
-    """An engine was asked for what it cannot run; the message names it and the remedy."""
+    """An engine cannot run a scenario; the message names the cause and the remedy."""
 
 
 class ScenarioError(NetkfError, ValueError):
-    """One mistake in a scenario: where it is, the rule, the value got and what to do.
+    """A mistake in a scenario: its key, the broken rule, the value and the remedy.
 
     ``str(error)`` is one line, ``file: key: rule; got value; remedy``.
     """
@@ -30,14 +30,14 @@ class ScenarioError(NetkfError, ValueError):
         super().__init__(key, rule, value, remedy, file)
 
     def under(self, prefix: str) -> ScenarioError:
-        """The same mistake seen from the table ``prefix`` that holds the key."""
+        """Return this error with ``prefix``, the table that holds the key, before the key."""
         joint = "" if not self.key or self.key.startswith("[") else "."
         return ScenarioError(
             f"{prefix}{joint}{self.key}", self.rule, self.value, self.remedy, self.file
         )
 
     def in_file(self, file: str) -> ScenarioError:
-        """The same mistake with the name of the file it stands in."""
+        """Return this error with the name of its file, unless it has one."""
         return ScenarioError(self.key, self.rule, self.value, self.remedy, self.file or file)
 
     def __str__(self) -> str:
@@ -54,7 +54,7 @@ def _printable(key: str, longest: int = 120) -> str:
 
 
 def nearest(word: object, known: Iterable[str]) -> str:
-    """``did you mean "..."?`` and a blank where one of the known words is close, else nothing."""
+    """Return ``did you mean "..."?`` and a space if a known word is close, else an empty text."""
     import difflib
 
     found = difflib.get_close_matches(str(word), list(known), n=1)
@@ -62,7 +62,7 @@ def nearest(word: object, known: Iterable[str]) -> str:
 
 
 def quote(value: object, longest: int = 80) -> str:
-    """``repr`` on one line, shortened in the middle when it is long."""
+    """Return ``repr(value)`` on one line, shortened in the middle if it is long."""
     tolist = getattr(value, "tolist", None)
     text = " ".join(repr(tolist() if callable(tolist) else value).split())
     half = (longest - 5) // 2

@@ -1,7 +1,7 @@
-"""Settings that check themselves: the parts of a scenario are frozen dataclasses of these.
+"""Dataclass fields that validate their values, and the base class of scenario components.
 
-``field(rule)`` declares a field; the rule converts what a file or a script gives and says in one
-line what is wrong with it. Files and Python meet the same rules because both go through
+``field(rule)`` declares a field; the rule converts the value that a file or a script gives and
+describes a wrong one in one line. Files and Python meet the same rules because both go through
 ``Component.__post_init__``.
 """
 

@@ -1,4 +1,4 @@
-"""What every engine promises, and the order of things that happen at one instant.
+"""The contract of engines, and the order of events at one instant.
 
 1. Simultaneous events run by (time, rank, entity), never by accident of insertion.
 2. All randomness comes from rng.streams, one generator for each purpose and entity.
@@ -24,11 +24,11 @@ from netkf.trace.recorder import Recorder
 
 
 class Rank(IntEnum):
-    """Order of kinds of happening at one instant.
+    """The order of the kinds of events at one instant.
 
-    The origin of coordinates moves first; sensors read, and nodes use all samples of the instant;
-    then clocks tick, and senders snapshot what they send; then delayed messages arrive; then every
-    node with mail absorbs all of it at once; probes see the result.
+    The origin of coordinates moves first. Sensors read, and nodes use all samples of the instant.
+    Then clocks tick, and senders take a snapshot of their state; then delayed messages arrive;
+    then every node with messages absorbs all of them at once. Probes see the result.
     """
 
     REBASE = 0
@@ -47,30 +47,30 @@ it should, takes a thousand of them and not a billion.
 """
 
 Progress = Callable[[float], None]
-"""Called with the simulated time now and then."""
+"""A callback that an engine calls with the simulated time from time to time."""
 
 
 def silent(time: float) -> None:
-    """No progress."""
+    """Ignore the progress of a run."""
 
 
 class Engine(ABC):
-    """Runs scenarios."""
+    """The contract of an engine, which runs scenarios."""
 
     name: str
 
     @abstractmethod
     def refusal(self, scenario: Scenario) -> str | None:
-        """Why this engine cannot run the scenario, with the remedy; None where it can."""
+        """Return why this engine cannot run the scenario, with the remedy; None if it can."""
 
     def announce(self, scenario: Scenario) -> None:  # noqa: B027 - there may be nothing to say
-        """Say on stderr what will take a while before the first run."""
+        """Tell the user on stderr if the first run needs some time to prepare, as to compile."""
 
     @abstractmethod
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
-        """Simulate up to the horizon; returns the status, complete or diverged."""
+        """Simulate up to the horizon and return the status, "complete" or "diverged"."""
 
     def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
         """Yield the runs of consecutive ``replicas`` in order, as many at a time as suits the

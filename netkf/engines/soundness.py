@@ -1,4 +1,4 @@
-"""Which estimates and covariances a run may go on with."""
+"""The test of estimates and covariances that ends a run as diverged."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ BoolArray = NDArray[np.bool_]
 def stack_estimates(
     pairs: Sequence[tuple[FloatArray, FloatArray | None]],
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """What ``estimate`` of N filters returned as arrays: xhat (N, n), P (N, n, n), nan where a
-    filter gives no covariance, and who is without one (N,).
+    """Stack the results (xhat, P) of ``estimate`` of N filters.
+
+    Returns xhat (N, n), P (N, n, n), nan for a filter without covariance, and a mask (N,) of these
+    filters.
     """
     xhat = np.array([mean for mean, _ in pairs])
     without = np.array([cov is None for _, cov in pairs])
@@ -26,15 +28,15 @@ def stack_estimates(
 
 
 INDEFINITE = 1e-9
-"""The share of its largest eigenvalue by which a covariance may be negative: rounding stays far
-below it.
-"""
+"""The tolerated negative eigenvalue, as a share of the largest; rounding errors are far smaller."""
 
 
 def sound(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = False) -> BoolArray:
-    """Whether estimates (..., n), in the coordinates that the filters compute in, are finite and
-    their covariances (..., n, n) are finite and positive semidefinite, of nodes ``without`` one
-    only whether estimates are finite. A run goes on while all are sound.
+    """Return a mask (...) of sound pairs of estimates (..., n) and covariances (..., n, n).
+
+    Both must be finite, and the covariance positive semidefinite; a filter ``without`` covariance
+    needs only a finite estimate. Estimates are in the coordinates that the filters compute in. A
+    run continues while all pairs are sound.
     """
     finite = np.isfinite(xhat).all(axis=-1)
     whole = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
@@ -43,7 +45,9 @@ def sound(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = False) ->
 
 
 def _semidefinite(P: FloatArray) -> BoolArray:
-    """Of symmetric (..., n, n). A Cholesky factor of P with a little added shows it at once."""
+    """Return a mask (...) of the symmetric matrices (..., n, n) that are positive semidefinite."""
+    # A Cholesky factor of P plus a little is much cheaper than its eigenvalues, and nearly always
+    # exists.
     size = np.abs(np.diagonal(P, axis1=-2, axis2=-1)).max(axis=-1, initial=0.0)
     little = (0.5 * INDEFINITE * size + np.finfo(float).tiny)[..., None, None]
     try:

@@ -1,4 +1,4 @@
-"""Clocks of the network: when links, directions or nodes activate by themselves."""
+"""Clocks that activate links, directions or nodes of the network."""
 
 from __future__ import annotations
 
@@ -31,28 +31,28 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology, demand_links, demand_nodes
 
 AT = ("links", "directions", "nodes")
-"""What has a clock: every link, every direction of every link, or every node."""
+"""The entities that have a clock: every link, every direction of a link, or every node."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkClock(Clock):
     """The contract of a clock that activates the network, see Clock.
 
-    ``at`` says what has a clock of its own. "links": both ends exchange; an entity is (i, j) with
-    i < j. "directions": the sender pushes; an entity is (sender, receiver). "nodes": the node
-    broadcasts to every neighbour; an entity is (node,).
+    ``at`` selects the entities that have a clock each. "links": both ends exchange; an entity is
+    (i, j) with i < j. "directions": the sender pushes; an entity is (sender, receiver). "nodes":
+    the node broadcasts to every neighbour; an entity is (node,).
     """
 
     at: str = field(choice(*AT), default="links")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
-        """Ids of everything that has a clock, in order."""
+        """Return the ids of all entities that have a clock, in order."""
         if self.at == "nodes":
             return tuple((node,) for node in topology.nodes)
         return topology.directions if self.at == "directions" else topology.links
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError if the settings do not fit the graph."""
+        """Raise ScenarioError if the fields do not fit the graph."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class OnReadings(LinkClock):
     at: str = dataclasses.field(init=False, default="readings")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
-        """None."""
+        """Return no entities."""
         return ()
 
     def ticks(
@@ -74,7 +74,7 @@ class OnReadings(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """None."""
+        """Return no ticks."""
         return np.empty(0)
 
 
@@ -100,8 +100,10 @@ _entity_rate = Rule(_link_rate.requirement, _one_rate, _link_rate.remedy)
 
 @dataclass(frozen=True, eq=False)
 class Poisson(LinkClock):
-    """Independent Poisson processes of ``rate`` ticks a second; ``rates = [[i, j, rate], ...]``
-    sets single links or directions over that default, ``[[i, rate], ...]`` single nodes.
+    """Independent Poisson processes of ``rate`` ticks per second.
+
+    ``rates = [[i, j, rate], ...]`` overrides the rate of single links or directions, and
+    ``[[i, rate], ...]`` of single nodes.
     """
 
     rate: float | None = field(_rate, default=None)
@@ -127,13 +129,13 @@ class Poisson(LinkClock):
         return tuple(sorted(ids)) if self.at == "links" else ids
 
     def mean_rate(self, entity: Entity) -> float:
-        """The rate of its process."""
+        """Return the rate of the process, in ticks per second."""
         rate = self._own.get(entity, self.rate)
         return math.nan if rate is None else rate
 
     @property
     def memoryless(self) -> bool:
-        """True."""
+        """True: the gaps are exponential."""
         return True
 
     def ticks(
@@ -145,11 +147,11 @@ class Poisson(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Exponential gaps; twice the rate gives the same gaps, halved."""
+        """Return ticks with exponential gaps; twice the rate gives the same gaps, halved."""
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
 
     def check(self, topology: Topology) -> None:
-        """Every entity has a rate, and every rate an entity, once."""
+        """Raise ScenarioError unless every entity has a rate and every rate has one entity."""
         entities, named = self.entities(topology), set()
         known, what = set(entities), self.at.removesuffix("s")
         for k, given in enumerate(self.rates):
@@ -171,7 +173,7 @@ class Poisson(LinkClock):
 
 
 SHORTEST = 1e-9
-"""Seconds; gaps below it are not told apart from rounding."""
+"""The shortest allowed gap in seconds; shorter ones could not be told from rounding."""
 
 PARAMETERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "gamma": (("shape",), ("mean", "rate", "scale")),
@@ -179,12 +181,12 @@ PARAMETERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "uniform": (("low", "high"), ()),
     "constant": ((), ("mean", "rate")),
 }
-"""What each distribution of gaps needs, and of what it takes exactly one."""
+"""The required fields of each distribution, and the fields of which it takes exactly one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Renewal(LinkClock):
-    """Independent gaps from one ``distribution``.
+    """A renewal process: independent gaps from one ``distribution``.
 
     gamma and weibull take ``shape`` and one of ``mean`` (seconds), ``rate`` (one over the mean) or
     ``scale``; uniform takes ``low`` and ``high``; constant takes ``mean`` or ``rate``. Gamma or
@@ -231,12 +233,12 @@ class Renewal(LinkClock):
         return self.mean if self.mean is not None else 1.0 / (self.rate or math.nan)
 
     def mean_rate(self, entity: Entity) -> float:
-        """One over the mean gap."""
+        """Return one over the mean gap, in ticks per second."""
         return 1.0 / self._mean
 
     @property
     def memoryless(self) -> bool:
-        """Only gamma and weibull gaps of shape 1."""
+        """True for gamma and weibull gaps of shape 1, which are exponential."""
         return self.shape == 1.0
 
     def ticks(
@@ -248,7 +250,7 @@ class Renewal(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Gaps of the distribution, added up."""
+        """Return cumulative sums of gaps of the distribution."""
         shape = self.shape or 1.0
         if self.distribution == "gamma":
             gaps = random.standard_gamma(shape, count)
@@ -291,13 +293,13 @@ class Periodic(LinkClock):
                 raise ScenarioError(name, "must be below the period", value, "give less")
 
     def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
-        """The phase."""
+        """Return the phase in seconds, drawn if it is random."""
         if isinstance(self.phase, str):
             return self.period * float(random().random())
         return self.phase
 
     def mean_rate(self, entity: Entity) -> float:
-        """One over the period."""
+        """Return one over the period, in ticks per second."""
         return 1.0 / self.period
 
     def ticks(
@@ -309,22 +311,23 @@ class Periodic(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """The lattice, shifted by the jitter."""
+        """Return the points of the lattice, each delayed by its jitter."""
         times = _lattice(origin, self.period, index + (origin == 0.0), count)
         return times + self.jitter * random.random(count) if self.jitter > 0.0 else times
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedClock(LinkClock):
-    """Ticks read from a table: ``t,node,peer`` for links and directions (from node to peer),
-    ``t,node`` for nodes. An entity listed twice at one time ticks once.
+    """Ticks read from a table ``t,node,peer`` (from node to peer), or ``t,node`` for nodes.
+
+    An entity that is listed twice at one time ticks once.
     """
 
     path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self._times  # a bad file is refused now
+        _ = self._times  # a mistake in the file is found on construction
 
     @cached_property
     def _times(self) -> dict[Entity, FloatArray]:
@@ -358,7 +361,7 @@ class RecordedClock(LinkClock):
 
     @property
     def rows(self) -> FloatArray:
-        """(K,) times of all rows, sorted."""
+        """The times (K,) of all rows in seconds, sorted."""
         return np.sort(np.concatenate([np.empty(0), *self._times.values()]))
 
     def ticks(
@@ -370,11 +373,11 @@ class RecordedClock(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """The recorded times."""
+        """Return the recorded times."""
         return self._instants.get(entity, np.empty(0))[index : index + count]
 
     def check(self, topology: Topology) -> None:
-        """Everything listed is a link, a direction or a node of the graph."""
+        """Raise ScenarioError unless the graph has every listed link, direction or node."""
         if self.at == "nodes":
             demand_nodes(self.path, (node for (node,) in self._times), topology)
         else:

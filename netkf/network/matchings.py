@@ -1,4 +1,4 @@
-"""Matchings: which pairs of nodes exchange in a slot, and what they are in the mean.
+"""Activation in slots: random matchings with their exact mean, broadcasts and records.
 
 The mean matching ``Abar`` has the probability that i and j are paired in a slot as entry (i, j) and
 that of staying alone on the diagonal, G section II. It is exact: a formula or a recursion.
@@ -27,12 +27,12 @@ from netkf.core.fields import (
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology, demand_links
 
-MOST_EDGES = 20  # beyond it the recursions over sets of edges take too long
+MAX_EDGES = 20  # beyond it the recursions over sets of edges take too long
 
 
 @dataclass(frozen=True, eq=False)
 class SlotActivation(Component):
-    """Who exchanges in the slots of a slot filter.
+    """The contract of activation in slots, which selects the links of each exchange.
 
     ``phase`` is the length of one exchange in seconds, shared evenly among its steps; the inbox of
     a step closes when its time is over. By default half of the period is shared evenly among the
@@ -43,7 +43,7 @@ class SlotActivation(Component):
 
     @abstractmethod
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError where the settings do not fit the graph."""
+        """Raise ScenarioError if the fields do not fit the graph."""
 
 
 PROTOCOLS = ("one-edge", "node-wakeup", "maximal", "uniform-maximal", "independent")
@@ -51,7 +51,7 @@ PROTOCOLS = ("one-edge", "node-wakeup", "maximal", "uniform-maximal", "independe
 
 @dataclass(frozen=True, eq=False)
 class Matching(SlotActivation):
-    """A random matching a slot, by ``protocol``.
+    """A random matching in each slot, drawn by ``protocol``.
 
     one-edge        one link, uniformly; with probability ``lazy`` none
     node-wakeup     one node, uniformly, and one of its neighbours, uniformly
@@ -75,17 +75,17 @@ class Matching(SlotActivation):
             raise ScenarioError("p", "is missing for independent", None, "add p = ...")
 
     def check(self, topology: Topology) -> None:
-        """Uniform maximal matchings are enumerated, so there may not be too many links."""
-        if self.protocol == "uniform-maximal" and len(topology.links) > MOST_EDGES:
+        """Raise ScenarioError if maximal matchings must be listed and there are too many links."""
+        if self.protocol == "uniform-maximal" and len(topology.links) > MAX_EDGES:
             raise ScenarioError(
                 "protocol",
-                f"uniform-maximal needs a graph of at most {MOST_EDGES} links",
+                f"uniform-maximal needs a graph of at most {MAX_EDGES} links",
                 f"{len(topology.links)} links",
                 'use "maximal"',
             )
 
     def draw(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        """The pairs of one slot."""
+        """Draw the pairs of one slot."""
         links = topology.links
         if not links:
             return []
@@ -104,22 +104,25 @@ class Matching(SlotActivation):
         return [] if lazy else [edge]
 
     def _independent(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        luck = random.random(len(topology.links))
-        up = [link for link, u in zip(topology.links, luck, strict=True) if u < (self.p or 0.0)]
+        uniform = random.random(len(topology.links))
+        up = [link for link, u in zip(topology.links, uniform, strict=True) if u < (self.p or 0.0)]
         busy = Counter(node for link in up for node in link)
         return [link for link in up if busy[link[0]] == busy[link[1]] == 1]
 
     def mean(self, topology: Topology) -> FloatArray:
-        """(N, N) the exact mean matching; raises ScenarioError where that is out of reach."""
-        chance = self._chances(topology)
+        """Return the exact mean matching (N, N).
+
+        Raises ScenarioError if the graph has too many links to compute it.
+        """
+        probabilities = self._pairing_probabilities(topology)
         mean = np.zeros((len(topology.nodes),) * 2)
-        for (i, j), value in chance.items():
+        for (i, j), value in probabilities.items():
             a, b = topology.index[i], topology.index[j]
             mean[a, b] = mean[b, a] = value
         mean[np.diag_indices(len(mean))] = 1.0 - mean.sum(axis=1)
         return mean
 
-    def _chances(self, topology: Topology) -> dict[Link, float]:
+    def _pairing_probabilities(self, topology: Topology) -> dict[Link, float]:
         links, degrees = topology.links, topology.degrees
         if self.protocol == "one-edge":
             return dict.fromkeys(links, (1.0 - (self.lazy or 0.0)) / max(len(links), 1))
@@ -129,10 +132,10 @@ class Matching(SlotActivation):
         if self.protocol == "independent":
             p = self.p or 0.0
             return {(i, j): p * (1.0 - p) ** (degrees[i] + degrees[j] - 2) for i, j in links}
-        if len(links) > MOST_EDGES:
+        if len(links) > MAX_EDGES:
             raise ScenarioError(
                 "network.activation.protocol",
-                f"has an exact mean for at most {MOST_EDGES} links only",
+                f"has an exact mean for at most {MAX_EDGES} links only",
                 f"{len(links)} links",
                 "use one-edge, node-wakeup or independent",
             )
@@ -181,7 +184,7 @@ def _greedy(links: list[Link]) -> list[Link]:
 
 @lru_cache(maxsize=8)
 def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
-    """All matchings to which no link can be added, each sorted, in sorted order."""
+    """Return all matchings to which no link can be added, each sorted, in sorted order."""
     found: set[tuple[Link, ...]] = set()
 
     def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:
@@ -199,7 +202,7 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
 
 
 def _greedy_shares(links: tuple[Link, ...]) -> tuple[float, ...]:
-    """Probability of each link in the greedy matching in random order.
+    """Return the probability of each link in the greedy matching in random order.
 
     The first link of a random order is uniform; what is left after it is a random order of the
     links that do not meet it. Recursion over the sets of links that are left, as bit masks.
@@ -225,28 +228,30 @@ def _greedy_shares(links: tuple[Link, ...]) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Broadcast(SlotActivation):
-    """In each step of an exchange every node sends to every neighbour."""
+    """Broadcasts: in each step of an exchange every node sends to every neighbour."""
 
     def check(self, topology: Topology) -> None:
-        """Any graph will do."""
+        """Accept any graph."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedSlots(SlotActivation):
-    """Exchanges read from a table: ``slot,node,peer`` for matchings (the pairs of each slot), or
-    ``slot,phase,step,node,peer`` for broadcasts (the links that were up, from node to peer, in both
-    directions where the graph is undirected).
+    """Exchanges read from a table.
+
+    Columns ``slot,node,peer`` are the pairs of matchings. Columns ``slot,phase,step,node,peer`` are
+    the links of broadcasts that were up, from node to peer, and in both directions if the graph is
+    undirected.
     """
 
     path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self._pairs  # a bad file is refused now
+        _ = self._pairs  # a mistake in the file is found on construction
 
     @property
     def matching(self) -> bool:
-        """Whether the table lists pairs of a matching."""
+        """True if the table lists the pairs of matchings."""
         return "phase" not in read_header(self.path)
 
     @cached_property
@@ -265,23 +270,21 @@ class RecordedSlots(SlotActivation):
             listed = pairs.setdefault((slot, phase, step), [])
             link = (min(i, j), max(i, j)) if matching else (i, j)
             if matching and link not in listed and (i == j or _meets(link, listed)):
-                words = f"{self.path.name}: a node may be paired once a slot"
-                raise ScenarioError("path", words, [slot, i, j], "mend the row")
+                rule = f"{self.path.name}: a node may be paired once a slot"
+                raise ScenarioError("path", rule, [slot, i, j], "mend the row")
             if link not in listed:
                 listed.append(link)
         return {key: sorted(listed) for key, listed in pairs.items()}
 
     @property
     def recorded(self) -> tuple[tuple[int, int, int], ...]:
-        """The (slot, phase, step) that have rows."""
+        """The (slot, phase, step) that have rows in the table."""
         return tuple(self._pairs)
 
     def pairs(self, slot: int, phase: int, step: int = 0) -> list[Link]:
-        """The pairs of one step of an exchange, sorted; for broadcasts from node to peer, as they
-        are listed.
-        """
+        """Return the sorted pairs of one step of an exchange; those of broadcasts as listed."""
         return self._pairs.get((slot, phase, step), [])
 
     def check(self, topology: Topology) -> None:
-        """Every recorded pair is a link."""
+        """Raise ScenarioError unless every recorded pair is a link."""
         demand_links(self.path, {p for listed in self._pairs.values() for p in listed}, topology)

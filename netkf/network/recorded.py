@@ -1,4 +1,4 @@
-"""Losses and delays read from tables, message by message."""
+"""Losses and delays read from a table with a row for each message."""
 
 from __future__ import annotations
 
@@ -17,15 +17,13 @@ from netkf.network.channels import Delay, Loss
 from netkf.network.graphs import Link, Topology, demand_links
 
 AFTER = ("deliver", "lose", "repeat", "refuse")
-"""What may happen to a message that a record does not list."""
+"""The treatments of a message that the table does not list."""
 
 _after = choice(*AFTER)
 
 
 class MessageUse(NamedTuple):
-    """How a record of messages and the messages of a run meet: ``rows`` in the table, ``unused``
-    rows, and messages ``beyond`` the record.
-    """
+    """Use of a table by a run: its ``rows``, ``unused`` rows, and messages ``beyond`` it."""
 
     rows: int
     unused: int
@@ -34,7 +32,7 @@ class MessageUse(NamedTuple):
 
 @dataclass(frozen=True)
 class MessageTable:
-    """One value for each listed message of each directed link."""
+    """A value for each listed message of each directed link."""
 
     source: SourceFile
     values: Mapping[Link, Mapping[int, float]]
@@ -44,7 +42,7 @@ class MessageTable:
         return {link: 1 + max(listed) for link, listed in self.values.items()}
 
     def value(self, link: Link, message: int, after: str) -> float | None:
-        """The value of a message; None if the record does not list it.
+        """Return the value of a message; None if the table does not list it.
 
         With ``after`` "repeat" the table of the link starts again after its largest number. With
         "refuse" raises ScenarioError at "path" for a message that is not listed.
@@ -64,7 +62,7 @@ class MessageTable:
         return value
 
     def use(self, sent: Mapping[Link, int]) -> MessageUse:
-        """What ``sent`` messages of each directed link, numbered from 0, use of the table."""
+        """Return how ``sent`` messages of each directed link, numbered from 0, use the table."""
         rows = sum(map(len, self.values.values()))
         used = sum(
             number < count for link, count in sent.items() for number in self.values.get(link, ())
@@ -73,10 +71,11 @@ class MessageTable:
 
 
 def read_messages(
-    source: SourceFile, column: str, words: str, allowed: Callable[[float], bool]
+    source: SourceFile, column: str, rule: str, allowed: Callable[[float], bool]
 ) -> MessageTable:
-    """The table of a file ``sender,receiver,message,COLUMN`` whose values are ``allowed``; a
-    message may be listed again with the same value.
+    """Read a file ``sender,receiver,message,COLUMN``; a message may be repeated with equal value.
+
+    Raises ScenarioError with the text ``rule`` for a value that is not ``allowed``.
     """
     names = ("sender", "receiver", "message")
     table = read_columns(source, (*names, column))
@@ -87,14 +86,16 @@ def read_messages(
         if not allowed(value) or listed.setdefault(message, value) != value:
             shown = int(value) if value.is_integer() else value
             row = [sender, receiver, message, shown]
-            raise ScenarioError("path", f"{source.name}: {words}", row, "mend the row")
+            raise ScenarioError("path", f"{source.name}: {rule}", row, "mend the row")
     return MessageTable(source, values)
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedLoss(Loss):
-    """Outcomes read from a table ``sender,receiver,message,delivered`` (0 or 1, messages of a
-    directed link counted from 0). ``after`` says what becomes of a message that is not listed.
+    """Outcomes read from a table ``sender,receiver,message,delivered`` (0 or 1).
+
+    Messages of a directed link are counted from 0; ``after`` is the treatment of a message that is
+    not listed.
     """
 
     path: SourceFile = field(source_file)
@@ -102,47 +103,48 @@ class RecordedLoss(Loss):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self.table  # a bad file is refused now
+        _ = self.table  # a mistake in the file is found on construction
 
     @cached_property
     def table(self) -> MessageTable:
-        """1 for each listed message that is delivered, else 0."""
-        words = "delivered must be 0 or 1, one value a message"
-        return read_messages(self.path, "delivered", words, lambda value: value in (0.0, 1.0))
+        """The table, with 1 for each message that is delivered and 0 for the others."""
+        rule = "delivered must be 0 or 1, one value a message"
+        return read_messages(self.path, "delivered", rule, lambda value: value in (0.0, 1.0))
 
     @property
     def deterministic(self) -> bool:
-        """True."""
+        """True: the table decides."""
         return True
 
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """0 or 1."""
+        """Return 0 or 1."""
         value = _at("network.channel.loss", self.table, link, message, self.after)
         if value is None:
             return 0.0 if self.after == "lose" else 1.0
         return value
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Not known beforehand."""
+        """Return nan: the fraction is unknown before a run."""
         return math.nan
 
     @property
     def independent(self) -> bool:
-        """A record is one outcome, not a law."""
+        """False: a record is one outcome, not a law."""
         return False
 
     def check(self, topology: Topology) -> None:
-        """Every recorded pair is a link."""
+        """Raise ScenarioError unless every recorded pair is a link."""
         demand_links(self.path, self.table.values, topology)
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedDelay(Delay):
-    """Delays read from a table ``sender,receiver,message,seconds`` (messages of a directed link
-    counted from 0). ``after`` says what becomes of a message that is not listed; one that is
-    delivered takes no time.
+    """Delays read from a table ``sender,receiver,message,seconds``.
+
+    Messages of a directed link are counted from 0; ``after`` is the treatment of a message that is
+    not listed. If it is delivered, it takes no time.
     """
 
     path: SourceFile = field(source_file)
@@ -150,38 +152,38 @@ class RecordedDelay(Delay):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self.table  # a bad file is refused now
+        _ = self.table  # a mistake in the file is found on construction
 
     @cached_property
     def table(self) -> MessageTable:
-        """Seconds of each listed message."""
-        words = "seconds must be at least 0, one value a message"
-        return read_messages(self.path, "seconds", words, lambda value: value >= 0.0)
+        """The table of the seconds of each message."""
+        rule = "seconds must be at least 0, one value a message"
+        return read_messages(self.path, "seconds", rule, lambda value: value >= 0.0)
 
     def draw(self, random: np.random.Generator) -> float:
-        """0; nothing is drawn."""
+        """Return 0; nothing is drawn."""
         return 0.0
 
     @property
     def is_random(self) -> bool:
-        """False."""
+        """False: the table decides."""
         return False
 
     @property
     def longest(self) -> float:
-        """The largest recorded delay."""
+        """The largest recorded delay in seconds."""
         listed = [value for link in self.table.values.values() for value in link.values()]
         return max(listed, default=0.0)
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """The recorded seconds."""
+        """Return the recorded seconds."""
         value = _at("network.channel.delay", self.table, link, message, self.after)
         if value is None:
             return math.nan if self.after == "lose" else 0.0
         return value
 
     def check(self, topology: Topology) -> None:
-        """Every recorded pair is a link."""
+        """Raise ScenarioError unless every recorded pair is a link."""
         demand_links(self.path, self.table.values, topology)
 
 

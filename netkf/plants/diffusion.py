@@ -14,7 +14,7 @@ from netkf.plants.laws import GridLaws
 from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
 from netkf.plants.transitions import Transitions, frame_period
-from netkf.plants.truth import SampledTruth, multiples
+from netkf.plants.truth import SampledTruth, TruthTimes, multiples
 from netkf.rng.normals import GeneratorNormals, Normals
 
 LONGEST_STEP = 8.0
@@ -44,7 +44,7 @@ class Diffusion(Plant):
 
     @cached_property
     def laws(self) -> GridLaws:
-        """What all paths of this plant share."""
+        """The laws on the sensing grid that all paths of this plant share."""
         assert self.sensing_period is not None
         return GridLaws(self.A, self.B, self.sensing_period)
 
@@ -95,7 +95,7 @@ class Diffusion(Plant):
         return DiffusionPaths(self.laws, start, normals, [*cuts, Cuts(shown, probing)], steps)
 
     def start(self, random: np.random.Generator) -> FloatArray:
-        """(n,) x(0), drawn."""
+        """Draw x(0) (n,)."""
         return np.asarray(self.starts(GeneratorNormals([random]))[0])
 
     def starts(self, normals: Normals) -> FloatArray:
@@ -125,7 +125,8 @@ class Diffusion(Plant):
         """
         marks = multiples(frame_period(self.A), horizon)
         start = self.start(random)
-        return SampledTruth(self.moves, start, random, probing, samples, probes, marks, frames)
+        times = TruthTimes(samples, probes, marks)
+        return SampledTruth(self.moves, start, random, probing, times, frames)
 
 
 def default_sensing_period(

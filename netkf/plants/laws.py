@@ -8,8 +8,8 @@ from netkf.linalg.arrays import FloatArray, symmetric, symmetric_root
 from netkf.linalg.legendre import forward_coefficients
 from netkf.linalg.series import polynomial, with_reach
 
-MAX_LAWS = 256  # kept laws of a state shown inside a step
-MAX_GRIDS = 256  # kept stretches of the sensing grid
+MAX_LAWS = 256  # laws of states inside a step that are kept
+MAX_GRIDS = 256  # parts of the sensing grid that are kept
 DEPENDENT = 1e-9  # share of a row that is not rounding
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
@@ -21,8 +21,9 @@ def grid_time(period: float, k: int) -> float:
 
 
 class GridLaws:
-    """What all paths of ``dx = A x dt + B dw`` on the grid of one ``period`` share; the laws of
-    states shown inside a step are worked out as they are asked for.
+    """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period``.
+
+    Laws of states inside a step are computed on demand and kept.
     """
 
     def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
@@ -72,8 +73,10 @@ class GridLaws:
         )
 
     def conditional_law(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
-        """Gain and root (3 n, 3 n) of the law of state and moments at ``left`` seconds given those
-        of a whole step of ``length``.
+        """Return the conditional law of state and moments at ``left`` seconds of a step.
+
+        It is given by those of the whole step of ``length`` seconds; the result is the gain and a
+        square root of the covariance, both (3 n, 3 n).
         """
         key = round(length, 12), round(left, 12)
         law = self._conditional_laws.get(key)

@@ -39,15 +39,15 @@ class LinearPlant(Plant):
         return len(self.F)
 
     def slot_time(self, k: int) -> float:
-        """Seconds; rounded so that lattices of other periods meet it."""
+        """Return the start of slot k in seconds, rounded so that other lattices meet it."""
         return float(round(k * self.period, 12))
 
     def slots_of(self, times: FloatArray) -> np.ndarray:
-        """The slot in which each time falls; one that rounding puts just before a slot is in it."""
+        """Return the slot of each time; rounding errors just before a slot are tolerated."""
         return np.asarray(np.floor(times / self.period + 1e-9).astype(int))
 
     def over(self, slot: int, horizon: float) -> bool:
-        """Whether a slot begins at the horizon or later; 3 * 0.1 is 0.3."""
+        """Return True if a slot begins at or after the horizon, up to rounding."""
         return self.slot_time(slot) >= horizon - 1e-9 * self.period
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
@@ -78,7 +78,7 @@ class Truth(Protocol):
         """(n,) x."""
 
     def state(self, slot: int) -> FloatArray:
-        """The same as ``absolute``."""
+        """Return x (n,), as ``absolute`` does."""
 
     def rebase(self, slot: int) -> FloatArray:
         """(n,) by which estimates are to be lowered at a slot that begins a frame: its local state.
@@ -96,7 +96,7 @@ class Readings(Protocol):
         """(p,) of that slot, in which the state is x."""
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both, (S, p) and (S, p, n), of slots that ascend, in which the states are x (S, n)."""
+        """Return readings (S, p) and matrices (S, p, n) of increasing slots; x is (S, n)."""
 
 
 class LinearPath:

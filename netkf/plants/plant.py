@@ -1,8 +1,9 @@
-"""What every plant is: a state of some dimension that starts somewhere."""
+"""The contract of plants."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,12 +15,17 @@ from netkf.linalg.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Plant(Component):
-    """x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n), both zero by default."""
+    """The contract of a plant, whose x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n).
+
+    Both are zero by default.
+    """
+
+    former_names: ClassVar[Mapping[str, str]] = {"is_random": "drawn", "truth_known": "shown"}
 
     is_random: ClassVar[bool] = True
-    """Whether runs draw the state from the model; else the model is what the filters believe."""
+    """True if runs draw the state from the model; otherwise only the filters use the model."""
     truth_known: ClassVar[bool] = True
-    """Whether the state is known, so that there are errors to speak of."""
+    """True if the state is known, so that errors can be computed."""
 
     mean: FloatArray | None = field(vector, default=None)
     cov: FloatArray | None = field(covariance, default=None)

@@ -39,13 +39,16 @@ NOTHING = np.empty(0)
 
 @dataclass(frozen=True, eq=False)
 class UnknownPlant(LinearPlant):
-    """Nobody knows the state; ``F``, ``Q``, ``mean`` and ``cov`` are the filters' model of it."""
+    """A plant in slots with unknown state.
+
+    ``F``, ``Q``, ``mean`` and ``cov`` are the filters' model of it.
+    """
 
     is_random: ClassVar[bool] = False
     truth_known: ClassVar[bool] = False
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Nan."""
+        """Return a path of nan."""
         return RecordedPath({}, np.full(self.n, math.nan))
 
 
@@ -61,7 +64,7 @@ class RecordedPlant(LinearPlant):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self.table  # a bad file is refused now
+        _ = self.table  # a mistake in the file is found on construction
 
     @cached_property
     def table(self) -> Table:
@@ -81,7 +84,7 @@ class RecordedPlant(LinearPlant):
 
 @dataclass(frozen=True, eq=False)
 class UnknownDiffusion(Diffusion):
-    """Nobody knows the state in continuous time; ``A``, ``B``, ``mean`` and ``cov`` are the
+    """A plant in continuous time with unknown state; ``A``, ``B``, ``mean`` and ``cov`` are the
     filters' model of it.
     """
 
@@ -90,11 +93,11 @@ class UnknownDiffusion(Diffusion):
 
     @property
     def recorded_truth(self) -> RecordedTruth:
-        """Nan."""
+        """The truth of a run: nan at all times."""
         return RecordedTruth(NOTHING, np.empty((0, self.n)), self.n)
 
     def demand(self, times: FloatArray, what: str) -> None:
-        """Nothing is demanded of a state that nobody knows."""
+        """Accept any times: no state is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +112,7 @@ class RecordedDiffusion(Diffusion):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self.table  # a bad file is refused now
+        _ = self.table  # a mistake in the file is found on construction
 
     @cached_property
     def table(self) -> tuple[FloatArray, FloatArray]:
@@ -194,7 +197,7 @@ class RecordedSensor(Sensor):
         if H is None:
             remedy = "add H = ..., or columns phi0, ... to the table"
             raise ScenarioError("H", "is missing", None, remedy)
-        _ = self._rows  # a bad file is refused now
+        _ = self._rows  # a mistake in the file is found on construction
 
     @cached_property
     def _regressors(self) -> list[str]:
@@ -204,7 +207,7 @@ class RecordedSensor(Sensor):
 
     @property
     def varying(self) -> bool:
-        """Whether the table has columns phi0, ..."""
+        """True if the table has columns phi0, ..."""
         return bool(self._regressors)
 
     @property
@@ -306,13 +309,13 @@ class RecordedSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> RecordedSamples:
-        """Those of the table; nothing is drawn."""
+        """Return the samples of the table; nothing is drawn."""
         return RecordedSamples(self.H, self.rows(node)[1])
 
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RecordedReadings:
-        """Those of the table; nothing is drawn."""
+        """Return the readings of the table; nothing is drawn."""
         return RecordedReadings(self.H, self.table(node, period))
 
 
@@ -336,8 +339,9 @@ class RecordedReadings:
         return np.full(len(self._H), math.nan) if row is None else row[: len(self._H)]
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both, (S, p) and (S, p, n), of some slots; without a row zeros of both, which tell a
-        filter nothing.
+        """Return readings (S, p) and matrices (S, p, n) of some slots.
+
+        Both are zero for a slot without a row, which carries no information.
         """
         y, H = np.zeros((len(slots), len(self._H))), np.zeros((len(slots), *self._H.shape))
         for k, slot in enumerate(slots):

@@ -8,7 +8,7 @@ from netkf.linalg.arrays import FloatArray
 
 
 class Recursion:
-    """What all paths of one ``F`` (n, n) share: its powers."""
+    """The powers of one ``F`` (n, n), which all paths share."""
 
     def __init__(self, F: FloatArray) -> None:
         self.F, self._powers = F, F[None]
@@ -34,7 +34,10 @@ class Recursion:
 
 
 def _one_by_one(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
-    """Where powers overflow, which a state that is not moved by them need not."""
+    """Compute the states step by step.
+
+    Powers of F may overflow although no state does.
+    """
     count, _, _, n = noise.shape
     x = [start[:, None]]
     for w in np.moveaxis(noise.reshape(count, -1, 1, n), 1, 0):

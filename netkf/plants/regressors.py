@@ -37,7 +37,7 @@ class RegressorSensor(Sensor):
 
     @property
     def varying(self) -> bool:
-        """True."""
+        """True: H is drawn for every slot."""
         return True
 
     @property
@@ -47,13 +47,13 @@ class RegressorSensor(Sensor):
 
     @cached_property
     def steps(self) -> Recursion:
-        """Of ``s``."""
+        """The recursion of the regressor's state ``s``."""
         return Recursion(self.A)
 
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RegressorReadings:
-        """From the streams "noise" and "regressor"."""
+        """Return readings drawn from the streams "noise" and "regressor"."""
         return RegressorReadings(self, generator("noise"), generator("regressor"))
 
 
@@ -75,6 +75,6 @@ class RegressorReadings(SlotReadings):
         return np.asarray((self._C @ self._s.state(slot))[None])
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
-        """Their ``matrix`` (S, 1, n)."""
+        """Return the rows ``phi_k'`` (S, 1, n) of increasing slots."""
         states = np.stack([self._s.state(slot) for slot in slots])
         return np.asarray(states[:, None] @ self._C.T)

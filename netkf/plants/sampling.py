@@ -1,4 +1,4 @@
-"""Sensors over a diffusion that sample it: when, and what they read."""
+"""Samples of sensors over a diffusion, and recorded sampling times."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Samples(Protocol):
         """
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both, (S, p) and (S, p, n), of samples that ascend, at which the states are x (S, n)."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of increasing samples with states x (S, n)."""
 
 
 class DrawnSamples:
@@ -42,7 +42,7 @@ class DrawnSamples:
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both, (S, p) and (S, p, n), of some samples."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of some samples."""
         return self._readings.several(ks, x)
 
 
@@ -59,7 +59,7 @@ class RecordedSamples:
         return self._rows[k, :p], phi[None] if phi.size else self._H
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Both, (S, p) and (S, p, n), of some samples."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of some samples."""
         p, rows = len(self._H), self._rows[list(ks)]
         if rows.shape[1] > p:
             return rows[:, :p], rows[:, None, p:]
@@ -76,7 +76,7 @@ class RecordedSampling(Clock):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self._times  # a bad file is refused now
+        _ = self._times  # a mistake in the file is found on construction
 
     @cached_property
     def _times(self) -> dict[int, FloatArray]:

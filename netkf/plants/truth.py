@@ -1,4 +1,4 @@
-"""The state of one run in continuous time, and the frames in which it is given.
+"""The true state of one run in continuous time, and the frames in which it is given.
 
 Errors ``x - xhat`` of affine filters do not change when the truth, the readings and all estimates
 are shifted along a solution of ``dc = A c dt``. On an unstable plant the state therefore starts
@@ -9,7 +9,7 @@ frame, which moves with the plant, and keep the digits that ``absolute`` ones lo
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -78,6 +78,14 @@ def absolute_states(
         return np.asarray(x + shift)
 
 
+class TruthTimes(NamedTuple):
+    """Times in seconds of samples, of probes and of the marks at which frames may begin."""
+
+    samples: FloatArray
+    probes: FloatArray
+    marks: FloatArray
+
+
 class SampledTruth:
     """A path drawn exactly at ``samples`` and ``marks`` from ``random``, and at ``probes`` from
     ``probing`` by the exact conditional law, so that neither probes nor the network move it.
@@ -92,12 +100,11 @@ class SampledTruth:
         start: FloatArray,
         random: np.random.Generator,
         probing: np.random.Generator,
-        samples: FloatArray,
-        probes: FloatArray,
-        marks: FloatArray,
+        at: TruthTimes,
         frames: bool,
     ) -> None:
         self._moves = moves
+        samples, probes, marks = at
         self.frame_times = marks if frames else np.empty(0)
         times = np.unique(np.concatenate([[0.0], samples, marks]))
         inside = np.unique(probes[~np.isin(probes, times)])

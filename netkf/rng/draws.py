@@ -40,7 +40,7 @@ class Ziggurat(NamedTuple):
 
 @cache
 def ziggurat() -> Ziggurat:
-    """As numpy has it."""
+    """Return the tables of numpy's ziggurat for exponential numbers."""
     with np.load(Path(__file__).with_name("ziggurat.npz")) as kept:
         return Ziggurat(kept["fe"], kept["we"], kept["ke"])
 
@@ -125,7 +125,7 @@ def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: F
 def fill_exponentials(
     states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
 ) -> None:
-    """The same for exponential numbers."""
+    """Write the next ``counts`` exponential numbers of mean 1 of each of the streams ``which``."""
     place = 0
     for m in range(len(which)):
         for _ in range(counts[m]):

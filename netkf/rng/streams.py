@@ -126,7 +126,7 @@ class _Words(ISeedSequence):
 
 
 def _small(entities: Sequence[tuple[int, ...]]) -> bool:
-    """Whether all are of numbers of one word."""
+    """Return True if every id fits into one word of 32 bits."""
     return max(max(entity, default=0) for entity in entities) < WORD
 
 

@@ -23,7 +23,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolved, to_toml
 from netkf.trace.recorder import Sink
-from netkf.trace.run import event_columns, state_table
+from netkf.trace.run import StateSamples, event_columns, state_table
 from netkf.trace.schema import EVENT
 
 ROWS = 1 << 17
@@ -204,7 +204,9 @@ class ParquetSink(Sink):
         self._samples.clear()
         self._rows = 0
         self._states.write(
-            state_table(self._replica, times, self._nodes, x, xhat, P, error, self._shown)
+            state_table(
+                self._replica, self._nodes, StateSamples(times, x, xhat, P, error), self._shown
+            )
         )
 
     def close(self) -> None:
@@ -239,7 +241,8 @@ class TraceTables:
         error: FloatArray,
     ) -> None:
         """Append one run: its EVENT rows, and its samples with the shapes of ``netkf.Run``."""
-        states = state_table(replica, times, self._nodes, x, xhat, P, error, self._shown)
+        samples = StateSamples(times, x, xhat, P, error)
+        states = state_table(replica, self._nodes, samples, self._shown)
         for gathered, columns in zip(
             self._gathered, (event_columns(log, replica, 0), states), strict=True
         ):

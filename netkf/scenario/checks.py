@@ -1,4 +1,4 @@
-"""What the parts of a scenario owe each other; each rule raises ScenarioError in one line."""
+"""The checks of a scenario as a whole; each raises ScenarioError in one line."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from netkf.scenario.registry import spoken
 from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.shapes import demand_shape
 
-MOST_SAMPLES = 10_000_000
-MOST_STEPS = 100_000_000
-MOST_TICKS = 1e9
+MAX_SAMPLES = 10_000_000
+MAX_STEPS = 100_000_000
+MAX_TICKS = 1e9
 
 
 def check(scenario: DerivedScenario) -> None:
-    """Everything that no single part can know."""
-    _times(scenario)
-    _plant(scenario)
-    _sensors(scenario)
+    """Check all rules that no single component can check alone; raises ScenarioError."""
+    _check_times(scenario)
+    _check_plant(scenario)
+    _check_sensors(scenario)
     check_time(scenario)
     check_readings(scenario)
-    _network(scenario)
-    _filter(scenario)
+    _check_network(scenario)
+    _check_filter(scenario)
     check_records(scenario)
     check_sampling(scenario)
     if scenario.slotted:
-        _slots(scenario)
+        _check_slots(scenario)
     elif uses_grid(scenario):
-        _sensing_period(scenario)
+        _check_sensing_period(scenario)
     scenario.hosted.check_scenario(scenario)
 
 
-def _times(scenario: DerivedScenario) -> None:
+def _check_times(scenario: DerivedScenario) -> None:
     probe, horizon = scenario.probe, scenario.horizon
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
             raise ScenarioError(
                 "probe", f"must be at most the horizon {horizon:g}", probe, "shorten the period"
             )
-        if horizon / probe > MOST_SAMPLES:
+        if horizon / probe > MAX_SAMPLES:
             raise ScenarioError(
                 "probe",
-                f"must ask for at most {MOST_SAMPLES:,} samples",
+                f"must ask for at most {MAX_SAMPLES:,} samples",
                 probe,
                 "lengthen the period",
             )
@@ -70,7 +70,7 @@ def _times(scenario: DerivedScenario) -> None:
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
 
 
-def _plant(scenario: DerivedScenario) -> None:
+def _check_plant(scenario: DerivedScenario) -> None:
     plant, n = scenario.plant, scenario.plant.n
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
@@ -84,7 +84,7 @@ def _plant(scenario: DerivedScenario) -> None:
         demand_shape("plant.cov", plant.cov, (n, n), why)
 
 
-def _sensors(scenario: DerivedScenario) -> None:
+def _check_sensors(scenario: DerivedScenario) -> None:
     n, known = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
@@ -117,7 +117,7 @@ def _ids(nodes: tuple[int, ...]) -> str:
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
-def _network(scenario: DerivedScenario) -> None:
+def _check_network(scenario: DerivedScenario) -> None:
     network, topology = scenario.network, scenario.topology
     algorithm = scenario.hosted
     for key, part in (
@@ -143,7 +143,7 @@ def _network(scenario: DerivedScenario) -> None:
         )
     if not scenario.slotted:
         check_activation(scenario)
-        _ticks(scenario)
+        _check_ticks(scenario)
     elif topology.directed and not algorithm.one_way:
         raise ScenarioError(
             "network.graph.directed",
@@ -162,22 +162,22 @@ def _network(scenario: DerivedScenario) -> None:
         )
 
 
-def _ticks(scenario: DerivedScenario) -> None:
+def _check_ticks(scenario: DerivedScenario) -> None:
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     what = clock.at.removesuffix("s")
     for entity in clock.entities(scenario.topology):
         ticks = clock.mean_rate(entity) * scenario.horizon
-        if ticks > MOST_TICKS:
+        if ticks > MAX_TICKS:
             raise ScenarioError(
                 "network.activation",
-                f"must make at most {MOST_TICKS:g} ticks of a {what} up to the horizon",
+                f"must make at most {MAX_TICKS:g} ticks of a {what} up to the horizon",
                 f"{ticks:.3g} ticks of {what} {entity[0] if len(entity) == 1 else entity}",
                 "lower the rate or shorten the horizon",
             )
 
 
-def _filter(scenario: DerivedScenario) -> None:
+def _check_filter(scenario: DerivedScenario) -> None:
     filtering, n = scenario.filter, scenario.plant.n
     why = f"the state has {n} components"
     for key, value, shape in (
@@ -216,14 +216,14 @@ def _filter(scenario: DerivedScenario) -> None:
                 "use F and Q for linear plants, A and B for diffusions",
             )
         demand_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
-    _believed_noise(scenario)
+    _check_believed_noise(scenario)
     check_weights(scenario)
     if filtering.algorithm.inverts:
         check_invertible(scenario)
-    _degrees(scenario)
+    _check_degrees(scenario)
 
 
-def _believed_noise(scenario: DerivedScenario) -> None:
+def _check_believed_noise(scenario: DerivedScenario) -> None:
     R, sensors = scenario.filter.model.R, scenario.sensors
     if R is None:
         return
@@ -242,7 +242,7 @@ def _believed_noise(scenario: DerivedScenario) -> None:
         demand_shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
 
 
-def _degrees(scenario: DerivedScenario) -> None:
+def _check_degrees(scenario: DerivedScenario) -> None:
     algorithm = scenario.filter.algorithm
     if not algorithm.talks or not scenario.topology.links:
         return
@@ -256,13 +256,13 @@ def _degrees(scenario: DerivedScenario) -> None:
         )
 
 
-def _sensing_period(scenario: DerivedScenario) -> None:
+def _check_sensing_period(scenario: DerivedScenario) -> None:
     period, horizon = scenario.truth.sensing_period, scenario.horizon
     assert period is not None
-    if horizon / period > MOST_STEPS:
+    if horizon / period > MAX_STEPS:
         raise ScenarioError(
             "plant.sensing_period",
-            f"must make at most {MOST_STEPS:,} steps to the horizon",
+            f"must make at most {MAX_STEPS:,} steps to the horizon",
             period,
             "lengthen it, shorten the horizon, or use less precise sensors",
         )
@@ -298,7 +298,7 @@ def _longest(scenario: DerivedScenario, model: FlowModel) -> float:
     return longest_interval(*scenario.belief, model.H, model.R)
 
 
-def _slots(scenario: DerivedScenario) -> None:
+def _check_slots(scenario: DerivedScenario) -> None:
     plant, algorithm = scenario.slot_plant, scenario.hosted
     off = [
         t
@@ -324,7 +324,7 @@ def _slots(scenario: DerivedScenario) -> None:
         raise ScenarioError(
             "network.activation.kind",
             f"must be a {'matching' if algorithm.pairwise else 'broadcast'} for the {name} filter",
-            _told(activation),
+            _describe(activation),
             "choose another activation or another filter",
         )
     exchanges = (algorithm.schedule or ()).count("exchange")
@@ -337,8 +337,8 @@ def _slots(scenario: DerivedScenario) -> None:
         )
 
 
-def _told(activation: Component) -> str:
-    """The kind of an activation in a sentence."""
+def _describe(activation: Component) -> str:
+    """Return the kind of an activation, with the columns of a recorded one."""
     name = spoken(activation, "activation")
     if not isinstance(activation, RecordedSlots):
         return name

@@ -1,4 +1,4 @@
-"""What regressors, weights of pairs and covariance intersection ask of the rest of a scenario."""
+"""Checks of regressors, weights of pairs, and filters that invert covariances."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from netkf.scenario.shapes import demand_shape
 
 
 def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:
-    """Raise ScenarioError where the matrices of a regressor do not fit, or time is continuous."""
+    """Raise ScenarioError if the matrices of a regressor do not fit, or time is continuous."""
     if not scenario.slotted:
         raise ScenarioError(
             f"{key}.kind",
@@ -32,7 +32,7 @@ def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor
 
 
 def check_weights(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError where weights given pair by pair do not fit nodes and links."""
+    """Raise ScenarioError if weights given for pairs do not fit the nodes and links."""
     given, nodes = scenario.hosted.pair_weights, scenario.nodes
     if given is None:
         return
@@ -50,8 +50,10 @@ def check_weights(scenario: DerivedScenario) -> None:
 
 
 def check_invertible(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError where a covariance may become singular: unless noise reaches every state,
-    or none starts so and no state is forgotten at once.
+    """Raise ScenarioError if a covariance may become singular.
+
+    It stays regular if noise reaches every state, or if all covariances are regular at the start
+    and no step is singular.
     """
     n = scenario.plant.n
     starts = [scenario.start(node)[1] for node in scenario.nodes]

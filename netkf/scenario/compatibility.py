@@ -1,4 +1,4 @@
-"""Which filters, activations, graphs and sensors can be run together; each refusal is one line."""
+"""Checks that filter, activation, graph and sensors can be run together."""
 
 from __future__ import annotations
 

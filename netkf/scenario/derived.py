@@ -40,7 +40,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def slot_belief(self) -> tuple[FloatArray, FloatArray]:
-        """``F`` and ``Q`` (n, n) as the filters have them."""
+        """The matrices ``F`` and ``Q`` (n, n) that the filters use in slots."""
         plant, model = self.slot_plant, self.filter.model
         return (
             plant.F if model.F is None else model.F,
@@ -49,7 +49,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def slot_models(self) -> tuple[SlotModel, ...]:
-        """What each node believes, in the order of ``nodes``; H of slot 0 where H is random."""
+        """The model of each node in slots, in the order of ``nodes``; random H as in slot 0."""
         return tuple(
             self._slot_model(self._stacked(self.placed.get(node, ()), believed=True))
             for node in self.nodes
@@ -60,7 +60,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
-        """What each node may know about itself and the network, in the order of ``nodes``."""
+        """The facts that each node may use about itself and the network, in order of ``nodes``."""
         information = np.zeros((self.plant.n, self.plant.n))
         for node in self.nodes:
             H, R = self._stacked(self.placed.get(node, ()), believed=True)
@@ -77,7 +77,7 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:
-        """What each node believes, in the order of ``nodes``."""
+        """The model of each node, in the order of ``nodes``."""
         return self.slot_models if self.slotted else self.models
 
     @property
@@ -129,7 +129,7 @@ class DerivedScenario(ScenarioModel):
         return plant.path(random, probing, self.times, sample_random, sampled, horizon, frames)
 
     def slot_truth(self, streams: Streams) -> Any:
-        """The state of one run in slots, in frames where they are used."""
+        """Return the state of one run in slots, in frames if errors are exact."""
         return self.slot_plant.truth(streams.generator("plant"), self.exact_errors)
 
     @cached_property
@@ -149,7 +149,7 @@ class DerivedScenario(ScenarioModel):
         return same and frame_period(self.truth.A) is not None
 
     def moved_back(self, offset: FloatArray, age: float) -> FloatArray:
-        """The state (n,) from which the plant alone would come to ``offset`` in ``age`` seconds."""
+        """Return the state (n,) that the plant without noise moves to ``offset`` in ``age`` s."""
         if self.slotted:
             return offset
         return np.asarray(scipy.linalg.expm(-age * self.truth.A) @ offset)
@@ -173,15 +173,15 @@ class DerivedScenario(ScenarioModel):
         return np.concatenate([empty, *H]), block_diagonal(R)
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
-        """The increasing times below the horizon at which each sensor (node, ordinal) samples."""
+        """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
         return sample_times(self, streams)
 
     def sample_path(self, streams: Streams, node: int, place: PlacedSensor) -> Samples:
-        """The samples of one sensor of a node in one run in continuous time."""
+        """Return the samples of one sensor of a node in one run in continuous time."""
         return sample_path(self, streams, node, place)
 
     def slot_path(self, streams: Streams, node: int, place: PlacedSensor) -> Readings:
-        """The readings of one sensor of a node in one run in slots."""
+        """Return the readings of one sensor of a node in one run in slots."""
         sensor, period = self.sensors[place.entry], self.slot_plant.period
         return sensor.slot_path(
             node, period, lambda purpose: streams.generator(purpose, node, place.ordinal)
@@ -189,7 +189,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def belief(self) -> tuple[FloatArray, FloatArray]:
-        """``A`` and ``Q = B B'`` (n, n) as the filters have them."""
+        """The matrices ``A`` and ``Q = B B'`` (n, n) that the filters use."""
         model = self.filter.model
         plant = self.truth
         A = plant.A if model.A is None else model.A
@@ -198,7 +198,7 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def filters_know_the_truth(self) -> bool:
-        """Whether the filters have the plant's matrices and the sensors' R."""
+        """True if the filters use the plant's own matrices and the sensors' own R."""
         plant = self.plant
         if not self.is_random:
             return False
@@ -211,7 +211,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def models(self) -> tuple[FlowModel, ...]:
-        """What each node believes, in the order of ``nodes``; equal models are one object."""
+        """The model of each node in continuous time; equal models are one object."""
         made: dict[bytes, FlowModel] = {}
         return tuple(
             self._model(self.observation(node, believed=True), made) for node in self.nodes
@@ -238,7 +238,7 @@ class DerivedScenario(ScenarioModel):
         return made[key]
 
     def start(self, node: int) -> tuple[FloatArray, FloatArray]:
-        """``xhat`` (n,) and ``P`` (n, n) of a node at time 0."""
+        """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0."""
         index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
         first = self.plant.start_mean if mean is None else mean
         spread = self.plant.start_cov if cov is None else cov
@@ -248,7 +248,10 @@ class DerivedScenario(ScenarioModel):
         )
 
     def weight(self, receiver: int, sender: int) -> float:
-        """The weight a node gives to a message: pi_ij of H (7), a_ji of D (8)."""
+        """Return the weight that ``receiver`` gives to messages of ``sender``.
+
+        It is pi_ij of H (7) and a_ji of D (8).
+        """
         algorithm, topology = self.hosted, self.topology
         given = algorithm.pair_weights
         if given is not None:
@@ -257,15 +260,16 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def own_weights(self) -> dict[int, float]:
-        """What is left to each node when the messages of all its neighbours arrive together."""
+        """The weight that remains to each node if messages of all its neighbours arrive."""
         own = dict.fromkeys(self.nodes, 1.0)
         for sender, receiver in self.topology.directions:
             own[receiver] -= self.weight(receiver, sender)
         return {node: max(value, 0.0) for node, value in own.items()}
 
     def effective_rates(self) -> dict[Link, float]:
-        """Messages per second that arrive on each direction (sender, receiver) in the long run;
-        nan where that is not known beforehand.
+        """Return the messages per second that arrive on each direction in the long run.
+
+        Keys are (sender, receiver); values are nan if they are unknown before a run.
         """
         clock, loss = self.network.activation, self.network.channel.loss
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:

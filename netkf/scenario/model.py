@@ -45,7 +45,7 @@ from netkf.plants.sensors import LinearSensor, Sensor
 
 @dataclass(frozen=True, eq=False)
 class Network(Component):
-    """Who can talk to whom, when, and what becomes of a message."""
+    """The graph of a network, the activation of its links and the channel of its messages."""
 
     graph: Graph = field(instance(Graph))
     activation: LinkClock | SlotActivation | None = field(
@@ -56,7 +56,7 @@ class Network(Component):
 
 @dataclass(frozen=True, eq=False)
 class Belief(Component):
-    """What the filters believe where it differs from the truth.
+    """The matrices that filters use where they differ from the true ones.
 
     ``A`` (n, n) and ``B`` (n, m) of a diffusion, ``F`` and ``Q`` (n, n) of a linear plant, ``R`` of
     the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry.
@@ -74,7 +74,7 @@ class Belief(Component):
 
 @dataclass(frozen=True, eq=False)
 class Filtering(Component):
-    """The filter of every node: its ``algorithm``, its start and what it believes.
+    """The filter of every node: its ``algorithm``, its initial estimate and its model.
 
     ``mean`` (n,) and ``cov`` (n, n) are one for all nodes or a tuple with one per node in the
     order of node ids; both default to the plant's.
@@ -153,7 +153,7 @@ class ScenarioModel(Component):
 
     @property
     def slotted(self) -> bool:
-        """Whether the scenario runs in slots, else in continuous time."""
+        """True if the scenario runs in slots, False if in continuous time."""
         return isinstance(self.plant, LinearPlant)
 
     @property
@@ -171,13 +171,15 @@ class ScenarioModel(Component):
 
     @cached_property
     def hosted(self) -> Filter:
-        """The filter of every node, as engines call it."""
+        """The filter of every node under the present contract."""
         return adapt(self.filter.algorithm)
 
     @property
     def ends(self) -> float:
-        """When the last thing may happen: the horizon, or the end of the slot that begins there
-        where a sample shows what is known after the exchanges of its slot.
+        """The time in seconds after which nothing happens.
+
+        It is the horizon, or the end of the slot that begins there if samples are taken after the
+        exchanges of their slot.
         """
         if not self.slotted or self.hosted.predicts:
             return self.horizon
@@ -209,18 +211,18 @@ class ScenarioModel(Component):
 
     @property
     def is_random(self) -> bool:
-        """Whether runs draw the state and all readings; else nobody knows their law."""
+        """True if runs draw the state and all readings; records of them follow no known law."""
         return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
 
     def noise(self, entry: int, believed: bool) -> FloatArray:
-        """R (p, p) of a ``[[sensors]]`` entry, as it is or as the filters believe it."""
+        """Return the true or the believed R (p, p) of a ``[[sensors]]`` entry."""
         R = self.filter.model.R
         if not believed or R is None:
             return self.sensors[entry].R
         return R[entry] if isinstance(R, tuple) else R
 
     def table_probability(self, link: Link) -> float:
-        """The delivery probability of a direction in the graph's table, 1 where it has none."""
+        """Return the delivery probability of a direction by the graph's table, 1 without one."""
         delivery = self.topology.delivery
         return 1.0 if delivery is None else delivery.get(link, 0.0)
 

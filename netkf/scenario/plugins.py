@@ -1,4 +1,4 @@
-"""Classes of users in a scenario: which there are, where they come from, and which one failed."""
+"""Classes of users in a scenario: a list of them, their files, and the one that failed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from netkf.core.fields import Component
 
 
 def plugged_in(part: Any) -> list[Component]:
-    """The parts of a scenario whose classes are not netkf's own."""
+    """Return the components of a scenario whose classes are not netkf's own."""
     if isinstance(part, tuple):
         return [found for item in part for found in plugged_in(item)]
     if not isinstance(part, Component):
@@ -22,14 +22,12 @@ def plugged_in(part: Any) -> list[Component]:
 
 
 def is_ours(cls: type) -> bool:
-    """Whether a class is netkf's own."""
+    """Return True if a class is netkf's own."""
     return cls.__module__.partition(".")[0] == "netkf"
 
 
 def module_files(scenario: Component) -> dict[str, Path | None]:
-    """The modules that a scenario's classes come from: the file where it is one file beside the
-    scenario, else None.
-    """
+    """Return the modules of users' classes: the file if it is beside the scenario, else None."""
     folder = getattr(scenario, "_folder", None)
     found: dict[str, Path | None] = {}
     for part in plugged_in(scenario):
@@ -40,8 +38,10 @@ def module_files(scenario: Component) -> dict[str, Path | None]:
 
 
 def blame(scenario: Any, error: Exception) -> str | None:
-    """``module:Class failed in method: error``, about the plugged-in class in whose method it
-    happened, or else the first one; None where all classes are netkf's own.
+    """Return ``module:Class failed in method: error`` for an error in a class of a user.
+
+    It names the class in whose method the error happened, or else the first one; None if all
+    classes are netkf's own.
     """
     parts = plugged_in(scenario)
     if not parts:
@@ -55,5 +55,5 @@ def blame(scenario: Any, error: Exception) -> str | None:
 
 
 def in_words(error: BaseException) -> str:
-    """The exception on one line."""
+    """Return the type and text of an exception on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300].rstrip(": ")

@@ -1,4 +1,4 @@
-"""What recorded states, readings and exchanges owe the rest of a scenario."""
+"""Checks of recorded states, readings and exchanges, and the slots that use them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from netkf.scenario.sampling import all_sample_times, sample_times
 
 
 def check_records(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError where a table does not fit, or a run would look for a row in vain."""
+    """Raise ScenarioError if a table does not fit or lacks a row that a run needs."""
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
         if isinstance(sensor, RecordedSensor):
@@ -52,7 +52,7 @@ def _readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> No
 
 
 def sensed_slots(scenario: DerivedScenario) -> range:
-    """The slots in which a run hands readings to its filters."""
+    """Return the slots in which a run hands readings to its filters."""
     plant, algorithm = scenario.slot_plant, scenario.hosted
     end = max(int(scenario.horizon / plant.period) - 1, 0)
     while not plant.over(end, scenario.horizon):
@@ -80,12 +80,12 @@ def _exchanges(scenario: DerivedScenario) -> None:
 
 
 def exchange_slots(scenario: DerivedScenario) -> range:
-    """The slots in which nodes exchange."""
+    """Return the slots in which nodes exchange."""
     return range(scenario.hosted.first_slot, sensed_slots(scenario).stop)
 
 
 def used_states(scenario: DerivedScenario) -> tuple[str, int, int] | None:
-    """File, rows and used rows of recorded states; None if the states are not recorded."""
+    """Return (file, rows, used rows) of recorded states; None if states are not recorded."""
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion):
         return plant.path.name, len(plant.table[0]), _used_rows(scenario, plant)
@@ -95,7 +95,7 @@ def used_states(scenario: DerivedScenario) -> tuple[str, int, int] | None:
 
 
 def _used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
-    """Rows at probe times, and at the sample times of sensors that are drawn, in replica 0."""
+    """Count the rows at probe times, and at random sensors' sample times, in replica 0."""
     times = [scenario.times]
     if any(sensor.is_random for sensor in scenario.sensors):
         times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))
@@ -107,13 +107,13 @@ def _used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
 
 
 def _wanted(scenario: DerivedScenario) -> set[int]:
-    """The slots in which a run needs the state."""
+    """Return the slots in which a run needs the state."""
     drawn = any(sensor.is_random for sensor in scenario.sensors)
     return {*scenario.slots, *(sensed_slots(scenario) if drawn else ())}
 
 
 def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:
-    """One line where recorded exchanges are in slots in which nothing is exchanged."""
+    """Return a line if recorded exchanges are in slots without exchanges."""
     activation = scenario.network.activation
     if not isinstance(activation, RecordedSlots) or not scenario.slotted:
         return ()

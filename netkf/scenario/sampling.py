@@ -1,4 +1,4 @@
-"""Sampled sensors and the truth of one run in continuous time, as engines and theory ask for them.
+"""Sampled sensors: their times and samples in one run, and their checks.
 
 A sensor over a diffusion gives increments, or it samples: with a clock of its own (``sampling``),
 or at the times of its table (``recorded``).
@@ -19,11 +19,11 @@ from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 
-MOST_SAMPLES = 1e9
+MAX_SAMPLES = 1e9
 
 
 def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:
-    """The increasing times below the horizon at which each sensor (node, ordinal) samples."""
+    """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
     found = {}
     for node, place in _placed(scenario):
         sensor, generator = scenario.sensors[place.entry], _generator(streams, node, place)
@@ -38,7 +38,7 @@ def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, i
 def sample_path(
     scenario: ScenarioModel, streams: Streams, node: int, place: PlacedSensor
 ) -> Samples:
-    """The samples of one sensor of a node in one run."""
+    """Return the samples of one sensor of a node in one run."""
     sensor = scenario.sensors[place.entry]
     return sensor.samples(node, _generator(streams, node, place), scenario.horizon)
 
@@ -56,7 +56,7 @@ def _generator(
 
 
 def sample_rate(scenario: ScenarioModel, node: int) -> float:
-    """Instants a second at which a node samples, in the long run; nan if it is not known."""
+    """Return the samples per second of a node in the long run; nan if unknown before a run."""
     places = scenario.sampled_sensors.get(node, ())
     if len(places) != 1:  # several may sample at one instant
         return math.nan if places else 0.0
@@ -66,13 +66,14 @@ def sample_rate(scenario: ScenarioModel, node: int) -> float:
 
 
 def all_sample_times(times: dict[tuple[int, int], FloatArray]) -> FloatArray:
-    """(K,) the instants at which anything samples, increasing."""
+    """Return the increasing instants (K,) at which any sensor samples."""
     return np.unique(np.concatenate([np.empty(0), *times.values()]))
 
 
 def uses_grid(scenario: ScenarioModel) -> bool:
-    """Whether the truth in continuous time is drawn on a sensing grid: where sensors give
-    increments, or there are no sensors at all.
+    """Return True if the truth in continuous time is drawn on a sensing grid.
+
+    That is so if sensors give increments, or if nothing samples.
     """
     drawn = not scenario.slotted and scenario.plant.is_random
     return drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
@@ -149,17 +150,17 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor) -> Non
         raise ScenarioError(f"{key}.sampling.at", words, getattr(clock, "at", None), "remove it")
     for node in sensor.nodes:
         count = clock.mean_rate((node, 0)) * scenario.horizon
-        if count > MOST_SAMPLES:
+        if count > MAX_SAMPLES:
             raise ScenarioError(
                 f"{key}.sampling",
-                f"must take at most {MOST_SAMPLES:g} samples up to the horizon",
+                f"must take at most {MAX_SAMPLES:g} samples up to the horizon",
                 f"{count:.3g} samples of node {node}",
                 "lower the rate or shorten the horizon",
             )
 
 
 def sampling_notes(scenario: ScenarioModel) -> tuple[str, ...]:
-    """One line for each table of readings that has none of a node of its sensor."""
+    """Return a line for each table without readings of some node of its sensor."""
     notes: list[str] = []
     for sensor in scenario.sensors:
         if not isinstance(sensor, RecordedSensor):

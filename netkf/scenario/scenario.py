@@ -29,8 +29,9 @@ class Scenario(DerivedScenario):
         check(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What travels when it is pickled: the settings, and the network, which may have been read
-        from a file.
+        """Return the fields and the topology for pickle.
+
+        Derived values are computed again; the topology may come from a file that is elsewhere.
         """
         kept = {field.name for field in dataclasses.fields(self)} | {"_folder", "topology"}
         return {name: value for name, value in self.__dict__.items() if name in kept}

@@ -1,4 +1,4 @@
-"""The rule that arrays of a scenario fit together."""
+"""The check of array shapes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from netkf.linalg.arrays import FloatArray
 
 
 def demand_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
-    """Raise ScenarioError where an array does not have the shape; None stands for any length."""
+    """Raise ScenarioError unless an array has the shape; None stands for any length."""
     fits = len(value.shape) == len(shape) and all(
         want is None or have == want for have, want in zip(value.shape, shape, strict=True)
     )

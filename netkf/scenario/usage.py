@@ -1,4 +1,4 @@
-"""What a finished run has used of the tables that its scenario names."""
+"""The use that a run makes of the tables of its scenario."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ OUTCOMES = {
     "lose": "were lost",
     "repeat": "followed the record from its start again",
 }
-"""What became of messages beyond a record, by its ``after``."""
+"""The treatment of messages beyond a record, by its ``after``."""
 NO_DELAY = "took no time unless lost"
-"""What became of messages beyond a record of delays with ``after`` "deliver"."""
+"""The treatment of messages beyond a record of delays with ``after`` "deliver"."""
 
 
 def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> dict[str, Use]:
-    """What one run to the horizon used of each table, by the key path of the part that names it.
+    """Return the use of each table by a run to the horizon, by key path of its component.
 
     ``sent`` counts the messages of each directed link, lost ones included; None leaves out the
     tables of messages, whose use differs from run to run. Each entry has ``path``,
@@ -53,7 +53,7 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
 
 
 def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
-    """One line for each table with rows that were not used, or with messages beyond it."""
+    """Return a line for each table with unused rows, or with messages beyond it."""
     notes = []
     for key, use in usage.items():
         if use["unused"]:

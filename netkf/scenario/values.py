@@ -1,4 +1,4 @@
-"""Values of scenario keys as they are typed on a command line: TOML, or bare words."""
+"""Values of scenario keys on a command line: TOML, or bare words."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LONGEST_WORD = 1000
 
 
 def split_setting(option: str, setting: str) -> tuple[str, str]:
-    """Key path and text of ``key.path=value``; raises ScenarioError at the ``option``."""
+    """Return key path and text of ``key.path=value``; raises ScenarioError at the ``option``."""
     key, equals, text = (part.strip() for part in setting.partition("="))
     if not equals or not key or not text:
         remedy = "write it that way"
@@ -22,7 +22,7 @@ def split_setting(option: str, setting: str) -> tuple[str, str]:
 
 
 def typed_value(option: str, key: str, text: str) -> Any:
-    """The value of a text: TOML, and bare words are strings."""
+    """Return the value of a text: TOML, or a string for bare words."""
     try:
         return _toml(text)
     except (ValueError, RecursionError):
@@ -34,7 +34,7 @@ def typed_value(option: str, key: str, text: str) -> Any:
 
 
 def typed_values(option: str, key: str, text: str) -> list[Any]:
-    """The values of ``v1,v2,...``; commas inside brackets and quotes belong to a value."""
+    """Return the values of ``v1,v2,...``; commas inside brackets and quotes separate nothing."""
     try:
         values = _toml(f"[{text}]")
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""Scenario to TOML, so that a run directory carries what was run."""
+"""A scenario as TOML, so that a run directory holds the scenario of the run."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from netkf.scenario.registry import name_of
 
 
 def as_table(scenario: DerivedScenario) -> dict[str, Any]:
-    """The tables of a file that says what the scenario was given, defaults left out."""
+    """Return the tables of a scenario file without fields at their defaults."""
     return _scenario(scenario, defaults=False)
 
 
 def resolved(scenario: DerivedScenario) -> dict[str, Any]:
-    """The tables of a file with every default written out; it gives the same runs."""
+    """Return the tables of a scenario file with all defaults; it gives the same runs."""
     network = scenario.network
     if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
         graph = dataclasses.replace(network.graph, seed=scenario.seed)
@@ -66,8 +66,8 @@ def _scenario(scenario: DerivedScenario, defaults: bool) -> dict[str, Any]:
 def _sensor(sensor: Sensor, defaults: bool) -> dict[str, Any]:
     table, clock = _kind("sensor", sensor, defaults), getattr(sensor, "sampling", None)
     if clock is not None:
-        told = _kind("sampling", clock, defaults)
-        table["sampling"] = {k: v for k, v in told.items() if k not in ("at", "rates")}
+        entries = _kind("sampling", clock, defaults)
+        table["sampling"] = {k: v for k, v in entries.items() if k not in ("at", "rates")}
     return table
 
 
@@ -105,7 +105,7 @@ def _plain(value: Any) -> Any:
 
 
 def to_toml(table: dict[str, Any]) -> str:
-    """TOML text of nested tables of numbers, strings and lists; equal tables give equal text."""
+    """Return nested tables of numbers, strings and lists as TOML; equal tables give equal text."""
     lines = [f"{key} = {toml_text(v)}" for key, v in table.items() if not _is_section(v)]
     for key, value in table.items():
         if isinstance(value, dict):
@@ -122,7 +122,7 @@ def _is_section(value: Any) -> bool:
 
 
 def toml_text(value: Any) -> str:
-    """One value as TOML."""
+    """Return one value as TOML."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{k} = {toml_text(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):

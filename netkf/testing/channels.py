@@ -1,4 +1,4 @@
-"""Whether a loss, a delay or a channel keeps its contract."""
+"""Check that a loss, a delay or a channel keeps its contract."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Channel, ChannelSampler, Delay, Loss
 from netkf.network.graphs import Link
 from netkf.rng.streams import Streams
-from netkf.testing.generators import Told, spoken
+from netkf.testing.generators import RecordingGenerator, describe_calls
 from netkf.testing.watching import Watched, demand, fail, global_randomness, made
 
 CHAINS, LENGTH, DRAWS = 1000, 50, 200
@@ -71,7 +71,7 @@ def _weather(watched: Watched) -> None:
     part, where = watched.part, f"{watched.name}.{watched.spoken('next_state')}"
     seen: dict[bool, list[Any]] = {}
     for twin in range(2):
-        random, bad, history = Told(5), None, []
+        random, bad, history = RecordingGenerator(5), None, []
         for k in range(DRAWS):
             bad = watched.call("next_state", bad, random, repeatable=False)
             demand(bad is True or bad is False, where, "must be True or False", bad)
@@ -82,14 +82,15 @@ def _weather(watched: Watched) -> None:
                     not calls,
                     where,
                     "must draw nothing where stateful is False",
-                    spoken(calls),
+                    describe_calls(calls),
                     "let stateful be True",
                 )
             elif calls != history[0][1]:
                 fail(
                     where,
                     "must draw the same at each activation",
-                    f"{spoken(history[0][1])} at the first and {spoken(calls)} at number {k}",
+                    f"{describe_calls(history[0][1])} at the first and {describe_calls(calls)} at "
+                    f"number {k}",
                     "draw first, then decide",
                 )
         seen[bool(twin)] = history
@@ -161,7 +162,7 @@ def _delays(watched: Watched) -> None:
 
 def _drawn(watched: Watched) -> list[float]:
     """Delays, each checked by itself."""
-    fixed, where, random = watched.part.fixed, f"{watched.name}.draw", Told(6)
+    fixed, where, random = watched.part.fixed, f"{watched.name}.draw", RecordingGenerator(6)
     first, rule = None, "must be a finite number of at least 0 seconds"
     delays: list[float] = []
     for k in range(DRAWS):
@@ -174,7 +175,7 @@ def _drawn(watched: Watched) -> list[float]:
             calls == first,
             where,
             "must draw the same for each message",
-            f"{spoken(first)} for the first and {spoken(calls)} for number {k}",
+            f"{describe_calls(first)} for the first and {describe_calls(calls)} for number {k}",
             "draw a fixed number of values, then decide",
         )
         same = fixed is None or seconds == fixed

@@ -1,4 +1,4 @@
-"""Whether a filter keeps its contract in continuous time."""
+"""Trials of a filter in continuous time."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class ClockTrial(Trial):
     def each_reading(
         cls, watched: Watched, system: System, shift: FloatArray | None, clock: str | None
     ) -> Iterator[ClockTrial]:
-        """With samples and with increments, as far as the filter takes them."""
+        """Yield a trial with samples and one with increments, if the filter takes them."""
         part = watched.part
         if not isinstance(part, FlowAdapter):
             yield cls(watched, system, shift, clock, increments=False)
@@ -68,7 +68,7 @@ class ClockTrial(Trial):
             yield cls(watched, system, shift, clock, increments=True)
 
     def model(self, sees: bool) -> FlowModel:
-        """It has the matrices of increment sensors only."""
+        """Return the model of a node, with the matrices of increment sensors only."""
         H, R = self.matrices(sees and self._increments)
         interval = min(0.1, longest_interval(self._A, self.system.Q, H, R))
         return FlowModel(self._A, self.system.Q, H, R, HORIZON, interval)
@@ -154,8 +154,8 @@ class ClockTrial(Trial):
             self._flying[k] = flying._replace(payload=payload)
 
     def _exchange(self, k: int, quiet: bool) -> None:
-        undisturbed = quiet and not self._flying
-        before = self.sums() if undisturbed else {}
+        nothing_in_flight = quiet and not self._flying
+        before = self.sums() if nothing_in_flight else {}
         payloads = [
             (node, receivers, self.emit(node, Exchange(time=self._time, receivers=receivers)))
             for node, receivers in self._transmissions(k)
@@ -169,11 +169,11 @@ class ClockTrial(Trial):
                     lands = k if quiet or self._count % 2 else k + 1
                     self._flying.append(Flying(lands, sender, receiver, payload, self._time))
         self._absorb(k)
-        if undisturbed:
+        if nothing_in_flight:
             self.compare(before, "none")
 
     def _transmissions(self, k: int) -> list[tuple[int, tuple[int, ...]]]:
-        """Who sends to whom: two nodes at once, as it may happen with any clock."""
+        """Return the senders of a round, each with its receivers; two nodes send at once."""
         one, other = sorted({k % len(self.nodes), (k + 1) % len(self.nodes)})
         if self._clock == "links":
             return [(one, (other,)), (other, (one,))]

@@ -1,4 +1,4 @@
-"""Whether a link clock keeps its contract."""
+"""Check that a link clock keeps its contract."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
-from netkf.testing.generators import Told
+from netkf.testing.generators import RecordingGenerator
 from netkf.testing.watching import Watched, demand, made
 
 BLOCKS = ((600,), (1,) * 600, (7, 64, 1, 256, 272))
@@ -58,7 +58,8 @@ def check_clock(clock: Any, /, link: Link = (0, 1), **settings: Any) -> None:
 
 def _origin(watched: Watched, link: Link) -> None:
     first, other = (
-        watched.call("origin", link, lambda: Told(8), repeatable=False) for _ in range(2)
+        watched.call("origin", link, lambda: RecordingGenerator(8), repeatable=False)
+        for _ in range(2)
     )
     where = f"{watched.name}.origin"
     number = isinstance(first, (int, float, np.floating)) and math.isfinite(first)
@@ -67,8 +68,8 @@ def _origin(watched: Watched, link: Link) -> None:
 
 
 def _ticks(watched: Watched, link: Link, blocks: tuple[int, ...], *entity: int) -> FloatArray:
-    random = Told(9, *entity)
-    origin = watched.part.origin(link, lambda: Told(10, *entity))
+    random = RecordingGenerator(9, *entity)
+    origin = watched.part.origin(link, lambda: RecordingGenerator(10, *entity))
     where, now, stopped = f"{watched.name}.ticks", 0.0, False
     times: list[FloatArray] = []
     for count in blocks:
@@ -141,7 +142,10 @@ def _rates(watched: Watched, link: Link) -> None:
 
 
 def _exponential(watched: Watched, gaps: FloatArray) -> None:
-    """By Kolmogorov's distance at a level of 1e-6, and by the relation of neighbouring gaps."""
+    """Check that gaps (chains, length) of mean 1 are independent and exponential.
+
+    The tests are Kolmogorov's at a level of 1e-6 and the correlation of neighbouring gaps.
+    """
     where, rule = f"{watched.name}.memoryless", "must be False where ticks are no Poisson process"
     remedy = "return False: theory relies on it"
     values = np.sort(gaps.reshape(-1))

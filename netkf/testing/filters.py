@@ -64,7 +64,7 @@ def former_names(hosted: Filter) -> dict[str, str]:
 
 
 def _class_variables(watched: Watched) -> None:
-    """Where the class says it runs."""
+    """Check the class variables that say where the filter runs."""
     part, name = watched.part, watched.name
     for flag in FLAGS:
         value = getattr(part, flag)

@@ -1,4 +1,4 @@
-"""Generators that tell what was drawn from them."""
+"""Random generators that record their calls."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from netkf.rng.streams import Streams
 Calls = list[tuple[str, int]]
 
 
-class Told(np.random.Generator):
+class RecordingGenerator(np.random.Generator):
     """A generator that lists the draws made from it: method and number of values."""
 
     def __init__(self, seed: int, *entity: int) -> None:
@@ -36,6 +36,6 @@ class Told(np.random.Generator):
         return calls
 
 
-def spoken(calls: Calls) -> str:
-    """Draws in words."""
+def describe_calls(calls: Calls) -> str:
+    """Return a text that lists calls of a generator."""
     return ", ".join(f"{count} x {name}" for name, count in calls) or "nothing"

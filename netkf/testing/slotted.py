@@ -1,4 +1,4 @@
-"""Whether a filter keeps its contract in slots."""
+"""Trials of a filter in slots."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class SlotTrial(Trial):
         self.compare(before, "all" if lost else "none")
 
     def _senders(self, slot: int) -> list[list[int]]:
-        """By receiver: everybody hears everybody, or pairs that change from slot to slot."""
+        """Return the senders that each node hears: all others, or its partner in this slot."""
         if not self.part.pairwise:
             return [[k for k in self.nodes if k != node] for node in self.nodes]
         paired = self._talking(slot)

@@ -24,8 +24,9 @@ class System(NamedTuple):
 
 
 def systems(inverts: bool) -> list[System]:
-    """Of 1, 2 and 3 states with 0, 1 and 2 readings, from a certain start and from an uncertain one
-    where filters allow that.
+    """Return systems of 1, 2 and 3 states with 0, 1 and 2 readings.
+
+    One starts from a certain state, unless the filter inverts covariances.
     """
     random = Streams(0).generator("testing")
     found = []

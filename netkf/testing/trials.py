@@ -1,4 +1,4 @@
-"""Nodes that hear each other, all with the filter that is checked: what slots and clocks share."""
+"""The base class of trials: connected nodes that all run the filter that is checked."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Trial(ABC):
         self.shown: list[Shown] = []
         self._shift = shift
         self.offset = np.zeros(len(system.M))
-        """What the truth is shifted by now."""
+        """The present shift of the truth (n,)."""
         self.nodes, self.weights = _network(self.part)
         models = [self.model(sees=node != 1) for node in self.nodes]
         information = np.sum([model.information for model in models], axis=0)
@@ -53,7 +53,7 @@ class Trial(ABC):
 
     @abstractmethod
     def model(self, sees: bool) -> Any:
-        """What a node believes."""
+        """Return the model of a node; without sensors unless it ``sees``."""
 
     @abstractmethod
     def run(self) -> None:
@@ -80,7 +80,7 @@ class Trial(ABC):
             self.show(node, self.states[node], method)
 
     def emit(self, node: int, exchange: Exchange) -> Any:
-        """What the node sends."""
+        """Call emit and return the payload."""
         pair = self.watched.call("emit", self.states[node], exchange)
         both = type(pair) is tuple and len(pair) == 2
         where = f"{self.watched.name}.emit"
@@ -97,7 +97,7 @@ class Trial(ABC):
         demand(truth, f"{self.watched.name}.stopped", "must be True or False", stopped)
 
     def sample(self, node: int, time: float) -> Reading:
-        """What the node's sensors see now."""
+        """Return a reading of the node's sensors at ``time``."""
         H, R = self.matrices(node != 1)
         return Reading(self.random.normal(size=len(H)) + H @ self.offset, H, R, time)
 
@@ -115,7 +115,7 @@ class Trial(ABC):
             self.step(node, "shift", self.offset)
 
     def sums(self) -> dict[str, float]:
-        """What ``conserved`` names, over all nodes."""
+        """Return the sums over all nodes of the quantities that ``conserved`` names."""
         where = f"{self.watched.name}.conserved"
         parts = [self.watched.call("conserved", state) for state in self.states]
         alike = all(isinstance(p, dict) and p.keys() == parts[0].keys() for p in parts)
@@ -124,7 +124,7 @@ class Trial(ABC):
         return {name: math.fsum(np.concatenate(values)) for name, values in terms.items()}
 
     def compare(self, before: dict[str, float], lost: str) -> None:
-        """Whether what is conserved is what it was before an exchange."""
+        """Check that the conserved sums are as they were before an exchange."""
         after = self.sums()
         for name, total in before.items():
             demand(
@@ -137,8 +137,10 @@ class Trial(ABC):
 
 
 def _network(part: Any) -> tuple[range, FloatArray]:
-    """As many nodes as ``pair_weights`` asks for, else three where the weights allow two links, all
-    linked; [l, i] is what node i gives to what l sends.
+    """Return the nodes and weights (N, N) of a complete graph.
+
+    N is the size of ``pair_weights``, else 3 if the weights allow two links, else 2. Entry [l, i]
+    is the weight that node i gives to messages of node l.
     """
     given = part.pair_weights
     count = (3 if part.largest_degree() >= 2.0 else 2) if given is None else len(given)

@@ -1,4 +1,4 @@
-"""Calls of a user's methods with everything around them watched."""
+"""Calls of a user's methods that check their side effects."""
 
 from __future__ import annotations
 
@@ -178,13 +178,11 @@ class Watched:
         return results[0]
 
     def once(self) -> Watched:
-        """The same part, each method called once and what is around it left alone: for runs that
-        are only compared with watched ones.
-        """
+        """Return the same component with unchecked calls, to compare with checked ones."""
         return _Once(self.part, self._owner, self._former)
 
     def _attributes(self) -> Leaves:
-        """What the part has, but for properties that it caches."""
+        """Return the attributes of the component, except for cached properties."""
         cls, own = type(self._owner), vars(self._owner)
         kept = {k: v for k, v in own.items() if not isinstance(_static(cls, k), cached_property)}
         return {path.strip("[]'"): leaf for path, leaf in leaves(kept)}
@@ -214,7 +212,7 @@ class Watched:
         return [*names, *["an argument"] * count][:count]
 
     def finish(self) -> None:
-        """What was returned at any time is still what it was."""
+        """Check that no result of an earlier call has changed since."""
         for where, result, old in self._kept:
             path = difference(old, dict(leaves(result)))
             demand(

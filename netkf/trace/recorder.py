@@ -1,4 +1,4 @@
-"""What a run leaves behind, gathered with as little work in the loop as Python allows.
+"""The recording of events and samples of a run, with little work in the event loop.
 
 Events are appended to a list as tuples and leave it in blocks, or come in blocks; states come as
 one block a sample time or several. Both go to sinks, which keep them in memory or write them to
@@ -28,29 +28,31 @@ NAN = math.nan
 
 
 class Sink(ABC):
-    """Where a recorder's blocks go; from another thread too, one call at a time, where that is
-    ``thread_safe``.
+    """The contract of a destination of recorded blocks.
+
+    If ``thread_safe``, the recorder may call it from a thread of its own, one call at a time.
     """
 
     thread_safe: ClassVar[bool] = False
     exact_errors: bool = False
-    """Whether errors keep their digits however large the state is; the recorder sets it."""
+    """True if errors keep their digits however large the state is; the recorder sets it."""
 
     @abstractmethod
     def events(self, rows: np.ndarray) -> None:
-        """A block of EVENT rows that follows the one before."""
+        """Take the next block of EVENT rows."""
 
     @abstractmethod
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Samples at times (T,): x (T, n), xhat (T, N, n), P (T, N, n, n), nan where the filter
-        gives none, and error (T, N, n), x - xhat without the rounding of large x and xhat.
+        """Take samples at times (T,): x (T, n), xhat (T, N, n), P (T, N, n, n), error (T, N, n).
+
+        P is nan if the filter gives none; error is x - xhat without the rounding of large x.
         """
 
 
 class MemorySink(Sink):
-    """Keeps everything."""
+    """A sink that keeps all blocks in memory."""
 
     thread_safe: ClassVar[bool] = True
 
@@ -59,18 +61,18 @@ class MemorySink(Sink):
         self.samples: list[tuple[FloatArray, ...]] = []
 
     def events(self, rows: np.ndarray) -> None:
-        """Appended."""
+        """Append the block."""
         self.blocks.append(rows)
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Appended."""
+        """Append the block."""
         self.samples.append((t, x, xhat, P, error))
 
 
 def _ignore(row: tuple[float, int, int, int, int, int, float]) -> None:
-    """No event."""
+    """Discard an event."""
 
 
 class Recorder:
@@ -91,14 +93,15 @@ class Recorder:
         self.sums: dict[str, tuple[float, float]] = {}
         """Sums over all nodes that exchanges should conserve: at the start, at the last sample."""
         self.stats: dict[str, int] = {}
-        """What the engine counted of its own work, such as SimPy processes and events."""
+        """Counts that the engine keeps of its own work, such as SimPy processes and events."""
         self._exact_errors = False
 
     @property
     def exact_errors(self) -> bool:
-        """Whether errors keep their digits however large the state is: False where the engine
-        subtracts xhat from x, and True where it simulates the state in a frame that moves along.
-        An engine sets it before the first sample.
+        """True if errors keep their digits however large the state is.
+
+        It is False if the engine subtracts xhat from x, and True if it simulates the state in a
+        moving frame. An engine sets it before the first sample.
         """
         return self._exact_errors
 
@@ -117,14 +120,12 @@ class Recorder:
         self.append = self._rows.append
 
     def flush_if_full(self) -> None:
-        """Pass the gathered events on once there are enough of them."""
+        """Pass the gathered events on if there are enough of them for a block."""
         if len(self._rows) >= BLOCK:
             self.flush()
 
     def flush(self) -> None:
-        """Pass the gathered events on; all that came is counted and kept then, and nothing goes on
-        in another thread.
-        """
+        """Pass the gathered events on and wait until every sink has taken all of them."""
         with defer_signals():
             try:
                 self._flush_gathered()
@@ -147,8 +148,8 @@ class Recorder:
         self._do(self._pass_on, rows)
 
     def extend(self, rows: np.ndarray) -> None:
-        """Record a block of EVENT rows, which nobody writes to from now on."""
-        with defer_signals():  # what is counted is also kept
+        """Record a block of EVENT rows; the caller must not write to it afterwards."""
+        with defer_signals():  # a signal must not separate the count from the rows
             self._flush_gathered()
             if not len(rows):
                 return
@@ -168,14 +169,14 @@ class Recorder:
         self._counts += counts
 
     def _do(self, something: Callable[..., None], *arguments: Any) -> None:
-        """At once, or in its turn where there is a thread for it."""
+        """Call ``something``, in the recorder's thread after earlier calls if it has one."""
         if self._thread is None:
             something(*arguments)
         else:
             self._handed.append(self._thread.submit(something, *arguments))
 
     def _wait(self) -> None:
-        """Until all that was handed over is done; raises what failed first."""
+        """Wait for the recorder's thread; raises the exception of the first call that failed."""
         while self._handed:
             self._handed[0].result()
             del self._handed[0]
@@ -200,8 +201,8 @@ class Recorder:
     def samples(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Record some samples, which nobody writes to from now on."""
-        with defer_signals():  # what one sink has seen all have
+        """Record several samples; the caller must not write to the arrays afterwards."""
+        with defer_signals():  # a signal must not leave the sinks with different samples
             self._do(self._show, t, x, xhat, P, error)
 
     def _show(self, *sample: FloatArray) -> None:
@@ -209,22 +210,20 @@ class Recorder:
             sink.states(*sample)
 
     def count(self, kind: str) -> int:
-        """Events of a kind that were flushed."""
+        """Return the number of flushed events of a kind."""
         return int(self._counts[CODES[kind]])
 
     @property
     def counts(self) -> np.ndarray:
-        """(len(KINDS),) flushed events by kind."""
+        """The number of flushed events of each kind, (len(KINDS),)."""
         return self._counts.copy()
 
     @property
     def total(self) -> int:
-        """Events that were flushed."""
+        """The number of flushed events."""
         return int(self._counts.sum())
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the flushed events, independent of blocks and machines; empty where they were
-        only counted.
-        """
+        """SHA-256 of the flushed events, whatever the blocks; empty if ``counts_only``."""
         return "" if self.counts_only else self._hash.hexdigest()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ the largest one are rounding themselves.
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run:
-    """What happened in one run.
+    """The samples and events of one run.
 
     times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n), nan where the filter gives no
     covariance, error (T, N, n); ``log`` holds the events as a structured array
@@ -69,22 +69,22 @@ class Run:
 
     @cached_property
     def events(self) -> pd.DataFrame:
-        """Table of events, columns as trace.schema.EVENT_COLUMNS."""
+        """The table of events, with columns trace.schema.EVENT_COLUMNS."""
         import pandas as pd
 
         return pd.DataFrame(event_columns(self.log, self.replica, 0))
 
     @cached_property
     def states(self) -> pd.DataFrame:
-        """Table of state samples, columns as trace.schema.state_columns."""
+        """The table of state samples, with columns trace.schema.state_columns."""
         import pandas as pd
 
-        samples = (self.times, self.nodes, self.x, self.xhat, self.P, self.error)
-        return pd.DataFrame(state_table(self.replica, *samples, self.truth_known))
+        samples = StateSamples(self.times, self.x, self.xhat, self.P, self.error)
+        return pd.DataFrame(state_table(self.replica, self.nodes, samples, self.truth_known))
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """(T,) the size of what rounding adds to ``error``."""
+        """The size (T,) of the rounding error in ``error``."""
         return rounding(carried(self.x, self.error, self.exact_errors))
 
     @cached_property
@@ -94,12 +94,12 @@ class Run:
         return rounding_from(self.times, size, self.P, self.error)
 
     def count(self, kind: str) -> int:
-        """Number of events of a kind."""
+        """Return the number of events of a kind."""
         return int((self.log["kind"] == CODES[kind]).sum())
 
 
 def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
-    """EVENT rows as named columns; ``first`` is the sequence number of the first row."""
+    """Return EVENT rows as named columns; ``first`` is the sequence number of the first row."""
     import pandas as pd
 
     kinds = pd.Categorical.from_codes(rows["kind"].astype(np.int8), categories=pd.Index(KINDS))
@@ -148,17 +148,24 @@ def blurred(run: Run, matrices: FloatArray) -> np.ndarray:
     return np.asarray((BLUR * run.rounding[:, None]) ** 2 > least)
 
 
+class StateSamples(NamedTuple):
+    """Samples at times (T,): x (T, n), xhat and error (T, N, n), P (T, N, n, n)."""
+
+    times: FloatArray
+    x: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+    error: FloatArray
+
+
 def state_table(
-    replica: int,
-    times: FloatArray,
-    nodes: tuple[int, ...],
-    x: FloatArray,
-    xhat: FloatArray,
-    P: FloatArray,
-    error: FloatArray,
-    truth_known: bool = True,
+    replica: int, nodes: tuple[int, ...], samples: StateSamples, truth_known: bool = True
 ) -> dict[str, Any]:
-    """Samples as named columns, a row a time and node; errors only where the truth is known."""
+    """Return samples as named columns, with a row for each time and node.
+
+    Without known truth there are no columns of errors.
+    """
+    times, x, xhat, P, error = samples
     count, n = len(nodes), x.shape[1]
     rows = len(times) * count
     upper = np.triu_indices(n)
@@ -180,7 +187,7 @@ def state_table(
 
 
 def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None:
-    """One line about the first event in which two runs differ, None where all are equal.
+    """Return one line about the first event in which two runs differ; None if all are equal.
 
     Takes runs or event tables; nan equals nan.
     """

@@ -1,4 +1,4 @@
-"""The names and types of everything that is recorded."""
+"""Names and types of recorded events, and the columns of tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = (
     "diverged",
     "transmit",
 )
-"""Event kinds; a row stores the place of its kind in this tuple.
+"""Event kinds; a row stores the index of its kind in this tuple.
 
 sense    node took the reading that ends at t
 tick     the link node - peer activated
@@ -56,14 +56,19 @@ EVENT_COLUMNS = ("run", "seq", "t", "kind", "node", "peer", "message", "phase", 
 
 
 def state_columns(n: int) -> list[str]:
-    """Columns of the table of states for an n-dimensional plant; P by rows of its upper half."""
+    """Return the columns of the table of states of n-dimensional plants.
+
+    P is given by the rows of its upper triangle.
+    """
     states = [f"{name}{i}" for name in ("x", "xhat") for i in range(n)]
     return ["run", "t", "node", *states, *_upper("P", n), "sq_error", "nees"]
 
 
 def ensemble_columns(n: int) -> list[str]:
-    """Columns of the table of an ensemble: means over ``runs`` of P, of E = (x - xhat)(x - xhat)'
-    and of NEES, each followed by its standard error.
+    """Return the columns of the table of an ensemble of n-dimensional plants.
+
+    They are means over ``runs`` of P, of E = (x - xhat)(x - xhat)' and of NEES, each followed by
+    its standard error.
     """
     P, E = _upper("P", n), _upper("E", n)
     matrices = [*P, *(f"{name}_se" for name in P), *E, *(f"{name}_se" for name in E)]

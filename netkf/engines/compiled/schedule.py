@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.clock import next_ticks
+from netkf.core.clock import ClockPosition, next_ticks
 from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import (
@@ -138,7 +138,8 @@ class Clocks:
         assert isinstance(self._clock, LinkClock)
         origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
         entity, random = self._entities[k], self._random[k]
-        return next_ticks(self._clock, entity, origin, index, now, random, int(count))
+        position = ClockPosition(origin, index, now)
+        return next_ticks(self._clock, entity, position, random, int(count))
 
 
 def plain(channel: Channel) -> bool:

@@ -1,4 +1,4 @@
-"""Clocks of the network in continuous time: each is a process that lets nodes transmit."""
+"""Clocks of the network in continuous time: one SimPy process for each clock."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import simpy
 
-from netkf.core.clock import next_ticks
+from netkf.core.clock import ClockPosition, next_ticks
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
@@ -24,7 +24,7 @@ FIRST_BLOCK, LONGEST_BLOCK = 8, 1024
 
 Process = Generator[simpy.Event, Any, None]
 Activation = Callable[[float], None]
-"""What happens when a clock ticks, at the time of the tick."""
+"""A callback for the tick of a clock, called with its time in seconds."""
 
 
 def clock_processes(
@@ -35,8 +35,9 @@ def clock_processes(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """One process for each link, direction or node that has a clock; with activation by readings
-    none, since nodes then transmit after their samples.
+    """Return one process for each link, direction or node that has a clock.
+
+    There are none with activation by readings: nodes then transmit after their samples.
     """
     activation = scenario.network.activation
     if not scenario.hosted.talks or not isinstance(activation, LinkClock):
@@ -62,14 +63,15 @@ def _ticking(
     place: int,
     activate: Activation,
 ) -> Process:
-    """Wait for a tick, activate, and so on until the horizon."""
+    """Wait for each tick up to the horizon, and activate the entity."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
+    # A stream of its own: the ticks of one entity never depend on those of another.
     random = streams.generator("clock", *entity)
     origin = clock.origin(entity, partial(stream, streams, entity, "phase"))
     now, index, count = 0.0, 0, FIRST_BLOCK
     while True:
-        times = next_ticks(clock, entity, origin, index, now, random, count).tolist()
+        times = next_ticks(clock, entity, ClockPosition(origin, index, now), random, count).tolist()
         for now in times:
             if now >= scenario.horizon:
                 return
@@ -91,7 +93,7 @@ def _links(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Places:
-    """A tick lets both ends of the link exchange."""
+    """Return for each link an activation in which both ends exchange."""
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
         i, j = link
@@ -113,7 +115,7 @@ def _directions(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Places:
-    """A tick lets one end push to the other."""
+    """Return for each direction an activation in which one end pushes to the other."""
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
         i, j = link
@@ -135,7 +137,10 @@ def broadcasts(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> dict[int, Activation]:
-    """For each node, one transmission to all that can hear it; each hearer has its own outcome."""
+    """Return for each node an activation that transmits once to all that can hear it.
+
+    Each hearer has an outcome of its own.
+    """
     ways: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
     for k, (i, j) in enumerate(scenario.topology.directions):
         ways[i].append(transmitter.directed((i, j), k, nodes[j], transmitter.sampler((i, j))))
@@ -145,6 +150,7 @@ def broadcasts(
 
         def transmit(now: float) -> None:
             nonlocal sent
+            # Drawn even if the filter sends nothing, so that the network does not depend on it.
             outcomes = [way.sampler.draw() for way in ways[node]]
             payload = nodes[node].emit(now, hearers)
             if payload is None:
@@ -165,7 +171,7 @@ def _nodes(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Places:
-    """A tick lets a node broadcast."""
+    """Return for each node an activation in which it broadcasts."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 
     def activation(node: int) -> Activation:
@@ -185,7 +191,7 @@ def _transmit_after_samples(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> None:
-    """A node broadcasts after it has used a sample, at the rank of ticks."""
+    """Make every node broadcast, at the rank of ticks, after it has used a sample."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
     for node in scenario.sampled_sensors:
         carrier = nodes[node]

@@ -1,4 +1,4 @@
-"""The engine that defines what a scenario means: SimPy processes for everything that happens."""
+"""The engine that defines the meaning of a scenario, by SimPy processes."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class SimpyEngine(Engine):
     name = "simpy"
 
     def refusal(self, scenario: Scenario) -> str | None:
-        """None: this engine defines what a scenario means."""
+        """Return None: this engine runs every scenario."""
         return None
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
-        """Simulate up to the horizon; returns complete or diverged."""
+        """Simulate up to the horizon and return the status, "complete" or "diverged"."""
         simulation = _Simulation(scenario, streams, recorder, progress)
         processes = simulation.slots() if scenario.slotted else simulation.clocks()
         timeline = simulation.timeline
@@ -72,7 +72,7 @@ class SimpyEngine(Engine):
 
 
 class _Simulation:
-    """What the processes of one run share."""
+    """The objects that the processes of one run share."""
 
     def __init__(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
@@ -84,7 +84,7 @@ class _Simulation:
         recorder.exact_errors = scenario.exact_errors
 
     def clocks(self) -> list[Process]:
-        """The processes of a scenario in continuous time."""
+        """Return the processes of a scenario in continuous time."""
         scenario, streams, timeline = self._scenario, self._streams, self.timeline
         truth = scenario.continuous_truth(streams)
 
@@ -105,7 +105,7 @@ class _Simulation:
         ]
 
     def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
-        """Show the states at the probe times."""
+        """Record the states at the probe times."""
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
             for node in distinct(nodes):
@@ -113,8 +113,9 @@ class _Simulation:
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
 
     def _moving_origin(self, truth: Any, nodes: dict[int, ClockedNode]) -> Process:
-        """Move the origin of the coordinates to the state, before the state becomes so large that
-        errors lose their digits.
+        """Move the origin of the coordinates to the state at every frame time.
+
+        Otherwise the state of an unstable plant becomes so large that errors lose their digits.
         """
         for k, time in enumerate(truth.frame_times.tolist()):
             yield self.timeline.at(time, Rank.REBASE, 0)
@@ -126,7 +127,7 @@ class _Simulation:
             self._transmitter.shift(self._scenario.hosted, offset)
 
     def slots(self) -> list[Process]:
-        """The processes of a scenario in slots."""
+        """Return the processes of a scenario in slots."""
         scenario, streams, recorder = self._scenario, self._streams, self._recorder
         truth = scenario.slot_truth(streams)
         schedule, period = Schedule(scenario), scenario.slot_plant.period
@@ -150,7 +151,7 @@ class _Simulation:
     def _sampling_slots(
         self, truth: Any, schedule: Schedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
-        """Show the states of slots: predictions at the start, filtered ones at the end."""
+        """Record the states of slots: predictions at their start, filtered states at their end."""
         predicts, recorder, slot = self._scenario.hosted.predicts, self._recorder, 0
 
         def sample() -> None:
@@ -181,7 +182,7 @@ class _Simulation:
             slot += 1
 
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
-        """Hand one sample on; ``local`` is the state in the coordinates of the estimates."""
+        """Record one sample; ``local`` is the state in the coordinates of the estimates."""
         scenario, recorder = self._scenario, self._recorder
         shown = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [shown[id(nodes[node])] for node in scenario.nodes]
@@ -191,6 +192,7 @@ class _Simulation:
         without = np.array([P is None for _, P in estimates])
         far = near if x is local else near + (x - local)
         recorder.sample(time, x, far, P, local - near)
+        # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
         if sums.start:
             recorder.sums = sums.pairs()
         recorder.flush_if_full()
@@ -203,7 +205,7 @@ class _Simulation:
 
 
 def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any]) -> dict[int, Any]:
-    """The carrier of every node; where the filter is pooled, all nodes share one."""
+    """Return the node process of every node; the nodes of a pooled filter share one."""
     nodes = scenario.nodes
     if scenario.hosted.pooled:
         return dict.fromkeys(nodes, make(-1, 0, scenario.sensing))
@@ -211,7 +213,7 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 
 def _identity(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
-    """What every node is made from: filter, id, place, model, start and what it may know."""
+    """Return the arguments of Node: filter, id, index, model, start and NodeInfo."""
     model, first = scenario.believed_models[entity], scenario.nodes[entity]
     if node < 0:
         model = scenario.believed_pooled_model
@@ -226,7 +228,7 @@ def _identity(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
 
 
 class _Sums:
-    """What exchanges should conserve, summed over all nodes at the start and now."""
+    """The conserved quantities of exchanges, summed over all nodes at the start and now."""
 
     def __init__(self, nodes: list[Node]) -> None:
         self._nodes = nodes
@@ -237,7 +239,7 @@ class _Sums:
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
 
     def pairs(self) -> dict[str, tuple[float, float]]:
-        """At the start and now, by name."""
+        """Return the sums (at the start, now) by name."""
         now = self._now()
         return {name: (first, now[name]) for name, first in self.start.items()}
 

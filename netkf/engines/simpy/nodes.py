@@ -19,9 +19,11 @@ SENSE, ABSORB = CODES["sense"], CODES["absorb"]
 
 
 class Envelope(NamedTuple):
-    """A message: who sent it ``number`` on their directed link, the weight it is given, what it
-    carries, when it was sent, in slots the exchange that it belongs to (-1 under clocks), and once
-    it has arrived how many seconds it took.
+    """A message under way: message ``number`` of its sender on a directed link.
+
+    ``weight`` is the weight that the receiver gives it, ``sent`` its time in seconds, ``exchange``
+    the exchange of the run that it belongs to in slots (-1 under clocks), and ``age`` the seconds
+    that it took, once it has arrived.
     """
 
     sender: int
@@ -34,8 +36,10 @@ class Envelope(NamedTuple):
 
 
 class Node:
-    """One filter and what it is told. ``entity`` is the node's place among the nodes, ``node`` the
-    id that the trace shows, -1 for a filter that all nodes share.
+    """A filter with its inbox.
+
+    ``entity`` is the index of the node, ``node`` its id in the trace, -1 for a filter that all
+    nodes share.
     """
 
     def __init__(
@@ -53,9 +57,7 @@ class Node:
         self.inbox: dict[int, list[Envelope]] = {}
 
     def put(self, envelope: Envelope) -> None:
-        """Put a message into the inbox; of several from one sender the newest counts, unless the
-        filter wants them all.
-        """
+        """Put a message into the inbox, in place of an older one of that sender if newest_only."""
         known = self.inbox.setdefault(envelope.sender, [])
         if self.algorithm.newest_only and known:
             if envelope.sent >= known[0].sent:
@@ -64,8 +66,8 @@ class Node:
             known.append(envelope)
 
     def take_mail(self) -> tuple[list[Envelope], list[Message]]:
-        """Empty the inbox: what was in it in the order of senders, and as the filter sees it."""
-        # In the order of senders, so that no sum depends on the order of arrival.
+        """Empty the inbox and return its envelopes and messages, ordered by sender."""
+        # A floating-point sum must not depend on the order of arrival.
         envelopes = [envelope for peer in sorted(self.inbox) for envelope in self.inbox[peer]]
         self.inbox.clear()
         messages = [Message(e.sender, e.weight, e.payload, e.age) for e in envelopes]
@@ -77,8 +79,10 @@ class Node:
 
 
 class ClockedNode(Node):
-    """A node in continuous time. It is brought to the present when something happens to it; mail
-    that came at one instant is absorbed in an event of its own, as are samples.
+    """A node in continuous time.
+
+    It is predicted to the present only when an event concerns it. All messages that arrive at one
+    instant are absorbed in one later event of that instant, and so are all samples.
     """
 
     def __init__(
@@ -98,13 +102,14 @@ class ClockedNode(Node):
         """Called once the node has used its samples of an instant, with the nodes that sensed."""
 
     def predict_to(self, time: float) -> None:
-        """Bring the filter to ``time``, with the increments of the stretch in between."""
+        """Predict the filter to ``time`` seconds, using the increments since its last event."""
         if self._now >= time:
             return
         if not self._increments:
             self.state = self.algorithm.predict(self.state, time - self._now)
             self._now = time
             return
+        # Without a lower bound, an exploding covariance would ask for ever shorter intervals.
         least = SHORTEST_SHARE * (time - self._now)
         while self._now < time:
             end = time
@@ -126,7 +131,7 @@ class ClockedNode(Node):
         return np.asarray(whole.reshape(-1))
 
     def sample(self, node: int, y: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        """Take a sample of one sensor of ``node``; all of this instant are used together."""
+        """Take a sample of one sensor of ``node``; one update uses all of this instant."""
         if not self._samples:
             self._timeline.call_at(self._timeline.now, Rank.UPDATE, self.entity, self._use_samples)
         self._samples.append((node, y, H, R))
@@ -145,18 +150,18 @@ class ClockedNode(Node):
             self.after_sample(time)
 
     def emit(self, time: float, receivers: tuple[int, ...]) -> Any:
-        """What the node sends at ``time``, from before any reset of that instant."""
+        """Return the payload that the node sends at ``time``, before it absorbs anything."""
         self.predict_to(time)
         exchange = Exchange(time=time, receivers=receivers)
         self.state, payload = self.algorithm.emit(self.state, exchange)
         return payload
 
-    def accepts(self, envelope: Envelope) -> bool:
-        """Whether a message that arrives now is of use."""
+    def in_time(self, envelope: Envelope) -> bool:
+        """Return True if the filter accepts a message that arrives now."""
         return self.algorithm.accepts(envelope.payload, envelope.age)
 
     def receive(self, envelope: Envelope) -> None:
-        """Keep a message until all of this instant are absorbed."""
+        """Put a message into the inbox, to be absorbed with all others of this instant."""
         if not self.inbox:
             self._timeline.call_at(self._timeline.now, Rank.ABSORB, self.entity, self._absorb)
         self.put(envelope)
@@ -171,5 +176,5 @@ class ClockedNode(Node):
 
 
 def distinct(nodes: dict[int, Any]) -> list[Any]:
-    """The carriers of these nodes, each once: a filter that is pooled has one for all."""
+    """Return the distinct node processes; all nodes of a pooled filter share one."""
     return list({id(node): node for node in nodes.values()}.values())

@@ -1,8 +1,9 @@
-"""Sensors in continuous time: each sampled one is a process, as is each node with increments."""
+"""Sensors in continuous time: a process per sampled sensor and per node with increments."""
 
 from __future__ import annotations
 
 from collections.abc import Generator
+from dataclasses import dataclass
 from typing import Any
 
 import simpy
@@ -10,6 +11,8 @@ import simpy
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
+from netkf.linalg.arrays import FloatArray
+from netkf.plants.sampling import Samples
 from netkf.plants.sensors import LinearSensor, SensorPath
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
@@ -29,7 +32,7 @@ def sensor_processes(
     truth: Any,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """All processes that read the truth."""
+    """Return all processes that read the truth."""
     index = scenario.topology.index
     processes = [
         _increments(scenario, timeline, recorder, truth, nodes[node], node, index[node])
@@ -38,11 +41,10 @@ def sensor_processes(
     times, entity = scenario.sample_times(streams), 0
     for node, placed in scenario.sampled_sensors.items():
         for place in placed:
-            path = scenario.sample_path(streams, node, place)
+            samples = scenario.sample_path(streams, node, place)
             R = scenario.noise(place.entry, believed=True)
-            instants = times[node, place.ordinal]
-            arguments = (timeline, truth, nodes[node], node, entity, instants, path, R)
-            processes.append(_sampling(*arguments))
+            sensor = SampledSensor(node, entity, times[node, place.ordinal], samples, R)
+            processes.append(sensor.run(timeline, truth, nodes[node]))
             entity += 1
     return processes
 
@@ -56,7 +58,7 @@ def _increments(
     node: int,
     entity: int,
 ) -> Process:
-    """Wake the node at each point of the sensing grid, where it uses the increments so far."""
+    """Make the node use its increments at each point of the sensing grid."""
     k = 1
     while (time := truth.grid(k)) < scenario.horizon:
         yield timeline.at(time, Rank.SENSE, entity)
@@ -65,27 +67,29 @@ def _increments(
         k += 1
 
 
-def _sampling(
-    timeline: Timeline,
-    truth: Any,
-    carrier: ClockedNode,
-    node: int,
-    entity: int,
-    instants: Any,
-    path: Any,
-    R: Any,
-) -> Process:
-    """One sensor: read the truth at its instants."""
-    for k, time in enumerate(instants.tolist()):
-        yield timeline.at(time, Rank.SENSE, entity)
-        y, H = path.reading(k, truth.local(time))
-        carrier.sample(node, y, H, R)
+@dataclass(frozen=True)
+class SampledSensor:
+    """One sampled sensor of ``node`` in one run: its times, its readings and the believed R."""
+
+    node: int
+    entity: int
+    times: FloatArray
+    samples: Samples
+    R: FloatArray
+
+    def run(self, timeline: Timeline, truth: Any, receiver: ClockedNode) -> Process:
+        """Read the truth at the sample times, and hand each sample to the node."""
+        for k, time in enumerate(self.times.tolist()):
+            yield timeline.at(time, Rank.SENSE, self.entity)
+            # In local coordinates, as the estimates are.
+            y, H = self.samples.reading(k, truth.local(time))
+            receiver.sample(self.node, y, H, self.R)
 
 
 def increment_sensors(
     scenario: Scenario, streams: Streams, placed: list[tuple[int, PlacedSensor]]
 ) -> list[SensorPath]:
-    """The readings of these increment sensors in one run."""
+    """Return the readings of some increment sensors in one run."""
     paths = []
     for node, place in placed:
         sensor = scenario.sensors[place.entry]

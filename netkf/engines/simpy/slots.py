@@ -1,4 +1,4 @@
-"""Slots: the same timeline with clocks that tick together.
+"""Scenarios in slots: clocks that all tick together.
 
 The filter's schedule says what happens in a slot and when: predictions, readings, exchanges in
 steps. Each node is a process that follows it, each node with sensors another one that reads, and
@@ -36,9 +36,10 @@ Process = Generator[simpy.Event, Any, None]
 
 
 class Stage(NamedTuple):
-    """One thing that a slot's schedule asks of the nodes: "predict", "read" (sensors), "update",
-    "send" or "absorb"; when, as which rank, and in which exchange of the slot (``phase``, ``step``;
-    ``number`` counts all exchanges of the run).
+    """One stage of a slot: "predict", "read" (sensors), "update", "send" or "absorb".
+
+    It happens at ``time`` seconds with ``rank``, in exchange ``phase`` and ``step`` of the slot;
+    ``number`` counts all exchanges of the run.
     """
 
     kind: str
@@ -50,7 +51,7 @@ class Stage(NamedTuple):
 
 
 class Schedule:
-    """The stages of every slot."""
+    """Computes the stages of every slot from the schedule of the filter."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._algorithm, self._plant = scenario.hosted, scenario.slot_plant
@@ -62,37 +63,37 @@ class Schedule:
         ]
         self._length = scenario.phase_length if any(self._exchanges) else 0.0
         self._samples = frozenset(scenario.slots)
-        self._kept: dict[int, list[Stage]] = {}
+        self._cache: dict[int, list[Stage]] = {}
 
     def over(self, slot: int) -> bool:
-        """Whether a slot begins at the horizon or later: it makes its sample only."""
+        """Return True if a slot begins at or after the horizon: it only records its sample."""
         return self._plant.over(slot, self.horizon)
 
     def sampled(self, slot: int) -> bool:
-        """Whether the states of a slot are shown."""
+        """Return True if the states of a slot are recorded."""
         return slot in self._samples
 
     def runs(self, slot: int) -> bool:
-        """Whether anything happens in a slot: at the horizon only what its sample shows."""
+        """Return True if a slot has stages; at the horizon only if its sample needs them."""
         return not self.over(slot) or (self.sampled(slot) and not self._algorithm.predicts)
 
     def start(self, slot: int) -> float:
-        """When a slot begins, seconds."""
+        """Return the time in seconds at which a slot begins."""
         return self._plant.slot_time(slot)
 
     def stages(self, slot: int) -> list[Stage]:
-        """In their order."""
-        if slot not in self._kept:
-            self._kept.pop(slot - 2, None)  # no process is so far behind
-            self._kept[slot] = list(self._made(slot))
-        return self._kept[slot]
+        """Return the stages of a slot in their order."""
+        if slot not in self._cache:
+            self._cache.pop(slot - 2, None)  # no process is so far behind
+            self._cache[slot] = list(self._stages_of(slot))
+        return self._cache[slot]
 
     def end(self, slot: int) -> tuple[float, int]:
-        """Time and rank after all stages."""
+        """Return a time and rank after all stages of a slot."""
         stages = self.stages(slot)
         return (stages[-1].time, stages[-1].rank + 1) if stages else (self.start(slot), FIRST_RANK)
 
-    def _made(self, slot: int) -> Generator[Stage, None, None]:
+    def _stages_of(self, slot: int) -> Generator[Stage, None, None]:
         algorithm, start = self._algorithm, self.start(slot)
         now, rank, phase = start, FIRST_RANK + 1, 0
         # A filtered estimate starts from what is known before any reading.
@@ -118,7 +119,7 @@ class Schedule:
 
 
 class SlotNode(Node):
-    """A node in slots; its inbox is open for one exchange at a time."""
+    """A node in slots, whose inbox is open for one exchange at a time."""
 
     def __init__(self, recorder: Recorder, schedule: Schedule, period: float, *rest: Any) -> None:
         super().__init__(*rest)
@@ -128,7 +129,7 @@ class SlotNode(Node):
         self._samples: list[tuple[FloatArray, FloatArray]] = []
 
     def running(self, timeline: Timeline) -> Process:
-        """The node's process: follow the schedule, slot after slot."""
+        """Run the process of the node: follow the schedule, slot after slot."""
         slot = 0
         while self._schedule.runs(slot):
             for stage in self._schedule.stages(slot):
@@ -162,7 +163,7 @@ class SlotNode(Node):
         self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
 
     def emit(self, exchange: Exchange) -> Any:
-        """What the node sends in an exchange."""
+        """Return the payload that the node sends in an exchange."""
         self.state, payload = self.algorithm.emit(self.state, exchange)
         return payload
 
@@ -170,16 +171,16 @@ class SlotNode(Node):
         """Open the inbox for an exchange."""
         self._open = number
 
-    def accepts(self, envelope: Envelope) -> bool:
-        """Whether the inbox of the message's exchange is still open."""
+    def in_time(self, envelope: Envelope) -> bool:
+        """Return True if the inbox is still open for the exchange of the message."""
         return envelope.exchange == self._open
 
     def receive(self, envelope: Envelope) -> None:
-        """Keep a message until the inbox closes."""
+        """Put a message into the inbox, to be absorbed when it closes."""
         self.put(envelope)
 
     def _close(self, stage: Stage, slot: int) -> None:
-        """Absorb the inbox, which closes."""
+        """Close the inbox and absorb its messages."""
         append, now, phase = self._recorder.append, stage.time, stage.phase
         envelopes, messages = self.take_mail()
         self._open = -1
@@ -259,6 +260,7 @@ class SlotClock:
 
     def _exchange(self, stage: Stage, slot: int) -> None:
         now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
+        # All inboxes open before anyone sends: a message without delay arrives at once.
         for node in self._distinct:
             node.open(stage.number)
         pairs, up = self._pairs(stage, slot, broadcast)
@@ -278,7 +280,7 @@ class SlotClock:
             self._links[i, j].exchange(both, phase, stage.number, here, fresh)
 
     def _pairs(self, stage: Stage, slot: int, broadcast: bool) -> tuple[list[Any], set[Any] | None]:
-        """The links that are used, and of those the ones that are up (None: all)."""
+        """Return the links that are used, and the subset of them that is up (None for all)."""
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
         if isinstance(activation, Matching):

@@ -1,4 +1,4 @@
-"""Transmissions: what becomes of a message between being sent and being received."""
+"""Transmissions: messages are sent, lost or delayed, and delivered."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ LINK_DOWN = ChannelDraw(math.inf, False, 0.0)
 
 
 class Receiver(Protocol):
-    """What takes messages at the end of a link."""
+    """A receiver at the end of a link."""
 
-    def accepts(self, envelope: Envelope) -> bool:
-        """Whether the message is in time."""
+    def in_time(self, envelope: Envelope) -> bool:
+        """Return True if the message arrives in time."""
 
     def receive(self, envelope: Envelope) -> None:
-        """Take the message."""
+        """Take a message that is in time."""
 
 
 class DirectedLink:
-    """One direction of a link: who receives, what decides the outcome, how many messages so far."""
+    """One direction of a link: its receiver, its sampler and its count of messages."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class DirectedLink:
 
 
 class Transmitter:
-    """The air: all messages of a run go through it. Each message that takes time is an event."""
+    """Carries all messages of a run; each message that takes time is an event."""
 
     def __init__(
         self, scenario: Scenario, streams: Streams, timeline: Timeline, recorder: Recorder
@@ -67,13 +67,13 @@ class Transmitter:
         self._flying: dict[tuple[Link, int], Envelope] = {}
 
     def sampler(self, link: Link) -> ChannelSampler:
-        """The outcomes of a link (symmetric channel) or of one direction of it."""
+        """Return the sampler of a link (symmetric channel) or of one direction of it."""
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
 
     def directed(
         self, link: Link, entity: int, receiver: Receiver, sampler: ChannelSampler
     ) -> DirectedLink:
-        """One direction."""
+        """Return one direction of a link."""
         return DirectedLink(self._scenario, link, entity, receiver, sampler)
 
     def send(
@@ -84,7 +84,7 @@ class Transmitter:
         phase: int = -1,
         exchange: int = -1,
     ) -> None:
-        """Send one message with its outcome; None is not sent."""
+        """Send one message with its outcome; a payload of None is not sent."""
         if payload is None:
             return
         now, (sender, receiver), number = self._timeline.now, way.link, way.messages
@@ -109,15 +109,16 @@ class Transmitter:
         now, (sender, receiver) = self._timeline.now, way.link
         envelope = self._flying.pop((way.link, envelope.number), envelope)
         envelope = envelope._replace(age=now - envelope.sent)
-        in_time = way.receiver.accepts(envelope)
+        arrives_in_time = way.receiver.in_time(envelope)
+        # After the horizon only the last slot is finished, for its sample: it leaves no events.
         if now < self._horizon or envelope.sent == now:
-            kind, number = DELIVER if in_time else LATE, envelope.number
+            kind, number = DELIVER if arrives_in_time else LATE, envelope.number
             self._recorder.append((now, kind, receiver, sender, number, phase, envelope.age))
-        if in_time:
+        if arrives_in_time:
             way.receiver.receive(envelope)
 
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
-        """Put all that is under way into coordinates whose origin has moved by ``-offset`` now."""
+        """Shift all messages under way: the origin of coordinates has moved by ``-offset``."""
         now = self._timeline.now
         for key, envelope in self._flying.items():
             earlier = self._scenario.moved_back(offset, now - envelope.sent)
@@ -126,8 +127,10 @@ class Transmitter:
 
 
 class LinkExchange:
-    """Both directions of one link, or the one that it has where the graph is directed: in each
-    activation every end sends to the other. With a symmetric channel both share one outcome.
+    """The directions of one link: a single one if the graph is directed, else both.
+
+    In each activation every end sends to the other. With a symmetric channel both directions share
+    one outcome.
     """
 
     def __init__(
@@ -155,10 +158,11 @@ class LinkExchange:
         up: bool = True,
         fresh: bool = True,
     ) -> None:
-        """Send one message each way that there is, of the payloads of both ends; all are lost where
-        the link is not ``up``. Unless they are ``fresh`` the outcomes are those of the last time.
+        """Send the payloads of both ends, one message in each direction of the link.
 
-        None is not sent, but its outcome is drawn all the same.
+        All are lost if the link is not ``up``. Outcomes are drawn anew if ``fresh``, otherwise
+        those of the last exchange are used again. A payload of None is not sent, but its outcome
+        is drawn all the same.
         """
         if fresh or not self._outcomes:
             first, *others = self._ways
@@ -172,5 +176,5 @@ class LinkExchange:
 
 
 def stream(streams: Streams, ends: tuple[int, ...], purpose: str) -> np.random.Generator:
-    """The stream of a link or of one direction of it."""
+    """Return the random stream of a link or of one direction of it."""
     return streams.generator(purpose, *ends)
