@@ -22,7 +22,7 @@ from netkf.algorithms.kernels.riccati import propagate_riccati
 from netkf.algorithms.models import FlowModel, usable
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import in_place
+from netkf.linalg.compiling import kernel
 
 Reading = Increments
 """Increments of a node's sensors over the last ``gap`` seconds."""
@@ -103,7 +103,7 @@ class FlowFilter(Component):
         return np.inf
 
 
-@in_place
+@kernel
 def stretch_end(now: float, time: float, stretch: float) -> float:
     """Return the end of a measurement interval that begins at ``now``, at most ``time``.
 

@@ -16,7 +16,7 @@ from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table,
 from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
 from netkf.algorithms.kernels.slots import predicted_root
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
-from netkf.linalg.compiling import in_place
+from netkf.linalg.compiling import kernel
 
 STRETCH = 1.0
 
@@ -166,7 +166,7 @@ class SlotModel:
         return math.inf
 
 
-@in_place
+@kernel
 def usable(rate: float) -> float:
     """Return the seconds of readings that may be used at once for ``rate = trace(P G)``, see
     ``Filter.max_measurement_interval``.

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from netkf.linalg.compiling import compilable
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -42,7 +40,6 @@ def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
     return bool(values[0] >= -tolerance * max(abs(values[-1]), np.finfo(float).tiny))
 
 
-@compilable
 def square_root(matrix: FloatArray) -> FloatArray:
     """A factor ``S`` with ``S S' = matrix``; the matrix may be singular."""
     values, vectors = np.linalg.eigh(matrix)

@@ -1,11 +1,7 @@
-"""Loops compiled by numba, which is imported when the first of them is called.
+"""Kernels: numerical functions written as loops, compiled by numba when first called.
 
-:func:`kernel` marks a numerical function that is written once, as loops: other kernels may call
-it, and Python may call it too. Its code is kept on disk, so that the next process starts at once.
-
-Older functions are marked with :func:`compilable`: compiled ones may call them, and they stay what
-they are for Python. Where numpy is the way to say it in Python and loops are what a compiler wants
-(products of small matrices), the loops stand beside it: ``compilable_as(loops)``.
+:func:`kernel` is the only decorator. Python and other kernels call a kernel alike. Its code is kept
+on disk, so that the next process starts at once; numba itself is imported with the first call.
 """
 
 from __future__ import annotations
@@ -22,7 +18,7 @@ from typing import Any, TypeVar, overload
 
 from netkf.linalg.linking import linked_once
 
-ROOMS = ("linalg", "rng", "core", "algorithms", "plants", "trace", "engines")
+ROOMS = ("linalg", "rng", "core", "algorithms", "plants", "trace", "engines", "ensembles")
 """Whose code and numbers compiled functions may hold."""
 
 MOST_STATES = 4
@@ -30,11 +26,11 @@ MOST_STATES = 4
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "_nrt": True}
-_UNCOUNTED: Any = {**_OPTIONS, "_nrt": False}
-_marked: list[tuple[Callable[..., Any], Callable[..., Any]]] = []
-_known: set[Callable[..., Any]] = set()
-_in_place: set[Callable[..., Any]] = set()
-_loops: dict[Callable[..., Any], Callable[..., Any]] = {}
+_WITHOUT_ARRAYS: Any = {**_OPTIONS, "_nrt": False}
+_kernels: dict[Callable[..., Any], Callable[..., Any]] = {}
+"""The loops of each kernel."""
+_allocating: set[Callable[..., Any]] = set()
+_overloaded: set[Callable[..., Any]] = set()
 _said: set[Callable[..., Any]] = set()
 _spent: list[float] = []
 
@@ -50,80 +46,39 @@ def kernel(*, allocates: bool) -> Callable[[Function], Function]: ...
 def kernel(function: Callable[..., Any] | None = None, *, allocates: bool = False) -> Any:
     """Mark a numerical function, written as loops over arrays, that is always run compiled.
 
-    Python and other kernels call it alike; it may call kernels and compilable functions. It works
-    in place and makes no arrays, or is marked ``@kernel(allocates=True)``.
+    It may call kernels, works in place and makes no arrays, or is marked
+    ``@kernel(allocates=True)``. It runs without the interpreter's lock.
     """
     if function is None:
-        return lambda loops: _marked_kernel(loops, allocates)
-    return _marked_kernel(function, allocates)
+        return lambda loops: _registered(loops, allocates)
+    return _registered(function, allocates)
 
 
-def _marked_kernel(loops: Callable[..., Any], allocates: bool) -> Callable[..., Any]:
+def _registered(loops: Callable[..., Any], allocates: bool) -> Callable[..., Any]:
     @wraps(loops)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return demanded(loops)(*args, **kwargs)
+        return _compiled(loops)(*args, **kwargs)
 
-    if not allocates:
-        _in_place.add(loops)
-    _loops[call] = loops
-    return compilable_as(loops)(call)
-
-
-def compilable(function: Function) -> Function:
-    """Mark a function that compiled ones may call; what it calls must be marked too."""
-    return compilable_as(function)(function)
-
-
-def compilable_as(loops: Callable[..., Any]) -> Callable[[Function], Function]:
-    """The same for a function that is ``loops``, of the same parameters, where it is compiled."""
-
-    def mark(function: Function) -> Function:
-        _marked.append((function, loops))
-        return function
-
-    return mark
-
-
-def in_place(function: Function) -> Function:
-    """``compilable``, for a function that neither makes nor returns arrays. It may call one that
-    makes some for itself.
-    """
-    _in_place.add(function)
-    return compilable(function)
-
-
-def compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
-    """The compiled form of a function that is made of loops and of compilable functions, or None
-    where numba is missing.
-
-    Kept on disk, so that the next process starts at once. It runs without the interpreter's lock.
-    """
-    return _compiled(_loops.get(function, function))
+    if allocates:
+        _allocating.add(loops)
+    _kernels[call] = loops
+    return call
 
 
 @cache
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any] | None:
-    try:
-        import numba
-    except ImportError:
-        return None
-    _introduce()
+def _compiled(loops: Callable[..., Any]) -> Callable[..., Any]:
+    import numba
+
+    _overload_kernels()
     config: Any = numba.config
     before = config.CACHE_DIR
     # numba looks at the file of the function alone, and what it calls may have changed.
     config.CACHE_DIR = str(_folder(before))
     try:
-        made: Callable[..., Any] = numba.njit(cache=True, **_options(function))(function)
+        made: Callable[..., Any] = numba.njit(cache=True, **_options(loops))(loops)
     finally:
         config.CACHE_DIR = before
     _moderately_optimised(made, config)
-    return made
-
-
-def demanded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``compiled``, where numba is known to be there."""
-    made = compiled(function)
-    assert made is not None, "numba is needed"
     return made
 
 
@@ -160,23 +115,24 @@ def announce(function: Callable[..., Any]) -> None:
         print(words, file=sys.stderr, flush=True)
 
 
-def _introduce() -> None:
+def _overload_kernels() -> None:
+    """Let compiled code call all kernels known so far."""
     from numba import extending
 
     from netkf.linalg import struct_types  # noqa: F401 - registers structs
 
-    for function, loops in _marked:
-        if function not in _known:
-            _known.add(function)
-            extending.overload(function, jit_options=_options(loops))(_always(loops))
+    for call, loops in _kernels.items():
+        if call not in _overloaded:
+            _overloaded.add(call)
+            extending.overload(call, jit_options=_options(loops))(_always(loops))
 
 
-def _options(function: Callable[..., Any]) -> Any:
-    return _UNCOUNTED if function in _in_place else _OPTIONS
+def _options(loops: Callable[..., Any]) -> Any:
+    return _OPTIONS if loops in _allocating else _WITHOUT_ARRAYS
 
 
 def _always(loops: Callable[..., Any]) -> Callable[..., Any]:
-    """What numba asks for an implementation; it must have the same signature."""
+    """Return what numba asks for an implementation; it must have the same signature."""
 
     @wraps(loops)
     def choose(*_types: Any) -> Callable[..., Any]:

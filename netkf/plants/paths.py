@@ -18,9 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import in_place, kernel
-from netkf.linalg.series import fill_polynomial, polynomial
-from netkf.linalg.small import added, applied
+from netkf.linalg.compiling import kernel
+from netkf.linalg.series import fill_polynomial
 from netkf.plants.laws import GridLaws, grid_time
 from netkf.plants.transitions import Transitions
 from netkf.rng.normals import Normals
@@ -370,7 +369,7 @@ def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
     return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=2)
 
 
-@in_place
+@kernel
 def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> None:
     """Write (2, 4) the two moments over ``gap`` seconds from ``since`` on of the Legendre
     polynomials of a step of ``length`` seconds, by Gauss's rule with three nodes, which is exact.
@@ -394,17 +393,14 @@ def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     n = len(step.x_start)
     if start == step.start and end == step.end:
         return step.moments
-    since, gap = start - step.start, end - start
-    x = step.x_start
-    if since > 0.0:
-        x = applied(polynomial(laws.to_end, since).reshape(n, n), x)
-    plain = applied(polynomial(laws.to_moments, gap).reshape(2 * n, n), x).reshape(2, n)
-    from_noise = np.empty((2, 4))
-    _fill_legendre(from_noise, since, gap, step.end - step.start)
-    return added(plain, from_noise, step.cubic)
+    out, work = np.empty((2, n)), (np.empty(2 * n * n), np.empty(n), np.empty((2, 4)))
+    since, gap, length = start - step.start, end - start, step.end - step.start
+    path = step.x_start[None], step.cubic[None]
+    fill_seen(out, laws.to_end, laws.to_moments, since, gap, length, *path, 0, *work)
+    return out
 
 
-@in_place
+@kernel
 def fill_seen(
     out: FloatArray,
     to_end: FloatArray,

@@ -27,8 +27,7 @@ from netkf.core.fields import (
     several,
 )
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import in_place
-from netkf.linalg.small import added, product
+from netkf.linalg.compiling import kernel
 from netkf.plants.linear import Readings, SlotReadings
 from netkf.plants.paths import BLOCK, DiffusionPath
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
@@ -169,10 +168,12 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 
 def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
     """(2, p) moments of dy from those of x (2, n) and of unit white noise (2, p)."""
-    return added(product(seen, H.T), noise, root.T)
+    out = np.empty(2 * len(H))
+    fill_reading(out, 0, len(H), seen, H[None], noise, root[None], 0)
+    return out.reshape(2, len(H))
 
 
-@in_place
+@kernel
 def fill_reading(
     out: FloatArray,
     row: int,
@@ -208,7 +209,7 @@ def cut(
     return first, left
 
 
-@in_place
+@kernel
 def divide(
     first: FloatArray, rest: FloatArray, normals: FloatArray, u: float, length: float
 ) -> None:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import demanded, in_place
+from netkf.linalg.compiling import kernel
 from netkf.rng.streams import ReplicaStreams, Streams
 
 _U = np.uint64
@@ -45,7 +45,7 @@ def ziggurat() -> Ziggurat:
         return Ziggurat(kept["fe"], kept["we"], kept["ke"])
 
 
-@in_place
+@kernel
 def high_word(a: Any, b: Any) -> Any:
     """The upper 64 bits of the product of two words."""
     a1, a0, b1, b0 = a >> S32, a & HALF, b >> S32, b & HALF
@@ -54,7 +54,7 @@ def high_word(a: Any, b: Any) -> Any:
     return a1 * b1 + (cross >> S32) + (middle >> S32)
 
 
-@in_place
+@kernel
 def next_word(states: np.ndarray, k: int) -> Any:
     """The next word of stream ``k`` of states (K, 4): state and increment, high words first."""
     high, low = states[k, 0], states[k, 1]
@@ -69,13 +69,13 @@ def next_word(states: np.ndarray, k: int) -> Any:
     return made
 
 
-@in_place
+@kernel
 def next_unit(states: np.ndarray, k: int) -> float:
     """The next number of stream ``k``, uniform on [0, 1)."""
     return float(next_word(states, k) >> S11) * TO_UNIT
 
 
-@in_place
+@kernel
 def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
     """The next number of stream ``k`` from the exponential law of mean 1."""
     while True:
@@ -92,7 +92,7 @@ def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
             return x
 
 
-@in_place
+@kernel
 def seed_states(words: np.ndarray, states: np.ndarray) -> None:
     """Write the states (K, 4) that follow from four words of seed (K, 4) each."""
     for k in range(len(words)):
@@ -109,7 +109,7 @@ def seed_states(words: np.ndarray, states: np.ndarray) -> None:
         states[k, 0] = product + high + carry
 
 
-@in_place
+@kernel
 def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: FloatArray) -> None:
     """Write the next ``counts`` uniform numbers of each of the streams ``which``, one stream after
     the other.
@@ -121,7 +121,7 @@ def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: F
             place += 1
 
 
-@in_place
+@kernel
 def fill_exponentials(
     states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
 ) -> None:
@@ -143,18 +143,18 @@ class StreamBatch:
     ) -> None:
         words = streams.seed_words(purpose, entities)
         self.states = np.empty(words.shape, dtype=np.uint64)
-        demanded(seed_states)(words, self.states)
+        seed_states(words, self.states)
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """``Generator.random(count)`` of each of the entities in these places, one after the
         other.
         """
         out = np.empty(int(counts.sum()))
-        demanded(fill_units)(self.states, which, counts, out)
+        fill_units(self.states, which, counts, out)
         return out
 
     def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """The same for ``Generator.standard_exponential``."""
         out = np.empty(int(counts.sum()))
-        demanded(fill_exponentials)(self.states, which, counts, ziggurat(), out)
+        fill_exponentials(self.states, which, counts, ziggurat(), out)
         return out

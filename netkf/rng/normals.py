@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import demanded, kernel
+from netkf.linalg.compiling import kernel
 from netkf.rng.draws import seed_states
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 
@@ -36,7 +36,7 @@ class StreamNormals:
 
     def __init__(self, words: np.ndarray) -> None:
         self.states = np.empty(words.shape, dtype=np.uint64)
-        demanded(seed_states)(words, self.states)
+        seed_states(words, self.states)
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
         """(K, *shape) the next numbers of each stream."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.small import eliminate
+from netkf.linalg.small import solve_inplace
 
 
 def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -39,7 +39,7 @@ def fill_nees(
             for j in range(n):
                 factor[i, j] = P[k, i, j]
                 finite = finite and np.isfinite(P[k, i, j])
-        eliminate(factor, solved, n)  # solved = P^-1 e
+        solve_inplace(factor, solved, n)  # solved = P^-1 e
         out[k] = 0.0
         for i in range(n):
             out[k] += e[k, i] * solved[i, 0]

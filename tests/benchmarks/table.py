@@ -51,10 +51,15 @@ def seconds(work, count):
 
 def pieces(side):
     """How many pieces of work make a measurement; what is compiled gets loaded by the way."""
-    work, least, most = side
-    work(least)
-    each = seconds(work, least) / least
-    return max(least, min(most, int(BUDGET / max(each, 1e-9))))
+    work, count, most = side
+    work(count)
+    while count < most:  # what a call costs whatever it does makes the first estimates too small
+        each = seconds(work, count) / count
+        wanted = min(most, int(BUDGET / max(each, 1e-9)))
+        if wanted < 2 * count:
+            break
+        count = wanted
+    return count
 
 
 def measured(row, runs):

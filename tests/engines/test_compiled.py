@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 
 import netkf
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.kernels import square_root
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
-from netkf.linalg import compiling, small
+from netkf.linalg import compiling
 from netkf.network.channels import Bernoulli, ChannelSampler
 from netkf.network.clocks import Poisson
 from netkf.rng.streams import Streams
@@ -494,46 +493,6 @@ def test_the_first_start_says_that_it_compiles(ring, monkeypatch, capsys, tmp_pa
     monkeypatch.setattr(compiling, "_said", set())
     netkf.simulate(ring, engine="simpy")
     assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize("n", [1, 2, 5])
-@pytest.mark.parametrize("p", [1, 3])
-def test_square_roots_in_loops_are_those_of_stacks(n, p):
-    draw = np.random.default_rng([n, p]).standard_normal
-    S, F, root_Q, H = draw((n, n)), draw((n, n)), draw((n, n)), draw((p, n))
-    root_R = np.linalg.cholesky(np.eye(p) + 0.1)
-    L = square_root._triangular_loops(np.concatenate([S, F], axis=1))
-    np.testing.assert_allclose(L @ L.T, S @ S.T + F @ F.T, rtol=1e-12, atol=1e-12)
-    np.testing.assert_array_equal(L, np.tril(L))
-    ahead, plain = (f(S, F, root_Q) for f in (square_root._predict_loops, square_root.predict_root))
-    np.testing.assert_allclose(ahead @ ahead.T, plain @ plain.T, rtol=1e-12, atol=1e-12)
-    (one, K), (other, G) = (
-        f(S, F, root_Q, H, root_R) for f in (square_root._update_loops, square_root.update_root)
-    )
-    np.testing.assert_allclose(one @ one.T, other @ other.T, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(K, G, rtol=1e-11, atol=1e-11)
-
-
-@pytest.mark.parametrize("n", [1, 2, 5])
-@pytest.mark.parametrize("seed", range(3))
-def test_loops_are_what_numpy_says(n, seed):
-    """The one place where a formula stands twice."""
-    draw = np.random.default_rng([seed, n]).standard_normal
-    a, b, x = draw((n, n)), draw((n, n)), draw(n)
-    close = {"rtol": 1e-12, "atol": 1e-12}
-    np.testing.assert_allclose(small._product_loops(a, b), a @ b, **close)
-    np.testing.assert_allclose(small._applied_loops(a, x), a @ x, **close)
-    np.testing.assert_allclose(small._even_loops(a), 0.5 * (a + a.T), **close)
-    solved = np.linalg.solve(a, b)
-    scale = np.linalg.cond(a)
-    np.testing.assert_allclose(small._solution_loops(a, b), solved, rtol=1e-12 * scale)
-    np.testing.assert_allclose(small.solution(a, b), solved, rtol=1e-12 * scale)
-
-
-def test_a_singular_matrix_gives_nan_in_both():
-    singular, right = np.array([[1.0, 2.0], [2.0, 4.0]]), np.eye(2)
-    assert np.isnan(small._solution_loops(singular, right)).all()
-    assert np.isnan(small.solution(singular, right)).all()
 
 
 BURSTS = {"mean_loss": 0.3, "mean_burst": 3.0}

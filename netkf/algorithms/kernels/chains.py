@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.square_root import lower_triangular, reflect
+from netkf.algorithms.kernels.square_root import lower_triangular, step_root
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
@@ -87,37 +87,3 @@ def run_words(
     for chain in range(words.shape[0]):
         for step in range(words.shape[1]):
             step_root(roots, chain, words[chain, step], F, root_Q, H, root_R, rows, work)
-
-
-@kernel
-def step_root(
-    roots: FloatArray,
-    chain: int,
-    m: int,
-    F: FloatArray,
-    root_Q: FloatArray,
-    H: FloatArray,
-    root_R: FloatArray,
-    rows: np.ndarray,
-    work: FloatArray,
-) -> None:
-    """Move one root by ``f_m``: update with reading ``m`` and predict."""
-    n, p = len(F), rows[m]
-    # [[H S, root_R, 0], [F S, 0, root_Q]]
-    for i in range(p + n):
-        for j in range(n):
-            total = 0.0
-            for k in range(j, n):
-                total += (H[m, i, k] if i < p else F[i - p, k]) * roots[chain, k, j]
-            work[i, j] = total
-        for j in range(p):
-            work[i, n + j] = root_R[m, i, j] if i < p else 0.0
-        for j in range(n):
-            work[i, n + p + j] = root_Q[i - p, j] if i >= p else 0.0
-    # Householder's reflections of the columns make it lower triangular, row by row; right of the
-    # end there are zeros, because root_Q is lower triangular.
-    for i in range(p + n):
-        reflect(work, i, p + n, n + p + max(0, i - p + 1))
-    for i in range(n):
-        for j in range(i + 1):
-            roots[chain, i, j] = work[p + i, p + j]

@@ -9,7 +9,7 @@ from netkf.engines.base import LONGER, SHORTEST_SHARE
 from netkf.engines.compiled.state import Sensing, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.small import fill_square
+from netkf.linalg.small import copy_matrix
 from netkf.plants.paths import fill_seen
 from netkf.plants.sensors import divide, fill_reading
 
@@ -34,7 +34,7 @@ def read_increments(
     while 2 * row < len(out):
         if sensing.step[s] != step:
             sensing.step[s] = step
-            fill_square(rest[s], sensing.noise[s, step])
+            copy_matrix(rest[s], sensing.noise[s, step])
         noise = rest[s]
         if u >= 0.0:
             noise = early
@@ -51,7 +51,7 @@ def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float)
     path, scratch = state.path, state.scratch
     start, stop = path.start[piece], path.stop[piece]
     if now == start and end == stop:
-        fill_square(scratch.state_moments, path.moments[piece])
+        copy_matrix(scratch.state_moments, path.moments[piece])
         return
     n = scratch.state_moments.shape[1]
     fill_seen(
@@ -95,7 +95,7 @@ def fill_moments(state: Simulation, now: float, end: float) -> None:
         if path.start[k] <= now:
             break
         k -= 1
-    fill_square(seen, total)
+    copy_matrix(seen, total)
 
 
 @kernel

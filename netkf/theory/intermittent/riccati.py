@@ -14,7 +14,6 @@ import scipy.linalg
 import scipy.optimize
 
 from netkf.algorithms.kernels.chains import advance, alphabet
-from netkf.algorithms.kernels.square_root import predict_root, update_root
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.rng.streams import Streams
@@ -74,7 +73,9 @@ def riccati_step(
     """
     system = check_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
-    root, _ = update_root(_root(start), system.F, square_root(system.Q), system.H, _root(system.R))
+    modes = alphabet([(system.H, system.R)], len(start))
+    first = np.zeros((1, 1), dtype=np.uint8)
+    root = advance(_root(start)[None], first, system.F, square_root(system.Q), modes)[0]
     return symmetric(root @ root.T)
 
 
@@ -332,11 +333,10 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     depth = as_whole("depth", depth, 0, MAX_DEPTH)
     F, Q, H, R = check_system(F, Q, H, R)
     roots = _root(steady_covariance(F, Q, H, R))[None]
-    root_Q, root_R = square_root(Q), _root(R)
+    root_Q, modes = square_root(Q), alphabet([(H[:0], R[:0, :0]), (H, R)], len(F))
     for _ in range(depth):
-        without = predict_root(roots, F, root_Q)
-        with_reading, _gain = update_root(roots, F, root_Q, H, root_R)
-        roots = np.concatenate([without, with_reading])
+        each = np.zeros((len(roots), 1), dtype=np.uint8), np.ones((len(roots), 1), dtype=np.uint8)
+        roots = np.concatenate([advance(roots, mode, F, root_Q, modes) for mode in each])
     return symmetric(roots @ np.swapaxes(roots, -1, -2))
 
 
