@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.integrate
 import scipy.linalg
-import scipy.sparse.linalg
 
 import netkf
 from netkf.theory.hybrid.coupled import coupled_riccati
@@ -259,23 +258,6 @@ class StackedBound:
             self.slope, (0.0, times[-1]), self.start, "DOP853", times, rtol=1e-10, atol=1e-13
         )
         return found.y.T.reshape(len(times), *self._equations.start.shape)
-
-
-def time_constant(case):
-    """Seconds: of the slowest mode of H(12) made linear at its steady state."""
-    packed = PackedRiccati(coupled_riccati(case))
-    blocks = packed.linear(netkf.theory.steady_covariance_bound(case))
-
-    def applied(x):
-        X = x.reshape(packed.start.shape)
-        return (np.einsum("ik,ikl->il", X, blocks) + packed.arriving(X)).reshape(-1)
-
-    size = packed.start.size
-    operator = scipy.sparse.linalg.LinearOperator((size, size), applied, dtype=float)
-    slowest = scipy.sparse.linalg.eigs(
-        operator, 1, which="LR", v0=np.ones(size), return_eigenvectors=False, tol=1e-4
-    )
-    return float(-1.0 / slowest[0].real)
 
 
 def plain_chains(roots, words, F, Q, H, R):
