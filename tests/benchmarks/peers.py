@@ -15,9 +15,7 @@ import numpy as np
 import scipy.integrate
 import scipy.linalg
 
-import netkf
 from netkf.theory.hybrid.coupled import coupled_riccati
-from netkf.theory.hybrid.packed import PackedRiccati
 
 EPOCH = datetime.datetime(2000, 1, 1)
 
