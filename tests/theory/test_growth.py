@@ -7,7 +7,7 @@ import pytest
 
 import netkf
 from netkf import theory
-from netkf.checks.mode_sequences import MAX_NODES, watched_note, watched_places
+from netkf.checks.points import MAX_NODES, sampled_indices, sampling_note
 from netkf.core.errors import TheoryError
 from netkf.runs import plots
 from netkf.runs.promises import promises, promises_text
@@ -130,8 +130,8 @@ def test_mean_squares_of_large_networks_say_what_they_would_take(tmp_path):
 
 
 def test_checks_of_large_networks_watch_some_nodes_and_say_so(tmp_path):
-    assert len(watched_places(ring(MAX_NODES, tmp_path))) == MAX_NODES
-    assert not watched_note(ring(MAX_NODES, tmp_path))
+    assert len(sampled_indices(ring(MAX_NODES, tmp_path))) == MAX_NODES
+    assert not sampling_note(ring(MAX_NODES, tmp_path))
     large = ring(1000, tmp_path)
-    assert len(watched_places(large)) <= MAX_NODES
-    assert "looked at 50 of 1,000 nodes" in watched_note(large)
+    assert len(sampled_indices(large)) <= MAX_NODES
+    assert "looked at 50 of 1,000 nodes" in sampling_note(large)
