@@ -12,7 +12,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import finite
 from netkf.runs.labels import delay_suffix, limit_label, mismatch_note
-from netkf.runs.tables import MAX_NODES, number, table
+from netkf.runs.tables import MAX_NODES, format_number, table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
@@ -98,11 +98,11 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
     lines = [title, "", "assumptions", *_assumption_lines(found["assumptions"])]
     paper = scenario.hosted.paper
     if paper and paper in found:
-        own_lines = paper_function(scenario, "promises", "slot_lines")(found[paper], number)
+        own_lines = paper_function(scenario, "promises", "slot_lines")(found[paper], format_number)
         return "\n".join([*lines, "", *own_lines])
     if scenario.slotted:
         central = found["slot_central_covariance"]
-        trace = central["reason"] or number(central["trace"])
+        trace = central["reason"] or format_number(central["trace"])
         lines += ["", f"trace of P*, the prediction covariance with all readings: {trace}"]
         return "\n".join(lines)
     return "\n".join([*lines, *_bound_lines(scenario, found), *_limit_lines(scenario, found)])
@@ -142,7 +142,7 @@ def _limit_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
     }
     lines = ["", "traces to compare"]
     for name, label in labels.items():
-        lines.append(f"  {label}: {found[name]['reason'] or number(found[name]['trace'])}")
+        lines.append(f"  {label}: {found[name]['reason'] or format_number(found[name]['trace'])}")
     note = mismatch_note(scenario)
     return [*lines, f"note: {note}"] if note else lines
 
@@ -150,7 +150,7 @@ def _limit_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
 def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
     """A row per node; of large networks the nodes with the smallest, middle and largest bounds."""
     rows = [
-        [str(node), *(number(c["trace"][k] if c["trace"] else None) for c in columns)]
+        [str(node), *(format_number(c["trace"][k] if c["trace"] else None) for c in columns)]
         for k, node in enumerate(scenario.nodes)
     ]
     header = ["node", f"at {scenario.horizon:g} s", "steady state"]

@@ -21,7 +21,7 @@ COLUMNS = {
 }
 
 
-def number(value: float | None) -> str:
+def format_number(value: float | None) -> str:
     """Format a number with four significant digits; a dash if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return "-"
@@ -108,13 +108,16 @@ def _sort_key(value: float | None) -> float:
 
 
 def _cells(name: str, row: dict[str, Any]) -> list[str]:
-    return [name, *(number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS)]
+    return [
+        name,
+        *(format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS),
+    ]
 
 
 def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
     traces = {limit: summary["limit"], "centralised filter": summary["central"]}
     known = [
-        f"{label} {number(value)}"
+        f"{label} {format_number(value)}"
         for label, value in traces.items()
         if value is not None and math.isfinite(value)
     ]
@@ -126,7 +129,7 @@ def _nees_lines(nees: dict[str, Any]) -> list[str]:
         return []
     return [
         f"NEES of one sample, mean over the runs: {nees['confidence']:.0%} in "
-        f"{number(nees['low'])} .. {number(nees['high'])} where P is exact, here "
+        f"{format_number(nees['low'])} .. {format_number(nees['high'])} where P is exact, here "
         f"{nees['inside']:.0%}"
     ]
 
@@ -145,7 +148,8 @@ def _message_line(messages: dict[str, Any]) -> str:
 
 def _conserved(sums: dict[str, dict[str, float]]) -> str:
     totals = [
-        f"{name} {number(found['total'])} of {number(found['exact'])} ({found['drift']:+.1e})"
+        f"{name} {format_number(found['total'])} of {format_number(found['exact'])} "
+        f"({found['drift']:+.1e})"
         for name, found in sums.items()
     ]
     worst = max(abs(found["drift"]) for found in sums.values())

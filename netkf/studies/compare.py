@@ -1,4 +1,4 @@
-"""``netkf compare``: finished runs and ensembles side by side, real differences marked."""
+"""``netkf.compare``: finished runs and ensembles side by side, with their differences."""
 
 from __future__ import annotations
 
@@ -25,8 +25,12 @@ ENDED = ("complete", "diverged")
 
 
 class Entry(NamedTuple):
-    """A quantity in one directory: its value, standard error and, where there is something to tell,
-    the difference from the first directory with its interval, whether it is real, and by what.
+    """A quantity of one directory.
+
+    value, se   : the value and its standard error, None if unknown
+    difference, low, high : difference from the first directory with its interval
+    real        : True if the interval excludes 0, None without an interval
+    method      : how the interval was computed, or why there is none
     """
 
     value: float | None
@@ -38,8 +42,8 @@ class Entry(NamedTuple):
     method: str = ""
 
 
-class Row(NamedTuple):
-    """A quantity, of one ``node`` or of all (-1), in every directory."""
+class ComparedRow(NamedTuple):
+    """A quantity of one ``node``, or of all (-1), in every directory."""
 
     quantity: str
     node: int
@@ -48,7 +52,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RunDirectory:
-    """A run directory that was read: its manifest and its summary."""
+    """The directory of a finished run or ensemble: its manifest and its summary."""
 
     directory: Path
     manifest: dict[str, Any]
@@ -56,11 +60,11 @@ class RunDirectory:
 
     @property
     def runs(self) -> int:
-        """How many runs are in it."""
+        """Number of runs."""
         return int(self.manifest["runs"]["done"] or 1)
 
     def value(self, quantity: str, node: int) -> tuple[float | None, float | None]:
-        """Value and standard error of a quantity, None where there is none."""
+        """Return the value and the standard error of a quantity, None if it has none."""
         if quantity in MESSAGES:
             table, errors = self.summary["messages"], self.summary.get("messages_se", {})
             return table.get(quantity), errors.get(quantity)
@@ -77,7 +81,7 @@ class RunDirectory:
 
     @cached_property
     def samples(self) -> pd.DataFrame | None:
-        """Samples after time 0 of all runs, where the directory has them."""
+        """Samples after time 0 of all runs, None if the directory does not have them all."""
         file = self.directory / "states.parquet"
         if not file.exists() or self.runs < 2:
             return None
@@ -88,13 +92,14 @@ class RunDirectory:
 
     @property
     def rounding_from(self) -> float:
-        """From when on rounding blurs the errors, inf where it does not."""
+        """Time from which rounding blurs the errors, inf if it does not."""
         found = self.summary.get("rounding_from")
         return math.inf if found is None else float(found)
 
     def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
-        """Averages over time, run by run; of the squared error where it is about errors, over the
-        samples before ``end``.
+        """Return averages over time, run by run; None if the states were not kept.
+
+        For ``rms_error`` it is the squared error, and only samples before ``end`` count.
         """
         columns = {"rms_error": "sq_error", "mean_trace": "mean_trace", "mean_nees": "nees"}
         if self.samples is None or quantity not in columns:
@@ -105,8 +110,8 @@ class RunDirectory:
         return chosen.groupby("run")[columns[quantity]].mean()
 
 
-def read(directory: Path) -> RunDirectory:
-    """A finished run directory; raises ScenarioError where it is not one."""
+def read_directory(directory: Path) -> RunDirectory:
+    """Return the directory of a finished run; raises ScenarioError if it is not one."""
     where = str(directory)
     if not directory.is_dir():
         raise ScenarioError(where, "is not a directory", None, "name run directories")
@@ -115,36 +120,37 @@ def read(directory: Path) -> RunDirectory:
         try:
             found.append(json.loads((directory / name).read_text(encoding="utf-8")))
         except (OSError, ValueError):
-            words = f"is not the directory of a run: {name} is missing or cannot be read"
-            raise ScenarioError(where, words, None, "name what netkf run left") from None
+            rule = f"is not the directory of a run: {name} is missing or cannot be read"
+            raise ScenarioError(where, rule, None, "name what netkf run left") from None
         if name == "manifest.json" and found[0].get("status") not in ENDED:
-            words = f"holds a run that did not finish ({found[0].get('status')})"
-            raise ScenarioError(where, words, None, "finish it with netkf run --resume")
+            rule = f"holds a run that did not finish ({found[0].get('status')})"
+            raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
     try:
         finished = RunDirectory(directory, found[0], found[1])
         _ = finished.runs, [finished.value(q, -1) for q in (*AVERAGES, *MESSAGES, *TRACES)]
         _ = [finished.value("rms_error", node) for node in finished.nodes]
     except (KeyError, TypeError, ValueError, AttributeError):
-        words = "is not the directory of a run: summary.json or manifest.json lacks what runs have"
-        raise ScenarioError(where, words, None, "name what netkf run left") from None
+        rule = "is not the directory of a run: summary.json or manifest.json lacks what runs have"
+        raise ScenarioError(where, rule, None, "name what netkf run left") from None
     return finished
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows side by side; all marks together are right with probability ``confidence``. ``notes``
-    say of each directory what its averages leave out.
+    """Rows side by side; all marks together are right with probability ``confidence``.
+
+    ``notes`` are those of the summaries, on what their averages leave out.
     """
 
     directories: tuple[str, ...]
     names: tuple[str, ...]
     runs: tuple[int, ...]
     confidence: float
-    rows: tuple[Row, ...]
+    rows: tuple[ComparedRow, ...]
     notes: tuple[tuple[str, ...], ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain JSON values."""
         rows = [
             {"quantity": q, "node": node, "entries": [entry._asdict() for entry in entries]}
             for q, node, entries in self.rows
@@ -160,16 +166,16 @@ class Comparison:
 
 
 def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comparison:
-    """The summaries of finished runs and ensembles, and which differ from the first for certain.
+    """Compare the summaries of finished runs and ensembles with the first one.
 
-    Where two ensembles have the same seed and met the same truth, and both kept the states of all
-    runs (``--trace full``), differences are taken run by run; else by the standard errors of both
+    If two ensembles have the same seed and the same truth, and both kept the states of all runs
+    (``--trace full``), differences are taken run by run; else by the standard errors of both
     (Welch). The intervals of all rows and directories hold together with probability
     ``confidence`` (Bonferroni). A single run says nothing about certainty. Raises ScenarioError for
     a directory that is not that of a finished run.
     """
     sure = number(above=0.0, below=1.0)("--confidence", confidence)
-    found = [read(Path(directory)) for directory in directories]
+    found = [read_directory(Path(directory)) for directory in directories]
     if not found:
         raise ScenarioError("compare", "needs run directories", None, "name at least one")
     first = found[0]
@@ -178,10 +184,12 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         wanted += [("rms_error", node) for node in first.nodes]
     level = (1.0 - sure) / (len(wanted) * max(1, len(found) - 1))
     rows = [
-        Row(q, node, tuple(_entry(first, other, q, node, level) for other in found))
+        ComparedRow(q, node, tuple(_entry(first, other, q, node, level) for other in found))
         for q, node in wanted
     ]
-    rows += [Row(q, -1, tuple(Entry(*other.value(q, -1)) for other in found)) for q in TRACES]
+    rows += [
+        ComparedRow(q, -1, tuple(Entry(*other.value(q, -1)) for other in found)) for q in TRACES
+    ]
     return Comparison(
         tuple(str(other.directory) for other in found),
         tuple(str(other.manifest.get("name", "")) for other in found),
@@ -207,7 +215,7 @@ def _entry(
 def _paired(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
-    """Run by run, where both met the same truth."""
+    """Return the entry with a paired difference, None if the runs do not have the same truth."""
     end = min(first.rounding_from, other.rounding_from)
     one, two = (finished.by_run(quantity, node, end) for finished in (first, other))
     if one is None or two is None or not _same_truth(first, other):
@@ -216,10 +224,10 @@ def _paired(
     if len(gaps) < 2:
         return None
     mean, error = mean_over_runs(gaps)
-    ends = _around(mean, error, len(gaps) - 1, level)
+    ends = _interval(mean, error, len(gaps) - 1, level)
     words = "paired" if quantity != "rms_error" else "paired, mean squares"
     return entry._replace(
-        difference=mean, low=ends[0], high=ends[1], real=_off_zero(*ends), method=words
+        difference=mean, low=ends[0], high=ends[1], real=_excludes_zero(*ends), method=words
     )
 
 
@@ -238,7 +246,7 @@ def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
 def _welch(
     base: tuple[float | None, float | None], entry: Entry, runs: tuple[int, int], level: float
 ) -> Entry:
-    """By standard errors of independent runs."""
+    """Return the entry with the difference of independent runs, by Welch's interval."""
     errors = [base[1], entry.se]
     if base[0] is None or entry.value is None:
         return entry
@@ -249,16 +257,16 @@ def _welch(
     total = sum(squares)
     parts = sum(s * s / (n - 1) for s, n in zip(squares, runs, strict=True))
     freedom = total * total / parts if parts > 0.0 else float(min(runs) - 1)
-    low, high = _around(difference, math.sqrt(total), freedom, level)
+    low, high = _interval(difference, math.sqrt(total), freedom, level)
     return entry._replace(
-        difference=difference, low=low, high=high, real=_off_zero(low, high), method="Welch"
+        difference=difference, low=low, high=high, real=_excludes_zero(low, high), method="Welch"
     )
 
 
-def _around(mean: float, error: float, freedom: float, level: float) -> tuple[float, float]:
+def _interval(mean: float, error: float, freedom: float, level: float) -> tuple[float, float]:
     width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
     return mean - width, mean + width
 
 
-def _off_zero(low: float, high: float) -> bool:
+def _excludes_zero(low: float, high: float) -> bool:
     return bool(np.isfinite([low, high]).all() and (low > 0.0 or high < 0.0))

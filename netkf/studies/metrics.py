@@ -91,34 +91,34 @@ def expected_errors_known(scenario: Scenario) -> bool:
     return True
 
 
-class Estimate(NamedTuple):
+class MeanEstimate(NamedTuple):
     """A mean over runs with its standard error, nan for a single run."""
 
     value: float
     error: float
 
 
-def mean_over_runs(values: FloatArray) -> Estimate:
+def mean_over_runs(values: FloatArray) -> MeanEstimate:
     """Return the mean of one value per run, (R,)."""
     with np.errstate(over="ignore", invalid="ignore"):
         spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-    return Estimate(float(values.mean()), spread / math.sqrt(len(values)))
+    return MeanEstimate(float(values.mean()), spread / math.sqrt(len(values)))
 
 
-def worst_node(values: FloatArray) -> Estimate:
+def worst_node(values: FloatArray) -> MeanEstimate:
     """Return the estimate (R, N) of the node with the largest mean."""
     return mean_over_runs(values[:, int(np.argmax(values.mean(axis=0)))])
 
 
-def all_nodes(values: FloatArray) -> Estimate:
+def all_nodes(values: FloatArray) -> MeanEstimate:
     """Return the estimate (R, N) of the mean over all nodes."""
     return mean_over_runs(values.mean(axis=1))
 
 
-def take_root(estimate: Estimate) -> Estimate:
+def square_root_of(estimate: MeanEstimate) -> MeanEstimate:
     """Return the estimate of the square root, by the delta method."""
     value = math.sqrt(estimate.value)
-    return Estimate(value, estimate.error / (2.0 * value) if value > 0.0 else math.nan)
+    return MeanEstimate(value, estimate.error / (2.0 * value) if value > 0.0 else math.nan)
 
 
 def time_average(scenario: Scenario, values: FloatArray) -> FloatArray:

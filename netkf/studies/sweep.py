@@ -29,14 +29,14 @@ from netkf.runs.provenance import versions
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
-    Estimate,
+    MeanEstimate,
     RunMetrics,
     all_nodes,
     block_metrics,
     bound_traces,
     central_trace,
     join_metrics,
-    take_root,
+    square_root_of,
     worst_node,
 )
 from netkf.studies.parameter_grid import GridPoint, expand_grid, table_value
@@ -116,9 +116,9 @@ def _simulate_points(plan: _Plan, options: PoolOptions, progress: Progress | Non
 
 
 def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
-    quantities: dict[str, Estimate] = {
-        "worst_rms": take_root(worst_node(metrics.mean_square)),
-        "mean_rms": take_root(all_nodes(metrics.mean_square)),
+    quantities: dict[str, MeanEstimate] = {
+        "worst_rms": square_root_of(worst_node(metrics.mean_square)),
+        "mean_rms": square_root_of(all_nodes(metrics.mean_square)),
         "mean_trace": all_nodes(metrics.trace),
         "worst_trace": worst_node(metrics.trace),
     }

@@ -1,11 +1,11 @@
-"""Sweeps, searches and comparisons for a terminal."""
+"""Tables of sweeps, searches and comparisons for a terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from netkf.runs.tables import number, shorten, standard_error, table
+from netkf.runs.tables import format_number, shorten, standard_error, table
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.consistency import Consistency
 from netkf.studies.search import Sizing
@@ -19,7 +19,7 @@ LONGEST = 30
 
 
 def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
-    """A row a cell; the ends of long tables."""
+    """Return the table of a sweep, one row per point; of long tables the ends."""
     header = [*keys, *(name.replace("_", " ") for name in COLUMNS), "messages", "status"]
     rows = [
         [
@@ -39,14 +39,21 @@ def _short(value: Any) -> str:
 
 
 def _with_error(value: float | None, error: float | None) -> str:
-    return number(value) + standard_error(error)
+    return format_number(value) + standard_error(error)
 
 
 def sizing_text(found: Sizing) -> str:
-    """What was tried, the answer, and how sure it is."""
+    """Return the values that were tried, the answer, and how sure it is."""
     header = [found.key, found.target.quantity, "at least", "at most", "runs", "target"]
     rows = [
-        [f"{p.value:g}", number(p.quantity), number(p.low), number(p.high), str(p.runs), p.target]
+        [
+            f"{p.value:g}",
+            format_number(p.quantity),
+            format_number(p.low),
+            format_number(p.high),
+            str(p.runs),
+            p.target,
+        ]
         for p in sorted(found.probes)
     ]
     if found.by == "theory":
@@ -58,7 +65,7 @@ def sizing_text(found: Sizing) -> str:
 
 
 def answer(found: Sizing) -> str:
-    """One line."""
+    """Return the answer of a search as one sentence."""
     values = [probe.value for probe in found.probes]
     span = f"{min(values):g} .. {max(values):g}"
     if found.value is None:
@@ -77,16 +84,16 @@ def answer(found: Sizing) -> str:
 
 
 def consistency_text(found: Consistency) -> str:
-    """A row a node, and what the numbers should be."""
+    """Return one row per node, and a legend of the columns."""
     header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
     rows = [
         [
             str(row.node),
-            f"{number(row.nees)} +- {row.width:.1g}",
-            number(row.expected),
+            f"{format_number(row.nees)} +- {row.width:.1g}",
+            format_number(row.expected),
             f"{row.inside:.0%}",
-            number(row.nis),
-            number(row.expected_nis),
+            format_number(row.nis),
+            format_number(row.expected_nis),
             row.verdict,
         ]
         for row in found.rows
@@ -107,7 +114,7 @@ def consistency_text(found: Consistency) -> str:
 
 
 def comparison_text(found: Comparison) -> str:
-    """Directories side by side; a star marks what really differs from the first."""
+    """Return directories side by side; a star marks significant differences from the first."""
     numbered = [f"({k + 1})" for k in range(len(found.directories))]
     lines = [
         f"{mark} {directory}: {name}, {runs:,} run{'s' if runs > 1 else ''}"
@@ -141,7 +148,10 @@ def comparison_text(found: Comparison) -> str:
             f"{found.confidence:g} ({how})",
         ]
     if "one run" in methods:
-        lines += ["", "differences of single runs are not marked: one run says nothing about luck"]
+        lines += [
+            "",
+            "differences of single runs are not marked: one run says nothing about luck",
+        ]
     return "\n".join(lines)
 
 
