@@ -10,7 +10,7 @@ from netkf import theory
 from netkf.checks.points import MAX_NODES, sampled_indices, sampling_note
 from netkf.core.errors import TheoryError
 from netkf.runs import plots
-from netkf.runs.promises import promises, promises_text
+from netkf.runs.promises import compute_promises, promises_text
 from netkf.theory.hybrid import coupled, steady
 
 FLOW = """
@@ -118,7 +118,7 @@ def test_the_threshold_is_that_of_a_slow_search(tmp_path):
 
 def test_tables_of_large_networks_show_some_nodes_and_say_so(tmp_path):
     scenario = ring(60, tmp_path, 1000.0)
-    lines = promises_text(scenario, promises(scenario)).splitlines()
+    lines = promises_text(scenario, compute_promises(scenario)).splitlines()
     assert len(lines) < 80
     assert any("the smallest, the middle and the largest bound of 60" in line for line in lines)
 
