@@ -34,11 +34,12 @@ def local_slots(
 ) -> None:
     """Carry filters that never talk through the slots of a plan: predict, then update."""
     H = len(nodes.rows)
-    for r in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
+    for s in range(plan.up.shape[1]):
+        if plan.sensed[s]:
+            predict(nodes, room)
+        for r in range(plan.up.shape[0]):
             if plan.sensed[s]:
                 for h in range(H):
-                    predict(nodes, r * H + h, room)
                     use_reading(nodes, r * H + h, readings, r, s, h, room.update)
             show(nodes, plan, samples, r, s)
             rebase(nodes, readings, r, s)

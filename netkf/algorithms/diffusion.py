@@ -65,7 +65,7 @@ class DiffusionWeights(NamedTuple):
     inverse: FloatArray
 
 
-@kernel
+@kernel(inlined=True)
 def effective_weights(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
     """Return the own weight and the divisor of the others, so that all of them sum to 1.
 
@@ -90,14 +90,15 @@ def diffusion_slots(
 ) -> None:
     """Carry diffusion filters through the slots of a plan, D (6)-(9)."""
     H = len(nodes.rows)
-    for r in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
+    for s in range(plan.up.shape[1]):
+        for r in range(plan.up.shape[0]):
             show(nodes, plan, samples, r, s)
             rebase(nodes, readings, r, s)
-            if plan.sensed[s]:
-                for h in range(H):
-                    use_reading(nodes, r * H + h, readings, r, s, h, room.update)
-                    predict(nodes, r * H + h, room)
+            for h in range(H if plan.sensed[s] else 0):
+                use_reading(nodes, r * H + h, readings, r, s, h, room.update)
+        if plan.sensed[s]:
+            predict(nodes, room)
+        for r in range(plan.up.shape[0]):
             if plan.exchanged[s]:
                 for h in range(H):
                     copy_estimate(nodes, r * H + h, room, h)
@@ -106,14 +107,14 @@ def diffusion_slots(
                     combine(nodes, plan, links, room, weights, r, s, h)
 
 
-@kernel
+@kernel(inlined=True)
 def copy_estimate(nodes: SlotNodes, place: int, room: SlotRoom, h: int) -> None:
     """Keep the estimate of a place as what filter ``h`` sends."""
     for i in range(nodes.xhat.shape[1]):
         room.xhat[h, i] = nodes.xhat[place, i]
 
 
-@kernel
+@kernel(inlined=True)
 def combine(
     nodes: SlotNodes,
     plan: SlotPlan,
@@ -133,32 +134,30 @@ def combine(
     if own == 1.0:
         return
     begin_intersection(room.update)
-    add_information(own, weights.inverse, h, h, room)
+    whiten(room.update.total, own, weights.inverse, h, h, room)
     for m in range(links.first[h], links.first[h + 1]):
-        if plan.up[r, s, 0, links.way[m]] == 1:
-            add_information(links.weight[m] / divisor, weights.inverse, links.sender[m], h, room)
+        if plan.up[r, s, 0, links.way[m]] == 1 and links.weight[m] > 0.0:
+            weight = links.weight[m] / divisor
+            whiten(room.update.whitened, weight, weights.inverse, links.sender[m], h, room)
+            merge_information(room.update.total, room.update.whitened)
     place = r * len(nodes.rows) + h
     end_intersection(nodes.root, nodes.xhat, place, room.xhat, h, room.update)
 
 
-@kernel
-def add_information(
-    weight: float, inverse: FloatArray, sender: int, h: int, room: SlotRoom
+@kernel(inlined=True)
+def whiten(
+    out: FloatArray, weight: float, inverse: FloatArray, sender: int, h: int, room: SlotRoom
 ) -> None:
-    """Add ``weight`` times the information that ``sender`` sends to filter ``h``; means count from
-    what the latter had.
+    """Write the root of ``weight`` times the information that ``sender`` sends into ``out``
+    (n, n + 1); means, in its last column, count from what filter ``h`` had.
     """
     n, size = inverse.shape[1], math.sqrt(weight)
-    if weight <= 0.0:
-        return
-    whitened = room.update.whitened
     for i in range(n):
         mean = 0.0
         for j in range(i + 1):
-            whitened[i, j] = size * inverse[sender, i, j]
-            mean += whitened[i, j] * (room.xhat[sender, j] - room.xhat[h, j])
-        whitened[i, n] = mean
-    merge_information(room.update.total, whitened)
+            out[i, j] = size * inverse[sender, i, j]
+            mean += out[i, j] * (room.xhat[sender, j] - room.xhat[h, j])
+        out[i, n] = mean
 
 
 @built_in("diffusion")

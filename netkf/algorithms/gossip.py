@@ -34,8 +34,8 @@ def gossip_slots(
 ) -> None:
     """Carry gossip filters through the slots of a plan, G (10)."""
     H = len(nodes.rows)
-    for r in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
+    for s in range(plan.up.shape[1]):
+        for r in range(plan.up.shape[0]):
             show(nodes, plan, samples, r, s)
             rebase(nodes, readings, r, s)
             if plan.exchanged[s]:
@@ -43,10 +43,11 @@ def gossip_slots(
             if plan.sensed[s]:
                 for h in range(H):
                     use_reading(nodes, r * H + h, readings, r, s, h, room.update)
-                    predict(nodes, r * H + h, room)
+        if plan.sensed[s]:
+            predict(nodes, room)
 
 
-@kernel
+@kernel(inlined=True)
 def swap_pairs(
     nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, room: SlotRoom, r: int, s: int
 ) -> None:

@@ -76,18 +76,17 @@ def intermittent_slots(
 ) -> None:
     """Carry intermittent filters through the slots of a plan, R (15)-(18)."""
     H = len(nodes.rows)
-    for r in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
+    for s in range(plan.up.shape[1]):
+        for r in range(plan.up.shape[0]):
             show(nodes, plan, samples, r, s)
             rebase(nodes, readings, r, s)
-            if not plan.sensed[s]:
-                continue
-            for h in range(H):
+            for h in range(H if plan.sensed[s] else 0):
                 use_reading(nodes, r * H + h, readings, r, s, h, room.update)
                 for m in range(links.first[h], links.first[h + 1]):
                     if plan.up[r, s, 0, links.way[m]] == 1:
                         use_reading(nodes, r * H + h, readings, r, s, links.sender[m], room.update)
-                predict(nodes, r * H + h, room)
+        if plan.sensed[s]:
+            predict(nodes, room)
 
 
 @built_in("intermittent")

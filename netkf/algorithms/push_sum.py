@@ -122,13 +122,15 @@ def push_sum_slots(
 ) -> None:
     """Carry push-sum filters through the slots of a plan, P Fig. 1."""
     H = len(nodes.rows)
-    for r in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
+    for s in range(plan.up.shape[1]):
+        if plan.sensed[s] and not arrays.asymptotic:
+            predict(nodes, room)
+        for r in range(plan.up.shape[0]):
             if plan.exchanged[s] and not arrays.asymptotic:
                 exchange_mass(arrays, plan, links, samples, room, r, s)
             if plan.sensed[s]:
                 for h in range(H):
-                    predict_and_correct(nodes, readings, room, arrays, r, s, h)
+                    correct(nodes, readings, room, arrays, r, s, h)
             if plan.exchanged[s]:
                 for step in range(arrays.gamma):
                     up = plan.up[r, s, 1 + step]
@@ -214,8 +216,8 @@ def learn(arrays: PushSumArrays, k: int, h: int, whole: bool, work: FloatArray) 
     return stops
 
 
-@kernel
-def predict_and_correct(
+@kernel(inlined=True)
+def correct(
     nodes: SlotNodes,
     readings: SlotReadings,
     room: SlotRoom,
@@ -224,7 +226,7 @@ def predict_and_correct(
     s: int,
     h: int,
 ) -> None:
-    """Steps 3 and 4: the prediction, P (7) and (8)."""
+    """Step 4 after the prediction, P (7) and (8); with asymptotic gains step 3 too."""
     k, n = r * len(nodes.rows) + h, nodes.xhat.shape[1]
     if arrays.asymptotic:
         predict_mean(nodes, k, room)
@@ -232,7 +234,6 @@ def predict_and_correct(
             for j in range(i + 1):
                 nodes.root[k, i, j] = arrays.limit[i, j]
     else:
-        predict(nodes, k, room)
         correct_root(nodes.root, k, arrays.information, k, room.moved, room.update)
     if nodes.rows[h] > 0:
         H = readings.H[r % readings.H.shape[0], s % readings.H.shape[1], h]
@@ -240,7 +241,7 @@ def predict_and_correct(
         add_gain(nodes.xhat, nodes.root, k, number, y, H, nodes.rows[h], room.vectors)
 
 
-@kernel
+@kernel(inlined=True)
 def average(
     z: FloatArray, first: int, links: SlotLinks, up: np.ndarray, moves: FloatArray, delta: float
 ) -> None:

@@ -30,6 +30,7 @@ _WITHOUT_ARRAYS: Any = {**_OPTIONS, "_nrt": False}
 _kernels: dict[Callable[..., Any], Callable[..., Any]] = {}
 """The loops of each kernel."""
 _allocating: set[Callable[..., Any]] = set()
+_inlined: set[Callable[..., Any]] = set()
 _overloaded: set[Callable[..., Any]] = set()
 _said: set[Callable[..., Any]] = set()
 _spent: list[float] = []
@@ -40,27 +41,32 @@ def kernel(function: Function) -> Function: ...
 
 
 @overload
-def kernel(*, allocates: bool) -> Callable[[Function], Function]: ...
+def kernel(*, allocates: bool = False, inlined: bool = False) -> Callable[[Function], Function]: ...
 
 
-def kernel(function: Callable[..., Any] | None = None, *, allocates: bool = False) -> Any:
+def kernel(
+    function: Callable[..., Any] | None = None, *, allocates: bool = False, inlined: bool = False
+) -> Any:
     """Mark a numerical function, written as loops over arrays, that is always run compiled.
 
     It may call kernels, works in place and makes no arrays, or is marked
-    ``@kernel(allocates=True)``. It runs without the interpreter's lock.
+    ``@kernel(allocates=True)``. It runs without the interpreter's lock. ``inlined``: its code
+    becomes part of each kernel that calls it, which pays for steps of a few hundred flops.
     """
     if function is None:
-        return lambda loops: _registered(loops, allocates)
-    return _registered(function, allocates)
+        return lambda loops: _registered(loops, allocates, inlined)
+    return _registered(function, allocates, inlined)
 
 
-def _registered(loops: Callable[..., Any], allocates: bool) -> Callable[..., Any]:
+def _registered(loops: Callable[..., Any], allocates: bool, inlined: bool) -> Callable[..., Any]:
     @wraps(loops)
     def call(*args: Any, **kwargs: Any) -> Any:
         return _compiled(loops)(*args, **kwargs)
 
     if allocates:
         _allocating.add(loops)
+    if inlined:
+        _inlined.add(loops)
     _kernels[call] = loops
     return call
 
@@ -128,7 +134,8 @@ def _overload_kernels() -> None:
 
 
 def _options(loops: Callable[..., Any]) -> Any:
-    return _OPTIONS if loops in _allocating else _WITHOUT_ARRAYS
+    options = _OPTIONS if loops in _allocating else _WITHOUT_ARRAYS
+    return {**options, "forceinline": True} if loops in _inlined else options
 
 
 def _always(loops: Callable[..., Any]) -> Callable[..., Any]:

@@ -49,7 +49,7 @@ def learn_network(
     number[0] = 1.0 if weight == 0.0 else mass[k, 1] / weight
 
 
-@kernel
+@kernel(inlined=True)
 def correct_root(
     root: FloatArray,
     k: int,
@@ -93,7 +93,7 @@ def correct_root(
 ROUNDING = 2.0**-52
 
 
-@kernel
+@kernel(inlined=True)
 def add_gain(
     x: FloatArray,
     root: FloatArray,

@@ -75,7 +75,7 @@ def lower_root(root: FloatArray) -> FloatArray:
 # Samples.
 
 
-@kernel
+@kernel(inlined=True)
 def rotate_out(
     root: FloatArray, k: int, row: FloatArray, m: int, gains: FloatArray, pivot: float
 ) -> float:
@@ -86,11 +86,14 @@ def rotate_out(
     n = root.shape[1]
     for i in range(n):
         gains[m, i] = 0.0
+    square = pivot * pivot  # summed up, so that no square root waits for another
     for j in range(n - 1, -1, -1):
         size = row[m, j]
         if size != 0.0:
-            whole = math.sqrt(pivot * pivot + size * size)
-            c, s = pivot / whole, size / whole
+            square += size * size
+            whole = math.sqrt(square)
+            inverse = 1.0 / whole
+            c, s = pivot * inverse, size * inverse
             pivot = whole
             for i in range(j, n):
                 old, gain = root[k, i, j], gains[m, i]
@@ -254,7 +257,7 @@ def combine_roots(
 # Covariance intersection, D (8) and (9): information is a root too, P^-1 = Z' Z.
 
 
-@kernel
+@kernel(inlined=True)
 def begin_intersection(scratch: UpdateScratch) -> None:
     """Forget what was intersected before."""
     total = scratch.total
@@ -288,7 +291,7 @@ def add_to_intersection(
     merge_information(total, whitened)
 
 
-@kernel
+@kernel(inlined=True)
 def merge_information(total: FloatArray, whitened: FloatArray) -> None:
     """Make ``total`` (n, n + 1) the root of both informations, means in the last column;
     ``whitened`` (n, n + 1) is used up.
@@ -317,7 +320,7 @@ def merge_information(total: FloatArray, whitened: FloatArray) -> None:
                 whitened[r, c] -= inner * whitened[r, j]
 
 
-@kernel
+@kernel(inlined=True)
 def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> None:
     """Write ``factor`` times the inverse of place ``k`` into ``out`` (n, >= n), lower triangular.
 
@@ -342,7 +345,7 @@ def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> Non
             out[i, j] = value / pivot
 
 
-@kernel
+@kernel(inlined=True)
 def end_intersection(
     root: FloatArray, x: FloatArray, k: int, centre: FloatArray, m: int, scratch: UpdateScratch
 ) -> None:

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.root_update import (
-    NEGLIGIBLE,
     TINY,
     UpdateScratch,
     rotate_out,
@@ -86,23 +85,42 @@ class SlotSamples(NamedTuple):
     conserved: FloatArray
 
 
+LANES = 8
+"""Covariances that are predicted side by side."""
+
+
+class Lanes(NamedTuple):
+    """Scratch of a prediction: ``root``, ``moved`` and ``noise`` (n, n, LANES), others (LANES,)."""
+
+    root: FloatArray
+    moved: FloatArray
+    noise: FloatArray
+    total: FloatArray
+    sign: FloatArray
+    pivot: FloatArray
+    scale: FloatArray
+
+
 class SlotRoom(NamedTuple):
-    """Scratch: of a sample and of combinations, ``vectors`` (2, n), of a prediction (n, n) twice,
-    and copies of the estimates (H, n) and roots (H, n, n) that are sent.
+    """Scratch: of a sample and of combinations, ``vectors`` (2, n), ``moved`` (n, n), of a
+    prediction, and copies of the estimates (H, n) and roots (H, n, n) that are sent.
     """
 
     update: UpdateScratch
     vectors: FloatArray
     moved: FloatArray
-    noise: FloatArray
+    lanes: Lanes
     xhat: FloatArray
     root: FloatArray
 
 
 def slot_room(H: int, n: int) -> SlotRoom:
     """Scratch for H filters of n states."""
-    shapes = ((2, n), (n, n), (n, n), (H, n), (H, n, n))
-    return SlotRoom(update_scratch(n, 1), *(np.zeros(shape) for shape in shapes))
+    wide = [np.zeros((n, n, LANES)) for _ in range(3)]
+    lanes = Lanes(*wide, *np.zeros((4, LANES)))
+    vectors, moved = np.zeros((2, n)), np.zeros((n, n))
+    sent = np.zeros((H, n)), np.zeros((H, n, n))
+    return SlotRoom(update_scratch(n, 1), vectors, moved, lanes, *sent)
 
 
 def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -111,7 +129,7 @@ def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, F
     return np.ascontiguousarray(made[:, 0]), np.ascontiguousarray(made[:, 1:])
 
 
-@kernel
+@kernel(inlined=True)
 def show(nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, r: int, s: int) -> None:
     """Fill in the sample of slot ``s``, where it is one."""
     k, H, n = plan.sample[s], len(nodes.rows), nodes.xhat.shape[1]
@@ -128,7 +146,7 @@ def show(nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, r: int, s: int)
                 samples.P[r, k, h, i, j] = samples.P[r, k, h, j, i] = total
 
 
-@kernel
+@kernel(inlined=True)
 def rebase(nodes: SlotNodes, readings: SlotReadings, r: int, s: int) -> None:
     """Count estimates from the state of slot ``s``, where a frame of coordinates begins."""
     if readings.rebased[s]:
@@ -138,7 +156,7 @@ def rebase(nodes: SlotNodes, readings: SlotReadings, r: int, s: int) -> None:
                 nodes.xhat[r * H + h, i] -= readings.local[r, s, i]
 
 
-@kernel
+@kernel(inlined=True)
 def use_reading(
     nodes: SlotNodes,
     place: int,
@@ -164,14 +182,7 @@ def use_reading(
             nodes.xhat[place, i] += room.gains[0, i] * (innovation / size)
 
 
-@kernel
-def predict(nodes: SlotNodes, place: int, room: SlotRoom) -> None:
-    """Move a place to the next slot: ``F xhat`` and ``F P F' + Q``."""
-    predict_mean(nodes, place, room)
-    predict_root(nodes.root, place, nodes.F, nodes.root_Q, room.moved, room.noise)
-
-
-@kernel
+@kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, place: int, room: SlotRoom) -> None:
     """Move the estimate of a place to the next slot, ``F xhat``."""
     n = nodes.xhat.shape[1]
@@ -185,59 +196,91 @@ def predict_mean(nodes: SlotNodes, place: int, room: SlotRoom) -> None:
 
 
 @kernel
-def predict_root(  # noqa: PLR0912 - one elimination, written as loops
-    root: FloatArray,
-    k: int,
-    F: FloatArray,
-    root_Q: FloatArray,
-    moved: FloatArray,
-    noise: FloatArray,
+def predict(nodes: SlotNodes, room: SlotRoom) -> None:
+    """Move all places to the next slot: ``F xhat`` and ``F P F' + Q``."""
+    for place in range(len(nodes.xhat)):
+        predict_mean(nodes, place, room)
+    for first in range(0, len(nodes.root), LANES):
+        predict_roots(nodes.root, first, nodes.F, nodes.root_Q, room.lanes)
+
+
+@kernel(inlined=True)
+def predict_roots(  # noqa: PLR0912 - loops side by side
+    root: FloatArray, first: int, F: FloatArray, root_Q: FloatArray, lanes: Lanes
 ) -> None:
-    """Make place ``k`` of root (K, n, n) the lower triangular root of ``F S S' F' + Q``; S and
-    ``root_Q`` (n, n) are lower triangular, ``moved`` and ``noise`` (n, n) are scratch.
+    """Make LANES places of root (K, n, n) from ``first`` on the lower triangular roots of
+    ``F S S' F' + Q``; S and ``root_Q`` (n, n) are lower triangular.
+
+    All are worked on side by side, which the processor does with one instruction for several.
     """
-    n = root.shape[1]
+    n, count = root.shape[1], min(LANES, len(root) - first)
+    S, moved, noise, total = lanes.root, lanes.moved, lanes.noise, lanes.total
+    for i in range(n):
+        for j in range(i + 1):
+            for q in range(count):
+                S[i, j, q] = root[first + q, i, j]
     for i in range(n):
         for j in range(n):
-            total = 0.0
+            for q in range(LANES):
+                moved[i, j, q] = 0.0
             for m in range(j, n):
-                total += F[i, m] * root[k, m, j]
-            moved[i, j] = total
+                for q in range(LANES):
+                    moved[i, j, q] += F[i, m] * S[m, j, q]
         for j in range(i + 1):
-            noise[i, j] = root_Q[i, j]
-    # Reflections from the right empty row i of [F S, root_Q] beyond its diagonal; the columns of
-    # root_Q right of i are still zero then.
+            for q in range(LANES):
+                noise[i, j, q] = root_Q[i, j]
     for i in range(n):
-        rest, pivot = 0.0, moved[i, i]
-        for j in range(i + 1, n):
-            rest += moved[i, j] * moved[i, j]
-        for j in range(i + 1):
-            rest += noise[i, j] * noise[i, j]
-        if rest <= NEGLIGIBLE * pivot * pivot + TINY:
-            sign = math.copysign(1.0, pivot)
-            for r in range(i, n):
-                root[k, r, i] = sign * moved[r, i]
-            continue
-        length = math.sqrt(pivot * pivot + rest)
-        first = -rest / (pivot + length) if pivot > 0.0 else pivot - length
-        scale = -1.0 / (length * first)
-        root[k, i, i] = length
+        reflect_row(i, n, lanes)
         for r in range(i + 1, n):
-            total = first * moved[r, i]
+            for q in range(LANES):
+                total[q] = lanes.pivot[q] * moved[r, i, q]
             for j in range(i + 1, n):
-                total += moved[i, j] * moved[r, j]
+                for q in range(LANES):
+                    total[q] += moved[i, j, q] * moved[r, j, q]
             for j in range(i + 1):
-                total += noise[i, j] * noise[r, j]
-            total *= scale
-            root[k, r, i] = moved[r, i] - total * first
+                for q in range(LANES):
+                    total[q] += noise[i, j, q] * noise[r, j, q]
+            for q in range(LANES):
+                total[q] *= lanes.scale[q]
+                S[r, i, q] = lanes.sign[q] * (total[q] * lanes.pivot[q] - moved[r, i, q])
             for j in range(i + 1, n):
-                moved[r, j] -= total * moved[i, j]
+                for q in range(LANES):
+                    moved[r, j, q] -= total[q] * moved[i, j, q]
             for j in range(i + 1):
-                noise[r, j] -= total * noise[i, j]
+                for q in range(LANES):
+                    noise[r, j, q] -= total[q] * noise[i, j, q]
+    for i in range(n):
+        for j in range(i + 1):
+            for q in range(count):
+                root[first + q, i, j] = S[i, j, q]
+
+
+@kernel(inlined=True)
+def reflect_row(i: int, n: int, lanes: Lanes) -> None:
+    """Find the reflection from the right that empties row ``i`` of [F S, root_Q] beyond its
+    diagonal: the row with ``pivot`` on the diagonal, times ``scale``.
+    """
+    # The columns of root_Q right of i are still zero here. Signs are those that cancel nothing.
+    moved, noise, total = lanes.moved, lanes.noise, lanes.total
+    for q in range(LANES):
+        total[q] = 0.0
+    for j in range(i + 1, n):
+        for q in range(LANES):
+            total[q] += moved[i, j, q] * moved[i, j, q]
+    for j in range(i + 1):
+        for q in range(LANES):
+            total[q] += noise[i, j, q] * noise[i, j, q]
+    for q in range(LANES):
+        pivot = moved[i, i, q]
+        length = math.sqrt(pivot * pivot + total[q])
+        lanes.sign[q] = math.copysign(1.0, pivot)
+        lanes.pivot[q] = pivot + lanes.sign[q] * length
+        lanes.scale[q] = 1.0 / (length * (length + abs(pivot)) + TINY)
+        lanes.root[i, i, q] = length
 
 
 def predicted_root(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
     """The lower triangular root (n, n) of ``F S S' F' + Q``, of lower triangular roots."""
-    result, (moved, noise) = root[None].copy(), np.empty((2, *root.shape))
-    predict_root(result, 0, F, root_Q, moved, noise)
-    return np.asarray(result[0])
+    nodes = SlotNodes(np.zeros((1, len(F))), root[None].copy(), F, root_Q, np.zeros(1, np.int64))
+    predict(nodes, slot_room(1, len(F)))
+    return np.asarray(nodes.root[0])

@@ -74,7 +74,8 @@ class SlotRuns:
     def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams) -> None:
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
-        self.runs, self._slot = len(streams.per_replica), 0
+        self.runs = 1 if isinstance(streams, Streams) else streams.count
+        self._slot = 0
         setup, runs = self.setup, self.runs
         self._nodes = SlotNodes(
             np.tile(setup.xhat, (runs, 1)),
@@ -166,11 +167,11 @@ class SlotRuns:
         setup, drawn = self.setup, None
         if self._events is None:
             count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
-            times = self._times(count)
+            times = self._times(count, rows > 0)
             drawn = self._draw_messages(times)
         else:
             count, up = self._events.following(rows, self._stopped[0])
-            times = self._times(count)
+            times = self._times(count, True)
             drawn = Drawn(up, *(np.zeros((0,) * d, dtype=np.int64) for d in (4, 3)))
         local, absolute, rebased = self._states(count)
         readings = self._readings(times, local, rebased)
@@ -189,7 +190,8 @@ class SlotRuns:
         sampled = np.flatnonzero(times.sample >= 0)
         return SlotBlock(absolute, local, sampled, samples, times, drawn)
 
-    def _times(self, count: int) -> SlotTimes:
+    def _times(self, count: int, wanted: bool) -> SlotTimes:
+        """What happens in the next slots; when they begin only if it is ``wanted``."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
         noted = slots < setup.last
@@ -199,7 +201,9 @@ class SlotRuns:
         sample = np.full(count, -1, dtype=np.int64)
         here = setup.samples[np.isin(setup.samples, slots)] - self._slot
         sample[here] = np.arange(len(here))
-        start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
+        start = np.zeros(count)
+        if wanted:
+            start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
         return SlotTimes(self._slot, start, noted, sensed, exchanged, sample, algorithm.predicts)
 
     def _draw_messages(self, times: SlotTimes) -> Drawn:
@@ -252,8 +256,10 @@ class SlotRuns:
             draw_paths(steps, states, normal_ziggurat(), self._slot, room, path, path)
         noise, room = self._noise, np.empty(setup.p)
         draw_readings(setup.sensors, noise, normal_ziggurat(), x, driven, room, y, H)
-        slots = [self._slot + s for s in np.flatnonzero(times.sensed).tolist()]
-        for s, path in self._recorded if slots else []:
+        if not self._recorded or not times.sensed.any():
+            return SlotReadings(y, H, local, rebased)
+        slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
+        for s, path in self._recorded:
             some = slice(s.row, s.row + len(s.root))
             values, matrices = path.several(slots, x[0, times.sensed])
             y[:, times.sensed, s.host, some] = np.linalg.solve(s.root, values.T).T

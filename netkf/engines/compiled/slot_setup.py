@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -29,14 +28,13 @@ from netkf.plants.transitions import frame_slots
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
-_known: WeakKeyDictionary[Scenario, SlotSetup] = WeakKeyDictionary()
-
 
 def slot_setup(scenario: Scenario) -> SlotSetup:
-    """The arrays of a scenario, made once."""
-    if scenario not in _known:
-        _known[scenario] = SlotSetup(scenario)
-    return _known[scenario]
+    """The arrays of a scenario, made once and kept with it like its cached properties."""
+    if "_slot_setup" not in vars(scenario):
+        vars(scenario)["_slot_setup"] = SlotSetup(scenario)
+    setup: SlotSetup = vars(scenario)["_slot_setup"]
+    return setup
 
 
 class AssignedSensor(NamedTuple):
