@@ -10,15 +10,18 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
+
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,14 @@ def field(rule: Rule, default: Any = MISSING) -> Any:
 
 setting = field
 """The public name of ``field``: classes of users import it from netkf.parts."""
+
+
+def required(method: Method) -> Method:
+    """Mark a method that subclasses must define, under its present or its former name.
+
+    It is an abstractmethod that type checkers do not see: they know nothing of former names.
+    """
+    return abstractmethod(method)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from netkf.core.fields import (
     number,
     positive,
     probability,
+    required,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
@@ -40,7 +41,7 @@ class Loss(Component):
         "stateful": "changing",
     }
 
-    @abstractmethod
+    @required
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
@@ -49,6 +50,7 @@ class Loss(Component):
         ``bad`` is the state of the link. ``table_probability`` is the entry of the graph's table
         for that direction, 1 without one.
         """
+        raise NotImplementedError
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Return True if the link is in its bad state at the next activation.

@@ -44,7 +44,7 @@ class Sensor(Component):
 
     @property
     def varying(self) -> bool:
-        """Whether H differs from slot to slot; such sensors exist in slots only."""
+        """True if H differs from slot to slot; such sensors exist in slots only."""
         return False
 
     @abstractmethod
@@ -101,7 +101,7 @@ class LinearSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> DrawnSamples:
-        """From the stream "noise"."""
+        """Return samples with noise from the stream "noise"."""
         return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
@@ -111,7 +111,7 @@ class LinearSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> SlotReadings:
-        """From the stream "noise"."""
+        """Return readings with noise from the stream "noise"."""
         return SlotReadings(self.H, self.R, generator("noise"))
 
 

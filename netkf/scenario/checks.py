@@ -25,7 +25,7 @@ MAX_STEPS = 100_000_000
 MAX_TICKS = 1e9
 
 
-def check(scenario: DerivedScenario) -> None:
+def check_scenario(scenario: DerivedScenario) -> None:
     """Check all rules that no single component can check alone; raises ScenarioError."""
     _check_times(scenario)
     _check_plant(scenario)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from netkf.scenario.checks import check
+from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
@@ -26,7 +26,7 @@ class Scenario(DerivedScenario):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self)
+        check_scenario(self)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields and the topology for pickle.

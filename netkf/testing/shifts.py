@@ -11,7 +11,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.testing.clocked import ClockTrial
 from netkf.testing.slotted import SlotTrial
 from netkf.testing.systems import systems
-from netkf.testing.trials import Shown, Trial
+from netkf.testing.trials import CheckedEstimate, Trial
 from netkf.testing.watching import Watched, demand
 
 SHIFT = np.array([7.0, -11.0, 5.0])
@@ -59,7 +59,7 @@ def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
             )
 
 
-def _differences(one: Shown, other: Shown) -> list[tuple[str, float, float]]:
+def _differences(one: CheckedEstimate, other: CheckedEstimate) -> list[tuple[str, float, float]]:
     found = [("xhat", _apart(one.xhat, other.xhat), 1.0 + one.size + other.size)]
     if one.P is not None and other.P is not None:
         found.append(("P", _apart(one.P, other.P), 1.0 + float(np.abs(one.P).max())))

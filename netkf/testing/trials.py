@@ -20,7 +20,7 @@ CONSERVED = 1e-9
 MAX_DELAY = 1.0
 
 
-class Shown(NamedTuple):
+class CheckedEstimate(NamedTuple):
     """An estimate of a node after something happened; ``xhat`` and ``size`` (its largest entry)
     before it was moved back by what the truth was shifted.
     """
@@ -40,7 +40,7 @@ class Trial(ABC):
     def __init__(self, watched: Watched, system: System, shift: FloatArray | None = None) -> None:
         self.watched, self.part, self.system = watched, watched.part, system
         self.random = Streams(0).generator("testing")
-        self.shown: list[Shown] = []
+        self.shown: list[CheckedEstimate] = []
         self._shift = shift
         self.offset = np.zeros(len(system.M))
         """The present shift of the truth (n,)."""
@@ -71,7 +71,7 @@ class Trial(ABC):
         """Check what the node shows and keep it."""
         xhat, P = check_estimate(self.watched, state, len(self.system.M), after)
         size = float(np.abs(xhat).max())
-        self.shown.append(Shown(node, after, xhat - self.offset, P, size))
+        self.shown.append(CheckedEstimate(node, after, xhat - self.offset, P, size))
 
     def step(self, node: int, method: str, *arguments: Any, shown: bool = True) -> None:
         """Call a method that returns the node's next state."""

@@ -58,6 +58,7 @@ class SimpyEngine(Engine):
         simulation = _Simulation(scenario, streams, recorder, progress)
         processes = simulation.slots() if scenario.slotted else simulation.clocks()
         timeline = simulation.timeline
+        # Any order will do: every event has an explicit time, rank and entity.
         for process in self.arrange(processes):
             timeline.start(process)
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
@@ -95,6 +96,7 @@ class _Simulation:
             return ClockedNode(*common, *_identity(scenario, node, entity))
 
         nodes = _nodes(scenario, make)
+        # Before anything happens: the sums that exchanges must conserve from now on.
         sums = _Sums(distinct(nodes))
         shared = (scenario, streams, timeline, self._recorder)
         return [
@@ -124,6 +126,7 @@ class _Simulation:
             offset = -truth.rebase(k)
             for node in distinct(nodes):
                 node.shift(offset)
+            # Payloads under way refer to the old origin too.
             self._transmitter.shift(self._scenario.hosted, offset)
 
     def slots(self) -> list[Process]:
@@ -190,6 +193,7 @@ class _Simulation:
         nothing = np.full((len(x), len(x)), math.nan)
         P = np.array([nothing if P is None else P for _, P in estimates])
         without = np.array([P is None for _, P in estimates])
+        # The trace shows absolute states; adding the origin loses digits, so the error is separate.
         far = near if x is local else near + (x - local)
         recorder.sample(time, x, far, P, local - near)
         # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
@@ -198,6 +202,7 @@ class _Simulation:
         recorder.flush_if_full()
         self._progress(time)
         lost = broken(scenario, near, P, without)
+        # Recorded after the sample, which shows the broken estimate.
         for node in lost:
             recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
         if lost:

@@ -117,6 +117,7 @@ class ClockedNode(Node):
             if interval < time - self._now:
                 end = stretch_end(self._now, time, max(interval, least))
                 least *= LONGER
+            # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
             self.state = self.algorithm.predict(self.state, gap)
             moments = self._read(self._now, end)
@@ -132,6 +133,7 @@ class ClockedNode(Node):
 
     def sample(self, node: int, y: FloatArray, H: FloatArray, R: FloatArray) -> None:
         """Take a sample of one sensor of ``node``; one update uses all of this instant."""
+        # The first sample of an instant schedules the update, which then uses all of them.
         if not self._samples:
             self._timeline.call_at(self._timeline.now, Rank.UPDATE, self.entity, self._use_samples)
         self._samples.append((node, y, H, R))
@@ -162,6 +164,7 @@ class ClockedNode(Node):
 
     def receive(self, envelope: Envelope) -> None:
         """Put a message into the inbox, to be absorbed with all others of this instant."""
+        # One event for all messages of this instant: filters absorb them together.
         if not self.inbox:
             self._timeline.call_at(self._timeline.now, Rank.ABSORB, self.entity, self._absorb)
         self.put(envelope)

@@ -43,7 +43,7 @@ def sensor_processes(
         for place in placed:
             samples = scenario.sample_path(streams, node, place)
             R = scenario.noise(place.entry, believed=True)
-            sensor = SampledSensor(node, entity, times[node, place.ordinal], samples, R)
+            sensor = SamplingProcess(node, entity, times[node, place.ordinal], samples, R)
             processes.append(sensor.run(timeline, truth, nodes[node]))
             entity += 1
     return processes
@@ -59,6 +59,7 @@ def _increments(
     entity: int,
 ) -> Process:
     """Make the node use its increments at each point of the sensing grid."""
+    # Nothing is sensed at time 0: increments need a time that has passed.
     k = 1
     while (time := truth.grid(k)) < scenario.horizon:
         yield timeline.at(time, Rank.SENSE, entity)
@@ -68,7 +69,7 @@ def _increments(
 
 
 @dataclass(frozen=True)
-class SampledSensor:
+class SamplingProcess:
     """One sampled sensor of ``node`` in one run: its times, its readings and the believed R."""
 
     node: int

@@ -131,6 +131,7 @@ class SlotNode(Node):
     def running(self, timeline: Timeline) -> Process:
         """Run the process of the node: follow the schedule, slot after slot."""
         slot = 0
+        # Readers and the clock follow the same stages; ranks put the processes in order.
         while self._schedule.runs(slot):
             for stage in self._schedule.stages(slot):
                 if stage.kind not in ("read", "send"):
@@ -183,6 +184,7 @@ class SlotNode(Node):
         """Close the inbox and absorb its messages."""
         append, now, phase = self._recorder.append, stage.time, stage.phase
         envelopes, messages = self.take_mail()
+        # From now on a message of this exchange is late.
         self._open = -1
         exchange = Exchange(now, phase, stage.step, slot)
         self.state = self.algorithm.absorb(self.state, messages, exchange)
@@ -270,7 +272,9 @@ class SlotClock:
         else:
             senders = sorted({node for pair in pairs for node in pair})
         exchange = Exchange(now, phase, stage.step, slot)
+        # Everyone emits before anyone hears, so that the order of nodes does not matter.
         payloads = {node: self._nodes[node].emit(exchange) for node in senders}
+        # Links that are held keep their outcome for all steps of an exchange.
         fresh = self._algorithm.redraws_links(phase, stage.step)
         for i, j in pairs:
             if not broadcast:

@@ -90,6 +90,7 @@ class Transmitter:
         now, (sender, receiver), number = self._timeline.now, way.link, way.messages
         way.messages = number + 1
         append = self._recorder.append
+        # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
         delay = transit_time(self._channel, way.link, number, outcome, way.table_probability)
         if math.isnan(delay):
@@ -98,6 +99,7 @@ class Transmitter:
         envelope = Envelope(sender, number, way.weight, payload, now, exchange)
         if delay == 0.0:
             self._arrive(way, phase, envelope, None)
+        # A message that would arrive after the end is neither delivered nor lost.
         elif now + delay < self._until:
             self._flying[way.link, number] = envelope
             callback = partial(self._arrive, way, phase, envelope)
@@ -107,6 +109,7 @@ class Transmitter:
         self, way: DirectedLink, phase: int, envelope: Envelope, _: simpy.Event | None
     ) -> None:
         now, (sender, receiver) = self._timeline.now, way.link
+        # The stored envelope may have been shifted since it was sent.
         envelope = self._flying.pop((way.link, envelope.number), envelope)
         envelope = envelope._replace(age=now - envelope.sent)
         arrives_in_time = way.receiver.in_time(envelope)
