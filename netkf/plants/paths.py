@@ -144,10 +144,10 @@ class DiffusionPaths:
         pieces = Block(
             start=block.start[which],
             end=block.end[which],
-            x_start=block.x_start[:, which],
-            x_end=block.x_end[:, which],
-            moments=block.moments[:, which],
-            cubic=block.cubic[:, which],
+            x_start=np.take(block.x_start, which, axis=1),
+            x_end=np.take(block.x_end, which, axis=1),
+            moments=np.take(block.moments, which, axis=1),
+            cubic=np.take(block.cubic, which, axis=1),
             step=block.step[which],
             ends=block.ends,
         )

@@ -64,7 +64,7 @@ from netkf.trace import schema
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import EVENT
 
-FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 1024, 4096, 256
+FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 AT_START = (
     *("frame_at", "piece", "grid_at", "wake_at", "instant_at", "tick_at", "probe_at", "row"),
