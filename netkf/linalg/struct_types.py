@@ -72,6 +72,8 @@ def struct_type(cls: type[Struct]) -> StructType:
 def _field_type(kind: Any) -> Any:
     if isinstance(kind, tuple):
         return types.Array(from_dtype(kind[0]), kind[1], "C")
+    if isinstance(kind, int):
+        return types.UniTuple(types.int64, kind)
     if issubclass(kind, Struct):
         return struct_type(kind)
     return from_dtype(np.dtype(kind))
@@ -106,6 +108,8 @@ def _place(builder: Any, address: Any, offset: int, kind: Any) -> Any:
 def load_field(context: Any, builder: Any, struct: StructType, address: Any, name: str) -> Any:
     """A number, an address, or an array without an owner."""
     offset, kind = struct.field(name)
+    if isinstance(kind, types.BaseTuple):
+        return context.get_constant_null(kind)
     if not isinstance(kind, types.Array):
         return builder.load(_place(builder, address, offset, context.get_value_type(kind)))
     itemsize = context.get_abi_sizeof(context.get_data_type(kind.dtype))

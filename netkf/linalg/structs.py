@@ -11,6 +11,10 @@ memory that holds its numbers, and where its arrays are. Kernels read ``state.xh
 
     walk = Walk(position=np.zeros((2, 3)), steps=0)
 
+A field ``size`` may be :func:`sized`: the tuple's length is part of the type, so that loops over
+``range(len(size))`` have a length that is known when they are compiled. Structs of other sizes are
+of other types then, ``cls.of_size(n)``.
+
 Annotations say what is a number (``int`` or ``float``); everything else is a C-contiguous array or
 another struct, whose types all instances of a class share. A struct keeps its arrays alive.
 
@@ -23,10 +27,15 @@ from __future__ import annotations
 from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
+from numpy.typing import NDArray
 
+FloatArray = NDArray[np.float64]
 NUMBERS = {"int": np.int64, "float": np.float64}
 WORD = 8  # bytes
-POINTER, SHAPE = 0, 1  # words of an array's entry
+MAX_UNROLLED = 4
+"""Largest n for which kernels are compiled for that n alone: they are half as fast again."""
+
+Size = tuple[int, ...] | FloatArray
 
 
 class StructClass(type):
@@ -54,6 +63,18 @@ class Struct(metaclass=StructClass):
         cls.struct_fields = tuple(cls.__annotations__)
         cls.struct_offsets, cls.struct_kinds = {}, {}
 
+    @classmethod
+    def of_size(cls, n: int) -> Any:
+        """The class of structs for loops over n, which are unrolled if n is small."""
+        if n > MAX_UNROLLED:
+            return cls
+        known = _sized_classes.get((cls, n))
+        if known is None:
+            body = {"__annotations__": cls.__annotations__, "__module__": cls.__module__}
+            made = StructClass(f"{cls.__name__}{n}", (cls,), body)
+            known = _sized_classes.setdefault((cls, n), made)
+        return known
+
     def __init__(self, **values: Any) -> None:
         """Raises TypeError where fields are missing, unknown, or of another type."""
         cls = type(self)
@@ -71,6 +92,8 @@ class Struct(metaclass=StructClass):
         """Words of memory."""
         last = cls.struct_fields[-1]
         kind = cls.struct_kinds[last]
+        if isinstance(kind, int):
+            return cls.struct_offsets[last] + 1
         return cls.struct_offsets[last] + 1 + (kind[1] if isinstance(kind, tuple) else 0)
 
     @classmethod
@@ -85,6 +108,8 @@ class Struct(metaclass=StructClass):
                 kinds[name] = NUMBERS[said]
             elif isinstance(value, Struct):
                 kinds[name] = type(value)
+            elif isinstance(value, tuple):
+                kinds[name], word = len(value), word - 1
             else:
                 kinds[name] = (value.dtype, value.ndim)
                 word += value.ndim
@@ -101,12 +126,16 @@ class Struct(metaclass=StructClass):
             self.__dict__[name] = value
         elif kind is np.int64 or kind is np.float64:
             self.memory.view(kind)[word] = value
+        elif isinstance(kind, int):
+            self.__dict__[name] = value
         else:
             self.memory[word] = value.address
             self.__dict__[name] = value
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (type(self), {name: getattr(self, name) for name in self.struct_fields})
+        cls, size = type(self), getattr(self, "size", None)
+        base, n = (cls.__base__, len(size)) if isinstance(size, tuple) else (cls, None)
+        return _rebuilt, (base, n, {name: getattr(self, name) for name in self.struct_fields})
 
     def __getattr__(self, name: str) -> Any:
         # Numbers are not in the dictionary: kernels change them.
@@ -119,8 +148,16 @@ class Struct(metaclass=StructClass):
 Derived = TypeVar("Derived", bound=Struct)
 
 
-def _rebuilt(cls: type[Derived], values: dict[str, Any]) -> Derived:
-    return cls(**values)
+_sized_classes: dict[tuple[type[Struct], int], Any] = {}
+
+
+def _rebuilt(cls: type[Derived], n: int | None, values: dict[str, Any]) -> Derived:
+    return (cls if n is None else cls.of_size(n))(**values)
+
+
+def sized(n: int) -> Size:
+    """A ``size`` of n: a tuple if loops over it are unrolled, else an array."""
+    return (0,) * n if n <= MAX_UNROLLED else np.zeros(n)
 
 
 def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:  # noqa: ARG001

@@ -208,7 +208,8 @@ def test_models_side_by_side_are_what_they_are_alone():
             assert np.array_equal(means[m], alone[1])
             P = np.tril(roots[m]) @ np.tril(roots[m]).T
             G = table.seen[0].T @ table.seen[0]
-            assert information_rate(stack, m, roots, m) == pytest.approx((P * G).sum(), rel=1e-12)
+            rate = information_rate(scratch.size, stack, m, roots, m)
+            assert rate == pytest.approx((P * G).sum(), rel=1e-12)
 
 
 def test_readings_are_used_as_before():

@@ -82,7 +82,7 @@ def correct_root(
             for i in range(j, n):
                 total += rest[best, i] / size * root[k, i, j]
             room.HS[0, j] = total
-        rotate_out(root, k, room.HS, 0, room.gains, 1.0)
+        rotate_out(room.size, root, k, room.HS, 0, room.gains, 1.0)
         for i in range(n):
             room.gains[0, i] = rest[best, i] / size
         for i in range(n):

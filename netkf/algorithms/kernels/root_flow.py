@@ -45,7 +45,7 @@ from netkf.algorithms.kernels.root_update import rotate_out
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.series import fill_polynomial, with_reach
-from netkf.linalg.structs import Struct, struct_at
+from netkf.linalg.structs import Size, Struct, sized, struct_at
 
 CELLS, CELL_BYTES = 16, 1 << 17  # of one model at most
 NARROW = 64.0  # trace(P) trace(G) of a gap up to which rounding of G is harmless
@@ -88,10 +88,11 @@ class FlowTable(Struct):
 
 
 class FlowScratch(Struct):
-    """Scratch arrays: values of the series, ``wide`` (n, n), ``T`` (n, n), rows (q, n), an
-    observation (1, n), its gain (1, n).
+    """The ``size`` n of states, and scratch arrays: values of the series, ``wide`` (n, n), ``T``
+    (n, n), rows (q, n), an observation (1, n), its gain (1, n).
     """
 
+    size: Size
     values: FloatArray
     wide: FloatArray
     T: FloatArray
@@ -100,10 +101,14 @@ class FlowScratch(Struct):
     gain: FloatArray
 
 
-def flow_scratch(table: FlowTable) -> FlowScratch:
-    """Room for all models of a table."""
+def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
+    """Scratch arrays for all models of a table; where ``unrolled`` kernels are compiled for its n,
+    if it is small.
+    """
     n, q = table.levels.shape[-1], table.seen.shape[1]
-    return FlowScratch(
+    cls = FlowScratch.of_size(n) if unrolled else FlowScratch
+    return cls(
+        size=sized(n) if unrolled else np.zeros(n),
         values=np.zeros(table.series.shape[3]),
         wide=np.zeros((n, n)),
         T=np.zeros((n, n)),
@@ -384,7 +389,7 @@ def move_root(
         gap = move_levels(table, m, octaves, root, x, k, gap, scratch)
     if not gap > 0.0:
         return
-    if table.sizes[m, 1] == 0 or table.size[m] * gap * root_size(root, k) < NARROW:
+    if table.sizes[m, 1] == 0 or table.size[m] * gap * root_size(scratch.size, root, k) < NARROW:
         move_narrow(table, m, root, x, k, gap, scratch)
         return
     gap = move_levels(table, m, 0, root, x, k, gap, scratch)
@@ -393,10 +398,10 @@ def move_root(
 
 
 @kernel
-def root_size(root: FloatArray, k: int) -> float:
+def root_size(size: Size, root: FloatArray, k: int) -> float:
     """``trace(P)``."""
     total = 0.0
-    for i in range(root.shape[1]):
+    for i in range(len(size)):
         for j in range(i + 1):
             total += root[k, i, j] * root[k, i, j]
     return total
@@ -438,7 +443,7 @@ def move_level(
     scratch: FlowScratch,
 ) -> None:
     """``move_root`` over ``unit 2^level`` seconds."""
-    n, levels, T, observed = x.shape[1], table.levels, scratch.T, scratch.observed
+    n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
         for r in range(n):
             for j in range(n):
@@ -446,7 +451,7 @@ def move_level(
                 for i in range(max(r, j), n):
                     total += levels[m, level, 2, r, i] * root[k, i, j]
                 observed[0, j] = total
-            rotate_out(root, k, observed, 0, scratch.gain, 1.0)
+            rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
     for i in range(n):
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
@@ -454,7 +459,7 @@ def move_level(
     for i in range(n):
         for j in range(n):
             values[i * n + j] = levels[m, level, flow, i, j]
-    transform(root, k, values, 0, scratch.wide, T, table.sizes[m, 2] > 0)
+    transform(scratch.size, root, k, values, 0, scratch.wide, T, table.sizes[m, 2] > 0)
     for i in range(n):
         total = 0.0
         for j in range(n):
@@ -476,7 +481,7 @@ def move_wide(
 ) -> None:
     """``move_root`` over less than a unit for any P, however wide."""
     use_readings(table, m, root, k, gap, scratch)
-    n = x.shape[1]
+    n = len(scratch.size)
     fill_cell(scratch.values, table, m, 0, n * (n + 1) // 2 + 2 * n * n, gap)
     move_by_series(table, m, root, x, k, scratch)
 
@@ -492,7 +497,7 @@ def move_narrow(
     scratch: FlowScratch,
 ) -> None:
     """``move_root`` over a gap inside a cell, where nothing is observed or P is not too wide."""
-    unit, n, values = table.unit[m], x.shape[1], scratch.values
+    unit, n, values = table.unit[m], len(scratch.size), scratch.values
     cell = int(gap / unit)
     since = gap if cell == 0 else gap - (cell + 0.5) * unit
     lower = n * (n + 1) // 2
@@ -500,7 +505,7 @@ def move_narrow(
         fill_cell(values, table, m, cell, lower + n * n, since)
     else:
         fill_cell(values, table, m, cell, 2 * (lower + n * n), since)
-        shrink_root(root, k, values, lower + 2 * n * n, scratch.wide)
+        shrink_root(scratch.size, root, k, values, lower + 2 * n * n, scratch.wide)
     move_by_series(table, m, root, x, k, scratch)
 
 
@@ -509,7 +514,7 @@ def move_by_series(
     table: FlowTable, m: int, root: FloatArray, x: FloatArray, k: int, scratch: FlowScratch
 ) -> None:
     """``x = exp(A g) x`` and ``P = Q_g + F P F'``, with what is in ``values``."""
-    n, values, T = x.shape[1], scratch.values, scratch.T
+    n, values, T = len(scratch.size), scratch.values, scratch.T
     begin = n * (n + 1) // 2
     for i in range(n):
         total = 0.0
@@ -520,37 +525,39 @@ def move_by_series(
         x[k, i] = scratch.gain[0, i]
     noisy = table.sizes[m, 2] > 0
     if noisy:
-        take_root(T, values)
+        take_root(scratch.size, T, values)
     if table.sizes[m, 1] > 0:
         begin += n * n
-    transform(root, k, values, begin, scratch.wide, T, noisy)
+    transform(scratch.size, root, k, values, begin, scratch.wide, T, noisy)
 
 
 @kernel
 def fill_cell(
-    out: FloatArray, table: FlowTable, m: int, cell: int, size: int, since: float
+    out: FloatArray, table: FlowTable, m: int, cell: int, width: int, since: float
 ) -> None:
-    """Write the first ``size`` values of the series of a cell, ``since`` seconds from its middle,
+    """Write the first ``width`` values of the series of a cell, ``since`` seconds from its middle,
     see linalg/series.
     """
     series, reach, distance = table.series, table.reach, abs(since)
-    for j in range(size):
+    for j in range(width):
         out[j] = series[m, cell, 0, j]
     k, even = 0, 1.0
     while distance > reach[m, cell, k]:
         odd = even * since
         even = odd * since
-        for j in range(size):
+        for j in range(width):
             out[j] += odd * series[m, cell, k + 1, j] + even * series[m, cell, k + 2, j]
         k += 2
 
 
 @kernel
-def shrink_root(root: FloatArray, k: int, G: FloatArray, begin: int, V: FloatArray) -> None:
+def shrink_root(
+    size: Size, root: FloatArray, k: int, G: FloatArray, begin: int, V: FloatArray
+) -> None:
     """Make place ``k`` the root of ``P (I + G P)^-1``; G is packed by rows of its lower triangle,
     from ``begin`` on.
     """
-    n = root.shape[1]
+    n = len(size)
     # V = I + S' G S by columns: G S first, whose column j is not needed by the ones before.
     for j in range(n):
         for i in range(n):
@@ -587,15 +594,12 @@ def use_readings(
     table: FlowTable, m: int, root: FloatArray, k: int, gap: float, scratch: FlowScratch
 ) -> None:
     """Use the information Gamma' Gamma of a gap of less than a unit."""
-    n, q, rows, observed = root.shape[1], table.sizes[m, 0], scratch.rows, scratch.observed
+    n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
-    size = 0.0
-    for i in range(n):
-        for j in range(i + 1):
-            size += root[k, i, j] * root[k, i, j]
+    spread = root_size(scratch.size, root, k)
     factor = math.sqrt(gap)
     for block in range(table.sizes[m, 1]):
-        if table.bound[m, block] * factor * factor * size < UNSEEN:
+        if table.bound[m, block] * factor * factor * spread < UNSEEN:
             break
         for j in range(width):
             rows[j] = gamma[m, block, 0, j + 1]
@@ -613,14 +617,14 @@ def use_readings(
                 for i in range(j, n):
                     total += rows[r * n + i] * root[k, i, j]
                 observed[0, j] = factor * total
-            rotate_out(root, k, observed, 0, scratch.gain, 1.0)
+            rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
         factor *= gap
 
 
 @kernel
-def take_root(T: FloatArray, packed: FloatArray) -> None:
+def take_root(size: Size, T: FloatArray, packed: FloatArray) -> None:
     """Cholesky's root of a lower triangle packed by rows; pivots that are rounding count as 0."""
-    n = T.shape[0]
+    n = len(size)
     for j in range(n):
         for i in range(j, n):
             total = packed[i * (i + 1) // 2 + j]
@@ -637,6 +641,7 @@ def take_root(T: FloatArray, packed: FloatArray) -> None:
 
 @kernel
 def transform(  # noqa: PLR0912 - loops are what the compiler wants
+    size: Size,
     root: FloatArray,
     k: int,
     F: FloatArray,
@@ -648,7 +653,7 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
     """Make place ``k`` the lower triangular root of ``F P F' + T T'``; F lies by rows from
     ``begin`` on, T is used up.
     """
-    n = root.shape[1]
+    n = len(size)
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -657,14 +662,14 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
             wide[i, j] = total
     # Householder's reflections, row by row, of F S and of the columns of T that reach the row.
     for i in range(n):
-        size = 0.0
+        rest = 0.0
         for j in range(i + 1, n):
-            size += wide[i, j] * wide[i, j]
+            rest += wide[i, j] * wide[i, j]
         if noisy:
             for j in range(i + 1):
-                size += T[i, j] * T[i, j]
+                rest += T[i, j] * T[i, j]
         pivot = wide[i, i]
-        length = math.sqrt(pivot * pivot + size)
+        length = math.sqrt(pivot * pivot + rest)
         root[k, i, i] = length
         if length > 0.0:
             first = pivot + length if pivot >= 0.0 else pivot - length
@@ -690,9 +695,9 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
 
 
 @kernel
-def information_rate(table: FlowTable, m: int, root: FloatArray, k: int) -> float:
+def information_rate(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
     """``trace(P G)`` in 1/s."""
-    n, rate = root.shape[1], 0.0
+    n, rate = len(size), 0.0
     for r in range(table.sizes[m, 0]):
         for j in range(n):
             total = 0.0
@@ -704,6 +709,7 @@ def information_rate(table: FlowTable, m: int, root: FloatArray, k: int) -> floa
 
 @kernel
 def gain_root(
+    size: Size,
     moments: FloatArray,
     series: FloatArray,
     root: FloatArray,
@@ -715,7 +721,7 @@ def gain_root(
     """Use the ``moments`` (2p,) of the readings of a gap, which become innovations, at its end:
     ``x += (U + S S' W) innovations``. ``series`` is that of a GainTable, ``values`` room for a row.
     """
-    n, q = x.shape[1], len(moments)
+    n, q = len(size), len(moments)
     fill_polynomial(values, series, gap)
     for m in range(q):
         for j in range(n):
@@ -785,5 +791,5 @@ def gain_update_root(
         return x
     n = len(x)
     means, values = x.reshape(1, n).copy(), np.zeros(table.series.shape[1] - 1)
-    gain_root(moments.copy(), table.series, root.reshape(1, n, n), means, 0, gap, values)
+    gain_root(x, moments.copy(), table.series, root.reshape(1, n, n), means, 0, gap, values)
     return np.asarray(means[0])

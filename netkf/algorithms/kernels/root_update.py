@@ -24,13 +24,14 @@ from :func:`update_scratch`; wrappers for Python take one node and return new ar
 from __future__ import annotations
 
 import math
+import threading
 
 import numpy as np
 
 from netkf.algorithms.kernels.square_root import lower_triangular
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.structs import Struct
+from netkf.linalg.structs import Size, Struct, sized
 
 SINGULAR = 2.0**-25
 """Least pivot of a root that counts in an intersection, relative to the length of its row: the
@@ -41,11 +42,12 @@ TINY = 1e-200
 
 
 class UpdateScratch(Struct):
-    """Scratch arrays: C (p, p), HS (p, n) and gains (p, n) of a sample, with p >= 1 its largest
-    number of rows; ``wide`` (n, n), ``whitened`` (n, n + 1) and ``total`` (n, n + 1) of
-    combinations.
+    """The ``size`` n of states, and scratch arrays: C (p, p), HS (p, n) and gains (p, n) of a
+    sample, with p >= 1 its largest number of rows; ``wide`` (n, n), ``whitened`` (n, n + 1) and
+    ``total`` (n, n + 1) of combinations.
     """
 
+    size: Size
     C: FloatArray
     HS: FloatArray
     gains: FloatArray
@@ -54,14 +56,34 @@ class UpdateScratch(Struct):
     total: FloatArray
 
 
-def update_scratch(n: int, p: int) -> UpdateScratch:
-    """Room for states of n entries and samples of at most p rows."""
+def update_scratch(n: int, p: int, unrolled: bool = False) -> UpdateScratch:
+    """Scratch arrays for states of n entries and samples of at most p rows; where ``unrolled``
+    kernels are compiled for that n, if it is small.
+    """
     p = max(p, 1)
     shapes = {
         **{"C": (p, p), "HS": (p, n), "gains": (p, n), "wide": (n, n)},
         **{"whitened": (n, n + 1), "total": (n, n + 1)},
     }
-    return UpdateScratch(**{name: np.zeros(shape) for name, shape in shapes.items()})
+    cls = UpdateScratch.of_size(n) if unrolled else UpdateScratch
+    size = sized(n) if unrolled else np.zeros(n)
+    return cls(size=size, **{name: np.zeros(shape) for name, shape in shapes.items()})
+
+
+class _Scratches(threading.local):
+    """Of each thread, for calls from Python, by n and p."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[int, int], UpdateScratch] = {}
+
+    def of(self, n: int, p: int) -> UpdateScratch:
+        """Scratch arrays for n states and samples of p rows."""
+        if (n, p) not in self.known:
+            self.known[n, p] = update_scratch(n, p)
+        return self.known[n, p]
+
+
+_scratches = _Scratches()
 
 
 def lower_root(root: FloatArray) -> FloatArray:
@@ -77,23 +99,23 @@ def lower_root(root: FloatArray) -> FloatArray:
 
 @kernel(inlined=True)
 def rotate_out(
-    root: FloatArray, k: int, row: FloatArray, m: int, gains: FloatArray, pivot: float
+    size: Size, root: FloatArray, k: int, row: FloatArray, m: int, gains: FloatArray, pivot: float
 ) -> float:
     """Use the scalar observation with ``h S = row[m]`` and noise variance ``pivot``^2; the gain is
     ``gains[m]`` (n,) over the value that is returned, the standard deviation of the innovation.
     """
     # [pivot, h S; 0, S] times rotations that empty h S from its end, so that S stays triangular.
-    n = root.shape[1]
+    n = len(size)
     for i in range(n):
         gains[m, i] = 0.0
     square = pivot * pivot  # summed up, so that no square root waits for another
     for j in range(n - 1, -1, -1):
-        size = row[m, j]
-        if size != 0.0:
-            square += size * size
+        entry = row[m, j]
+        if entry != 0.0:
+            square += entry * entry
             whole = math.sqrt(square)
             inverse = 1.0 / whole
-            c, s = pivot * inverse, size * inverse
+            c, s = pivot * inverse, entry * inverse
             pivot = whole
             for i in range(j, n):
                 old, gain = root[k, i, j], gains[m, i]
@@ -119,7 +141,7 @@ def sample_root(
     are independent standard normals where the filter is consistent.
     """
     # [root_R, H S; 0, S] is made lower triangular, [C, 0; gains', S+], row by row of H.
-    p, n = len(y), x.shape[1]
+    p, n, size = len(y), len(scratch.size), scratch.size
     C, HS, gains = scratch.C, scratch.HS, scratch.gains
     for r in range(p):
         for m in range(r + 1):
@@ -134,7 +156,7 @@ def sample_root(
         y[r] -= seen
     for r in range(p):
         if r == p - 1:
-            C[r, r] = rotate_out(root, k, HS, r, gains, C[r, r])
+            C[r, r] = rotate_out(size, root, k, HS, r, gains, C[r, r])
         else:
             rotate_rows(root, k, C, HS, gains, r, p)
         total = y[r]
@@ -175,7 +197,7 @@ def update_with_sample(
     """Root (n, n), x (n,) and normalised innovation (p,) once the sample y (p,) is used."""
     n = len(x)
     roots, means, innovation = root.reshape(1, n, n).copy(), x.reshape(1, n).copy(), y.copy()
-    sample_root(roots, means, 0, innovation, H, root_R, update_scratch(n, len(y)))
+    sample_root(roots, means, 0, innovation, H, root_R, _scratches.of(n, len(y)))
     return roots[0], means[0], innovation
 
 
@@ -183,13 +205,13 @@ def update_with_sample(
 
 
 @kernel
-def scale_root(root: FloatArray, x: FloatArray, k: int, weight: float) -> None:
+def scale_root(size: Size, root: FloatArray, x: FloatArray, k: int, weight: float) -> None:
     """Weigh place ``k`` alone: ``weight`` >= 0 times P and x."""
-    n, size = x.shape[1], math.sqrt(weight)
+    n, factor = len(size), math.sqrt(weight)
     for i in range(n):
         x[k, i] *= weight
         for j in range(i + 1):
-            root[k, i, j] *= size
+            root[k, i, j] *= factor
 
 
 @kernel
@@ -204,21 +226,21 @@ def add_root(
     scratch: UpdateScratch,
 ) -> None:
     """Add ``weight`` >= 0 times P and x of place ``m`` of ``other`` (M, n, n), ``other_x``."""
-    n, size, wide = x.shape[1], math.sqrt(weight), scratch.wide
+    n, factor, wide = len(scratch.size), math.sqrt(weight), scratch.wide
     for i in range(n):
         x[k, i] += weight * other_x[m, i]
         for j in range(i + 1):
-            wide[i, j] = size * other[m, i, j]
-    absorb_columns(root, k, wide)
+            wide[i, j] = factor * other[m, i, j]
+    absorb_columns(scratch.size, root, k, wide)
 
 
 @kernel
-def absorb_columns(root: FloatArray, k: int, wide: FloatArray) -> None:
+def absorb_columns(size: Size, root: FloatArray, k: int, wide: FloatArray) -> None:
     """Make place ``k`` the root of ``S S' + wide wide'``; ``wide`` (n, n) is lower triangular and
     is used up.
     """
     # Householder's reflections of a column of S with the columns of ``wide`` that reach its row.
-    n = root.shape[1]
+    n = len(size)
     for i in range(n):
         below = 0.0
         for j in range(i + 1):
@@ -247,8 +269,8 @@ def combine_roots(
     (k, n) and roots (k, n, n).
     """
     x, root = means[:1].copy(), roots[:1].copy()
-    scratch = update_scratch(means.shape[1], 1)
-    scale_root(root, x, 0, float(weights[0]))
+    scratch = _scratches.of(means.shape[1], 1)
+    scale_root(scratch.size, root, x, 0, float(weights[0]))
     for m in range(1, len(weights)):
         add_root(root, x, 0, float(weights[m]), roots, means, m, scratch)
     return x[0], root[0]
@@ -374,7 +396,8 @@ def intersect_roots(
     (k, n, n).
     """
     x, root = means[:1].copy(), np.zeros_like(roots[:1])
-    scratch = update_scratch(means.shape[1], 1)
+    scratch = _scratches.of(means.shape[1], 1)
+    begin_intersection(scratch)
     for m in range(len(weights)):
         add_to_intersection(float(weights[m]), roots, means, m, means, 0, scratch)
     end_intersection(root, x, 0, means, 0, scratch)

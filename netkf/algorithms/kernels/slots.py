@@ -177,7 +177,7 @@ def use_reading(
                 total += readings.H[rH, sH, h, row, i] * nodes.root[place, i, j]
             room.HS[0, j] = total
             innovation -= readings.H[rH, sH, h, row, j] * nodes.xhat[place, j]
-        size = rotate_out(nodes.root, place, room.HS, 0, room.gains, 1.0)
+        size = rotate_out(room.size, nodes.root, place, room.HS, 0, room.gains, 1.0)
         for i in range(n):
             nodes.xhat[place, i] += room.gains[0, i] * (innovation / size)
 

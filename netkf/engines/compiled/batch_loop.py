@@ -61,24 +61,24 @@ def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
     """Simulate all runs of a batch up to the horizon, or until an estimate is no longer finite."""
     ziggurat = normal_ziggurat()
     for run in range(len(batch.lengths)):
-        begin_run(state.memory, batch.memory, run, ziggurat)
+        begin_run(state, batch.memory, run, ziggurat)
         wanted = -1
         while wanted != DONE:
             wanted = int(event_loop(state, None, None))
-            if not keep_samples(state.memory, batch.memory, run):
+            if not keep_samples(state, batch.memory, run):
                 break
             if wanted == WANT_CUTS:
-                draw_cuts(state.memory, batch.memory, run, ziggurat)
+                draw_cuts(state, batch.memory, run, ziggurat)
             elif wanted == WANT_MESSAGES:
                 add_messages(state, state.most_messages)
 
 
 @kernel
 def begin_run(
-    state_memory: IntArray, batch_memory: IntArray, run: int, ziggurat: NormalZiggurat
+    state: Simulation, batch_memory: IntArray, run: int, ziggurat: NormalZiggurat
 ) -> None:
     """Put the Simulation to time 0 of a run and copy its draws there."""
-    begin(struct_at(state_memory, Simulation), struct_at(batch_memory, BatchArrays), run, ziggurat)
+    begin(state, struct_at(batch_memory, BatchArrays), run, ziggurat)
 
 
 @kernel
@@ -165,10 +165,10 @@ def copy_noise(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 @kernel
 def draw_cuts(
-    state_memory: IntArray, batch_memory: IntArray, run: int, ziggurat: NormalZiggurat
+    state: Simulation, batch_memory: IntArray, run: int, ziggurat: NormalZiggurat
 ) -> None:
     """Draw new normals for cuts where they are used up."""
-    state, batch = struct_at(state_memory, Simulation), struct_at(batch_memory, BatchArrays)
+    batch = struct_at(batch_memory, BatchArrays)
     refill_cuts(state, batch, run, ziggurat)
 
 
@@ -186,11 +186,11 @@ def refill_cuts(state: Simulation, batch: BatchArrays, run: int, ziggurat: Norma
 
 
 @kernel
-def keep_samples(state_memory: IntArray, batch_memory: IntArray, run: int) -> bool:
+def keep_samples(state: Simulation, batch_memory: IntArray, run: int) -> bool:
     """Copy the samples that were taken into the batch, up to the first that is not finite; False
     where there is such a one. What happened after it did not happen.
     """
-    return keep(struct_at(state_memory, Simulation), struct_at(batch_memory, BatchArrays), run)
+    return keep(state, struct_at(batch_memory, BatchArrays), run)
 
 
 @kernel

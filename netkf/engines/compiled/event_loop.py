@@ -290,7 +290,7 @@ def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: fl
     elif state.kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
-        copy_state(state.pool_x, state.pool_root, m, state.xhat, state.root, h)
+        copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     if delay == 0.0:
         arrive(state, m, now)
         return
@@ -391,14 +391,14 @@ def combine(state: Simulation, h: int, now: float) -> None:
             intersect(state, h, own / total, total)
     elif state.kind == SWAP:
         last = state.nodes[h].last
-        copy_state(state.xhat, state.root, h, state.pool_x, state.pool_root, last)
+        copy_state(state.size, state.xhat, state.root, h, state.pool_x, state.pool_root, last)
 
 
 @kernel
 def combine_convex(state: Simulation, h: int, own: float) -> None:
     """H (7) and (9): what others sent is a copy, so that sums may grow in their place."""
     xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
-    scale_root(root, xhat, h, own)
+    scale_root(state.size, root, xhat, h, own)
     m = state.nodes[h].inbox
     while m != -1:
         weight = ways[pool[m].way].weight
@@ -426,7 +426,7 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
     """Keep a sample of all nodes: estimates and covariances ``P = S S'``. False once there is no
     space for another one.
     """
-    shown, root, n, k = state.shown, state.root, state.xhat.shape[1], state.samples
+    shown, root, n, k = state.shown, state.root, len(state.size), state.samples
     for h in range(len(state.nodes)):
         for i in range(n):
             shown.xhat[k, h, i] = state.xhat[h, i]

@@ -55,6 +55,7 @@ from netkf.engines.compiled.state import (
 )
 from netkf.engines.compiled.truth import KnownStates, PathStates, States
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.structs import sized
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import all_sample_times, uses_grid
@@ -191,7 +192,9 @@ class Workspace:
         pool = self._pool[0]
         pool["next"] = np.arange(1, len(pool) + 1)
         scratch, flow, update = scratch_arrays(start.table, start.gains, instants)
-        return Simulation(
+        n = start.xhat.shape[1]
+        state: Simulation = Simulation.of_size(n)(
+            size=sized(n),
             nodes=start.nodes.copy(),
             xhat=start.xhat.copy(),
             root=start.root.copy(),
@@ -221,6 +224,7 @@ class Workspace:
             **self._numbers(instants),
             **dict.fromkeys(AT_START, 0),
         )
+        return state
 
     def _numbers(self, instants: Instants) -> dict[str, Any]:
         algorithm = self._scenario.hosted

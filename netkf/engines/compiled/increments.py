@@ -112,7 +112,7 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
     readings, values = scratch.moments[: shape[k, 0]], scratch.values[: width - 1]
     while node.now < time:
         now, end = node.now, time
-        stretch = usable(information_rate(table, k, root, h))
+        stretch = usable(information_rate(state.size, table, k, root, h))
         if stretch < time - now:
             if node.least == 0.0:
                 node.least = SHORTEST_SHARE * (time - now)
@@ -136,7 +136,7 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
             last - now,
             scratch.early,
         )
-        gain_root(readings, gains, root, xhat, h, end - now, values)
+        gain_root(state.size, readings, gains, root, xhat, h, end - now, values)
         node.now = end
     node.least = 0.0
     return True

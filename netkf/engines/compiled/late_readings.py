@@ -10,7 +10,7 @@ from netkf.algorithms.kernels.root_update import sample_root
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.structs import Struct
+from netkf.linalg.structs import Size, Struct
 
 PAST = np.dtype(
     [("instant", np.int64), ("frame", np.int64), ("before", np.int64), ("time", np.float64)]
@@ -90,13 +90,18 @@ def use_instant(
 
 @kernel
 def copy_state(
-    x: FloatArray, root: FloatArray, k: int, from_x: FloatArray, from_root: FloatArray, m: int
+    size: Size,
+    x: FloatArray,
+    root: FloatArray,
+    k: int,
+    from_x: FloatArray,
+    from_root: FloatArray,
+    m: int,
 ) -> None:
     """Copy place ``m`` to place ``k``."""
-    n = x.shape[1]
-    for i in range(n):
+    for i in range(len(size)):
         x[k, i] = from_x[m, i]
-        for j in range(n):
+        for j in range(i + 1):
             root[k, i, j] = from_root[m, i, j]
 
 
@@ -119,7 +124,7 @@ def remember(
     k = take_past(history, time, instant, frame)
     history.past[k].before = history.newest[h]
     history.newest[h] = k
-    copy_state(history.x, history.root, k, state.xhat, state.root, h)
+    copy_state(state.size, history.x, history.root, k, state.xhat, state.root, h)
 
 
 @kernel
@@ -166,7 +171,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
     before, k = k, take_past(history, time, instant, -1)
     past[k].before = before
     while True:
-        copy_state(x, root, k, x, root, before)
+        copy_state(state.size, x, root, k, x, root, before)
         if past[k].time > past[before].time:
             gap = past[k].time - past[before].time
             move_root(state.table, model, root, x, k, gap, state.flow_scratch)
@@ -180,7 +185,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
         before, k, again = k, again, past[again].before
         past[k].before = before
     history.newest[h] = k
-    copy_state(state.xhat, state.root, h, x, root, k)
+    copy_state(state.size, state.xhat, state.root, h, x, root, k)
     if now > past[k].time:
         gap = now - past[k].time
         move_root(state.table, model, state.root, state.xhat, h, gap, state.flow_scratch)

@@ -252,7 +252,7 @@ def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArr
     for i in range(n):
         for j in range(i + 1):
             root[h, i, j] = 1.0 if i == j else 0.0
-    transform(root, h, F, 0, state.flow_scratch.wide, state.flow_scratch.T, False)
+    transform(state.size, root, h, F, 0, state.flow_scratch.wide, state.flow_scratch.T, False)
 
 
 @kernel

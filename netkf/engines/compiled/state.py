@@ -21,7 +21,7 @@ from netkf.algorithms.kernels.root_update import UpdateScratch, update_scratch
 from netkf.algorithms.models import FlowModel, first_root
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
-from netkf.linalg.structs import Struct
+from netkf.linalg.structs import Size, Struct
 from netkf.scenario.scenario import Scenario
 
 
@@ -185,10 +185,11 @@ class Shown(Struct):
 class Simulation(Struct):
     """A run, and where it stands.
 
-    Filters: ``nodes`` (N,), xhat (N, n), root (N, n, n), the ``table`` of their models and, last,
-    of prediction alone. Messages: ``pool`` (C,), what they carry (C, n), (C, n, n), the ``heap`` of
-    arrivals (C,), ``waiting`` (N,) nodes with mail. Times of ``frames`` (F,) and ``probes`` (T,).
-    The trace: ``rows``, or only ``counts`` (len(KINDS),) of events where it is not ``traced``.
+    The ``size`` n of states. Filters: ``nodes`` (N,), xhat (N, n), root (N, n, n), the ``table`` of
+    their models and, last, of prediction alone. Messages: ``pool`` (C,), what they carry (C, n),
+    (C, n, n), the ``heap`` of arrivals (C,), ``waiting`` (N,) nodes with mail. Times of ``frames``
+    (F,) and ``probes`` (T,). The trace: ``rows``, or where it is not ``traced`` only ``counts``
+    (len(KINDS),) of events.
 
     ``kind`` and ``at``: see KINDS and CLOCKS; ``..._at``: the next frame, point of the sensing
     grid, node that wakes there, instant of samples, tick and probe; the ``piece`` of the path; the
@@ -199,6 +200,7 @@ class Simulation(Struct):
     ``age_limit`` seconds are late.
     """
 
+    size: Size
     nodes: np.ndarray
     xhat: FloatArray
     root: FloatArray
@@ -332,7 +334,7 @@ def scratch_arrays(
         H=np.zeros((q, n)),
         root_R=np.zeros((q, q)),
     )
-    return scratch, flow_scratch(table), update_scratch(n, q)
+    return scratch, flow_scratch(table, unrolled=True), update_scratch(n, q, unrolled=True)
 
 
 def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
