@@ -310,7 +310,9 @@ class Filter(Component):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[Any, ...]:
-        """What ``slot_kernel`` is given besides, for so many runs that start in these states."""
+        """Return the arrays that ``slot_kernel`` is given besides, for ``runs`` runs that start in
+        these states.
+        """
         return ()
 
     def stopped(self, state: Any) -> bool:
@@ -338,7 +340,7 @@ class Filter(Component):
         """Raise ScenarioError where the rest of a ``netkf.Scenario`` does not fit this filter."""
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """What a user should know about this filter in a ``netkf.Scenario``, one line each."""
+        """Return notes on this filter in a ``netkf.Scenario`` for the user, one line each."""
         return ()
 
     def largest_degree(self) -> float:

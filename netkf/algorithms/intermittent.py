@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -121,15 +122,25 @@ class Intermittent(Filter):
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> IntermittentState:
-        """Nothing has happened yet."""
+        """Return the state at time 0, before any reading."""
         root = first_root(cov)
-        lag = node.max_delay if self.window is None else min(self.window, node.max_delay)
         start = Past(0.0, None, None, mean, root, None)
-        kept = 0.0 if self.late == "drop" else lag
-        return IntermittentState(mean, root, model, None, 0.0, start, SLACK * kept)
+        span = self.history_span(node.max_delay)
+        return IntermittentState(mean, root, model, None, 0.0, start, span)
+
+    @property
+    def max_age(self) -> float:
+        """Seconds beyond which a reading that arrives is too old to use."""
+        if self.late == "drop":
+            return 0.0
+        return math.inf if self.window is None else self.window
+
+    def history_span(self, max_delay: float) -> float:
+        """Return the seconds of its past that a node must keep for late readings."""
+        return SLACK * min(self.max_age, max_delay)
 
     def predict(self, state: IntermittentState, gap: float) -> IntermittentState:
-        """The reading of an earlier instant is not sent any more."""
+        """Predict, and drop the unsent reading: one of an earlier instant is never sent."""
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
 
@@ -156,10 +167,8 @@ class Intermittent(Filter):
         return state
 
     def accepts(self, payload: Reading, age: float) -> bool:
-        """Unless it took longer than the window, or late readings are dropped."""
-        if self.late == "drop":
-            return age <= 0.0
-        return self.window is None or age <= self.window
+        """Return False if it took longer than the window, or if late readings are dropped."""
+        return age <= self.max_age
 
     def shift(self, state: IntermittentState, offset: FloatArray) -> IntermittentState:
         """Affine; the past is in the coordinates of its own time."""

@@ -101,8 +101,8 @@ class SlotFilter(Component):
         return 1
 
     def redraws(self, phase: int, step: int) -> bool:
-        """Whether the links draw new fates in a step, else each keeps its last one; True in the
-        first.
+        """Return True if links draw new outcomes in a step, else each keeps its last one; True in
+        the first.
         """
         return True
 
@@ -111,7 +111,7 @@ class SlotFilter(Component):
         """The state once the node's reading of this slot is known; p is 0 without sensors."""
 
     def emit(self, state: Any, phase: int) -> Any:
-        """What the node sends in each step of exchange number ``phase``; None for nothing."""
+        """Return the payload of each step of exchange number ``phase``; None sends nothing."""
         return None
 
     def absorb(self, state: Any, phase: int, messages: Messages) -> Any:
@@ -121,7 +121,7 @@ class SlotFilter(Component):
         return state
 
     def stopped(self, state: Any) -> bool:
-        """Whether the node has stopped learning what it learns from the others, for ever."""
+        """Return True once the node has permanently frozen its network estimate."""
         return False
 
     def conserved(self, state: Any) -> dict[str, float]:

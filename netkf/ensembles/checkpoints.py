@@ -32,18 +32,18 @@ class BlockCheckpoints:
         return sorted(int(file.stem) for file in files if zipfile.is_zipfile(file))
 
     def save(self, number: int, statistics: RunStatistics) -> None:
-        """A block with the traces that its runs left."""
+        """Write a block with the traces that its runs left."""
         self._folder.mkdir(exist_ok=True)
         with write_atomically(self._file(number)) as part, part.open("wb") as opened:
             np.savez(opened, **_as_arrays(statistics))
 
     def load(self, number: int) -> RunStatistics:
-        """A block without its traces."""
+        """Return a block without its traces."""
         with np.load(self._file(number)) as arrays:
             return _statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
-        """Of all blocks, in the order of replicas."""
+        """Yield the traces of all blocks in the order of replicas."""
         for number in self.numbers():
             with np.load(self._file(number)) as arrays:
                 for k in range(_words(arrays)["traces"]):
@@ -51,7 +51,7 @@ class BlockCheckpoints:
                     yield Trace(int(fields[0]), *fields[1:])
 
     def remove(self) -> None:
-        """All of them."""
+        """Delete all blocks."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _file(self, number: int) -> Path:

@@ -63,8 +63,8 @@ class _Plan:
     trace: str
     block: int
 
-    def words(self, ended: bool) -> dict[str, Any]:
-        """As the manifest says it; the size of blocks means nothing in the end."""
+    def manifest_entries(self, ended: bool) -> dict[str, Any]:
+        """Return the entries for the manifest; once the runs ended, the block size is left out."""
         block = {} if ended else {"block": self.block}
         return {"scenario": self.scenario, "trace": self.trace, **block}
 
@@ -140,7 +140,7 @@ def runs_to_directory(
         raise reason from error
     totals = {"diverged": int(whole.totals[1]), "events": int(whole.totals[0])}
     totals["fingerprint"] = whole.fingerprint
-    manifest.write(finished.status, {**plan.words(ended=True), **totals}, runs)
+    manifest.write(finished.status, {**plan.manifest_entries(ended=True), **totals}, runs)
     blocks.remove()
     return finished
 
@@ -190,13 +190,13 @@ class _Keeper:
 
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:
         """Say how the runs stand."""
-        self._manifest.write(status, self._plan.words(ended=False), self._done, error)
+        self._manifest.write(status, self._plan.manifest_entries(ended=False), self._done, error)
 
 
 def _directory(
     scenario: Scenario, out: Path | None, resume: bool, plan: _Plan, engine: str
 ) -> tuple[Path, _Plan]:
-    """Where to write, and the size of blocks that was begun with."""
+    """Return the directory to write to, and the plan with the block size that was begun with."""
     if not resume:
         return new_directory(out, scenario.name), plan
     if out is None:
@@ -224,7 +224,7 @@ def _directory(
 
 
 def is_finished(directory: Path) -> bool:
-    """Whether all runs of a directory are done and written."""
+    """Return True if all runs of a directory are done and written."""
     if not (directory / "manifest.json").exists():
         return False
     return read_manifest(directory).get("status") in ("complete", "diverged")

@@ -66,7 +66,9 @@ def _bands(
     mean: FloatArray,
     error: FloatArray,
 ) -> None:
-    """Of the traces of (T, N, n, n) matrices; a trace's standard error is at most their sum."""
+    """Draw traces of (T, N, n, n) matrices with bands; the standard error of a trace is at most the
+    sum of those of its terms.
+    """
     times, promised = finished.ensemble.times, finished.promised
     trace = np.trace(mean, axis1=2, axis2=3)
     spread = 2.0 * np.trace(error, axis1=2, axis2=3)

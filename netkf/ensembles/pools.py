@@ -118,7 +118,7 @@ class Adaptive(Here):
         return super().submit(job)
 
     def next_size(self, left: int, runs: int) -> int:
-        """As suits where the next block is done."""
+        """Return the size of the next block: small here, larger for worker processes."""
         if self._processes is None:
             return super().next_size(left, runs)
         return block_size(left, self.width)
@@ -298,7 +298,7 @@ def make_pool(
 
 
 def _prepare() -> None:
-    """In a worker: the parent deals with Ctrl-C, and a worker without a parent ends."""
+    """Prepare a worker process: the parent handles Ctrl-C, and an orphan ends itself."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()

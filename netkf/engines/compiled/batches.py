@@ -13,8 +13,6 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.push_sum import PushSum
 from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
@@ -65,7 +63,7 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
             return _run_by_run(scenario, workspace, sources, replicas)
         draws = BatchDraws(scenario, seed, replicas)
-        special = type(scenario.hosted) in (PushSum, Intermittent)
+        special = scenario.hosted.combination in ("sums", "readings")
         if len(draws.paths.frame_times) or special:
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
         return _all_at_once(scenario, workspace, draws)

@@ -8,9 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from netkf.algorithms.baselines import Central, Local
-from netkf.algorithms.covariance_intersection import CovarianceIntersection
-from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.registry import built_in_filters
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.batches import flow_batches
@@ -40,7 +38,6 @@ KNOWN = (
     *(Diffusion, RecordedDiffusion, UnknownDiffusion),
     *(LinearPlant, RecordedPlant, UnknownPlant),
     *(LinearSensor, RegressorSensor, RecordedSensor),
-    *(Hybrid, CovarianceIntersection, Local, Central),
 )
 
 
@@ -53,21 +50,21 @@ class CompiledEngine(Engine):
     name = "compiled"
 
     def refusal(self, scenario: Scenario) -> str | None:
-        """Why this engine cannot run the scenario, with the remedy; None where it can."""
+        """Return why this engine cannot run the scenario, with the remedy; None if it can."""
         remedy = 'use engine="simpy", or "auto", which chooses'
         parts: list[tuple[str, Component]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
+        known = {*KNOWN, *built_in_filters().values()}
         for family, part in parts:
-            compiled = vars(type(part)).get("slot_kernel") is not None
-            if type(part) not in KNOWN and not compiled:
+            if type(part) not in known:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
         return None
 
     def announce(self, scenario: Scenario) -> None:
-        """That code is compiled, where it is not kept from before."""
+        """Say on stderr that code is compiled, unless it is kept from an earlier run."""
         if scenario.slotted:
             compiling.announce(type(scenario.hosted).slot_kernel)
         else:

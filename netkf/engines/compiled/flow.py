@@ -11,9 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from netkf.algorithms.intermittent import SLACK, Intermittent
 from netkf.algorithms.models import FlowModel
-from netkf.algorithms.push_sum import PushSum
 from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.draws import Noise, Paths, no_path, sizes
@@ -38,7 +36,7 @@ from netkf.engines.compiled.schedule import ReadingsSchedule, Window
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
     CLOCKS,
-    KINDS,
+    COMBINATIONS,
     SUMS,
     Filters,
     Instants,
@@ -167,7 +165,7 @@ class Workspace:
         self._pool = empty_pool(FIRST_MESSAGES, n)
         self._rows = np.empty(FIRST_ROWS, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
-        kind = KINDS[type(scenario.hosted).__name__]
+        kind = COMBINATIONS.index(scenario.hosted.combination)
         terms = 2 * size + len(self._senders.ways) if kind == SUMS else 0
         room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
         self._shown = Shown(
@@ -227,21 +225,17 @@ class Workspace:
         return state
 
     def _numbers(self, instants: Instants) -> dict[str, Any]:
-        algorithm = self._scenario.hosted
+        algorithm: Any = self._scenario.hosted
         most = int(np.diff(self._senders.first).max(initial=0))
-        age_limit = math.inf
-        if isinstance(algorithm, Intermittent):
-            window = math.inf if algorithm.window is None else algorithm.window
-            age_limit = 0.0 if algorithm.late == "drop" else window
         return {
-            "kind": KINDS[type(algorithm).__name__],
+            "kind": COMBINATIONS.index(algorithm.combination),
             "at": CLOCKS.index(self._senders.at),
             "keep_own": getattr(algorithm, "on_loss", "") == "keep-own",
             "most_messages": most,
             "free_count": len(self._pool[0]),
             "most_rows": 2 + 2 * most + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
-            "age_limit": age_limit,
+            "age_limit": getattr(algorithm, "max_age", math.inf),
             "mail_time": 0.0,
         }
 
@@ -369,7 +363,7 @@ def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, fl
 
 
 def _totals(scenario: Scenario, state: Simulation) -> Totals | None:
-    if not isinstance(scenario.hosted, PushSum):
+    if scenario.hosted.combination != "sums":
         return None
     receivers = np.array([info.receivers for info in scenario.node_infos], dtype=np.int64)
     model: FlowModel = scenario.models[0]
@@ -377,10 +371,8 @@ def _totals(scenario: Scenario, state: Simulation) -> Totals | None:
 
 
 def _history(scenario: Scenario, state: Simulation) -> History | None:
-    algorithm = scenario.hosted
-    if not isinstance(algorithm, Intermittent):
+    if scenario.hosted.combination != "readings":
         return None
-    lag = max((info.max_delay for info in scenario.node_infos), default=0.0)
-    if algorithm.window is not None:
-        lag = min(algorithm.window, lag)
-    return empty_history(state, 0.0 if algorithm.late == "drop" else SLACK * lag, FIRST_PAST)
+    algorithm: Any = scenario.hosted
+    delay = max((info.max_delay for info in scenario.node_infos), default=0.0)
+    return empty_history(state, algorithm.history_span(delay), FIRST_PAST)

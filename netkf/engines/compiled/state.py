@@ -51,18 +51,9 @@ instant of a reading that is sent, or the number of a running sum.
 """
 
 CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT = range(7)
-"""Kinds of filters by what they do with messages."""
+COMBINATIONS = ("convex", "intersection", "swap", "shares", "readings", "sums", "none")
+"""``Filter.combination`` in the order of the numbers by which the event loop knows it."""
 
-KINDS = {
-    "Hybrid": CONVEX,
-    "CovarianceIntersection": INTERSECTION,
-    "Gossip": SWAP,
-    "DiffusionFilter": SHARES,
-    "Intermittent": READINGS,
-    "PushSum": SUMS,
-    "Local": SILENT,
-    "Central": SILENT,
-}
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")
 
@@ -191,7 +182,7 @@ class Simulation(Struct):
     (F,) and ``probes`` (T,). The trace: ``rows``, or where it is not ``traced`` only ``counts``
     (len(KINDS),) of events.
 
-    ``kind`` and ``at``: see KINDS and CLOCKS; ``..._at``: the next frame, point of the sensing
+    ``kind`` and ``at``: see COMBINATIONS and CLOCKS; ``..._at``: next frame, point of the sensing
     grid, node that wakes there, instant of samples, tick and probe; the ``piece`` of the path; the
     next ``row``, and how many one event may need (``most_rows``); the first ``free`` message and
     how many are (``free_count``, ``most_messages``); messages on the heap (``flying``) and how many
