@@ -37,6 +37,8 @@ def alphabet(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> Lette
     rows = np.array([len(H) for H, _ in readings], dtype=np.int64)
     H_, root_R = np.zeros((len(readings), most, n)), np.zeros((len(readings), most, most))
     for m, (H, R) in enumerate(readings):
+        # Padding with zero rows keeps one array for all letters; kernels read the first rows[m]
+        # only.
         H_[m, : len(H)] = H
         if len(H):
             root_R[m, : len(H), : len(H)] = np.linalg.cholesky(R)
@@ -53,11 +55,14 @@ def advance(
     """
     moved = np.ascontiguousarray(lower_triangular(roots))
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
+    # One byte per letter where it suffices, an eighth of an int64.
     spelled = np.ascontiguousarray(words, dtype=np.uint8 if len(letters.rows) < 256 else np.int64)
+    # More threads than chains or cores would only wait.
     workers = min(os.cpu_count() or 1, len(roots))
     if words.size < FEW or workers < 2:
         run_words(moved, spelled, F, low_Q, *letters)
         return moved
+    # Threads own contiguous blocks of chains, as views of one array, so nothing is copied back.
     cuts = np.linspace(0, len(roots), workers + 1).astype(int)
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
@@ -65,6 +70,7 @@ def advance(
             for a, b in itertools.pairwise(cuts)
         ]
         for job in jobs:
+            # Without result() an exception in a worker would be lost.
             job.result()
     return moved
 
@@ -83,6 +89,8 @@ def run_words(
 
     square_root's triangularisation without its zeros: some 300 operations a step at n = 4.
     """
+    # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]] of the largest reading, reused by all
+    # steps.
     work = np.empty((H.shape[1] + len(F), 2 * len(F) + H.shape[1]))
     for chain in range(words.shape[0]):
         for step in range(words.shape[1]):

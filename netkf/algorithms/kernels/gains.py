@@ -43,22 +43,32 @@ def gain_table(
     :func:`longest_interval`.
     """
     n, p = len(A), len(H)
+    # H' R^-1 (n, p).
     HR = np.linalg.solve(R, H).T
     M, scale = hamiltonian(A, Q, HR @ H)
+    # The 1-norm of M times g bounds every term of the power series.
     size = float(np.abs(M).sum(axis=0).max()) * longest
+    # The tolerance admits an interval that was computed from LONGEST_INTERVAL itself.
     if size > LONGEST_INTERVAL * (1.0 + 1e-9):
         raise ValueError(f"an interval of {longest:g} s is too long for the gains of this sensor")
     terms = _terms(size)
+    # k(s) looks back from the end b, hence exp(-M (b - s)).
     E = exponential_series(-M, terms)
     c = backward_coefficients(terms)
+    # ``(2 j + 1)`` normalises P_j, whose square has the mean 1 / (2 j + 1) over the interval.
     weight = np.array([1.0, 3.0])  # 2 j + 1
+    # [X; Y] = E [I; P] and k = Y' H' R^-1: the block of Y that multiplies I gives U, the one that
+    # multiplies P gives W. M belongs to P / scale, so only the first of them is scaled back.
     from_Y = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, :n] * scale, HR)
     from_P = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, n:], HR)
+    # C = moments of H exp(-A (b - s)): the reading that x(b), taken back without noise, predicts.
     seen = np.einsum("jk,pa,kab->kjpb", c, H, exponential_series(-A, terms))
     series = np.zeros((terms + 1, 3 * n * MOMENTS * p))
     size_U = n * MOMENTS * p
     series[:-1, :size_U] = from_Y.reshape(terms, -1)
     series[:-1, size_U : 2 * size_U] = from_P.reshape(terms, -1)
+    # One power of g more than the gains have: a moment of dy is an integral over the interval,
+    # while a gain is a mean.
     series[1:, 2 * size_U :] = seen.reshape(terms, -1)
     return GainTable(n, MOMENTS * p, with_reach(series, longest))
 
@@ -67,10 +77,12 @@ def longest_interval(A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray)
     """Seconds; the longest interval whose reading the gains can use."""
     M, _ = hamiltonian(A, Q, H.T @ np.linalg.solve(R, H))
     norm = float(np.abs(M).sum(axis=0).max())
+    # No dynamics and no information: every interval is short enough.
     return LONGEST_INTERVAL / norm if norm > 0.0 else math.inf
 
 
 def _terms(size: float) -> int:
+    # Until size^k / k!, the next term of the exponential series, is below double rounding.
     terms, last = 1, 1.0
     while last > 1e-18 or terms < 8:
         last *= size / terms
@@ -84,8 +96,10 @@ def gain_update(
 ) -> FloatArray:
     """``xhat(b)`` (n,) from the open-loop prediction ``x``, ``P = P(b)`` and the moments (2p,)."""
     n, q = table.n, table.moments
+    # One evaluation of the concatenated series [U, W, C].
     values = polynomial(table.series, gap)
     U = values[: n * q].reshape(n, q)
     W = values[n * q : 2 * n * q].reshape(n, q)
     C = values[2 * n * q :].reshape(q, n)
+    # xhat(b) = x + (U + P W) (moments - C x), with the innovation of both moments.
     return x + matvec(add_matmul(U, P, W), moments - matvec(C, x))

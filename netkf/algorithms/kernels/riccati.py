@@ -51,6 +51,7 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
     series = np.empty((terms, *M.shape), dtype=M.dtype)
     series[0] = np.eye(len(M))
     for k in range(1, terms):
+        # (M g)^k / k! from the term before it.
         series[k] = series[k - 1] @ M / k
     return series
 
@@ -60,6 +61,7 @@ def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
     series = np.zeros((terms, *A.shape))
     series[1] = Q
     for k in range(2, terms):
+        # k W_k = A W_(k-1) + W_(k-1) A' from k = 2 on: Q is constant and enters W_1 only.
         moved = A @ series[k - 1]
         series[k] = (moved + moved.T) / k
     return series
@@ -68,12 +70,15 @@ def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
 def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray, float]:
     """The Hamiltonian of ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``."""
     size_A, size_Q, size_G = (float(np.abs(matrix).max()) for matrix in (A, Q, G))
+    # A floor, so that a plant without dynamics does not divide by zero below.
     size_A = max(size_A, 1e-6)
     if size_Q > 0.0 and size_G > 0.0:
+        # Equal sizes of Q / s and G s keep |M| small and with it the number of units.
         scale = (size_Q / size_G) ** 0.5
     elif size_Q > 0.0 or size_G > 0.0:  # one of them may be made as small as A
         scale = size_Q / size_A if size_Q > 0.0 else size_A / size_G
     else:
+        # Nothing drives P and nothing is observed: any scale is right.
         scale = 1.0
     return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
 
@@ -88,12 +93,14 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
     # A power of two, so that a whole number of units is exact.
     unit = 2.0 ** np.floor(np.log2(min(1.0 / max(norm, 1e-300), longest)))
     blocks = exponential_series(M, TAYLOR_TERMS)
+    # Undo the scaling of hamiltonian(): G and Q get their units back, and kernels need no scale.
     blocks[:, :n, n:] /= scale
     blocks[:, n:, :n] *= scale
     transition = exponential_series(A, TAYLOR_TERMS)
     series, short = _side_by_side(unit, blocks, transition), np.zeros((0, 2 * n * n + 1))
     if unobserved:
         short = _side_by_side(unit, transition, lyapunov_series(A, Q, TAYLOR_TERMS))
+    # Binary digits of the largest number of whole units.
     levels = max(1, int(longest / unit).bit_length())
     return RiccatiTable(n, unit, series, short, *_triples(M, scale, A, unit, levels))
 
@@ -110,6 +117,8 @@ def _triples(
     # Doubling also doubles the relative error, so it works in extended precision (where the
     # machine has it): after 2^14 units a table in double would have lost 1e-12.
     n, wide = len(A), np.longdouble
+    # exp(M unit) gives the first triple: with [X; Y] = E [I; P], F = X^-T, G = X^-1 E12 and Q = E21
+    # X^-1.
     E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
     inverse = _inverse(E[:n, :n])
     F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
@@ -117,9 +126,12 @@ def _triples(
     tables = tuple(np.empty((levels, n, n)) for _ in range(4))
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable blind plant overflows late
         for level in range(levels):
+            # Symmetry would drift by rounding, and doubling would amplify the drift.
             G, Q = symmetric(G), symmetric(Q)
             for table, value in zip(tables, (move, F, G / scale, Q * scale), strict=True):
                 table[level] = value
+            # Two equal gaps in a row: W = (I + G Q)^-1 joins the noise of the first with the
+            # information of the second.
             W = _inverse(np.eye(n) + G @ Q)
             move, F, G, Q = move @ move, F @ W.T @ F, G + F.T @ W @ G @ F, Q + F @ Q @ W @ F.T
     return tables  # type: ignore[return-value]
@@ -135,6 +147,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
         inverse = np.linalg.inv(matrix.astype(np.float64)).astype(matrix.dtype)
     except np.linalg.LinAlgError:
         return np.full_like(matrix, np.nan)
+    # X <- X (2 I - M X) doubles the correct digits: twice takes double precision to extended.
     for _ in range(2):
         inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
     return inverse
@@ -146,6 +159,7 @@ def substep(
 ) -> tuple[FloatArray, FloatArray]:
     """Return what ``propagate_riccati`` does, for a gap of at most one unit."""
     n = table.n
+    # G = 0, a Lyapunov equation: P <- e P e' + W, and no inverse is needed.
     if len(table.unobserved):
         values = polynomial(table.unobserved, gap)
         transition, noise = values[: n * n].reshape(n, n), values[n * n :].reshape(n, n)
@@ -156,6 +170,8 @@ def substep(
     # [X; Y] = E [I; P], and the new P is Y X^-1
     X = add_matmul(E[:n, :n], E[:n, n:], P)
     Y = add_matmul(E[n:, :n], E[n:, n:], P)
+    # Y X^-1 by a linear solve with X'; P is symmetric, so the transpose of the result does not
+    # matter.
     return symmetrize(solve(X.T, Y.T)), matvec(transition, x)
 
 
@@ -165,14 +181,17 @@ def propagate_riccati(
 ) -> tuple[FloatArray, FloatArray]:
     """Return P (n, n) moved by the flow over ``gap`` seconds and x (n,) by ``exp(A gap)``."""
     P, x = P.copy(), x.copy()  # of one layout, whatever the caller's
+    # The binary digits of the number of whole units, each with its tabulated triple.
     whole, level = int(gap / table.unit), 0
     while whole >> level:
         if whole >> level & 1:  # Q + F P (I + G P)^-1 F' over 2^level units
             F = table.F[level]
+            # P (I + G P)^-1 = (I + P G)^-1 P.
             middle = solve(add_matmul(np.eye(table.n), P, table.G[level]), P)
             P = symmetrize(add_matmul(table.Q[level], matmul(F, middle), F.T))
             x = matvec(table.transition[level], x)
         level += 1
+    # The rest, less than a unit, by the power series.
     rest = gap - whole * table.unit
     if rest <= 0.0:
         return P, x

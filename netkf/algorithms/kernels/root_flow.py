@@ -107,6 +107,8 @@ def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
     """
     n, q = table.levels.shape[-1], table.seen.shape[1]
     cls = FlowScratch.of_size(n) if unrolled else FlowScratch
+    # Rows of the series hold Q_g, exp(A g) and perhaps F and G_g; a level needs less room than
+    # that.
     return cls(
         size=sized(n) if unrolled else np.zeros(n),
         values=np.zeros(table.series.shape[3]),
@@ -135,17 +137,23 @@ def flow_table(
     norm = float(size.sum(axis=0).max() + size.sum(axis=1).max())  # exp(A s) Q exp(A' s)
     if len(seen):
         norm = max(norm, float(np.abs(M).sum(axis=0).max()))
+    # A power of two, so that multiples of the unit and its halves are exact.
     unit = 2.0 ** np.floor(np.log2(min(UNIT / max(norm, 1e-300), longest)))
     E, F, grown, G = transition_series(A, Q, seen, np.zeros(1))
     blocks, bound = information_blocks(seen, F[0], unit)
     # The reach comes first: a table that is padded to a common width still has it there.
     gamma = [np.roll(with_reach(block.astype(np.float64), unit), 1, axis=1) for block in blocks]
+    # Binary digits of the longest gap in units.
     count = max(1, int(longest / unit).bit_length())
     levels = doubled(E[0], F[0], grown[0], blocks, scale, unit, count)
+    # Entries of a packed Q_g and exp(A g), and of F and a packed G_g where something is observed.
     width = n * (n + 1) // 2 * (1 + (len(seen) > 0)) + n * n * (1 + (len(seen) > 0))
+    # As many cells as fit the cache budget, and none beyond the longest level.
     most = min(CELLS, CELL_BYTES // (8 * TERMS * width), 2 ** (len(levels) - 1))
     octaves = max(0, most.bit_length() - 1)
     if octaves:
+        # Cell k covers [k, k + 1) units around its middle. The first is expanded at 0, where Q_g =
+        # 0 and short gaps lose no digits.
         middles = unit * (np.arange(2**octaves) + 0.5)
         middles[0] = 0.0
         E, F, grown, G = transition_series(A, Q, seen, middles)
@@ -154,6 +162,7 @@ def flow_table(
     if len(seen):
         parts += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
     cells = np.concatenate(parts, axis=2).astype(np.float64)
+    # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     series = np.stack(
         [with_reach(cell, unit if k == 0 else 0.5 * unit) for k, cell in enumerate(cells)]
     )
@@ -176,6 +185,7 @@ def whitened(H: FloatArray, R: FloatArray) -> FloatArray:
     p, n = H.shape
     if p == 0:
         return np.zeros((0, n))
+    # L^-1 H with R = L L'; more rows than states are compressed by QR, since only H' R^-1 H counts.
     rows = np.linalg.solve(np.linalg.cholesky(R), H)
     return np.asarray(rows if p <= n else np.linalg.qr(rows, mode="r"))
 
@@ -193,19 +203,24 @@ def transition_series(
     E, F, grown, G, drain = (wide_zeros(count, TERMS, n, n) for _ in range(5))
     rows = wide_zeros(count, TERMS, len(seen), n)
     E[:, 0], F[:, 0], grown[:, 0], G[:, 0] = transitions_at(A, Q, seen, middles)
+    # Power-series recursion: the coefficient k + 1 follows from coefficient k of the right-hand
+    # side, and products of series are Cauchy products.
     for k in range(TERMS - 1):
         drain[:, k] = (grown[:, k] @ seen.T) @ seen  # Q_g G
         rows[:, k] = seen @ F[:, k]
         moved = A @ grown[:, k]
+        # Q is constant: it enters the coefficient of g^0 only.
         change = moved + np.swapaxes(moved, 1, 2) + (Q if k == 0 else 0.0)
         grown[:, k + 1] = symmetric(change - _convolved(drain, grown, k)) / (k + 1)
         F[:, k + 1] = (A @ F[:, k] - _convolved(drain, F, k)) / (k + 1)
+        # dG/dg = F' G F = rows' rows, with rows = R^-1/2 H F.
         G[:, k + 1] = _convolved(np.swapaxes(rows, 2, 3), rows, k) / (k + 1)
         E[:, k + 1] = A @ E[:, k] / (k + 1)
     return E, F, grown, G
 
 
 def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
+    # Coefficient k of the product of two power series.
     return np.asarray((a[:, : k + 1] @ b[:, k::-1]).sum(axis=1))
 
 
@@ -218,18 +233,23 @@ def transitions_at(
     n, count = len(A), len(middles)
     E, F, grown, G = wide_zeros(4, count, n, n)
     E[0] = F[0] = np.eye(n)
+    # A single cell is expanded at 0, whose values are already there.
     if count == 1:
         return E, F, grown, G
     M, scale = hamiltonian(A, Q, seen.T @ seen)
+    # A third of the first middle, 3/2 unit, is half a unit: all middles are odd multiples of it.
     powers = (middles[1] / WIDE(3.0)) ** np.arange(TERMS)
     half, step = (
         np.tensordot(powers, exponential_series(matrix.astype(WIDE), TERMS), 1) for matrix in (M, A)
     )
     moved, E[1:] = half, step
+    # Each middle is two halves of a unit after the one before it; the first step leads from 1/2 to
+    # 3/2.
     for k in range(1, count):
         moved = half @ half @ moved
         E[k] = step @ step @ (E[k - 1] if k > 1 else step)
         inverse = wide_inverse(moved[:n, :n])
+        # [X; Y] = E [I; P]: F = X^-T, G = X^-1 E12 and Q_g = E21 X^-1, with the scale of P undone.
         F[k] = inverse.T
         G[k] = inverse @ moved[:n, n:] / scale
         grown[k] = moved[n:, :n] @ inverse * scale
@@ -244,6 +264,7 @@ def wide_zeros(*shape: int) -> Any:
 def wide_inverse(matrix: FloatArray) -> FloatArray:
     """The inverse in extended precision, by Newton's iteration from double."""
     inverse = np.linalg.inv(matrix.astype(np.float64)).astype(WIDE)
+    # X <- X (2 I - M X) doubles the correct digits: twice takes double precision to extended.
     for _ in range(2):
         inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
     return np.asarray(inverse)
@@ -257,10 +278,13 @@ def information_blocks(
     blocks: list[FloatArray] = []
     bounds: list[float] = []
     rows = seen.astype(WIDE) @ F  # (TERMS, q, n)
+    # No sensor: no block, and nothing is observed.
     for j in range(min(BLOCKS, TERMS) if q else 0):
         block = np.zeros((TERMS, q * n), dtype=WIDE)
+        # Moments of u^k with P_j vanish for k < j, so block j starts at g^j, which is factored out.
         for k in range(j, TERMS):
             block[k - j] = legendre_moment(k, j) * math.sqrt(2 * j + 1) * rows[k].ravel()
+        # The triangle inequality over the terms bounds each entry for every gap up to the unit.
         sizes = (np.abs(block) * WIDE(unit) ** np.arange(TERMS)[:, None]).sum(axis=0)
         blocks.append(block)
         bounds.append(float((sizes**2).sum()))
@@ -289,23 +313,31 @@ def doubled(
     """
     n = E.shape[1]
     powers = WIDE(unit) ** np.arange(TERMS)
+    # exp(A unit), F and Q_g over one unit, from the series around 0.
     jump, move, Q = (np.tensordot(powers, part, 1) for part in (E, F, grown))
+    # Gamma by blocks: sqrt(g) g^j times the series of c_j / (g^j sqrt(2 j + 1)).
     rows = [WIDE(unit) ** (j + WIDE(0.5)) * (powers @ block) for j, block in enumerate(blocks)]
     gamma = upper_root(np.concatenate([row.reshape(-1, n) for row in rows] or [np.zeros((0, n))]))
     T, eye = cholesky_root(Q), np.eye(n, dtype=WIDE)
+    # P / scale balances G against Q; their roots scale with its square root.
     root_scale = np.sqrt(WIDE(scale))
     gamma, T = gamma * root_scale, T / root_scale
     table = np.zeros((levels, 4, n, n))
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable plant overflows late
         for level in range(levels):
             table[level] = jump, move, gamma / root_scale, T * root_scale
+            # upper upper' = I + T' G T, so middle = T upper^-T is a root of Q (I + G Q)^-1.
             cross = gamma @ T
             upper = upper_root(np.concatenate([eye, cross])).T
             middle, share = substitute(upper, T.T).T, substitute(upper, cross.T)
+            # A root of G (I + Q G)^-1: the information of the second half that the noise of the
+            # first half leaves about the start.
             lost = substitute(upper_root(np.concatenate([eye, cross.T])).T, gamma)
+            # Q <- Q + F Q (I + G Q)^-1 F' as one triangularisation.
             T = upper_root(np.concatenate([(move @ middle).T, T.T])).T
             # F (I + Q G)^-1 F without an inverse: Q G may be 1e9 beside the I.
             move, closed = move @ (move - middle @ (share @ (gamma @ move))), move
+            # G <- G + F' G (I + Q G)^-1 F, with the F of half the gap.
             gamma = upper_root(np.concatenate([gamma, lost @ closed]))
             jump = jump @ jump
             # What F magnifies, rounding in the middle included, the readings of the same level can
@@ -320,17 +352,21 @@ def upper_root(rows: FloatArray) -> FloatArray:
     n = rows.shape[1]
     work = np.concatenate([rows, np.zeros((n, n))]).astype(WIDE)
     for i in range(n):
+        # Row pivoting keeps rows of very different sizes apart.
         best = i + int(np.argmax(np.abs(work[i:, i])))
         work[[i, best]] = work[[best, i]]
         column = work[i:, i].copy()
         length = np.sqrt((column * column).sum())
         if not length > 0.0:
             continue
+        # Householder reflection that zeroes column i below the diagonal; the sign avoids
+        # cancellation.
         column[0] += np.copysign(length, column[0])
         scale = 2.0 / (column * column).sum()
         work[i:, i:] -= np.outer(column, scale * (column @ work[i:, i:]))
         work[i + 1 :, i] = 0.0
     U = work[:n]
+    # Nonnegative diagonal, so that the root is unique.
     return np.asarray(U * np.where(np.diag(U) < 0.0, -1.0, 1.0)[:, None])
 
 
@@ -357,6 +393,7 @@ def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
     """One table for all models, in their order."""
 
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
+        # The padding is never read: ``sizes`` and the infinite last reach end every loop before it.
         shape = np.max([part.shape for part in parts], axis=0)
         out = np.full((sum(len(part) for part in parts), *shape[1:]), fill, dtype=parts[0].dtype)
         row = 0
@@ -384,14 +421,17 @@ def move_root(
     scratch: FlowScratch,
 ) -> None:
     """Move place ``k`` over ``gap`` seconds by model ``m``."""
+    # Beyond all cells: whole multiples of the first level that is longer than them.
     octaves = table.sizes[m, 4]
     if gap >= table.unit[m] * (1 << octaves):
         gap = move_levels(table, m, octaves, root, x, k, gap, scratch)
     if not gap > 0.0:
         return
+    # Narrow P: rounding of G_g times P is harmless, and one step inside a cell suffices.
     if table.sizes[m, 1] == 0 or table.size[m] * gap * root_size(scratch.size, root, k) < NARROW:
         move_narrow(table, m, root, x, k, gap, scratch)
         return
+    # Wide P: whole units by levels, and the rest row by row of Gamma.
     gap = move_levels(table, m, 0, root, x, k, gap, scratch)
     if gap > 0.0:
         move_wide(table, m, root, x, k, gap, scratch)
@@ -401,6 +441,7 @@ def move_root(
 def root_size(size: Size, root: FloatArray, k: int) -> float:
     """``trace(P)``."""
     total = 0.0
+    # |S|_F^2 = trace(S S').
     for i in range(len(size)):
         for j in range(i + 1):
             total += root[k, i, j] * root[k, i, j]
@@ -423,6 +464,7 @@ def move_levels(
     whole = int(gap / length)
     rest: float = gap - whole * length
     while whole > 0:
+        # A binary digit of the number of steps, or one of many steps of the last level.
         if whole & 1 or level == levels - 1:
             move_level(table, m, level, root, x, k, scratch)
             whole -= 1
@@ -445,6 +487,7 @@ def move_level(
     """``move_root`` over ``unit 2^level`` seconds."""
     n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
+        # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
         for r in range(n):
             for j in range(n):
                 total = 0.0
@@ -452,14 +495,17 @@ def move_level(
                     total += levels[m, level, 2, r, i] * root[k, i, j]
                 observed[0, j] = total
             rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
+    # A copy: transform() uses T up.
     for i in range(n):
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
+    # The rows of exp(A g) where nothing is observed, else of F.
     values, flow = scratch.values, 0 if table.sizes[m, 1] == 0 else 1
     for i in range(n):
         for j in range(n):
             values[i * n + j] = levels[m, level, flow, i, j]
     transform(scratch.size, root, k, values, 0, scratch.wide, T, table.sizes[m, 2] > 0)
+    # The estimate moves open loop, by exp(A g): gain_root() corrects it when the readings are used.
     for i in range(n):
         total = 0.0
         for j in range(n):
@@ -480,8 +526,10 @@ def move_wide(
     scratch: FlowScratch,
 ) -> None:
     """``move_root`` over less than a unit for any P, however wide."""
+    # First the information of the whole gap, then F and Q_g: P (I + G P)^-1, then F . F' + Q_g.
     use_readings(table, m, root, k, gap, scratch)
     n = len(scratch.size)
+    # Without G_g, the last part of the series: Gamma has replaced it.
     fill_cell(scratch.values, table, m, 0, n * (n + 1) // 2 + 2 * n * n, gap)
     move_by_series(table, m, root, x, k, scratch)
 
@@ -498,6 +546,7 @@ def move_narrow(
 ) -> None:
     """``move_root`` over a gap inside a cell, where nothing is observed or P is not too wide."""
     unit, n, values = table.unit[m], len(scratch.size), scratch.values
+    # Cell 0 is expanded at 0 and the others at their middles.
     cell = int(gap / unit)
     since = gap if cell == 0 else gap - (cell + 0.5) * unit
     lower = n * (n + 1) // 2
@@ -505,6 +554,7 @@ def move_narrow(
         fill_cell(values, table, m, cell, lower + n * n, since)
     else:
         fill_cell(values, table, m, cell, 2 * (lower + n * n), since)
+        # P (I + G_g P)^-1; G_g lies behind Q_g, exp(A g) and F.
         shrink_root(scratch.size, root, k, values, lower + 2 * n * n, scratch.wide)
     move_by_series(table, m, root, x, k, scratch)
 
@@ -526,6 +576,7 @@ def move_by_series(
     noisy = table.sizes[m, 2] > 0
     if noisy:
         take_root(scratch.size, T, values)
+    # Without sensors F = exp(A g), and the series holds it once.
     if table.sizes[m, 1] > 0:
         begin += n * n
     transform(scratch.size, root, k, values, begin, scratch.wide, T, noisy)
@@ -542,6 +593,8 @@ def fill_cell(
     for j in range(width):
         out[j] = series[m, cell, 0, j]
     k, even = 0, 1.0
+    # Two terms at a time: ``out`` is gone through half as often. Terms end where the reach says
+    # that the rest is below rounding.
     while distance > reach[m, cell, k]:
         odd = even * since
         even = odd * since
@@ -563,6 +616,7 @@ def shrink_root(
         for i in range(n):
             total = 0.0
             for r in range(j, n):
+                # G is symmetric and packed: (i, r) and (r, i) are one entry.
                 g = i * (i + 1) // 2 + r if r <= i else r * (r + 1) // 2 + i
                 total += G[begin + g] * root[k, r, j]
             V[i, j] = total
@@ -573,6 +627,7 @@ def shrink_root(
             V[i, j] = total
     # V V' from the last column on, V upper triangular.
     for j in range(n - 1, -1, -1):
+        # The reciprocal is stored on the diagonal: the substitution below multiplies by it.
         pivot = 1.0 / math.sqrt(V[j, j])
         V[j, j] = pivot
         for i in range(j):
@@ -599,10 +654,12 @@ def use_readings(
     spread = root_size(scratch.size, root, k)
     factor = math.sqrt(gap)
     for block in range(table.sizes[m, 1]):
+        # Later blocks shrink with g^(2 j + 1): their information is below rounding from here on.
         if table.bound[m, block] * factor * factor * spread < UNSEEN:
             break
         for j in range(width):
             rows[j] = gamma[m, block, 0, j + 1]
+        # The power series of this block at the gap, two terms at a time.
         term, even = 0, 1.0
         while gap > gamma[m, block, term, 0]:
             odd = even * gap
@@ -611,6 +668,7 @@ def use_readings(
                 rows[j] += odd * gamma[m, block, term + 1, j + 1]
                 rows[j] += even * gamma[m, block, term + 2, j + 1]
             term += 2
+        # Each row of Gamma is a scalar observation with unit noise: sqrt(g) g^j c_j S.
         for r in range(q):
             for j in range(n):
                 total = 0.0
@@ -618,6 +676,7 @@ def use_readings(
                     total += rows[r * n + i] * root[k, i, j]
                 observed[0, j] = factor * total
             rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
+        # g^(j + 1/2) of the next block.
         factor *= gap
 
 
@@ -632,6 +691,7 @@ def take_root(size: Size, T: FloatArray, packed: FloatArray) -> None:
                 total -= T[i, r] * T[j, r]
             T[i, j] = total
         pivot = T[j, j]
+        # A pivot that is rounding zeroes its column: no noise in this direction.
         inverse = 0.0
         if pivot > PIVOT * packed[j * (j + 1) // 2 + j]:
             inverse = 1.0 / math.sqrt(pivot)
@@ -654,6 +714,7 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
     ``begin`` on, T is used up.
     """
     n = len(size)
+    # F S; S is lower triangular, so the sum begins at r = j.
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -665,6 +726,7 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
         rest = 0.0
         for j in range(i + 1, n):
             rest += wide[i, j] * wide[i, j]
+        # T is lower triangular: its columns beyond i do not reach row i yet.
         if noisy:
             for j in range(i + 1):
                 rest += T[i, j] * T[i, j]
@@ -672,9 +734,11 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
         length = math.sqrt(pivot * pivot + rest)
         root[k, i, i] = length
         if length > 0.0:
+            # The sign that does not cancel.
             first = pivot + length if pivot >= 0.0 else pivot - length
             sign = -1.0 if pivot >= 0.0 else 1.0
             scale = 1.0 / (length * abs(first))
+            # Apply the reflection to the rows below.
             for r in range(i + 1, n):
                 total = first * wide[r, i]
                 for j in range(i + 1, n):
@@ -683,6 +747,8 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
                     for j in range(i + 1):
                         total += T[i, j] * T[r, j]
                 total *= scale
+                # The reflection turns the pivot into -sign(pivot) length; the column is flipped so
+                # that the diagonal stays nonnegative.
                 root[k, r, i] = sign * (wide[r, i] - total * first)
                 for j in range(i + 1, n):
                     wide[r, j] -= total * wide[i, j]
@@ -690,6 +756,7 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
                     for j in range(i + 1):
                         T[r, j] -= total * T[i, j]
         else:
+            # A zero row needs no reflection.
             for r in range(i + 1, n):
                 root[k, r, i] = wide[r, i]
 
@@ -697,6 +764,7 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
 @kernel
 def information_rate(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
     """``trace(P G)`` in 1/s."""
+    # |R^-1/2 H S|_F^2 = trace(S' G S).
     n, rate = len(size), 0.0
     for r in range(table.sizes[m, 0]):
         for j in range(n):
@@ -723,6 +791,7 @@ def gain_root(
     """
     n, q = len(size), len(moments)
     fill_polynomial(values, series, gap)
+    # Innovations: the moments minus C x.
     for m in range(q):
         for j in range(n):
             moments[m] -= values[(2 * q + m) * n + j] * x[k, j]
@@ -739,6 +808,7 @@ def gain_root(
         for i in range(j, n):
             total += root[k, i, j] * values[first + i]
         values[first + j] = total
+    # x += S (S' W innovations), the part of the gain that depends on P.
     for i in range(n):
         for j in range(i + 1):
             x[k, i] += root[k, i, j] * values[first + j]
@@ -763,6 +833,7 @@ class _Scratches(threading.local):
 
     def of(self, table: FlowTable) -> FlowScratch:
         """Scratch arrays for a table."""
+        # Scratch holds no results, so tables of equal shapes may share it.
         sizes = table.series.shape[3], *table.seen.shape[1:]
         if sizes not in self.known:
             self.known[sizes] = flow_scratch(table)

@@ -65,6 +65,7 @@ def update_scratch(n: int, p: int, unrolled: bool = False) -> UpdateScratch:
         **{"C": (p, p), "HS": (p, n), "gains": (p, n), "wide": (n, n)},
         **{"whitened": (n, n + 1), "total": (n, n + 1)},
     }
+    # A struct sized by n makes numba compile loops of constant length; the plain one serves any n.
     cls = UpdateScratch.of_size(n) if unrolled else UpdateScratch
     size = sized(n) if unrolled else np.zeros(n)
     return cls(size=size, **{name: np.zeros(shape) for name, shape in shapes.items()})
@@ -89,8 +90,10 @@ _scratches = _Scratches()
 def lower_root(root: FloatArray) -> FloatArray:
     """The lower triangular S (n, n) with nonnegative diagonal and ``S S' = root root'`` (n, c)."""
     n, columns = root.shape
+    # QR of the transpose needs at least as many columns as rows.
     wide = np.concatenate([root, np.zeros((n, max(n - columns, 0)))], axis=1)
     L = np.tril(lower_triangular(wide))
+    # Column signs are free in S S'; a nonnegative diagonal makes the root unique.
     return np.asarray(L * np.where(np.diag(L) < 0.0, -1.0, 1.0))
 
 
@@ -109,6 +112,7 @@ def rotate_out(
     for i in range(n):
         gains[m, i] = 0.0
     square = pivot * pivot  # summed up, so that no square root waits for another
+    # From the last column on: rotation j touches rows i >= j only, where S has entries.
     for j in range(n - 1, -1, -1):
         entry = row[m, j]
         if entry != 0.0:
@@ -117,6 +121,7 @@ def rotate_out(
             inverse = 1.0 / whole
             c, s = pivot * inverse, entry * inverse
             pivot = whole
+            # Rotate column j of [h S; S] into the column of the gain.
             for i in range(j, n):
                 old, gain = root[k, i, j], gains[m, i]
                 root[k, i, j] = c * old - s * gain
@@ -144,6 +149,7 @@ def sample_root(
     p, n, size = len(y), len(scratch.size), scratch.size
     C, HS, gains = scratch.C, scratch.HS, scratch.gains
     for r in range(p):
+        # rotate_rows() changes C below the diagonal, so it starts from a fresh copy of root_R.
         for m in range(r + 1):
             C[r, m] = root_R[r, m]
         seen = 0.0
@@ -152,17 +158,22 @@ def sample_root(
             for i in range(j, n):
                 total += H[r, i] * root[k, i, j]
             HS[r, j] = total
+            # H x, for the innovation y - H x with the x before any row is used.
             seen += H[r, j] * x[k, j]
         y[r] -= seen
+    # Row by row, C becomes the root of H P H' + R.
     for r in range(p):
+        # The last row has no rows below it to turn.
         if r == p - 1:
             C[r, r] = rotate_out(size, root, k, HS, r, gains, C[r, r])
         else:
             rotate_rows(root, k, C, HS, gains, r, p)
+        # Forward substitution: y <- C^-1 (y - H x), the normalised innovation.
         total = y[r]
         for m in range(r):
             total -= C[r, m] * y[m]
         y[r] = total / C[r, r] if C[r, r] != 0.0 else 0.0
+        # x += gains' C^-1 (y - H x) = K (y - H x).
         for i in range(n):
             x[k, i] += gains[r, i] * y[r]
 
@@ -181,10 +192,12 @@ def rotate_rows(
             whole = math.sqrt(C[r, r] * C[r, r] + size * size)
             c, s = C[r, r] / whole, size / whole
             C[r, r] = whole
+            # Rows of the observation that are still to be used turn along.
             for i in range(r + 1, p):
                 old, gain = HS[i, j], C[i, r]
                 HS[i, j] = c * old - s * gain
                 C[i, r] = s * old + c * gain
+            # Column j of S and the gain turn last; S stays lower triangular.
             for i in range(j, n):
                 old, gain = root[k, i, j], gains[r, i]
                 root[k, i, j] = c * old - s * gain
@@ -207,6 +220,7 @@ def update_with_sample(
 @kernel
 def scale_root(size: Size, root: FloatArray, x: FloatArray, k: int, weight: float) -> None:
     """Weigh place ``k`` alone: ``weight`` >= 0 times P and x."""
+    # sqrt(w) S is a root of w P.
     n, factor = len(size), math.sqrt(weight)
     for i in range(n):
         x[k, i] *= weight
@@ -231,6 +245,7 @@ def add_root(
         x[k, i] += weight * other_x[m, i]
         for j in range(i + 1):
             wide[i, j] = factor * other[m, i, j]
+    # [S, sqrt(w) S_m]: the convex combination of H (7), one term at a time.
     absorb_columns(scratch.size, root, k, wide)
 
 
@@ -249,9 +264,11 @@ def absorb_columns(size: Size, root: FloatArray, k: int, wide: FloatArray) -> No
         if below <= NEGLIGIBLE * pivot * pivot + TINY:
             continue
         length = math.sqrt(pivot * pivot + below)
+        # pivot - length without cancellation.
         first = -below / (pivot + length) if pivot >= 0.0 else pivot - length
         root[k, i, i] = length
         scale = 2.0 / (first * first + below)
+        # Apply the reflection to the rows below; row i itself is known to be [length, 0].
         for r in range(i + 1, n):
             total = first * root[k, r, i]
             for j in range(i + 1):
@@ -282,6 +299,7 @@ def combine_roots(
 @kernel(inlined=True)
 def begin_intersection(scratch: UpdateScratch) -> None:
     """Forget what was intersected before."""
+    # Zero information: Z = 0.
     total = scratch.total
     for i in range(total.shape[0]):
         for j in range(total.shape[1]):
@@ -304,7 +322,9 @@ def add_to_intersection(
     whitened, total, n = scratch.whitened, scratch.total, x.shape[1]
     if weight <= 0.0:
         return
+    # Z_k = sqrt(w) S^-1, since w P^-1 = Z' Z.
     invert_root(whitened, root, k, math.sqrt(weight))
+    # The last column is Z (x - centre): differences of near states lose no digits.
     for i in range(n):
         mean = 0.0
         for j in range(i + 1):
@@ -328,9 +348,11 @@ def merge_information(total: FloatArray, whitened: FloatArray) -> None:
         if below <= NEGLIGIBLE * pivot * pivot + TINY:
             continue
         length = math.sqrt(pivot * pivot + below)
+        # pivot - length without cancellation: pivots of ``total`` are never negative.
         first = -below / (pivot + length)
         total[j, j] = length
         scale = 2.0 / (first * first + below)
+        # Reflect the columns left of j and, in the place of column j itself, that of the means.
         for column in range(j + 1):
             c = n if column == j else column
             inner = first * total[j, c]
@@ -349,6 +371,7 @@ def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> Non
     Soon after a start from 0 the noise has reached some combinations of states only to rounding:
     pivots are at least SINGULAR of their row, which makes P no smaller.
     """
+    # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
     n, least = root.shape[1], TINY
     for i in range(n):
         for j in range(i + 1):
@@ -360,6 +383,7 @@ def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> Non
         pivot = max(abs(root[k, i, i]), SINGULAR * math.sqrt(row))
         if root[k, i, i] < 0.0:
             pivot = -pivot
+        # Forward substitution, row i of S^-1.
         for j in range(i + 1):
             value = factor if j == i else 0.0
             for m in range(j, i):
@@ -373,12 +397,14 @@ def end_intersection(
 ) -> None:
     """Write the intersection into place ``k``; nan where nothing was added."""
     total, whitened, n = scratch.total, scratch.whitened, x.shape[1]
+    # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     for i in range(n):
         for j in range(i + 1):
             value = 1.0 if j == i else 0.0
             for r in range(j, i):
                 value -= total[i, r] * whitened[r, j]
             whitened[i, j] = value / total[i, i]
+    # x = centre + Z^-1 (Z (x - centre)).
     for i in range(n):
         mean = centre[m, i]
         for j in range(i + 1):

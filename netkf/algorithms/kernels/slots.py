@@ -125,6 +125,7 @@ def slot_room(H: int, n: int) -> SlotRoom:
 
 def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A reading y (p,) and its H (p, n) times ``L^-1``, with ``L L' = R``."""
+    # One solve for y and H together.
     made = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
     return np.ascontiguousarray(made[:, 0]), np.ascontiguousarray(made[:, 1:])
 
@@ -139,6 +140,7 @@ def show(nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, r: int, s: int)
         place = r * H + h
         for i in range(n):
             samples.xhat[r, k, h, i] = nodes.xhat[place, i]
+            # P = S S', lower triangle and its mirror image, because samples hold covariances.
             for j in range(i + 1):
                 total = 0.0
                 for m in range(j + 1):
@@ -149,6 +151,7 @@ def show(nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, r: int, s: int)
 @kernel(inlined=True)
 def rebase(nodes: SlotNodes, readings: SlotReadings, r: int, s: int) -> None:
     """Count estimates from the state of slot ``s``, where a frame of coordinates begins."""
+    # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
         H = len(nodes.rows)
         for h in range(H):
@@ -168,8 +171,10 @@ def use_reading(
 ) -> None:
     """Update a place with the reading of filter ``h`` in slot ``s`` of run ``r``."""
     n = nodes.xhat.shape[1]
+    # H that is fixed has one run and one slot, and r % 1 = 0 finds it.
     rH, sH = r % readings.H.shape[0], s % readings.H.shape[1]
     for row in range(nodes.rows[h]):
+        # Scalar update with unit noise: h S and the innovation y - h x with all earlier rows used.
         innovation = readings.y[r, s, h, row]
         for j in range(n):
             total = 0.0
@@ -177,6 +182,7 @@ def use_reading(
                 total += readings.H[rH, sH, h, row, i] * nodes.root[place, i, j]
             room.HS[0, j] = total
             innovation -= readings.H[rH, sH, h, row, j] * nodes.xhat[place, j]
+        # ``size`` is the standard deviation of the innovation, so the gain is gains / size.
         size = rotate_out(room.size, nodes.root, place, room.HS, 0, room.gains, 1.0)
         for i in range(n):
             nodes.xhat[place, i] += room.gains[0, i] * (innovation / size)
@@ -191,6 +197,7 @@ def predict_mean(nodes: SlotNodes, place: int, room: SlotRoom) -> None:
         for j in range(n):
             total += nodes.F[i, j] * nodes.xhat[place, j]
         room.vectors[0, i] = total
+    # F xhat needs all of the old xhat, hence the copy.
     for i in range(n):
         nodes.xhat[place, i] = room.vectors[0, i]
 
@@ -200,6 +207,7 @@ def predict(nodes: SlotNodes, room: SlotRoom) -> None:
     """Move all places to the next slot: ``F xhat`` and ``F P F' + Q``."""
     for place in range(len(nodes.xhat)):
         predict_mean(nodes, place, room)
+    # Filters of all runs share F and Q, so their covariances are predicted LANES at a time.
     for first in range(0, len(nodes.root), LANES):
         predict_roots(nodes.root, first, nodes.F, nodes.root_Q, room.lanes)
 
@@ -216,19 +224,25 @@ def predict_roots(  # noqa: PLR0912 - loops side by side
     n, count = root.shape[1], min(LANES, len(root) - first)
     S, moved, noise, total = lanes.root, lanes.moved, lanes.noise, lanes.total
     for i in range(n):
+        # Lanes are the last axis: contiguous, so that one load fills a vector register.
         for j in range(i + 1):
             for q in range(count):
                 S[i, j, q] = root[first + q, i, j]
     for i in range(n):
+        # All LANES are computed even if fewer are used: a constant length compiles to vector code,
+        # and the surplus is not stored.
         for j in range(n):
             for q in range(LANES):
                 moved[i, j, q] = 0.0
+            # F S; S is lower triangular, so the sum begins at m = j.
             for m in range(j, n):
                 for q in range(LANES):
                     moved[i, j, q] += F[i, m] * S[m, j, q]
+        # A fresh root of Q per lane: the reflections use it up.
         for j in range(i + 1):
             for q in range(LANES):
                 noise[i, j, q] = root_Q[i, j]
+    # Reflect row by row, as root_flow.transform() does, which leaves a lower triangular root.
     for i in range(n):
         reflect_row(i, n, lanes)
         for r in range(i + 1, n):
@@ -240,6 +254,7 @@ def predict_roots(  # noqa: PLR0912 - loops side by side
             for j in range(i + 1):
                 for q in range(LANES):
                     total[q] += noise[i, j, q] * noise[r, j, q]
+            # Columns are flipped so that the diagonal stays nonnegative.
             for q in range(LANES):
                 total[q] *= lanes.scale[q]
                 S[r, i, q] = lanes.sign[q] * (total[q] * lanes.pivot[q] - moved[r, i, q])
@@ -273,8 +288,10 @@ def reflect_row(i: int, n: int, lanes: Lanes) -> None:
     for q in range(LANES):
         pivot = moved[i, i, q]
         length = math.sqrt(pivot * pivot + total[q])
+        # pivot and its length with one sign: nothing cancels.
         lanes.sign[q] = math.copysign(1.0, pivot)
         lanes.pivot[q] = pivot + lanes.sign[q] * length
+        # TINY keeps a row of zeros from dividing by zero: its reflection then only flips a column.
         lanes.scale[q] = 1.0 / (length * (length + abs(pivot)) + TINY)
         lanes.root[i, i, q] = length
 

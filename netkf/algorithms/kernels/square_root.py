@@ -30,9 +30,12 @@ def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
     size = 0.0
     for j in range(i, columns):
         size += work[i, j] * work[i, j]
+    # A zero row is triangular already.
     if size == 0.0:
         return
+    # The sign opposite to the pivot's, so that the difference below does not cancel.
     pivot = -math.copysign(math.sqrt(size), work[i, i])
+    # Half the squared length of the reflection's vector: v v' / scale is its projector times two.
     scale = size - work[i, i] * pivot
     work[i, i] -= pivot
     for r in range(i + 1, rows):
@@ -74,6 +77,7 @@ def step_root(
     # end there are zeros, because root_Q is lower triangular.
     for i in range(p + n):
         reflect(work, i, p + n, n + p + max(0, i - p + 1))
+    # The post-array is [[C, 0], [K C, S+]]: its lower right block is the root of f_m(P).
     for i in range(n):
         for j in range(i + 1):
             roots[chain, i, j] = work[p + i, p + j]

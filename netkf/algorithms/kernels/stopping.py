@@ -35,10 +35,13 @@ def has_stopped(
     ones. ``whole``: all links of the node were up. ``work`` (n, n) is scratch.
     """
     if rule == PAPER:
+        # P step 2.3 waits until information has reached the node: mass of zero does not move
+        # either.
         seen = False
         for i in range(2, mass.shape[1]):
             seen = seen or mass[k, i] != 0.0
         return seen and moved_within(mass, k, before, tolerance, work)
+    # SAFE trusts a step only if all links were up: an outage also makes the estimate stand still.
     if rule == SAFE and whole and mass[k, 0] > 0.0:
         return settled(information, number[0], former, k, former_number[k], tolerance)
     return False
@@ -52,10 +55,13 @@ def moved_within(
     spectral norm below ``bound``: ``bound I - D`` and ``bound I + D`` have positive pivots only.
     """
     n = len(work)
+    # |D_ii| < bound is necessary, costs n comparisons only and saves an elimination where it fails.
+    # ``not <`` rejects nan.
     for i in range(n):
         place = 2 + i * n + i
         if not abs(mass[k, place] - before[place]) < bound:
             return False
+    # Spectral norm below bound if and only if bound I - D and bound I + D are positive definite.
     for sign in (-1.0, 1.0):
         for i in range(n):
             for j in range(n):
@@ -77,6 +83,8 @@ def has_positive_pivots(work: FloatArray) -> bool:
         if not work[k, k] > 0.0:
             return False
         for i in range(k + 1, n):
+            # LDL' elimination of the lower triangle; by Sylvester's law the pivots carry the
+            # inertia.
             factor = work[i, k] / work[k, k]
             for j in range(k + 1, i + 1):
                 work[i, j] -= factor * work[j, k]
@@ -103,5 +111,6 @@ def settled(
         for j in range(n):
             step = information[0, i, j] - former[k, i, j]
             moved += step * step
+            # The Frobenius norm of the new G, by which the step is scaled.
             size += information[0, i, j] * information[0, i, j]
     return math.sqrt(moved) <= tolerance * math.sqrt(size)
