@@ -62,14 +62,19 @@ def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
     ziggurat = normal_ziggurat()
     for run in range(len(batch.lengths)):
         begin_run(state, batch.memory, run, ziggurat)
+        # Each call of the loop simulates until it wants something that only Python can make.
         wanted = -1
         while wanted != DONE:
             wanted = int(event_loop(state, None, None))
+            # Samples first: after one that is not finite, whatever the loop wants is of no use any
+            # more.
             if not keep_samples(state, batch.memory, run):
                 break
             if wanted == WANT_CUTS:
                 draw_cuts(state, batch.memory, run, ziggurat)
             elif wanted == WANT_MESSAGES:
+                # Ticks, path and noise are there up to the horizon; only cuts and messages have no
+                # known number.
                 add_messages(state, state.most_messages)
 
 
@@ -78,6 +83,7 @@ def begin_run(
     state: Simulation, batch_memory: IntArray, run: int, ziggurat: NormalZiggurat
 ) -> None:
     """Put the Simulation to time 0 of a run and copy its draws there."""
+    # numba identifies an array much faster than a struct, and this is called once a run.
     begin(state, struct_at(batch_memory, BatchArrays), run, ziggurat)
 
 
@@ -86,6 +92,7 @@ def begin(state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggu
     """``begin_run`` for kernels."""
     reset_filters(state, batch)
     reset_messages(state)
+    # Positions in the arrays of draws: the run begins at the first frame, piece, tick and sample.
     state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
     state.tick_at = state.probe_at = state.row = state.samples = 0
     for kind in range(len(state.counts)):
@@ -103,6 +110,7 @@ def reset_filters(state: Simulation, batch: BatchArrays) -> None:
     for h in range(len(batch.nodes)):
         state.nodes[h] = batch.nodes[h]
         for i in range(n):
+            # Entry by entry: an assignment of arrays costs seconds of compiling.
             state.xhat[h, i] = batch.xhat[h, i]
             for j in range(n):
                 state.root[h, i, j] = batch.root[h, i, j]
@@ -113,8 +121,10 @@ def reset_messages(state: Simulation) -> None:
     """No message is on its way; all of the pool is free."""
     for w in range(len(state.ways)):
         state.ways[w].messages = 0
+    # Chain the whole pool into the list of free messages.
     for m in range(len(state.pool)):
         state.pool[m].next = m + 1
+    # The heap needs no reset: only its first ``flying`` entries count.
     state.free = state.flying = state.order = state.receivers = state.absorbing = 0
     state.free_count, state.mail_time = len(state.pool), 0.0
 
@@ -144,6 +154,7 @@ def copy_ticks(state: Simulation, batch: BatchArrays, run: int) -> None:
     for k in range(last - first):
         ticks.t[k] = batch.t[first + k]
         ticks.entity[k], ticks.at[k] = batch.entity[first + k], batch.at[first + k]
+    # Ticks of a longer run before this one must not happen again.
     for k in range(last - first, len(ticks.t)):
         ticks.t[k] = np.inf
     begin = batch.first_delay[run]
@@ -156,6 +167,8 @@ def copy_noise(state: Simulation, batch: BatchArrays, run: int) -> None:
     """The noise of all steps; no step is begun and no normals for cuts are left."""
     sensing = state.sensing
     for s in range(len(sensing.rows)):
+        # No step begun (-1), and all normals of the run before count as used, so that refill_cuts()
+        # draws.
         sensing.step[s], sensing.used[s] = -1, sensing.normals.shape[1]
         for k in range(batch.noise.shape[2]):
             for m in range(2):
@@ -175,8 +188,11 @@ def draw_cuts(
 @kernel
 def refill_cuts(state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggurat) -> None:
     """``draw_cuts`` for kernels."""
+    # Streams are numbered run by run, sensor by sensor.
     sensing, stream = state.sensing, run * len(state.sensing.rows)
     for s in range(len(sensing.rows)):
+        # Refill only what is used up: a stream then gives the numbers that it would give a run
+        # alone.
         if sensing.used[s] == sensing.normals.shape[1]:
             sensing.used[s] = 0
             for k in range(sensing.normals.shape[1]):
@@ -196,14 +212,17 @@ def keep_samples(state: Simulation, batch_memory: IntArray, run: int) -> bool:
 @kernel
 def keep(state: Simulation, batch: BatchArrays, run: int) -> bool:
     """``keep_samples`` for kernels."""
+    # Samples are kept from the time after those that an earlier call has copied.
     taken, first = state.samples, state.probe_at - state.samples
     state.samples = 0
     for k in range(taken):
         broken = copy_sample(state, batch, run, first + k, k)
         batch.lengths[run] = first + k + 1
+        # The counts are those at the broken sample, not those at the stop of the loop.
         if broken > 0:
             for kind in range(batch.counts.shape[1]):
                 batch.counts[run, kind] = state.shown.counts[k, kind]
+            # One filter may stand for several nodes (pooled), each of which has diverged.
             batch.counts[run, DIVERGED] += broken * batch.carriers
             batch.diverged[run] = 1
             return False
@@ -221,6 +240,7 @@ def copy_sample(state: Simulation, batch: BatchArrays, run: int, t: int, k: int)
     shown, n, broken = state.shown, batch.xhat.shape[1], 0
     for h in range(len(batch.nodes)):
         finite = True
+        # Finiteness is enough here, because P = S S' cannot be indefinite.
         for i in range(n):
             value = shown.xhat[k, h, i]
             batch.shown_xhat[run, t, h, i] = value

@@ -49,7 +49,8 @@ _kept = threading.local()
 
 
 def _workspace(scenario: Scenario) -> Workspace:
-    """The workspace of this thread for a scenario, kept from one block of its runs to the next."""
+    """Return the workspace of this thread, kept from one block of a scenario's runs to the next."""
+    # Identity, not equality: the tables belong to this very scenario object.
     known, workspace = getattr(_kept, "last", (None, None))
     if workspace is None or known is not scenario:
         workspace = Workspace(scenario)
@@ -63,6 +64,8 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
             return _run_by_run(scenario, workspace, sources, replicas)
         draws = BatchDraws(scenario, seed, replicas)
+        # Both have state outside the Simulation, which simulate_batch() does not carry. Origins that
+        # move are moved by Python, run by run.
         special = scenario.hosted.combination in ("sums", "readings")
         if len(draws.paths.frame_times) or special:
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
@@ -83,6 +86,7 @@ def _run_by_run(
 
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
     """Simulate all runs by ``simulate_batch``."""
+    # All runs start from the same filters: the arrays hold the start once.
     arrays = draws.arrays(workspace.filters)
     simulate_batch(workspace.begin(draws.first_run(), traced=False), arrays)
     x = draws.sampled_states(scenario.times)
@@ -92,6 +96,7 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
         x=x,
         xhat=arrays.shown_xhat,
         P=arrays.shown_P,
+        # No origin moves in these runs: local and absolute states are the same.
         error=x[:, :, None] - arrays.shown_xhat,
         lengths=arrays.lengths,
         counts=arrays.counts,
@@ -109,13 +114,18 @@ def batch_size(scenario: Scenario) -> int:
     """Number of runs that are drawn and kept together, at least 1."""
     if not drawn_together(scenario):
         return 1
+    # An estimate of what one run draws and shows, in floats.
     n, period = scenario.plant.n, scenario.truth.sensing_period
     filters = 1 if scenario.hosted.pooled else len(scenario.nodes)
+    # One piece for each step, and one more for each sample that cuts a step.
     steps = BLOCK + len(scenario.times) + (scenario.horizon / period if period else 0.0)
     sensors = sum(len(placed) for placed in scenario.placed.values())
     rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
+    # Per piece: two states, two moments and the four coefficients of the cubic, of n entries each;
+    # per step the two moments of each sensor's noise.
     drawn = steps * (8 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
     samples = len(scenario.times) * filters * n * (n + 2)
+    # At least one run, however large it is.
     return max(1, int(min(LARGEST_BATCH, MOST_BYTES / (8.0 * (drawn + samples)))))
 
 
@@ -138,10 +148,15 @@ class BatchDraws:
         self.ticks = all_ticks(scenario, streams)
         self.paths = Paths(scenario, streams, blocks)
         self._block = self.paths.of_all_runs()
+        # Largest number of ticks of any run.
         most = int(np.diff(self.ticks.first).max())
+        # A guess: samples cut steps, and each tick perhaps three, spread over the nodes. The loop
+        # asks for more if that is too few.
         cuts = 16 + len(scenario.times) + 3 * most // len(scenario.nodes)
         self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
+        # One stretch of noise reaches the horizon: it is drawn once.
         self._noise.following()
+        # An empty table: increment sensors have no samples.
         self._no_samples = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
 
     def runs(self) -> Iterator[RunDraws]:
@@ -153,6 +168,7 @@ class BatchDraws:
         ticks, sent = (
             int(np.diff(first).max()) for first in (self.ticks.first, self.ticks.first_delay)
         )
+        # Contents do not matter: begin_run() overwrites the ticks before each run.
         entity, at = (np.zeros(ticks, dtype=np.int64) for _ in range(2))
         return self._run(Window(math.inf, np.empty(ticks), entity, at, np.empty(sent)), 0)
 
@@ -188,6 +204,7 @@ class BatchDraws:
     def sampled_states(self, times: FloatArray) -> FloatArray:
         """(R, T, n) states at the sample times, where no origin moves."""
         block = self._block
+        # Times of samples are ends of pieces or, at time 0, the start of the first.
         pieces = np.searchsorted(block.end, times)
         ends = (times == block.end[pieces])[:, None]
         return np.where(ends, block.x_end[:, pieces], block.x_start[:, pieces])
@@ -217,5 +234,5 @@ class RunDraws:
         return self._path
 
     def more_cuts(self) -> None:
-        """As many more."""
+        """Draw new normals for cuts, as many as before."""
         self._noise.more_cuts(self._run)

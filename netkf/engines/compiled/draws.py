@@ -28,10 +28,12 @@ MOST_NORMALS = 1 << 20  # of all sensors
 
 
 def blocks_to_the_end(scenario: Scenario) -> int:
-    """How many blocks of steps reach the horizon."""
+    """Number of blocks of steps that reach the horizon."""
     period = scenario.truth.sensing_period
     assert period is not None
+    # A first guess from below, which the loop completes.
     blocks = max(1, int(scenario.horizon / (period * BLOCK)))
+    # The test is the grid time itself, as the engine compares it.
     while grid_time(period, blocks * BLOCK) < scenario.horizon:
         blocks += 1
     return blocks
@@ -44,8 +46,9 @@ def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
 
 
 def sizes(scenario: Scenario) -> tuple[int, int]:
-    """How many blocks of steps and how many cuts of each sensor are drawn at once in a run."""
+    """Number of blocks of steps, and of cuts of each sensor, that a run draws at once."""
     rows = [len(scenario.sensors[place.entry].R) for _, place in increments(scenario)]
+    # Two moments for each row of each sensor and step share the budget of normals.
     share = MOST_NORMALS // max(2 * sum(rows), 1)
     blocks = min(MOST_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
     return blocks, max(LEAST_CUTS, min(MOST_CUTS, share))
@@ -64,6 +67,8 @@ class Paths:
         sampled: FloatArray = NO_TIMES,
     ) -> None:
         self._blocks = blocks
+        # One stream each for the path, for the states shown and for those sampled, so that none
+        # depends on how many numbers the others take.
         plant, probe, samples = (
             StreamNormals(streams.seed_words(purpose, [()]))
             for purpose in ("plant", "probe", "samples")
@@ -79,6 +84,7 @@ class Paths:
         self._senses, self._horizon = bool(scenario.increment_sensors), scenario.horizon
         steps, laws = self._paths.frame_steps, self._paths.laws
         self.frame_times = np.empty(0)
+        # Frames begin every so many steps of the grid; their times are grid times, bit for bit.
         if steps is not None:
             count = int(scenario.horizon / (steps * laws.period)) + 2
             times = np.array([grid_time(laws.period, steps * k) for k in range(1, count)])
@@ -100,6 +106,7 @@ class Paths:
             end=float(ends[-1]),
             start=block.start,
             stop=block.end,
+            # C-contiguous copies: a Struct takes no other layout.
             x_start=np.array(block.x_start[run], order="C"),
             x_stop=np.array(block.x_end[run], order="C"),
             moments=np.array(block.moments[run], order="C"),
@@ -113,7 +120,7 @@ class Paths:
 
 
 def no_path(n: int) -> PathBlock:
-    """Where nothing senses increments: one piece without an end."""
+    """Return one piece without an end, for runs in which nothing senses increments."""
     rows = {name: np.zeros((1, n)) for name in ("x_start", "x_stop")}
     responses = {name: np.zeros((1, 1)) for name in ("to_end", "to_moments")}
     return PathBlock(
@@ -131,7 +138,7 @@ def no_path(n: int) -> PathBlock:
 
 
 class Own(NamedTuple):
-    """What of a Sensing differs from run to run."""
+    """The fields of a Sensing that differ from run to run."""
 
     rest: FloatArray
     step: np.ndarray
@@ -157,9 +164,11 @@ class Noise:
         keys = [(node, place.ordinal) for node, place in placed]
         self._noise = StreamNormals(streams.seed_words("noise", keys))
         self._cuts = StreamNormals(streams.seed_words("cut", keys))
+        # Without increment sensors the period is not used; it only must not be None.
         self._period, self._steps = (scenario.truth.sensing_period or 1.0) if placed else 1.0, steps
         n, count, runs = scenario.plant.n, len(sensors), len(streams.per_replica)
         self._rows = np.array([len(sensor.R) for sensor in sensors], dtype=np.int64)
+        # Sensors with fewer rows are padded to the most.
         most = int(self._rows.max(initial=0))
         H, root = np.zeros((count, most, n)), np.zeros((count, most, most))
         for k, sensor in enumerate(sensors):
@@ -172,6 +181,7 @@ class Noise:
             step=np.full((runs, count), -1, dtype=np.int64),
             noise=np.zeros((runs, count, steps, 2, most)),
             normals=np.zeros((runs, count, cuts, 2, most)),
+            # All cuts count as used: the first prediction that ends inside a step asks for normals.
             used=np.full((runs, count), cuts, dtype=np.int64),
         )
         self._shared: dict[str, Any] = {
@@ -184,16 +194,20 @@ class Noise:
 
     def sensing(self, run: int) -> Sensing:
         """The sensors of one run with their noise."""
+        # Views of one run: the loop writes its use of normals into these arrays.
         own: dict[str, Any] = {name: array[run] for name, array in self._own._asdict().items()}
         return Sensing(**self._shared, **own)
 
     def following(self) -> None:
         """Draw the noise of the next stretch."""
         own, shape = self._own, self._own.noise.shape
+        # Streams of all runs and sensors, run by run.
         every = np.arange(shape[0] * shape[1])
         normals = own.noise.reshape(len(every), *shape[2:])
         fill_sensor_normals(self._noise.states, every, self._rows, normal_ziggurat(), normals)
+        # Standard normals become moments of white noise over one step: variances h and h / 3.
         own.noise[:] = step_noise(own.noise, self._period)
+        # No sensor has begun a step of this stretch.
         own.step[:] = -1
 
     @property
@@ -206,6 +220,7 @@ class Noise:
     def more_cuts(self, run: int) -> None:
         """Draw new normals where they are used up."""
         used, shape = self._own.used[run], self._own.normals.shape
+        # Only streams whose normals are used up: the others keep their place.
         empty = np.flatnonzero(used == shape[2]) + run * shape[1]
         normals = self._own.normals.reshape(shape[0] * shape[1], *shape[2:])
         fill_sensor_normals(self._cuts.states, empty, self._rows, normal_ziggurat(), normals)
@@ -225,7 +240,9 @@ def fill_sensor_normals(
     """
     for m in range(len(which)):
         k = which[m]
+        # Streams are numbered run by run, so the sensor is the remainder.
         p = rows[k % len(rows)]
+        # Rows beyond p draw nothing: a stream gives what it gives without padding.
         for c in range(out.shape[1]):
             for half in range(2):
                 for i in range(p):

@@ -57,6 +57,7 @@ class CompiledEngine(Engine):
         parts += [("filter", scenario.filter.algorithm)]
         known = {*KNOWN, *built_in_filters().values()}
         for family, part in parts:
+            # ``type`` and not ``isinstance``: a derived class may change what kernels do not know of.
             if type(part) not in known:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
@@ -65,6 +66,7 @@ class CompiledEngine(Engine):
 
     def announce(self, scenario: Scenario) -> None:
         """Say on stderr that code is compiled, unless it is kept from an earlier run."""
+        # Slots and continuous time are compiled separately.
         if scenario.slotted:
             compiling.announce(type(scenario.hosted).slot_kernel)
         else:
@@ -84,9 +86,11 @@ class CompiledEngine(Engine):
         """Yield the runs of consecutive replicas in order."""
         if not scenario.slotted:
             yield from flow_batches(scenario, seed, replicas)
+        # Messages made in Python come one run at a time.
         elif not slot_setup(scenario).is_drawn:
             yield from super().run_many(scenario, seed, replicas)
         else:
+            # A run that diverges has to be repeated alone: batches carry it to the end.
             alone = partial(super().run_many, scenario, seed)
             for batch in slot_batches(scenario, seed, replicas):
                 yield with_ends(batch, alone)

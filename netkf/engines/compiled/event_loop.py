@@ -62,14 +62,19 @@ NEVER = math.inf
 
 @kernel
 def event_loop(state: Simulation, totals: Totals | None, history: History | None) -> int:
-    """Simulate until something is wanted; returns what, see the words above."""
+    """Simulate until the loop needs something from Python, and return what (WANT_... or DONE)."""
     while True:
+        # Nothing changes before the loop knows that the event has all that it needs: it may stop
+        # here and find the same event again.
         event, now = next_event(state)
         wanted = wanted_first(state, history, event, now)
         if wanted != GO_ON:
             return wanted
+        # The piece of the path that the event lies in; events come in the order of time.
         while state.path.stop[state.piece] < now:
             state.piece += 1
+        # Participants are predicted first. A node that is there already is skipped, so that this
+        # may be repeated after a stop.
         for k in range(count_participants(state, event)):
             if not predict(state, participant(state, event, k), now):
                 return WANT_CUTS
@@ -84,25 +89,31 @@ def event_loop(state: Simulation, totals: Totals | None, history: History | None
         elif event == ON_DELIVER:
             on_deliver(state, now)
         elif event == ON_REBASE:
+            # Python moves the origin and steps over the frame.
             return WANT_REBASE
+        # No space for another sample: this one has been kept, and the loop goes on behind it.
         elif not on_probe(state, totals):
             return WANT_SHOWN
 
 
 @kernel
 def wanted_first(state: Simulation, history: History | None, event: int, now: float) -> int:
-    """What an event needs before it can happen, or GO_ON."""
+    """Return what an event needs before it can happen (WANT_..., DONE), or GO_ON."""
+    # Worst cases of one event, so that no handler has to stop half-way.
     wanted = GO_ON
     if state.traced and state.row + state.most_rows > len(state.rows):
         wanted = WANT_ROWS
     elif state.free_count < state.most_messages:
         wanted = WANT_MESSAGES
+    # At or after the end of the window a tick may come first that is not drawn yet.
     elif now >= state.ticks.end and state.ticks.end < NEVER:
         wanted = WANT_TICKS
+    # Events after the last step need more of the path, unless it reaches the horizon.
     elif now > state.path.end and state.path.end < state.horizon:
         wanted = WANT_STEPS
     elif now == NEVER:
         wanted = DONE
+    # The pool of the past is as finite as that of messages.
     elif history is not None and history.free[1] < readings_at_once(state, event):
         wanted = WANT_PAST
     return wanted
@@ -110,7 +121,8 @@ def wanted_first(state: Simulation, history: History | None, event: int, now: fl
 
 @kernel
 def next_event(state: Simulation) -> tuple[int, float]:
-    """What happens next, and when; the earlier in the list, the earlier at one instant."""
+    """Return the next event (ON_...) and its time in seconds; ties go to the earlier kind."""
+    # ``<`` keeps the earlier event of the list at equal times: the order of ranks.
     event, now = ON_REBASE, next_of(state.frames, state.frame_at)
     sense = next_of(state.path.grid, state.grid_at)
     if sense < now:
@@ -121,9 +133,11 @@ def next_event(state: Simulation) -> tuple[int, float]:
     tick = next_of(state.ticks.t, state.tick_at)
     if tick < now:
         event, now = ON_TICK, tick
+    # The heap is ordered by arrival, so its top is the next delivery.
     deliver = state.pool[state.heap[0]].arrival if state.flying > 0 else NEVER
     if deliver < now:
         event, now = ON_DELIVER, deliver
+    # Mail is absorbed at the instant it arrived, after all arrivals of that instant.
     absorb = state.mail_time if state.receivers > 0 else NEVER
     if absorb < now:
         event, now = ON_ABSORB, absorb
@@ -141,10 +155,12 @@ def next_of(times: FloatArray, k: int) -> float:
 
 @kernel
 def count_participants(state: Simulation, event: int) -> int:
-    """How many nodes must be at the time of the event before it happens."""
+    """Number of nodes that must be at the time of the event before it happens."""
     count = 1
+    # Samples and moves of the origin concern the states of all nodes at one time.
     if event in (ON_REBASE, ON_PROBE):
         count = len(state.nodes)
+    # A message goes into an inbox: its receiver is predicted when it absorbs.
     elif event == ON_DELIVER:
         count = 0
     elif event == ON_TICK and state.at == LINKS:
@@ -154,11 +170,14 @@ def count_participants(state: Simulation, event: int) -> int:
 
 @kernel
 def participant(state: Simulation, event: int, k: int) -> int:
-    """The k-th of them."""
+    """Return the index of the k-th of those nodes."""
+    # Ends of a link are predicted one after the other; only then the tick happens.
     if event == ON_TICK:
         entity = state.entities[state.ticks.entity[state.tick_at]]
         return int(entity.sender if k == 0 else entity.other)
     if event == ON_ABSORB:
+        # Sorted once, before the first node absorbs: simultaneous events run in the order of
+        # entities.
         if state.absorbing == 0:
             sort_places(state.waiting, state.receivers)
         return int(state.waiting[state.absorbing])
@@ -171,11 +190,12 @@ def participant(state: Simulation, event: int, k: int) -> int:
 
 @kernel
 def readings_at_once(state: Simulation, event: int) -> int:
-    """How many readings an event uses at most."""
+    """Largest number of readings that an event uses."""
     if event == ON_SAMPLE:
         return 1
     count = 0
     if event == ON_ABSORB:
+        # A node may absorb as many readings as it has messages.
         m = state.nodes[participant(state, event, 0)].inbox
         while m != -1:
             count, m = count + 1, state.pool[m].next
@@ -194,10 +214,12 @@ def note_age(
 ) -> None:
     """Write one row of the trace, or only count it."""
     if not state.traced:
+        # A batch keeps counts only: no row is written.
         state.counts[kind] += 1
         return
     row = state.rows[state.row]
     row.t, row.kind, row.node, row.peer = t, kind, node, peer
+    # -1: exchanges have phases in slots only.
     row.message, row.phase, row.age = message, -1, age
     state.row += 1
 
@@ -206,11 +228,14 @@ def note_age(
 def predict(state: Simulation, h: int, time: float) -> bool:
     """Predict node ``h`` to ``time``; False where it needs more normals for cuts first."""
     node = state.nodes[h]
+    # ``not <`` also stops at a time that is not a number.
     if not node.now < time:
         return True
+    # With increment sensors the gap is cut into stretches.
     if node.sensors > node.sensor:
         return predict_with_increments(state, h, time)
     gap = time - node.now
+    # One step of the Riccati flow, exact for a gap of any length.
     move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
     node.now = time
     return True
@@ -222,6 +247,7 @@ def on_sense(state: Simulation, now: float) -> None:
     sensing = state.sensing
     note(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
     state.wake_at += 1
+    # One point of the grid wakes all nodes that sense increments, one event for each.
     if state.wake_at == len(sensing.host):
         state.wake_at = 0
         state.grid_at += 1
@@ -238,12 +264,14 @@ def on_sample(
         if given.node[s] != sensed:  # of a pooled filter several nodes, in order
             sensed = given.node[s]
             note(state, now, SENSE, sensed, -1, -1)
+    # Running sums weigh the reading, and late readings keep it in the past.
     if totals is not None:
         add_reading(state, totals, h, instant)
     elif history is not None:
         use_reading(state, history, h, instant)
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
+    # The newest sample: what a filter of readings sends after this event.
     state.nodes[h].reading = instant
     state.instant_at += 1
 
@@ -252,16 +280,21 @@ def on_sample(
 def on_tick(state: Simulation, totals: Totals | None, now: float) -> None:
     """A clock ticks, or a node has used a sample: who transmits sends to each receiver."""
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
+    # The record lists directed links, so that one tick may send on several.
     entity = state.entities[ticks.entity[k]]
     i, j = entity.sender, entity.other
+    # A transmission after a sample has no tick of its own.
     if state.at != AFTER_READINGS:
         note(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     state.tick_at += 1
+    # A node whose masses nobody hears does not transmit.
     if totals is not None and not offer_round(state, totals, i, now):
         return
+    # A node's clock makes one transmission, which each receiver hears or loses.
     if state.at >= NODES:
         note(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
+    # Outcomes of a tick lie one after the other in the order of its directed links.
     first = ticks.at[k] - entity.first
     for m in range(entity.first, entity.after):
         send(state, totals, state.hearing[m], ticks.delay[first + m], now)
@@ -272,17 +305,21 @@ def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: fl
     """Send one message on a directed link; ``delay`` is LOST or nan where it is lost."""
     way, pool = state.ways[w], state.pool
     number, h = way.messages, way.sender
+    # The number is taken even if the message is lost: recorded losses name messages by it.
     way.messages += 1
     one, other = state.nodes[h].id, state.nodes[way.receiver].id
     note(state, now, SEND, one, other, number)
+    # ``not >=`` catches both LOST, which is negative, and nan.
     if not delay >= 0.0:
         note(state, now, LOST, one, other, number)
         return
+    # The horizon is half open: a message that arrives after it leaves no event.
     if delay > 0.0 and not now + delay < state.horizon:
         return
     m = take(state)
     message = pool[m]
     message.way, message.number, message.sent = w, number, now
+    # The total after this round; rounds are numbered from 0.
     if totals is not None:
         message.tag = totals.rounds[h] - 1
         for k in range(totals.sent.shape[1]):
@@ -290,10 +327,12 @@ def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: fl
     elif state.kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
+        # A copy: the sender goes on while the message is on its way.
         copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     if delay == 0.0:
         arrive(state, m, now)
         return
+    # ``order`` breaks ties between messages of one link that arrive at one time.
     message.arrival, message.order = now + delay, state.order
     state.order += 1
     push(pool, state.heap, state.flying, m)
@@ -315,11 +354,13 @@ def arrive(state: Simulation, m: int, now: float) -> None:
     way = state.ways[message.way]
     one, other = state.nodes[way.sender].id, state.nodes[way.receiver].id
     age = now - message.sent
+    # ``not <=`` also rejects an age that is nan.
     if not age <= state.age_limit:
         note_age(state, now, LATE, other, one, message.number, age)
         release(state, m)
         return
     note_age(state, now, DELIVER, other, one, message.number, age)
+    # The first message of the instant puts its receiver on the list of those that absorb.
     if state.nodes[way.receiver].inbox == -1:
         state.waiting[state.receivers] = way.receiver
         state.receivers += 1
@@ -334,6 +375,7 @@ def on_absorb(
     """A node uses all that arrived at this instant, in the order of senders."""
     pool, h = state.pool, state.waiting[state.absorbing]
     node, oldest = state.nodes[h], 0.0
+    # The age of the oldest message goes into the trace.
     m = node.inbox
     while m != -1:
         oldest, m = max(oldest, now - pool[m].sent), pool[m].next
@@ -343,6 +385,7 @@ def on_absorb(
         use_mail(state, history, h, now)
     else:
         combine(state, h, now)
+    # Messages go back to the pool only now, because handlers read them through the inbox.
     m = node.inbox
     while m != -1:
         following = pool[m].next
@@ -351,6 +394,7 @@ def on_absorb(
     node.inbox = -1
     note_age(state, now, ABSORB, node.id, -1, -1, oldest)
     state.absorbing += 1
+    # All mail of this instant is absorbed.
     if state.absorbing == state.receivers:
         state.absorbing = state.receivers = 0
 
@@ -361,6 +405,7 @@ def use_mail(state: Simulation, history: History, h: int, now: float) -> None:
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
+        # Messages without delay are of now, and need no going back.
         if now - message.sent <= 0.0:
             use_reading(state, history, h, message.tag)
         else:
@@ -371,25 +416,32 @@ def use_mail(state: Simulation, history: History, h: int, now: float) -> None:
 @kernel
 def combine(state: Simulation, h: int, now: float) -> None:
     """Estimates of other nodes, predicted to now without readings where they took time."""
+    # The last model of the table has no sensors: prediction alone, as readings since then are
+    # unknown here.
     pool, ways, model = state.pool, state.ways, len(state.table.unit) - 1
     m, heard = state.nodes[h].inbox, 0.0
     while m != -1:
         age = now - pool[m].sent
+        # SWAP takes over the last message of the inbox only, so the others need no prediction.
         if age > 0.0 and (state.kind != SWAP or pool[m].next == -1):
             move_root(state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch)
         heard += ways[pool[m].way].weight
         m = pool[m].next
     if state.kind == CONVEX:
+        # Lost weight goes to the node itself, so that weights sum to 1.
         combine_convex(state, h, max(0.0, 1.0 - heard))
     elif state.kind == INTERSECTION:
         intersect(state, h, max(0.0, 1.0 - heard), 1.0)
     elif state.kind == SHARES:
         own, total = state.nodes[h].own, state.nodes[h].own + heard
+        # "keep-own", or weights that are all 0: the own weight is what the others leave.
         if state.keep_own == 1 or total == 0.0:
             own, total = max(0.0, 1.0 - heard), 1.0
+        # With weight 1 the node keeps its estimate to the last bit.
         if own / total != 1.0:
             intersect(state, h, own / total, total)
     elif state.kind == SWAP:
+        # Gossip: the node takes over the estimate of its peer.
         last = state.nodes[h].last
         copy_state(state.size, state.xhat, state.root, h, state.pool_x, state.pool_root, last)
 
@@ -397,6 +449,7 @@ def combine(state: Simulation, h: int, now: float) -> None:
 @kernel
 def combine_convex(state: Simulation, h: int, own: float) -> None:
     """H (7) and (9): what others sent is a copy, so that sums may grow in their place."""
+    # w_i P_i first, then + w_j P_j for each message.
     xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
     scale_root(state.size, root, xhat, h, own)
     m = state.nodes[h].inbox
@@ -411,6 +464,7 @@ def intersect(state: Simulation, h: int, own: float, total: float) -> None:
     """D (8) and (9), with weights over their ``total``."""
     xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
     scratch = state.update_scratch
+    # Means count from the node's own estimate: differences of near states lose no digits.
     begin_intersection(scratch)
     add_to_intersection(own, root, xhat, h, xhat, h, scratch)
     m = state.nodes[h].inbox
@@ -431,10 +485,12 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
         for i in range(n):
             shown.xhat[k, h, i] = state.xhat[h, i]
             for j in range(i + 1):
+                # P = S S', with the lower triangle of S only.
                 total = 0.0
                 for r in range(j + 1):
                     total += root[h, i, r] * root[h, j, r]
                 shown.P[k, h, i, j] = shown.P[k, h, j, i] = total
+    # The weight of the whole network: held by nodes, sent, and less what was heard.
     if totals is not None:
         count = len(state.nodes)
         for h in range(count):
@@ -442,6 +498,7 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
             shown.terms[k, count + h] = totals.sent[h, 0]
         for w in range(len(state.ways)):
             shown.terms[k, 2 * count + w] = totals.heard[w, 0]
+    # Counts and rows at the sample: a run that diverges here ends with them.
     for kind in range(len(state.counts)):
         shown.counts[k, kind] = state.counts[kind]
     shown.rows[k], shown.piece[k] = state.row, state.piece

@@ -73,14 +73,14 @@ AT_START = (
 
 
 class Windows(Protocol):
-    """Where ticks come from."""
+    """A source of ticks, window by window."""
 
     def following(self) -> Window:
         """The next window; its end is infinite where nothing comes after it."""
 
 
 class Draws(Protocol):
-    """What is drawn for one run, given out as the run goes on."""
+    """Random numbers of one run, given out as the run goes on."""
 
     sensing: Sensing
     instants: Instants
@@ -110,15 +110,18 @@ class Source:
         self.instants = samples.instants
         self._windows = _windows(scenario, streams, samples.instants)
         self._grid = uses_grid(scenario)
+        # Without a grid there are no steps and no cuts.
         blocks, cuts = sizes(scenario) if self._grid else (0, 0)
         self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
         self.sensing = self._noise.sensing(0)
         self._read, self._n = -math.inf, scenario.plant.n
         if self._grid:
+            # Cut the path where a state is sampled: it is drawn there from its own stream.
             self._paths = Paths(scenario, streams, blocks, sampled)
             self.states = PathStates(scenario, self._paths.frame_times)
         else:
             self.states = known = KnownStates(scenario, streams)
+            # The whole truth is known here, so that all samples are read at once.
             samples.read(known.truth.states(sampled)[0], sampled, -math.inf, math.inf)
 
     def window(self) -> Window:
@@ -129,8 +132,10 @@ class Source:
         """A block of steps."""
         if not self._grid:
             return no_path(self._n)
+        # Noise and path advance together, a block of steps at a time.
         self._noise.following()
         path = self._paths.following()[0]
+        # Samples in (read, end]: a time at the border of two blocks is read once.
         first, last = np.searchsorted(self._sampled, [self._read, path.end], side="right")
         if first < last:
             times = self._sampled[first:last]
@@ -166,7 +171,9 @@ class Workspace:
         self._rows = np.empty(FIRST_ROWS, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
         kind = COMBINATIONS.index(scenario.hosted.combination)
+        # Terms of conserved sums: weights held, totals sent and totals heard.
         terms = 2 * size + len(self._senders.ways) if kind == SUMS else 0
+        # Space for many samples, within a budget of floats.
         room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
         self._shown = Shown(
             xhat=np.zeros((room, size, n)),
@@ -186,11 +193,14 @@ class Workspace:
         """The state of a run at time 0."""
         start, instants = self._start, draws.instants
         entities, ways = self._records
+        # Records are shared by all runs of the workspace: numbers of messages start again.
         ways["messages"] = 0
         pool = self._pool[0]
+        # All messages are free, in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
         scratch, flow, update = scratch_arrays(start.table, start.gains, instants)
         n = start.xhat.shape[1]
+        # A class for this n, so that loops over few states are unrolled.
         state: Simulation = Simulation.of_size(n)(
             size=sized(n),
             nodes=start.nodes.copy(),
@@ -233,6 +243,8 @@ class Workspace:
             "keep_own": getattr(algorithm, "on_loss", "") == "keep-own",
             "most_messages": most,
             "free_count": len(self._pool[0]),
+            # Each message of a tick leaves a "send" and its outcome, and the tick or transmission
+            # two rows more; an instant of samples leaves one row per sensing node.
             "most_rows": 2 + 2 * most + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
             "age_limit": getattr(algorithm, "max_age", math.inf),
@@ -260,13 +272,17 @@ class FlowRun:
     def to_the_end(self) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
         try:
+            # Any value but DONE.
             wanted = WANT_ROWS
             while wanted != DONE:
                 wanted = int(event_loop(self._state, self._totals, self._history))
+                # Samples first: the run ends at one that is not finite, and with the rows before
+                # it.
                 if not self._hand_samples_on():
                     return "diverged"
                 self._give(wanted)
         finally:
+            # Ctrl-C between the two calls would lose rows that the loop has made.
             with defer_signals():
                 try:
                     self._pass_rows_on(self._state.row, self._state.counts)
@@ -280,6 +296,7 @@ class FlowRun:
             state.ticks, state.tick_at = Ticks(**self._draws.window()._asdict()), 0
         elif wanted == WANT_STEPS:
             state.path = self._draws.path()
+            # Positions count from the first piece and grid point of the new block.
             state.piece = state.grid_at = 0
         elif wanted == WANT_CUTS:
             self._draws.more_cuts()
@@ -295,7 +312,9 @@ class FlowRun:
 
     def _rebase(self) -> None:
         state, k = self._state, self._state.frame_at
+        # Estimates are lowered by the state, which is the new origin.
         offset = -self._draws.states.offset(k, state.path, state.piece)
+        # The past of each node gets one entry: the frame that begins.
         if self._history is not None and self._history.free[1] < len(state.nodes):
             add_past(self._history, len(state.nodes))
         move_origin(self._scenario, state, self._totals, self._history, k, offset)
@@ -303,6 +322,7 @@ class FlowRun:
 
     def _more_messages(self) -> None:
         add_messages(self._state, self._state.most_messages)
+        # Totals are offered by message: their array grows with the pool.
         if self._totals is not None:
             grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
             grown[: len(self._totals.offered)] = self._totals.offered
@@ -317,6 +337,7 @@ class FlowRun:
         state, recorder = self._state, self._recorder
         if not state.traced:
             recorder.add_counts(counts)
+            # Counts go on from zero, because the recorder has added them.
             state.counts[:] = 0
             return
         rows = state.rows
@@ -332,10 +353,12 @@ class FlowRun:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
         local, x = self._draws.states.shown(times, state.path, shown.piece[:count])
+        # Index of the sample at which the run stands: the last, or the first that is broken.
         lost = [count - 1]
 
         def pass_rows_on(k: int) -> None:
             lost[0] = k
+            # Rows up to that sample, and no row after it.
             self._pass_rows_on(int(shown.rows[k]), shown.counts[k])
 
         fine = recorded(
@@ -345,6 +368,7 @@ class FlowRun:
             times,
             x,
             local,
+            # Copies: the loop writes the next samples into the same space.
             shown.xhat[:count].copy(),
             shown.P[:count].copy(),
             pass_rows_on,
@@ -357,7 +381,9 @@ class FlowRun:
 def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, float]]:
     """The weights that nodes hold, with what each sent and less what was heard."""
     count = len(receivers)
+    # A total is sent to each receiver of the node.
     sent = np.repeat(terms[count : 2 * count], receivers)
+    # fsum: rounding of the check itself would look like a loss of weight.
     now = math.fsum([*terms[:count].tolist(), *sent.tolist(), *(-terms[2 * count :]).tolist()])
     return {"weight": (float(count), now)}
 

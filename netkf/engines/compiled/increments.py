@@ -31,11 +31,14 @@ def read_increments(
     """
     rows, rest, used, H, root = sensing.rows, sensing.rest, sensing.used, sensing.H, sensing.root
     s, row = first, 0
+    # ``out`` holds the first moments of all rows and then the second: 2 rows of it per row of H.
     while 2 * row < len(out):
+        # The first reading of a step takes over the noise of that step.
         if sensing.step[s] != step:
             sensing.step[s] = step
             copy_matrix(rest[s], sensing.noise[s, step])
         noise = rest[s]
+        # A part of the step: divide its noise exactly, and keep the rest for the next call.
         if u >= 0.0:
             noise = early
             divide(early, rest[s], sensing.normals[s, used[s]], u, length)
@@ -50,6 +53,7 @@ def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float)
     """Write the moments of x over [now, end], inside one piece, into ``scratch.state_moments``."""
     path, scratch = state.path, state.scratch
     start, stop = path.start[piece], path.stop[piece]
+    # A whole piece has its moments already, drawn from their exact law.
     if now == start and end == stop:
         copy_matrix(scratch.state_moments, path.moments[piece])
         return
@@ -76,11 +80,13 @@ def fill_moments(state: Simulation, now: float, end: float) -> None:
     into ``scratch.state_moments``.
     """
     path, k = state.path, state.piece
+    # Back to the piece that ``end`` lies in: the node may be behind the present piece.
     while k > 0 and path.stop[k - 1] >= end:
         k -= 1
     if now >= path.start[k]:
         fill_moments_of_piece(state, k, now, end)
         return
+    # The interval covers several pieces: sum their moments, from the last to the first.
     seen, total, gap = state.scratch.state_moments, state.scratch.total, end - now
     for i in range(seen.shape[1]):
         total[0, i] = total[1, i] = 0.0
@@ -90,6 +96,8 @@ def fill_moments(state: Simulation, now: float, end: float) -> None:
         # P_1 of the whole interval on this part of it.
         middle, share = ((first - now) - (end - last)) / gap, (last - first) / gap
         for i in range(seen.shape[1]):
+            # The moment with P_0 adds up; that with P_1 is shifted and scaled from the part to the
+            # whole.
             total[0, i] += seen[0, i]
             total[1, i] += middle * seen[0, i] + share * seen[1, i]
         if path.start[k] <= now:
@@ -110,20 +118,30 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
     terms, width, last = shape[k, 1], shape[k, 2], path.last[piece]
     gains = state.gains.series[begin : begin + terms * width].reshape(terms, width)
     readings, values = scratch.moments[: shape[k, 0]], scratch.values[: width - 1]
+    # The state of a node is whole after each stretch, so that a stop for normals may come in
+    # between.
     while node.now < time:
         now, end = node.now, time
+        # How much of the gap may be used at once depends on the rate of information, trace(P G).
         stretch = usable(information_rate(state.size, table, k, root, h))
         if stretch < time - now:
+            # A lower bound that is set once per gap, else an exploding P asks for ever shorter
+            # stretches.
             if node.least == 0.0:
                 node.least = SHORTEST_SHARE * (time - now)
             end = stretch_end(now, time, max(stretch, node.least))
+        # Only a stretch that ends inside a step cuts it and needs normals of each sensor.
         if end < last:
             for s in range(node.sensor, node.sensors):
                 if sensing.used[s] == sensing.normals.shape[1]:
                     return False
+        # The bound grows geometrically, so that a gap takes about a thousand stretches at most.
         node.least *= LONGER
+        # Predict first, with the moments of the reading used at the end: they belong to the whole
+        # stretch.
         move_root(table, k, root, xhat, h, end - now, state.flow_scratch)
         fill_moments(state, now, end)
+        # Share of what is left of the step; -1 takes all of it.
         share = (end - now) / (last - now) if end < last else -1.0
         step = path.step[piece]
         read_increments(
@@ -138,5 +156,6 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
         )
         gain_root(state.size, readings, gains, root, xhat, h, end - now, values)
         node.now = end
+    # The next gap sets its own bound.
     node.least = 0.0
     return True

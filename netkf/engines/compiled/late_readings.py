@@ -18,7 +18,7 @@ PAST = np.dtype(
 
 
 class History(Struct):
-    """What nodes keep so that late readings can be used: a pool ``past`` (P,) of things that
+    """The past of nodes, for the use of late readings: a pool ``past`` (P,) of things that
     happened, each with the instant of the reading that was used or the number of the frame that
     began (else -1), and the state right after it, ``x`` (P, n), ``root`` (P, n, n). ``newest`` (N,)
     of each node; ``free`` (2,) the first free one and how many are; ``offsets`` (F, n) of frames;
@@ -35,12 +35,14 @@ class History(Struct):
 
 
 def empty_history(state: Simulation, lag: float, capacity: int) -> History:
-    """What is known at the start."""
+    """Return a history of all nodes at time 0, with ``capacity`` free entries."""
     count, n = state.xhat.shape
     capacity = count + capacity
+    # The first entries are the states of all nodes at time 0, and the others are free.
     past = np.zeros(capacity, dtype=PAST)
     past["instant"] = past["frame"] = -1
     past["before"] = np.arange(1, capacity + 1)
+    # Nothing was before time 0.
     past["before"][:count] = -1
     x, root = np.zeros((capacity, n)), np.zeros((capacity, n, n))
     x[:count], root[:count] = state.xhat, state.root
@@ -55,6 +57,7 @@ def add_past(history: History, least: int) -> None:
     """Double the capacity of a history, or add ``least``."""
     old = len(history.past)
     more = max(old, least)
+    # Chain the new entries, and the former free list behind them.
     past = np.zeros(more, dtype=PAST)
     past["before"] = np.arange(old + 1, old + more + 1)
     past["before"][-1], history.free[0] = history.free[0], old
@@ -72,6 +75,7 @@ def use_instant(
     ``scale``^2 times.
     """
     given, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
+    # All sensors of the instant in one reading: R is block diagonal, and so is its root.
     for s in range(given.first[instant], given.first[instant + 1]):
         sensor, matrix = given.sensor[s], given.matrix[s]
         p = given.rows[sensor]
@@ -79,11 +83,13 @@ def use_instant(
             scratch.y[row + i] = given.y[s, i]
             for j in range(n):
                 scratch.H[row + i, j] = given.H[matrix, i, j]
+            # Zeros left of the diagonal block: an earlier instant may have left entries there.
             for j in range(row):
                 scratch.root_R[row + i, j] = 0.0
             for j in range(i + 1):
                 scratch.root_R[row + i, row + j] = scale * given.root[sensor, i, j]
         row += p
+    # One update with all rows, as the SimPy engine makes it.
     if row > 0:
         sample_root(root, x, k, scratch.y[:row], scratch.H, scratch.root_R, state.update_scratch)
 
@@ -101,6 +107,7 @@ def copy_state(
     """Copy place ``m`` to place ``k``."""
     for i in range(len(size)):
         x[k, i] = from_x[m, i]
+        # Only the lower triangle of a root is ever read.
         for j in range(i + 1):
             root[k, i, j] = from_root[m, i, j]
 
@@ -122,6 +129,7 @@ def remember(
 ) -> None:
     """Keep the state of node ``h`` after it used a reading, or a frame began."""
     k = take_past(history, time, instant, frame)
+    # Each node has a list of its past, the newest first.
     history.past[k].before = history.newest[h]
     history.newest[h] = k
     copy_state(state.size, history.x, history.root, k, state.xhat, state.root, h)
@@ -132,12 +140,14 @@ def forget(history: History, h: int, since: float) -> None:
     """Free all that no late reading can reach: what is before the last thing before ``since``."""
     past = history.past
     k = history.newest[h]
+    # The last event before ``since`` stays: a late reading starts from its state.
     while k != -1 and not past[k].time < since:
         k = past[k].before
     if k == -1:
         return
     gone = past[k].before
     past[k].before = -1
+    # Give back all that is older.
     while gone != -1:
         following = past[gone].before
         past[gone].before = history.free[0]
@@ -151,8 +161,10 @@ def use_reading(state: Simulation, history: History, h: int, instant: int) -> No
     """Use a reading of now."""
     use_instant(state, instant, state.root, state.xhat, h, 1.0)
     lag, time = history.lag, state.instants.t[instant]
+    # Without delays nothing is kept.
     if lag <= 0.0:
         return
+    # Once in each interval of length lag, so that forgetting costs little.
     if time // lag > history.past[history.newest[h]].time // lag:  # now and then
         forget(history, h, time - lag)
     remember(state, history, h, time, instant, -1)
@@ -163,13 +175,18 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
     """Go back to before the time of a reading, use it, and do again what came after it."""
     past, x, root, model = history.past, history.x, history.root, state.nodes[h].model
     time = state.instants.t[instant]
+    # Go back: entries after the reading's time are reversed into the list ``again``. Times that
+    # differ by rounding count as equal.
     again, k = -1, history.newest[h]
     while past[k].time > time + SAME * now and past[k].before != -1:
         before = past[k].before
         past[k].before = again
         again, k = k, before
+    # The late reading becomes an entry of its own at its place in time.
     before, k = k, take_past(history, time, instant, -1)
     past[k].before = before
+    # Go forward again: predict from the entry before, use the reading or move the origin, and store
+    # the state.
     while True:
         copy_state(state.size, x, root, k, x, root, before)
         if past[k].time > past[before].time:
@@ -177,6 +194,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
             move_root(state.table, model, root, x, k, gap, state.flow_scratch)
         if past[k].instant >= 0:
             use_instant(state, past[k].instant, root, x, k, 1.0)
+        # A frame that began since then: estimates count from its origin afterwards.
         if past[k].frame >= 0:
             for i in range(x.shape[1]):
                 x[k, i] += history.offsets[past[k].frame, i]
@@ -186,6 +204,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
         past[k].before = before
     history.newest[h] = k
     copy_state(state.size, state.xhat, state.root, h, x, root, k)
+    # From the last event to now.
     if now > past[k].time:
         gap = now - past[k].time
         move_root(state.table, model, state.root, state.xhat, h, gap, state.flow_scratch)

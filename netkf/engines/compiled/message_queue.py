@@ -10,7 +10,8 @@ from netkf.linalg.compiling import kernel
 
 @kernel
 def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
-    """Whether message ``a`` arrives before ``b``: by time, directed link, order of sending."""
+    """Return True if message ``a`` arrives before ``b``: by time, directed link, order sent."""
+    # Never by insertion: the order must be that of the SimPy engine.
     one, other = pool[a], pool[b]
     if one.arrival != other.arrival:
         return bool(one.arrival < other.arrival)
@@ -22,6 +23,7 @@ def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
 @kernel
 def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
     """Put a message on the heap of ``size``."""
+    # A binary heap of places in the pool: sift up. heapq would need Python objects.
     k = size
     while k > 0 and arrives_first(pool, message, heap[(k - 1) // 2]):
         heap[k] = heap[(k - 1) // 2]
@@ -32,6 +34,7 @@ def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
 @kernel
 def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
     """Take the next message off the heap of ``size``."""
+    # Sift the last entry down from the top.
     top, moved, k = heap[0], heap[size - 1], 0
     while 2 * k + 1 < size - 1:
         child = 2 * k + 1
@@ -48,6 +51,7 @@ def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
 @kernel
 def take(state: Simulation) -> int:
     """Take a free message from the pool."""
+    # The free messages are a linked list: a stack, so that recently used memory comes first.
     message = state.free
     state.free = state.pool[message].next
     state.free_count -= 1
@@ -70,17 +74,23 @@ def put(state: Simulation, h: int, message: int) -> None:
     nodes, ways, pool, newest_only = state.nodes, state.ways, state.pool, state.kind != READINGS
     node, peer = nodes[h], ways[pool[message].way].sender
     before, here = -1, node.inbox
+    # Inboxes are linked lists, with the last one known: a message from a later sender goes to the
+    # end.
     if here != -1 and ways[pool[node.last].way].sender < peer:  # mostly they come in order
         before, here = node.last, -1
     while here != -1:
         other = ways[pool[here].way].sender
+        # Before the first message of a later sender, and in place of one of this sender if the
+        # newest counts.
         if other > peer or (other == peer and newest_only):
             break
         before, here = here, pool[here].next
     if here != -1 and ways[pool[here].way].sender == peer:
+        # An older message than the one that is there brings nothing.
         if pool[message].sent < pool[here].sent:
             release(state, message)
             return
+        # The newer message takes the place of the older one.
         gone, here = here, pool[here].next
         release(state, gone)
     pool[message].next = here
@@ -88,6 +98,7 @@ def put(state: Simulation, h: int, message: int) -> None:
         node.inbox = message
     else:
         pool[before].next = message
+    # The end of the list moved.
     if here == -1:
         node.last = message
 

@@ -21,23 +21,27 @@ def move_origin(
     what the plant makes of it since that was sent.
     """
     now = float(state.frames[k])
+    # Covariances stay: only means refer to an origin.
     state.xhat[:] += offset
     if totals is not None:
         _move_totals(scenario, state, totals, now, offset)
+    # A late reading that goes back over this time must move the origin again on its way forward.
     if history is not None and history.lag > 0.0:
         history.offsets[k] = offset
         for h in range(len(state.nodes)):
             remember(state, history, h, now, -1, k)
+    # Totals were moved above, and readings stay in the coordinates of their own time.
     if totals is not None or state.kind == READINGS:
         return
     for m in state.heap[: state.flying]:
+        # An estimate under way is of the time it was sent: the offset is moved back to then.
         state.pool_x[m] += scenario.moved_back(offset, now - state.pool["sent"][m])
 
 
 def _move_totals(
     scenario: Scenario, state: Simulation, totals: Totals, now: float, offset: FloatArray
 ) -> None:
-    """``u`` by ``U offset`` wherever there is one, in coordinates of the time that it refers to."""
+    """Move every ``u`` by ``U offset``, in coordinates of the time that it refers to."""
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
             _shift(values[k], scenario.moved_back(offset, now - time))
@@ -47,4 +51,5 @@ def _move_totals(
 
 def _shift(total: FloatArray, offset: FloatArray) -> None:
     n = len(offset)
+    # u = U x: it moves by U times the move of x.
     total[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset

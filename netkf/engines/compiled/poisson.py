@@ -76,21 +76,28 @@ def draw_ticks(
     them and their outcomes. False where the room ended first.
     """
     coming, first, count = drawing.coming, drawing.first, len(drawing.first) - 1
+    # Entity by entity, each from its own stream; the order of time is made afterwards.
     for e in range(count):
         k = run * count + e
         while coming[k] < end:
+            # The room is checked before a tick is written, so that a stop leaves the streams where
+            # they are for this tick.
             if used[0] == len(found.t) or used[1] + first[e + 1] - first[e] > len(found.delay):
                 return False
             found.t[used[0]], found.entity[used[0]], found.at[used[0]] = coming[k], e, used[1]
             luck, drawn = 0.0, -1
+            # One uniform number for each source of outcomes: directions that share a source follow
+            # one another.
             for m in range(first[e], first[e + 1]):
                 w = drawing.hearing[m]
                 if drawing.streams > 0 and drawing.source[w] != drawn:
                     drawn = drawing.source[w]
+                    # The number is below 1, so that a link with probability 1 never loses.
                     luck = next_unit(drawing.luck, run * drawing.streams + drawn)
                 found.delay[used[1]] = delay if luck < drawing.chance[w] else LOST
                 used[1] += 1
             used[0] += 1
+            # The next tick is drawn now: it may lie in the next window.
             gap: float = next_exponential(drawing.ticks, k, exponential)
             coming[k] += gap / drawing.rate[k]
     return True
@@ -103,7 +110,9 @@ def put_in_time_order(
     """Write the first ``count`` ticks, which lie in [begin, end), in the order of (time, entity);
     ``place`` (count + 1,) is room to work in.
     """
+    # Ticks are evenly spread, hence about one in each of ``count`` equal stretches.
     scale = count / (end - begin)
+    # Counting sort by stretch: count, sum up, and place.
     for m in range(count + 1):
         place[m] = 0
     for m in range(count):
@@ -112,10 +121,13 @@ def put_in_time_order(
         place[m + 1] += place[m]
     t, entity, at = ordered.t, ordered.entity, ordered.at
     for m in range(count):
+        # place[k] is where the next tick of stretch k goes.
         k = min(int((found.t[m] - begin) * scale), count - 1)
         to = place[k]
         place[k] += 1
         t[to], entity[to], at[to] = found.t[m], found.entity[m], found.at[m]
+    # Insertion sort mends the order inside stretches, in linear time on average, as few share one.
+    # It is by (time, entity): ties keep the order of entities.
     for m in range(1, count):
         now, which, where = t[m], entity[m], at[m]
         to = m
@@ -159,12 +171,14 @@ def draw_all_ticks(
             return False
         first, begin = ticks.first[run], ticks.first_delay[run]
         last, end = first + used[0], begin + used[1]
+        # The arrays are too small for this run: the caller starts again with more space.
         if last > len(ticks.t) or end > len(ticks.delay):
             return False
         ordered = Found(
             ticks.t[first:last], ticks.entity[first:last], ticks.at[first:last], found.delay
         )
         put_in_time_order(0.0, horizon, used[0], found, ordered, place)
+        # ``at`` counts within the run, so that outcomes are copied without a change.
         for k in range(used[1]):
             ticks.delay[begin + k] = found.delay[k]
         ticks.first[run + 1], ticks.first_delay[run + 1] = last, end
@@ -172,7 +186,7 @@ def draw_all_ticks(
 
 
 def is_poisson(scenario: Scenario) -> bool:
-    """Whether the schedules of a scenario can be made so."""
+    """Return True if kernels can draw the schedules of a scenario."""
     network = scenario.network
     talks = scenario.hosted.talks and bool(scenario.topology.links)
     return talks and type(network.activation) is Poisson and plain(network.channel)
@@ -188,6 +202,7 @@ class PoissonSchedules:
         senders = senders_of(scenario) if senders is None else senders
         assert isinstance(clock, LinkClock)
         ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs
+        # No states where nothing is random: draw_ticks() then draws no number.
         luck: np.ndarray = np.empty((0, 4), dtype=np.uint64)
         if not scenario.network.channel.loss.deterministic:
             luck = StreamBatch(streams, "loss", senders.sources).states
@@ -203,20 +218,24 @@ class PoissonSchedules:
             source=senders.source,
             chance=delivery_chances(scenario, senders.ways),
         )
+        # The first tick of each entity, unit exponentials over its rate.
         self._drawing.coming[:] /= self._drawing.rate
         self._runs, self._rate = runs, float(rates.sum())
+        # Mean number of messages for each tick.
         self._sends = float(rates @ np.diff(senders.first)) / self._rate
         self._most = int(np.diff(senders.first).max())
         self._delay = float(scenario.network.channel.delay.fixed or 0.0)
         self._horizon, self._length = scenario.horizon, math.inf
         if self._rate > 0.0:
             entities = len(senders.entities)
+            # A window of some thousand ticks, more of them where there are many links.
             self._length = max(TICKS, min(TICKS_A_LINK * entities, MOST_TICKS)) / self._rate
         self._end, self._found = 0.0, _room(0, 0)
 
     def following(self) -> Window:
         """The next window of one run; its end is infinite where nothing comes after it."""
         begin, end = self._end, self._end + self._length
+        # The last window has no end, so that the loop asks for no other.
         if not begin < end < self._horizon:
             end = math.inf
         self._end = end
@@ -225,7 +244,10 @@ class PoissonSchedules:
     def whole(self) -> AllTicks:
         """All ticks of all runs."""
         states = self._drawing.coming, self._drawing.ticks, self._drawing.luck
+        # Streams as they are now: a try without enough space begins with them again.
         begun = [state.copy() for state in states]
+        # A Poisson count exceeds its mean by eight standard deviations with a negligible chance,
+        # and even then the loop only tries again.
         expected, spread = self._rate * self._horizon, 8.0
         while True:
             most = int(expected + spread * math.sqrt(expected)) + 8
@@ -251,11 +273,13 @@ class PoissonSchedules:
         last, used = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         expected = self._rate * (last - begin)
         ticks = int(expected + 8.0 * math.sqrt(expected)) + 8
+        # The same bound for one window.
         sends = int(self._sends * ticks) + self._most
         while True:
             self._make_room(ticks, sends, used)
             if draw_ticks(self._drawing, run, last, self._delay, ziggurat(), self._found, used):
                 break
+            # What was found so far stays: drawing goes on where it stopped.
             ticks, sends = 2 * ticks, 2 * sends
         count = int(used[0])
         ordered = _room(count, 0)._replace(delay=self._found.delay[: used[1]].copy())
@@ -264,6 +288,7 @@ class PoissonSchedules:
         return Window(end, *ordered)
 
     def _make_room(self, ticks: int, sends: int, used: np.ndarray) -> None:
+        # The room only grows.
         if len(self._found.t) >= ticks and len(self._found.delay) >= sends:
             return
         larger = _room(ticks, sends)
@@ -282,6 +307,7 @@ def all_ticks(scenario: Scenario, streams: ReplicaStreams) -> AllTicks:
     """All ticks of several runs."""
     if is_poisson(scenario):
         return PoissonSchedules(scenario, streams).whole()
+    # Any other clock or channel: windows made in Python, joined run after run.
     windows = whole_schedules(scenario, streams)
     first, first_delay = (
         np.cumsum([0, *(len(getattr(window, name)) for window in windows)])

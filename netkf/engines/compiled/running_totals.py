@@ -85,14 +85,17 @@ def fill_inverse(totals: Totals, gap: float) -> None:
     A, out, term, moved = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
     n, norm = len(A), 0.0
     for i in range(n):
+        # The largest row sum of |A| gap bounds the norm of the series.
         row = 0.0
         for j in range(n):
             row += abs(A[i, j]) * gap
             out[i, j] = term[i, j] = 1.0 if i == j else 0.0
         norm = max(norm, row)
+    # exp(-A g) = exp(-A g / 2^k)^(2^k): scaling and squaring.
     halvings, step = 0, -gap
     while norm > 0.5:
         norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
+    # A norm of 0 leaves the identity.
     for k in range(1, TERMS if norm > 0.0 else 1):
         multiply(moved, term, A)
         for i in range(n):
@@ -111,8 +114,10 @@ def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
     """``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` of row ``k``, ``gap`` seconds later."""
     if not gap > 0.0:
         return
+    # Phi^-1 = exp(-A gap); information moves by Phi^-T from the left and by Phi^-1 from the right.
     fill_inverse(totals, gap)
     inverse, half, moved = totals.scratch[0], totals.scratch[1], totals.scratch[2]
+    # Forgetting multiplies information by s = exp(-2 f gap).
     n, fading = len(inverse), math.exp(-2.0 * totals.forgetting * gap)
     for i in range(n):
         for j in range(n):
@@ -140,21 +145,27 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
     receivers, n, weight = totals.receivers[h], state.xhat.shape[1], totals.weight[h]
     if receivers == 0:
         return False
+    # The node's own total is brought to now before it grows.
     move_total(totals, totals.sent, h, now - totals.sent_at[h])
     totals.sent_at[h] = now
     totals.rounds[h] += 1
     inverse, U, sent = totals.scratch[0], totals.scratch[1], totals.sent
     # The node gives up exactly what its total grows by, for each receiver, or nothing.
     before, share = sent[h, 0], weight / (receivers + 1)
+    # Exact in floating point: the total in fact grows by ``grown``, which may differ from
+    # ``share``.
     grown = (before + share) - before
+    # The share has become rounding beside the total: sending it would lose mass.
     if abs(grown - share) > MIN_ACCURACY * share:
         return True
+    # P^-1 = S^-T S^-1.
     fill_inverse_root(inverse, state.root, h)
     for i in range(n):
         for j in range(n):
             total = 0.0
             for r in range(max(i, j), n):
                 total += inverse[r, i] * inverse[r, j]
+            # U = w / N P^-1 and u = U xhat.
             U[i, j] = weight / len(state.nodes) * total
             sent[h, 1 + i * n + j] += U[i, j] / (receivers + 1)
     for i in range(n):
@@ -163,6 +174,7 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
             total += U[i, j] * state.xhat[h, j]
         sent[h, 1 + n * n + i] += total / (receivers + 1)
     sent[h, 0] = before + share
+    # Conserved: the node gives up as often as a receiver will gain.
     totals.weight[h] -= receivers * grown
     return True
 
@@ -183,21 +195,27 @@ def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
 def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
     """Gain what each total grew by since it was heard last; an older one brings nothing."""
     gained, pool, heard, offered = totals.gained, state.pool, totals.heard, totals.offered
+    # Two passes over the inbox: gains first, because nothing is remembered if the mass did not
+    # grow.
     for j in range(len(gained)):
         gained[j] = 0.0
     m = state.nodes[h].inbox
     while m != -1:
         message = pool[m]
         w = message.way
+        # A total of a later round contains all earlier ones: only growth since then counts.
         if message.tag > totals.number[w]:
+            # Both totals are brought to now before they are compared.
             move_total(totals, offered, m, now - message.sent)
             move_total(totals, heard, w, now - totals.heard_at[w])
             totals.heard_at[w] = now
             for j in range(len(gained)):
                 gained[j] += offered[m, j] - heard[w, j]
         m = message.next
+    # Rounding, or old totals only.
     if not gained[0] > 0.0:
         return
+    # Now remember what was heard, so that it is not gained again.
     m = state.nodes[h].inbox
     while m != -1:
         message = pool[m]
@@ -206,6 +224,7 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
             for j in range(len(gained)):
                 heard[message.way, j] = offered[m, j]
         m = message.next
+    # The weight of the node grows by what it gained, and P^-1 becomes the weighted mean.
     weight = totals.weight[h] + gained[0]
     size = math.sqrt(weight / totals.weight[h])
     totals.weight[h] = weight
@@ -219,9 +238,11 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
     """
     root, gained, n = state.root, totals.gained, state.xhat.shape[1]
     inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
+    # S sqrt(w+ / w): the root of P with P^-1 scaled by w / w+.
     for i in range(n):
         for j in range(i + 1):
             root[h, i, j] *= size
+    # inner = I + share S' U S, with U symmetrised.
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -234,6 +255,7 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
             for r in range(i, n):
                 total += root[h, r, i] * half[r, j]
             inner[i, j] = 0.5 * share * total + (1.0 if i == j else 0.0)
+    # By eigenvalues, because U is a difference of sums and may be indefinite by rounding.
     diagonalise(inner, vectors)
     shrink_root(state, h, inner, vectors)
     move_by_gain(state, h, gained, share, totals.scratch[3, 0])
@@ -248,7 +270,9 @@ def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArr
             total = 0.0
             for r in range(i + 1):
                 total += root[h, i, r] * vectors[r, j]
+            # Eigenvalues below 1 would add covariance: information cannot be negative.
             F[i * n + j] = total / math.sqrt(max(values[j, j], 1.0))
+    # The new root is I times F, made triangular by Householder's reflections.
     for i in range(n):
         for j in range(i + 1):
             root[h, i, j] = 1.0 if i == j else 0.0
@@ -261,6 +285,7 @@ def move_by_gain(
 ) -> None:
     """``xhat += P share (u - U xhat)``; ``news`` (n,) is a scratch array."""
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
+    # N / w (u - U xhat): the innovation in terms of information.
     for i in range(n):
         total = gained[1 + n * n + i]
         for j in range(n):
@@ -271,6 +296,7 @@ def move_by_gain(
         for i in range(j, n):
             total += root[h, i, j] * news[i]
         news[j] = total
+    # S (S' news) = P news.
     for i in range(n):
         for j in range(i + 1):
             xhat[h, i] += root[h, i, j] * news[j]
@@ -285,10 +311,12 @@ def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
     for i in range(n):
         for j in range(n):
             vectors[i, j] = 1.0 if i == j else 0.0
+    # Cyclic sweeps converge quadratically: few are needed.
     for _ in range(SWEEPS):
         turned = False
         for p in range(n):
             for q in range(p + 1, n):
+                # Relative to both diagonal entries, so that small eigenvalues are accurate too.
                 if a[p, q] * a[p, q] > SMALL * abs(a[p, p] * a[q, q]):
                     turned = True
                     rotate(a, vectors, p, q)
@@ -299,6 +327,7 @@ def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
 @kernel
 def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
     """Turn rows and columns p and q so that ``a[p, q]`` becomes 0."""
+    # The smaller of both angles: |t| <= 1.
     n, tilt = len(a), 0.5 * (a[q, q] - a[p, p]) / a[p, q]
     t = 1.0 / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))
     if tilt < 0.0:
@@ -308,6 +337,7 @@ def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
     for k in range(n):
         one, other = a[k, p], a[k, q]
         a[k, p], a[k, q] = c * one - s * other, s * one + c * other
+    # Then the rows: a <- J' a J.
     for k in range(n):
         one, other = a[p, k], a[q, k]
         a[p, k], a[q, k] = c * one - s * other, s * one + c * other
@@ -319,5 +349,6 @@ def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
 @kernel
 def add_reading(state: Simulation, totals: Totals, h: int, instant: int) -> None:
     """``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms of P^-1."""
+    # R scaled by w / N: the information counts N / w times in P^-1.
     scale = math.sqrt(totals.weight[h] / len(state.nodes))
     use_instant(state, instant, state.root, state.xhat, h, scale)

@@ -35,9 +35,12 @@ class SampleTables:
     ) -> None:
         placed = [(n, place) for n, some in scenario.sampled_sensors.items() for place in some]
         counts = [len(times[node, place.ordinal]) for node, place in placed]
+        # All samples of all sensors in one list, sensor by sensor.
         t = np.concatenate([np.empty(0), *(times[n, place.ordinal] for n, place in placed)])
         sensor = np.repeat(np.arange(len(placed)), counts)
+        # Sorted by (time, sensor), the order in which one update stacks them.
         order = np.lexsort((sensor, t))
+        # The inverse permutation: where the samples of each sensor have gone.
         back = np.empty(len(t), dtype=np.int64)
         back[order] = np.arange(len(t))
         cuts = np.cumsum(counts)[:-1]
@@ -57,10 +60,12 @@ class SampleTables:
         """
         given = self.instants
         for sensor in self._sensors:
+            # (after, until]: a time at the border of two blocks is read once.
             first, last = np.searchsorted(sensor.times, [after, until], side="right")
             if first == last:
                 continue
             here = sensor.times[first:last]
+            # The state at each sample; ``times`` contains all of them.
             x = states[np.searchsorted(times, here)]
             y, H = sensor.samples.several(range(first, last), x)
             places, p = sensor.places[first:last], y.shape[1]
@@ -79,13 +84,16 @@ def _instants(
     rows = np.array([len(R) for _, R in parts], dtype=np.int64)
     most = int(rows.max(initial=1))
     root, H = np.zeros((len(parts), most, most)), np.zeros((len(parts), most, n))
+    # The Cholesky factor of the R that filters believe, once for each sensor.
     for k, (part, R) in enumerate(parts):
         root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.H
+    # Sensors whose H varies get a matrix for each sample, behind the fixed ones.
     own = np.array([part.varying for part, _ in parts], dtype=bool)
     matrix, varying = sensor.copy(), own[sensor] if parts else np.zeros(0, dtype=bool)
     matrix[varying] = len(parts) + np.arange(int(varying.sum()))
     H = np.concatenate([H, np.zeros((int(varying.sum()), most, n))])
     whose = host[sensor] if parts else sensor
+    # Samples of one node at one time are one instant, and one update.
     begins = np.ones(len(t), dtype=bool)
     begins[1:] = (np.diff(t) != 0.0) | (np.diff(whose) != 0)
     first = np.flatnonzero(begins)

@@ -62,6 +62,7 @@ class Ticks(NamedTuple):
 
     def chosen(self, which: np.ndarray, sizes: np.ndarray) -> Ticks:
         """Those in some places, where a tick of entity e has ``sizes[e]`` outcomes."""
+        # Outcomes lie tick after tick: the places of those that are chosen, in their new order.
         sent = sizes[self.entity]
         first, count = (np.cumsum(sent) - sent)[which], sent[which]
         begin = np.cumsum(count) - count
@@ -91,10 +92,12 @@ class Clocks:
         self._clock, self._entities, self._horizon = clock, entities * runs, scenario.horizon
         count = len(self._entities)
         self.last, self.drawn = np.zeros(count), np.zeros(count, dtype=np.int64)
+        # Poisson clocks are drawn for all entities at once; others one by one in Python.
         self._all_poisson = type(clock) is Poisson
         self._rates = self._origins = np.empty(0)
         if isinstance(clock, LinkClock) and self._all_poisson:
             self._draws = StreamBatch(streams, "clock", entities)
+            # Entities of several runs follow one another, run by run.
             self._rates = np.tile([clock.mean_rate(entity) for entity in entities], runs)
         elif isinstance(clock, LinkClock):
             self._random = streams.generators("clock", entities)
@@ -116,22 +119,27 @@ class Clocks:
         else:
             drawn = [self._ticks(k, count) for k, count in zip(places, counts, strict=True)]
             asked = np.array([len(t) for t in drawn])
+            # Rows of different lengths are padded with infinity.
             times = np.full((len(places), max(asked.max(), 1)), np.inf)
             for row, t in zip(times, drawn, strict=True):
                 row[: len(t)] = t
+        # The horizon is half open.
         kept = times < self._horizon
         got = kept.sum(axis=1)
         self.drawn[places] += asked
+        # Fewer than asked for lie before the horizon: this entity has ended.
         ended = (asked == 0) | (got < asked)
         self.last[places] = np.where(ended, np.inf, times[np.arange(len(places)), asked - 1])
         return times[kept], got
 
     def _exponential(self, places: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """As ``Poisson.ticks`` for all at once; infinite where an entity has fewer."""
+        """Times (E, count) of the next ticks, see ``Poisson.ticks``; infinite beyond the counts."""
         times = np.full((len(places), counts.max() + 1), np.inf)
         times[:, 0] = self.last[places]
+        # Exponential gaps over the rate, one batch for all streams.
         gaps = self._draws.exponentials(places, counts) / np.repeat(self._rates[places], counts)
         times[:, 1:][np.arange(times.shape[1] - 1) < counts[:, None]] = gaps
+        # Accumulated from the last tick, in the same order of additions as tick by tick.
         return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
 
     def _ticks(self, k: int, count: int) -> FloatArray:
@@ -143,7 +151,7 @@ class Clocks:
 
 
 def plain(channel: Channel) -> bool:
-    """Whether each directed link has one chance and all messages one delay."""
+    """Return True if each directed link has one probability and all messages one delay."""
     delay = channel.delay
     fixed = delay.fixed is not None and not delay.is_random and not delay_depends_on_message(delay)
     return fixed and identical_per_link(channel.loss)
@@ -158,7 +166,7 @@ def delivery_chances(scenario: Scenario, ways: tuple[Link, ...]) -> FloatArray:
 
 
 class Outcomes:
-    """What becomes of all messages, run by run, activation after activation of each entity."""
+    """Outcomes of all messages, run by run, activation after activation of each entity."""
 
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
@@ -170,8 +178,10 @@ class Outcomes:
         self._count, self._sources = len(senders.entities), len(senders.sources)
         self._measured = np.array([scenario.table_probability(way) for way in senders.ways])
         self._identical, self._plain = identical_per_link(channel.loss), plain(channel)
+        # Probabilities that depend on the link only are tabulated.
         if self._identical:
             self._chances = delivery_chances(scenario, senders.ways)
+        # Channels with memory or random delays keep a sampler for each stream.
         if not self._plain:
             self._fates = [
                 ChannelSampler(channel, partial(_stream, made, source))
@@ -182,6 +192,7 @@ class Outcomes:
                 for source in senders.sources
             ]
         elif not channel.loss.deterministic:
+            # A batch of streams draws for all links at once.
             self._luck = StreamBatch(streams, "loss", senders.sources)
         self.sizes = np.tile(np.diff(senders.first), runs)
 
@@ -194,13 +205,16 @@ class Outcomes:
         out = np.empty(int((counts * sizes).sum()))
         begin = np.cumsum(counts * sizes) - counts * sizes
         drawn: tuple[np.ndarray, ...] = ()
+        # The k-th directed link of all entities that have one, so that each pass is vectorised.
         for k in range(int(sizes.max(initial=0))):
             some = sizes > k
             ways = self._hearing[self._first[entity[some]] + k]
             count = counts[some]
+            # With a symmetric channel the second direction of a link takes the draws of the first.
             if not drawn or not self._senders.shared:
                 sources = runs[some] * self._sources + self._senders.source[ways]
                 drawn = self._draw(sources, count)
+            # Place of each outcome: tick after tick, and inside a tick in the order of its links.
             step = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
             to = np.repeat(begin[some] + k, count) + step * np.repeat(sizes[some], count)
             out[to] = self._delays(ways, count, first[some], *drawn)
@@ -213,8 +227,10 @@ class Outcomes:
             parts = [self._fates[k].draws(n) for k, n in zip(sources, counts.tolist(), strict=True)]
             columns = zip(*parts, strict=True)
             return tuple(np.concatenate([np.empty(0), *column]) for column in columns)
+        # A broadcast view: one delay for all.
         delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
         certain = self._channel.loss.deterministic
+        # 0 is below every positive probability: nothing is lost where nothing is random.
         luck = np.zeros(total) if certain else self._luck.units(sources, counts)
         return luck, np.zeros(total, dtype=bool), delay
 
@@ -241,6 +257,7 @@ class Outcomes:
         self, ways: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0
+        # Probabilities that may depend on the state of the link and on the number of the message.
         for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
             part = slice(done, done + count)
             way, measured = self._senders.ways[w], float(self._measured[w])
@@ -258,6 +275,7 @@ class Outcomes:
     ) -> FloatArray:
         model, out, k = self._channel.delay, np.array(delay), 0
         for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
+            # A delay is asked only for messages that arrive.
             for message in range(number, number + count):
                 if not lost[k]:
                     way = self._senders.ways[w]
@@ -278,6 +296,7 @@ class EntityDraws:
         self._clocks = Clocks(scenario, streams, senders)
         self._outcomes = Outcomes(scenario, streams, senders)
         self.sizes = self._outcomes.sizes
+        # Longer blocks cost less for each tick, but must not make too many at once.
         self._longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(self.count, 1)))
         self._block = np.full(self.count, FIRST_BLOCK)
 
@@ -289,12 +308,14 @@ class EntityDraws:
     @property
     def rate(self) -> float:
         """Ticks a second of all together, as far as they are known."""
+        # Measured: ticks so far over the time of the last.
         return float((self._clocks.drawn / self.last).sum())
 
     def more(self, places: np.ndarray) -> Ticks:
         """A block of ticks of each of these entities (places, in order)."""
         first = self._clocks.drawn[places]
         t, counts = self._clocks.more(places, self._block[places])
+        # Blocks double: an entity with few ticks draws few.
         self._block[places] = np.minimum(2 * self._block[places], self._longest)
         return Ticks(t, np.repeat(places, counts), self._outcomes.of(places, counts, first))
 
@@ -311,24 +332,30 @@ class Schedule:
     ) -> None:
         senders = senders_of(scenario) if senders is None else senders
         self._draws = draws = EntityDraws(scenario, streams, senders)
+        # About so many ticks in a window.
         wanted = min(max(TICKS_A_LINK * draws.count, LEAST_TICKS), MOST_TICKS)
         self._horizon, self._end = scenario.horizon, 0.0
         self._known = draws.more(np.arange(draws.count)) if draws.count else NO_TICKS
+        # The rate of the first blocks decides the length of all windows.
         self._length = wanted / draws.rate if draws.rate > 0.0 else math.inf
 
     def following(self) -> Window:
         """The next window; its end is infinite where nothing comes after it."""
         end, draws = self._end + self._length, self._draws
+        # The last window has no end, so that the loop asks for no other.
         if not self._end < end < self._horizon:
             end = math.inf
         self._end = end
         parts = [self._known]
+        # An entity's ticks are complete up to ``end`` once its last known tick is beyond it.
         while len(late := np.flatnonzero(draws.last < end)):
             parts.append(draws.more(late))
         known = _joined(parts)
         now = known.t < end
+        # Ticks beyond the end wait for the next window.
         self._known = known.chosen(np.flatnonzero(~now), draws.sizes)
         order = np.flatnonzero(now)
+        # Sorting by time alone is faster; ties are rare, and only then entities matter.
         order = order[np.argsort(known.t[order])]
         if (np.diff(known.t[order]) == 0.0).any():
             order = order[np.lexsort((known.entity[order], known.t[order]))]
@@ -355,12 +382,15 @@ class ReadingsSchedule:
     def following(self) -> Window:
         """The next window; its end is infinite where nothing comes after it."""
         begin, sizes = self._begin, self._outcomes.sizes
+        # As many instants as have about MOST_TICKS messages; a node without receivers counts as
+        # one.
         sent = np.cumsum(np.maximum(sizes[self._host[begin:]], 1))
         stop = begin + int(np.searchsorted(sent, MOST_TICKS))
         while 0 < stop < len(self._t) and self._t[stop] == self._t[stop - 1]:
             stop += 1  # an instant is in one window
         self._begin = stop
         t, host = self._t[begin:stop], self._host[begin:stop]
+        # Outcomes are drawn entity by entity, and put back into the order of time.
         places, counts = np.unique(host, return_counts=True)
         delay = self._outcomes.of(places, counts, self._sent[places])
         self._sent[places] += counts
@@ -379,16 +409,19 @@ def whole_schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]
     if not draws.count:
         return [NO_TICKS.window(math.inf, draws.sizes)] * runs
     parts = [NO_TICKS]
+    # All ticks up to the horizon: an entity whose last tick is infinite has ended.
     while len(late := np.flatnonzero(draws.last < math.inf)):
         parts.append(draws.more(late))
     known, count = _joined(parts), draws.count // runs
     run, entity = np.divmod(known.entity, count)
+    # By run, then by (time, entity), as within one run.
     order = np.lexsort((entity, known.t, run))
     known = known.chosen(order, draws.sizes)
     cuts = np.concatenate([[0], np.cumsum(np.bincount(run, minlength=runs))])
     windows = []
     for k in range(runs):
         mine = known.chosen(np.arange(cuts[k], cuts[k + 1]), draws.sizes)
+        # Entities are numbered within the run again.
         mine = mine._replace(entity=mine.entity - k * count)
         windows.append(mine.window(math.inf, draws.sizes))
     return windows

@@ -29,13 +29,14 @@ class Senders(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """Whether both ways of a link share outcomes."""
+        """Return True if both directions of a link share outcomes."""
         return len(self.sources) < len(self.ways)
 
 
 def senders_of(scenario: Scenario) -> Senders:
-    """Nobody where the filter does not talk."""
+    """Return who transmits over which directed links; nobody if the filter does not talk."""
     topology, clock = scenario.topology, scenario.network.activation
+    # Slots have no link clock: nobody is woken by one.
     if not scenario.hosted.talks or not isinstance(clock, LinkClock):
         none = np.zeros(0, dtype=np.int64)
         return Senders("links", (), (), np.zeros(1, dtype=np.int64), none, (), none)
@@ -43,13 +44,16 @@ def senders_of(scenario: Scenario) -> Senders:
         return _links(topology.links, topology.directed, scenario.network.channel.symmetric)
     ways = topology.directions
     each = np.arange(len(ways))
+    # Each direction has a clock, and sends on itself only.
     if clock.at == "directions":
         first = np.arange(len(ways) + 1)
         return Senders(clock.at, ways, ways, first, each, ways, each)
+    # Nodes have clocks: each sends on all directed links that leave it.
     senders = np.array([topology.index[i] for i, _ in ways], dtype=np.int64)
     counts = np.bincount(senders, minlength=len(topology.nodes))
     first = np.concatenate([[0], np.cumsum(counts)])
     entities = tuple((node,) for node in topology.nodes)
+    # Stable, so that the links of a node keep the order in which messages arrive.
     hearing = np.argsort(senders, kind="stable")
     return Senders(clock.at, entities, ways, first, hearing, ways, each)
 
@@ -58,9 +62,12 @@ def _links(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
     if directed:
         each = np.arange(len(links))
         return Senders("links", links, links, np.arange(len(links) + 1), each, links, each)
+    # Both directions of a link are neighbours, forth and back, so that 2 k and 2 k + 1 belong to
+    # link k.
     ways = tuple(way for i, j in links for way in ((i, j), (j, i)))
     each = np.arange(len(ways))
     first = np.arange(0, len(ways) + 1, 2)
+    # Both directions share the stream of their link.
     if symmetric:
         return Senders("links", links, ways, first, each, links, each // 2)
     return Senders("links", links, ways, first, each, ways, each)

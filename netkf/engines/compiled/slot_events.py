@@ -51,8 +51,10 @@ class Direction:
         )
 
     def draws(self) -> Iterator[Draw]:
-        """What is drawn for its activations, one after the other."""
+        """Yield (uniform number, bad state, delay) of its activations, one after the other."""
         while True:
+            # Draws come in blocks, and are handed out one by one: the numbers do not depend on the
+            # block.
             columns = self._sampler.draws(DRAWN_TOGETHER)
             yield from zip(*(column.tolist() for column in columns), strict=True)
 
@@ -87,10 +89,12 @@ class SlotEvents:
         ]
         self._places = {way.ends: way.place for way in self._directions}
         ways, own = setup.ways, setup.streams
+        # Directions of a link are neighbours; a directed graph has one of them.
         pairs = [way.ends for way in self._directions[::ways]]
         self._ways = {
             link: self._directions[k * ways : (k + 1) * ways] for k, link in enumerate(pairs)
         }
+        # With a symmetric channel only the first direction of a link draws.
         self._draws = {
             link: [way.draws() for way in both[:own]] for link, both in self._ways.items()
         }
@@ -110,8 +114,10 @@ class SlotEvents:
         while self._slot < setup.slots:
             made.append(self._one_slot())
             self._slot += 1
+            # Where nodes fall silent the kernel must have seen this slot before the next is made.
             if setup.silences or len(self._rows) >= rows:
                 break
+        # Messages that are still under way after the last slot may be delivered or late.
         if self._slot == setup.slots:
             self._noted = True
             self._arrivals(math.inf)
@@ -122,9 +128,12 @@ class SlotEvents:
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
         start = self._scenario.slot_plant.slot_time(slot)
         sampled = bool(np.isin(slot, setup.samples))
+        # First what arrived since the slot before, at the latest at this very time.
         self._arrivals(start)
+        # Filters that predict are sampled at the beginning of the slot, the others at its end.
         if sampled and algorithm.predicts:
             self._rows.append(None)
+        # At the horizon only the sample matters: no events.
         self._noted = slot < setup.last
         if self._noted or not algorithm.predicts:
             self._stages(slot, start, up)
@@ -139,12 +148,14 @@ class SlotEvents:
         now = start
         for step, phase, end in zip(*(c.tolist() for c in self._setup.stages[:3]), strict=True):
             if step < 0:
+                # Slot 0 of a filter that does not predict has no reading: it shows its start.
                 if slot > 0 or algorithm.predicts:
                     for node in self._scenario.sensing:
                         self._note((now, SENSE, node, -1, -1, -1, NAN))
             elif talks:
                 made = Step(slot, step, phase, repeats[phase], now, start + end)
                 now, repeats[phase] = made.end, repeats[phase] + 1
+                # The number of the exchange tells messages in time from late ones.
                 self._exchanges += 1
                 self._open = self._exchanges
                 self._send_all(made)
@@ -158,6 +169,7 @@ class SlotEvents:
         for row in self._rows:
             if row is None:
                 before.append(len(rows))
+            # The kernel knows only afterwards who has stopped: stop rows are inserted by node then.
             elif isinstance(row, Closed):
                 stops: list[Row] = [
                     (
@@ -172,6 +184,7 @@ class SlotEvents:
                     for k in np.flatnonzero(stopped == row.slot).tolist()
                 ]
                 first = len(rows) - row.rows
+                # Stable sort by node: an absorption of a node comes before its stop.
                 rows[first:] = sorted([*rows[first:], *stops], key=lambda one: one[2])
             else:
                 rows.append(row)
@@ -191,10 +204,14 @@ class SlotEvents:
                 self._note((now, TICK, i, j, -1, phase, NAN))
             ways = self._ways[i, j]
             if self._setup.fresh[step.step] or (i, j) not in self._last:
+                # Drawn even if a node sends nothing, so that the network does not depend on the
+                # filter.
                 drawn = [next(draws) for draws in self._draws[i, j]]
+                # Both directions take the one draw of a symmetric channel.
                 self._last[i, j] = drawn if len(drawn) == len(ways) else drawn * 2
             here = up is None or (i, j) in up
             for way, draw in zip(ways, self._last[i, j], strict=True):
+                # A link that is down loses its messages whatever was drawn.
                 if self._setup.talks[step.step, way.place] and not self._is_silent(way, step):
                     self._send(step, way, draw if here else None)
 
@@ -209,6 +226,7 @@ class SlotEvents:
         listed = activation.pairs(step.slot, step.phase, step.repeat)
         if self._algorithm.pairwise:
             return listed, None
+        # A recorded list names links once: in an undirected graph both directions are up.
         up = set(listed)
         return links, up if topology.directed else up | {(j, i) for i, j in listed}
 
@@ -224,6 +242,7 @@ class SlotEvents:
         self._note((now, SEND, sender, receiver, number, step.phase, NAN))
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
+            # Checked, because a user's channel may return anything.
             chance = checked_delivery_probability(
                 channel.loss, way.ends, number, draw[1], way.probability
             )
@@ -233,9 +252,12 @@ class SlotEvents:
             self._note((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:
             self._note((now, DELIVER, receiver, sender, number, step.phase, 0.0))
+            # The inbox keeps one message of each sender, the last to arrive.
             self._inbox.setdefault(receiver, {})[sender] = (number, 0.0)
+        # A message that would arrive after the end leaves no event.
         elif now + delay < self._scenario.ends:
             self._order += 1
+            # Order in the heap: time, directed link, order of sending.
             mail = now + delay, way.place, self._order, way, number, now, step.phase, self._open
             heapq.heappush(self._mail, mail)
 
@@ -244,6 +266,7 @@ class SlotEvents:
         while self._mail and self._mail[0][0] <= until:
             now, _, _, way, number, sent, phase, exchange = heapq.heappop(self._mail)
             (sender, receiver), in_time = way.ends, exchange == self._open
+            # After the horizon nothing is recorded; the last exchange may still be finished.
             if now < self._scenario.horizon:
                 kind = DELIVER if in_time else LATE
                 self._note((now, kind, receiver, sender, number, phase, now - sent))
@@ -253,6 +276,7 @@ class SlotEvents:
     def _close(self, step: Step, up: np.ndarray) -> None:
         """End a step: what its inboxes hold has arrived."""
         count = len(self._rows)
+        # By receiver and sender, the order of the kernels and of SimPy.
         for node in sorted(self._inbox):
             taken = self._inbox[node]
             for peer in sorted(taken):
@@ -266,4 +290,5 @@ class SlotEvents:
         if step.step == self._setup.stages.stopping and self._noted:
             self._rows.append(Closed(step.slot, step.end, len(self._rows) - count))
         self._inbox.clear()
+        # From now on messages of this exchange are late.
         self._open = -1

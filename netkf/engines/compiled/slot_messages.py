@@ -43,7 +43,7 @@ class Matchings(NamedTuple):
 
 
 class Channels(NamedTuple):
-    """What decides about messages on L links with so many directions each (``ends`` (L, 2) are
+    """Properties and draws of messages on L links with so many directions each (``ends`` (L, 2) are
     places of nodes; direction 2 l goes from the first to the second).
 
     ``delivery`` (2, W): chance of a direction in the good and the bad state of its link. Streams
@@ -75,6 +75,7 @@ def draw_matching(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) ->
     count = len(ends)
     if count == 0:
         return 0
+    # The order of the draws is that of Matching.draw: it decides which numbers a protocol takes.
     if m.protocol == ONE_EDGE:
         lazy = next_unit(m.states, r) < m.chance
         active[0] = next_integer(m.states, r, count)
@@ -83,6 +84,7 @@ def draw_matching(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) ->
         node = next_integer(m.states, r, len(m.busy))
         share = next_unit(m.states, r)
         peers = m.first[node + 1] - m.first[node]
+        # Both numbers are drawn before this, so that isolated nodes take as many as others.
         if peers == 0:
             return 0
         active[0] = m.members[m.first[node] + int(share * peers)]
@@ -104,6 +106,7 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
     for h in range(len(m.busy)):
         m.busy[h] = 0
     if m.protocol == MAXIMAL:
+        # A random order of links, taken greedily: a maximal matching.
         shuffle(m.states, r, m.order, count)
         for k in range(count):
             i, j = ends[m.order[k], 0], ends[m.order[k], 1]
@@ -112,10 +115,12 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
                 active[found] = m.order[k]
                 found += 1
         return found
+    # Independent: each link wakes with the probability, and busy counts its ends.
     for k in range(count):
         m.order[k] = 1 if next_unit(m.states, r) < m.chance else 0
         m.busy[ends[k, 0]] += m.order[k]
         m.busy[ends[k, 1]] += m.order[k]
+    # A link that meets no other is the only one at both of its ends.
     for k in range(count):
         if m.order[k] == 1 and m.busy[ends[k, 0]] == 1 and m.busy[ends[k, 1]] == 1:
             active[found] = k
@@ -129,14 +134,19 @@ def draw_link(c: Channels, r: int, link: int, fresh: bool, up: np.ndarray, e: in
     that are not ``fresh`` keep their last numbers.
     """
     for d in range(c.ways):
+        # The stream of this direction: with one stream per link (symmetric), both directions use
+        # it.
         k = (r * len(c.ends) + link) * c.streams + d
         if d >= c.streams:
             k -= 1
+        # Held links keep their number; -1 marks one that has none yet.
         elif len(c.states) > 0 and (fresh or c.drawn[k] < 0.0):
             c.drawn[k] = next_unit(c.states, k)
+            # A chain of states takes one step for each activation.
             if len(c.state_draws) > 0:
                 c.bad[k] = next_state(c.bad[k], next_unit(c.state_draws, k), c.to_bad, c.to_good)
         w = link * c.ways + d
+        # ``bad`` is -1 for channels without a state, whose first row applies.
         arrives = c.drawn[k] < c.delivery[max(c.bad[k], 0), w] and c.talks[e, w] == 1
         up[w] = 1 if arrives else 0
 
@@ -173,9 +183,11 @@ def draw_messages(
                 continue
             for e in range(up.shape[2]):
                 if m.protocol < 0:
+                    # Broadcast: every link is used in every step.
                     for link in range(len(c.ends)):
                         draw_link(c, r, link, fresh[e], up[r, s, e], e)
                     continue
+                # A matching uses few links: the others must be 0.
                 for w in range(up.shape[3]):
                     up[r, s, e, w] = 0
                 found = draw_matching(m, c.ends, r, active[r, s, e])
@@ -256,6 +268,7 @@ def note(
     at: int,
 ) -> int:
     """Count one event and write it into row ``at``; return the next row."""
+    # Counting is cheap and always done; rows are written as long as there is room.
     rows.counts[r, kind] += 1
     if at < len(rows.t):
         rows.t[at], rows.kind[at], rows.node[at], rows.peer[at] = t, kind, node, peer
@@ -278,12 +291,15 @@ def make_rows(  # noqa: PLR0912 - the order of a slot
     """Write the events of these slots in their order; return the number of rows of the last run."""
     at = 0
     for r in range(up.shape[0]):
+        # Rows are those of the last run: only a single run asks for them.
         at = 0
         for s in range(len(times.start)):
+            # Filters that predict are sampled before anything happens in the slot.
             if times.predicts and times.sample[s] >= 0 and times.sample[s] < len(rows.at_sample):
                 rows.at_sample[times.sample[s]] = at
             now = times.start[s]
             for k in range(len(stages.step)):
+                # At the horizon nothing is recorded but the sample.
                 if not times.noted[s]:
                     break
                 e = stages.step[k]
@@ -315,6 +331,7 @@ def make_rows(  # noqa: PLR0912 - the order of a slot
                             at,
                             stages.stopping,
                         )
+                    # Absorptions happen at the end of the step, when its inboxes close.
                     now = times.start[s] + stages.end[k]
                     at = _closed(
                         h,
@@ -353,12 +370,14 @@ def _sent(
     at: int,
     stopping: int,
 ) -> int:
-    """What is sent on a link, each message followed by whether it arrives."""
+    """Write the messages sent on a link, each followed by its arrival or loss; return the row."""
     for d in range(c.ways):
         w, i = link * c.ways + d, c.ends[link, d]
+        # By the paper's rule a node that stopped in an earlier slot sends no more mass.
         gone = h.silences and e == stopping and h.stopped[r, i] < slot
         if c.talks[e, w] == 0 or gone:
             continue
+        # Messages of a direction are numbered from 0, lost ones included.
         number, sender, receiver = h.sent[r, w], h.nodes[i], h.nodes[c.ends[link, 1 - d]]
         h.sent[r, w] = number + 1
         at = note(rows, r, now, SEND, sender, receiver, number, phase, NAN, at)
@@ -383,17 +402,19 @@ def _closed(
     pairwise: bool,
     stopping: int,
 ) -> int:
-    """What becomes of all that arrived when a step ends, and who stops learning."""
+    """Write who absorbs when a step ends, and who stops learning; return the row."""
     for i in range(len(h.nodes)):
         heard = False
         for k in range(h.first[i], h.first[i + 1]):
             if up[h.way[k]] == 1:
                 heard = True
                 if pairwise:
+                    # The message of this step is the last one that was numbered.
                     peer, number = h.nodes[h.sender[k]], h.sent[r, h.way[k]] - 1
                     at = note(rows, r, end, SWAP, h.nodes[i], peer, number, phase, 0.0, at)
         if heard and not pairwise:
             at = note(rows, r, end, ABSORB, h.nodes[i], -1, -1, phase, 0.0, at)
+        # A node that stops in this slot does so after it absorbed.
         if e == stopping and h.stopped[r, i] == slot:
             at = note(rows, r, end, STOP, h.nodes[i], -1, -1, phase, NAN, at)
     return at

@@ -74,9 +74,11 @@ class SlotRuns:
     def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams) -> None:
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
+        # One run, or the replicas of a batch.
         self.runs = 1 if isinstance(streams, Streams) else streams.count
         self._slot = 0
         setup, runs = self.setup, self.runs
+        # Filters of run r are places r H to (r + 1) H - 1 of all arrays.
         self._nodes = SlotNodes(
             np.tile(setup.xhat, (runs, 1)),
             np.tile(setup.root, (runs, 1, 1)),
@@ -86,6 +88,7 @@ class SlotRuns:
         )
         self._room = slot_room(setup.hosts, setup.n)
         self._extra = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
+        # No slot reaches it: a node that never stops.
         self._stopped = np.full((runs, setup.hosts), NEVER)
         self._conserved = np.zeros((runs, setup.hosts, 2))
         self._sent = np.zeros((runs, len(setup.directions)), dtype=np.int64)
@@ -101,6 +104,7 @@ class SlotRuns:
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
         self._path: Path | None = None
+        # A recorded truth is the same in all runs.
         if not plant.is_random:
             self._truth = self._scenario.slot_truth(self._streams.per_replica[0])
             return
@@ -108,16 +112,19 @@ class SlotRuns:
         x = np.empty((self.runs, setup.n))
         root = square_root(plant.start_cov)
         draw_starts(self._plant_states, normal_ziggurat(), plant.start_mean, root, x)
+        # A root of the covariance, which may be singular.
         origin = np.zeros(x.shape)
         self._path = Path(plant.F, square_root(plant.Q), setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.place.ordinal) for s in setup.drawn]
+        # One stream for each drawn sensor of each run.
         self._noise = StreamBatch(streams, "noise", entities).states
         self._regressors: list[tuple[Path, np.ndarray]] = []
         for s, (A, drive, start) in zip(setup.driven, setup.regressors, strict=True):
             x = np.tile(start, (self.runs, 1))
+            # No frame: regressors do not grow as an unstable plant does.
             path = Path(A, drive, 0, x, np.zeros(x.shape))
             states = StreamBatch(streams, "regressor", [(s.node, s.place.ordinal)]).states
             self._regressors.append((path, states))
@@ -128,6 +135,7 @@ class SlotRuns:
 
     def _begin_messages(self) -> None:
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
+        # Empty arrays tell the kernels to draw nothing.
         nothing = np.zeros((0, 4), dtype=np.uint64)
         drawn = setup.is_drawn and links > 0
         loss = drawn and not setup.loss.deterministic
@@ -142,6 +150,7 @@ class SlotRuns:
             StreamBatch(streams, "weather", entities).states
             if loss and setup.is_chain
             else nothing,
+            # -1 marks numbers that are not drawn yet and states without a past.
             np.full(count, -1.0),
             np.full(count, -1, dtype=np.int64),
             to_bad,
@@ -151,6 +160,8 @@ class SlotRuns:
             setup.streams,
         )
         protocol, chance, first, members = setup.matching
+        # numpy's generator keeps half a 64-bit draw for small integers: two words more than the
+        # state.
         states = np.zeros((self.runs, 6), dtype=np.uint64)
         if drawn and protocol >= 0:
             states[:, :4] = StreamBatch(streams, "matching", [()]).states
@@ -159,17 +170,19 @@ class SlotRuns:
 
     @property
     def over(self) -> bool:
-        """Whether all slots are done."""
+        """Return True if all slots are done."""
         return self._slot >= self.setup.slots
 
     def following(self, rows: int) -> SlotBlock:
         """Carry the filters through the next slots, of about so many ``rows`` of events at most."""
         setup, drawn = self.setup, None
         if self._events is None:
+            # The kernels draw the messages of many slots and runs at once.
             count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
             times = self._times(count, rows > 0)
             drawn = self._draw_messages(times)
         else:
+            # Python makes the messages: as many slots as gave about so many rows.
             count, up = self._events.following(rows, self._stopped[0])
             times = self._times(count, True)
             drawn = Drawn(up, *(np.zeros((0,) * d, dtype=np.int64) for d in (4, 3)))
@@ -191,17 +204,20 @@ class SlotRuns:
         return SlotBlock(absolute, local, sampled, samples, times, drawn)
 
     def _times(self, count: int, wanted: bool) -> SlotTimes:
-        """What happens in the next slots; when they begin only if it is ``wanted``."""
+        """Flags, samples and, if ``wanted``, start times of the next slots."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
         noted = slots < setup.last
+        # At the horizon a filter that predicts shows what it predicted, and does nothing else.
         acts = noted | (not algorithm.predicts)
+        # Filters that do not predict begin with their start, before any reading.
         sensed = acts & ((slots > 0) | algorithm.predicts)
         exchanged = acts & (slots >= algorithm.first_slot) & algorithm.talks
         sample = np.full(count, -1, dtype=np.int64)
         here = setup.samples[np.isin(setup.samples, slots)] - self._slot
         sample[here] = np.arange(len(here))
         start = np.zeros(count)
+        # Times are computed only if rows are wanted: a batch has none.
         if wanted:
             start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
         return SlotTimes(self._slot, start, noted, sensed, exchanged, sample, algorithm.predicts)
@@ -226,8 +242,10 @@ class SlotRuns:
         rebased = np.zeros(count, dtype=bool)
         if self._path is None:
             x = np.stack([self._truth.state(slot) for slot in slots])
+            # One truth for all runs, as a contiguous array that the kernels take.
             x = np.ascontiguousarray(np.broadcast_to(x, (self.runs, *x.shape)))
             return x, x, rebased
+        # At the end of a frame the origin moves to the state.
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
         shape = self.runs, count, setup.n
@@ -236,6 +254,7 @@ class SlotRuns:
         draw_paths(
             self._path, self._plant_states, normal_ziggurat(), self._slot, room, local, absolute
         )
+        # Without frames both are the same array.
         return local, (absolute if setup.frame else local), rebased
 
     def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> SlotReadings:
@@ -262,6 +281,7 @@ class SlotRuns:
         for s, path in self._recorded:
             some = slice(s.row, s.row + len(s.root))
             values, matrices = path.several(slots, x[0, times.sensed])
+            # Whitened with the R that filters believe.
             y[:, times.sensed, s.host, some] = np.linalg.solve(s.root, values.T).T
             H[:, times.sensed, s.host, some] = np.linalg.solve(s.root, matrices)
         return SlotReadings(y, H, local, rebased)
@@ -273,6 +293,7 @@ class SlotRuns:
         if self._events is not None:
             return self._events.rows(self._stopped[0])
         setup = self.setup
+        # Space for the largest number of rows; 0 counts only.
         size = setup.rows_of(len(block.times.start)) if wanted else 0
         places: Any = [np.empty(size, dtype=EVENT[name]) for name in ROW_COLUMNS]
         at_sample = np.zeros(len(block.sampled) if wanted else 0, dtype=np.int64)
@@ -286,6 +307,7 @@ class SlotRuns:
             setup.stages, block.times, self._channels, hearing, *block.drawn,
             setup.algorithm.pairwise, rows,
         )  # fmt: skip
+        # Kernels fill plain columns, which become records here.
         table = np.empty(min(count, size), dtype=EVENT)
         for name, column in zip(ROW_COLUMNS, places, strict=True):
             table[name] = column[: len(table)]
@@ -296,6 +318,7 @@ class SlotRuns:
         given: list[Any] = [self.setup.algorithm.conserved(s) for s in self.setup.states]
         found = {}
         for k, name in enumerate(given[0]):
+            # fsum: the check is of the exchanges, and not of its own rounding.
             start = math.fsum(values[name] for values in given)
             now = [math.fsum(column) for column in self._conserved[:, :, k].tolist()]
             found[name] = np.array([[start, value] for value in now])
@@ -322,6 +345,7 @@ def _record_block(
     scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
 ) -> bool:
     """Simulate and record some slots; return True if all estimates are sound."""
+    # A block of about so many rows: memory does not grow with the run.
     block = runs.following(MOST_ROWS)
     rows, before = runs.events(block, wanted=True)
     if len(block.sampled):
@@ -337,6 +361,7 @@ def _record_block(
         block.local[0, block.sampled] if runs.setup.frame else x,
         block.samples.xhat[0],
         block.samples.P[0],
+        # The rows up to the first broken sample, if there is one.
         lambda k: recorder.extend(rows[: before[k]]),
     )
     if fine:
@@ -351,6 +376,7 @@ MOST_ROWS = 1 << 15
 def slot_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
     """Yield the runs of consecutive replicas in order."""
     setup = slot_setup(scenario)
+    # As many runs side by side as fit the memory.
     size = setup.batch_runs()
     for first in range(replicas.start, replicas.stop, size):
         count = min(size, replicas.stop - first)
@@ -370,6 +396,7 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
         x, local = block.absolute[:, block.sampled], block.local[:, block.sampled]
         error = local[:, :, None] - block.samples.xhat
         xhat = block.samples.xhat
+        # Estimates in absolute coordinates for the batch; errors stay local.
         if runs.setup.frame:
             xhat = xhat + (x - local)[:, :, None]
         parts.append((x, xhat, block.samples.P, error))
@@ -393,6 +420,7 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
 
 def with_ends(batch: RunBatch, alone: Callable[[range], Iterator[RunBatch]]) -> RunBatch:
     """The batch with every run that diverges as it is ``alone``, where it ends."""
+    # A run that diverges goes on in a batch; its true end is that of the run alone.
     fine = np.isfinite(batch.xhat).all(axis=(1, 2, 3)) & np.isfinite(batch.P).all(axis=(1, 2, 3, 4))
     for r in np.flatnonzero(~fine).tolist():
         (one,) = alone(batch.replicas[r : r + 1])

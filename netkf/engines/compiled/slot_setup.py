@@ -31,6 +31,7 @@ from netkf.scenario.scenario import Scenario
 
 def slot_setup(scenario: Scenario) -> SlotSetup:
     """The arrays of a scenario, made once and kept with it like its cached properties."""
+    # The scenario is frozen: its dictionary is where its cached properties are kept, too.
     if "_slot_setup" not in vars(scenario):
         vars(scenario)["_slot_setup"] = SlotSetup(scenario)
     setup: SlotSetup = vars(scenario)["_slot_setup"]
@@ -56,6 +57,7 @@ class SlotSetup:
         algorithm, topology = scenario.hosted, scenario.topology
         self.algorithm: Filter = algorithm
         self.n, self.nodes = scenario.plant.n, np.array(scenario.nodes, dtype=np.int64)
+        # Frames are for exact errors of unstable plants; 0: the origin never moves.
         self.frame = frame_slots(scenario.slot_plant.F) or 0 if scenario.exact_errors else 0
         self._set_slots(scenario)
         self._set_stages(scenario)
@@ -64,6 +66,7 @@ class SlotSetup:
         links = topology.links if algorithm.talks else ()
         ends = [[topology.index[i], topology.index[j]] for i, j in links]
         self.ends = np.array(ends, dtype=np.int64).reshape(-1, 2)
+        # Directions 2 l and 2 l + 1 belong to link l, as in the SimPy engine.
         self.ways = 1 if topology.directed else 2
         self.directions: tuple[Link, ...] = tuple(
             way for i, j in links for way in ((i, j), (j, i))[: self.ways]
@@ -76,10 +79,12 @@ class SlotSetup:
     def _set_slots(self, scenario: Scenario) -> None:
         """The slots of a run: the last one, at the horizon, is there if it is sampled."""
         plant, last = scenario.slot_plant, 0
+        # A guess below the last slot; the plant itself decides which is over.
         last = max(0, int(scenario.horizon / plant.period) - 2)
         while not plant.over(last, scenario.horizon):
             last += 1
         self.samples = np.array(sorted(set(scenario.slots)), dtype=np.int64)
+        # The slot at the horizon exists only to be sampled.
         self.slots = last + bool(len(self.samples) and self.samples[-1] >= last)
         self.last = last
         self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
@@ -91,10 +96,12 @@ class SlotSetup:
         fresh: list[bool] = []
         for kind in algorithm.schedule or ():
             if kind == "sense":
+                # -1: a reading, which is no step of an exchange.
                 stages.append((-1, -1, 0.0))
             elif kind == "exchange":
                 steps = algorithm.steps(phase) if algorithm.talks else 0
                 for k in range(steps):
+                    # Steps share the phase equally; ends are seconds after the slot begins.
                     stages.append((step, phase, (phase + (k + 1) / steps) * length))
                     fresh.append(algorithm.redraws_links(phase, k))
                     step += 1
@@ -111,7 +118,7 @@ class SlotSetup:
         self.phases = [phase for step, phase, _ in stages if step >= 0]
 
     def _set_sensors(self, scenario: Scenario) -> None:
-        """Where the readings of each sensor go: one filter reads those of one node, or of all."""
+        """Assign the readings of each sensor: one filter reads those of one node, or of all."""
         pooled = self.algorithm.pooled
         self.hosts = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.hosts, dtype=np.int64)
@@ -122,11 +129,14 @@ class SlotSetup:
             for place in scenario.placed[node]:
                 R = scenario.noise(place.entry, believed=True)
                 root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
+                # A filter stacks the readings of its sensors: each begins where the one before
+                # ends.
                 self.placed.append(AssignedSensor(node, place, host, int(rows[host]), root))
                 rows[host] += len(root)
         self.rows, self.p = rows, int(rows.max(initial=1))
         kinds = [type(scenario.sensors[s.place.entry]) for s in self.placed]
         self.recorded = [s for s, k in zip(self.placed, kinds, strict=True) if k is RecordedSensor]
+        # Recorded sensors are read in Python, the others by kernels.
         self.drawn = [s for s, k in zip(self.placed, kinds, strict=True) if k is not RecordedSensor]
         self.driven = [s for s, k in zip(self.placed, kinds, strict=True) if k is RegressorSensor]
         self.varies = bool(self.recorded or self.driven)
@@ -141,13 +151,17 @@ class SlotSetup:
             sensor = scenario.sensors[s.place.entry]
             rows = len(s.root)
             true = np.linalg.cholesky(sensor.R)
+            # Noise L_b^-1 L of a whitened reading, with the believed R = L_b L_b' and the true R =
+            # L L'.
             noise[m, :rows, :rows] = np.linalg.solve(s.root, true)
             if isinstance(sensor, RegressorSensor):
+                # A regressor's one row is random: H holds the whitening factor alone.
                 driven[m], H[m, 0, 0] = self.driven.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = np.linalg.solve(s.root, sensor.H)
             self.H[0, 0, s.host, s.row : s.row + rows] = H[m, :rows]
         regressors: list[Any] = [scenario.sensors[s.place.entry] for s in self.driven]
+        # Regressors of different sizes are padded with zeros, which stay zero.
         k = max((len(sensor.A) for sensor in regressors), default=1)
         q = max((sensor.B.shape[1] for sensor in regressors), default=1)
         C = np.zeros((len(regressors), n, k))
@@ -158,6 +172,7 @@ class SlotSetup:
             root = sensor.B @ square_root(sensor.xi_cov)
             A[:size, :size], drive[:size, : root.shape[1]] = sensor.A, root
             C[d, :, :size], start[:size] = sensor.C, sensor.start
+            # Columns of noise are not padded: each takes as many numbers as it does alone.
             self.regressors.append((A, np.ascontiguousarray(drive[:, : root.shape[1]]), start))
         self.sensors = SlotSensors(
             np.array([s.host for s in self.drawn], dtype=np.int64),
@@ -180,16 +195,19 @@ class SlotSetup:
             self.algorithm.init(model, *scenario.start(info.node), info)
             for info, model in zip(infos, models, strict=True)
         ]
+        # All filters of a scenario believe one F and Q.
         self.F, self.root_Q = np.array(models[0].F), lower_root(models[0].root_Q)
         self.xhat = np.stack([state.xhat for state in self.states])
         self.root = np.stack([state.root for state in self.states])
 
     def _links(self, scenario: Scenario) -> SlotLinks:
         index = scenario.topology.index
+        # By receiver and sender: the order in which a filter adds what it hears.
         heard = sorted(
             (index[receiver], index[sender], way, scenario.weight(receiver, sender))
             for way, (sender, receiver) in enumerate(self.directions)
         )
+        # zip() of nothing gives no columns.
         receivers, senders, ways, weights = zip(*heard, strict=True) if heard else [()] * 4
         first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.hosts + 1))
         return SlotLinks(
@@ -204,6 +222,7 @@ class SlotSetup:
         channel, ways = scenario.network.channel, self.ways
         self.loss, bad = channel.loss, (False, True)
         self.is_chain = type(self.loss) is GilbertElliott
+        # Channels of a user's own have probabilities that only Python can ask for.
         self.has_known_chances = identical_per_link(self.loss) or self.is_chain
         self.delivery = np.ones((2, len(self.directions)))
         if self.has_known_chances:
@@ -213,7 +232,10 @@ class SlotSetup:
                     self.loss.delivery_probability(way, 0, b, table) for b in bad
                 ]
         self.streams = 1 if channel.symmetric else ways
+        # Streams belong to the first direction of each link, or to each direction.
         self.entities = [way for w, way in enumerate(self.directions) if w % ways < self.streams]
+        # By phase: with asymptotic gains no mass is sent, and nodes without a sensor have no
+        # reading.
         sends = self.algorithm.sends_in_slots
         talks = [
             [sends(phase, way[0] in scenario.placed) for way in self.directions]
@@ -224,6 +246,7 @@ class SlotSetup:
     def _draws_everything(self, scenario: Scenario) -> bool:
         """Return True if kernels can draw all messages, else they are made one by one."""
         network = scenario.network
+        # Kernels know broadcasts and matchings without delay, with the built-in losses.
         exchanges = type(network.activation) in (Matching, Broadcast) or not self.algorithm.talks
         return self.has_known_chances and network.channel.delay.fixed == 0.0 and exchanges
 
@@ -236,11 +259,13 @@ class SlotSetup:
         """The largest number of events in so many slots."""
         pairs = self.most_pairs
         sends = self.ways * (pairs if self.matching[0] >= 0 else len(self.ends))
+        # A send and its outcome for each direction, a tick for each pair, a round, and one
+        # absorption per node.
         steps = len(self.fresh) * (1 + pairs + 2 * sends + len(self.nodes))
         return slots * (len(self.sensing) + steps + len(self.nodes))
 
     def bytes_of_slot(self) -> int:
-        """What is drawn for one slot of one run."""
+        """Bytes that are drawn for one slot of one run."""
         floats = self.hosts * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.most_pairs + 8)
         return 8 * floats + messages
@@ -257,6 +282,7 @@ class SlotSetup:
     def batch_runs(self) -> int:
         """Runs that are simulated side by side."""
         samples = 8 * len(self.samples) * self.hosts * (2 + self.n) * self.n
+        # All slots of so many runs fit one call.
         runs = min(BLOCK_BYTES // self.bytes_of_slot() // max(1, self.slots), MOST_RUNS)
         return max(1, int(min(runs, SAMPLE_BYTES // max(1, samples))))
 
@@ -278,6 +304,7 @@ def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarr
     lists: list[list[int]] = []
     if protocol == NODE_WAKEUP:
         peers: dict[int, dict[int, int]] = {node: {} for node in topology.nodes}
+        # A dictionary for each node: its peers, in ascending order, choose among its links.
         for k, (i, j) in enumerate(links):
             peers[i][j] = peers[j][i] = k
         lists = [[here[peer] for peer in sorted(here)] for here in peers.values()]

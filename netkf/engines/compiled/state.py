@@ -1,4 +1,4 @@
-"""What the event loop works on: everything of a run as plain arrays in a few named groups.
+"""Everything that the event loop works on: a run as plain arrays in a few named groups.
 
 Numbers that belong to one node, message or directed link are fields of a record, so that they have
 names in compiled code too. No type depends on the size of a scenario: one compiled loop fits all.
@@ -26,6 +26,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def _record(integers: str, floats: str = "") -> np.dtype:
+    # int64 fields first, then float64 ones: every field is aligned without padding.
     fields = [(name, np.int64) for name in integers.split()]
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
 
@@ -254,22 +255,27 @@ class Filters(NamedTuple):
 
 
 def filters_at_start(scenario: Scenario) -> Filters:
-    """Where they are pooled, one stands for all."""
+    """Return the filters at time 0; if they are pooled, one stands for all."""
+    # A pooled filter is one node with the id -1 and the sensors of all.
     ids, pooled = scenario.nodes, scenario.hosted.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
+    # Nodes that share a model share its table: identity is enough, as models are cached.
     distinct = list({id(model): model for model in models}.values())
     place = {id(model): k for k, model in enumerate(distinct)}
     starts = [scenario.start(node) for node in (ids[:1] if pooled else ids)]
     covariances = {id(cov): cov for _, cov in starts}  # nodes share them
     roots = {key: first_root(cov) for key, cov in covariances.items()}
     counts = [len(scenario.increment_sensors.get(node, ())) for node in ids]
+    # Increment sensors of all nodes in one list: each has those up to ``sensors``.
     after = np.array([sum(counts)] if pooled else np.cumsum(counts), dtype=np.int64)
     nodes = np.zeros(len(starts), dtype=NODE)
     nodes["model"] = [place[id(model)] for model in models]
     nodes["id"] = [-1] if pooled else ids
+    # ``sensor`` of the first node stays 0.
     nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
     nodes["inbox"] = nodes["reading"] = -1
     nodes["own"] = [scenario.own_weights[node] for node in (ids[:1] if pooled else ids)]
+    # One table for each distinct model.
     table, gains = _tables(distinct)
     xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
     return Filters(nodes, xhat, np.stack([roots[id(cov)] for _, cov in starts]), table, gains)
@@ -277,9 +283,12 @@ def filters_at_start(scenario: Scenario) -> Filters:
 
 def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     n = len(models[0].A)
+    # A model without sensors has no gains; its place keeps the numbering.
     nothing = GainTable(n, 0, np.zeros((0, 0)))
     gains = [model.gains if len(model.H) else nothing for model in models]
+    # Tables differ in size, so they are stored flat.
     sizes = [gain.series.size for gain in gains]
+    # The last model of the stack has no sensors: it predicts messages under way.
     return stack_tables([*(model.flow for model in models), models[0].blind_flow]), Gains(
         series=np.concatenate([gain.series.ravel() for gain in gains]),
         first=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
@@ -291,6 +300,7 @@ def entity_records(scenario: Scenario, senders: Senders) -> tuple[np.ndarray, np
     """ENTITY and WAY records of a run that has not begun."""
     index = scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
+    # (i, j) of a link or direction, (i, -1) of a node.
     ends = np.array([(*e, -1)[:2] for e in senders.entities], dtype=np.int64).reshape(-1, 2)
     place = np.vectorize(lambda node: index.get(node, -1), otypes=[np.int64])
     if len(ends):
@@ -309,15 +319,19 @@ def scratch_arrays(
     table: FlowTable, gains: Gains, instants: Instants
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
     """Scratch arrays for all that is computed."""
+    # ``most``, ``width``: the largest of all models.
     n, (most, _, width) = table.levels.shape[3], gains.shape.max(axis=0)
+    # Rows of the reading of each sample, then the largest sum over one instant.
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
     totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
     q = max(1, int(np.diff(totals).max(initial=0)))
     scratch = Scratch(
         moments=np.zeros(most),
+        # moments come in pairs: two for each row.
         early=np.zeros((2, most // 2)),
         state_moments=np.zeros((2, n)),
         total=np.zeros((2, n)),
+        # fill_seen() needs two responses (n, n).
         values=np.zeros(max(width, 2 * n * n)),
         x=np.zeros(n),
         from_noise=np.zeros((2, 4)),
@@ -336,11 +350,13 @@ def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArra
 
 
 def add_messages(state: Simulation, least: int) -> None:
-    """At least double the pool of messages, by ``least`` or more."""
+    """Double the pool of messages at least, by ``least`` or more."""
+    # Doubling keeps the cost of copies proportional to the messages.
     old, n = len(state.pool), state.xhat.shape[1]
     more = max(old, least)
     fresh = empty_pool(more, n)
     fresh[0]["next"] = np.arange(old + 1, old + more + 1)
+    # The new messages come first in the list of free ones.
     fresh[0]["next"][-1], state.free = state.free, old
     state.free_count += more
     for name, part in zip(("pool", "pool_x", "pool_root", "heap"), fresh, strict=True):

@@ -14,7 +14,7 @@ from netkf.scenario.scenario import Scenario
 
 
 class States(Protocol):
-    """What a run asks for."""
+    """The states that a run asks for."""
 
     frame_times: FloatArray
 
@@ -28,7 +28,7 @@ class States(Protocol):
 
 
 class KnownStates:
-    """Those of a truth that was drawn up to the horizon, or recorded."""
+    """States of a truth that was drawn up to the horizon, or recorded."""
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
         self.truth = scenario.continuous_truth(streams)
@@ -36,6 +36,7 @@ class KnownStates:
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
         """(n,) the local state just before ``frame_times[k]``."""
+        # The truth keeps its own frames.
         return np.asarray(self.truth.rebase(k))
 
     def shown(
@@ -47,17 +48,20 @@ class KnownStates:
 
 
 class PathStates:
-    """Those of a path that is drawn block by block."""
+    """States of a path that is drawn block by block."""
 
     def __init__(self, scenario: Scenario, frame_times: FloatArray) -> None:
         self.frame_times = frame_times
+        # Without frames the origin never moves, and no transition is needed.
         self._moves = Transitions(scenario.truth.A, scenario.truth.B) if len(frame_times) else None
         self._frame, self._begun, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
 
     def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:
         """(T, n) states in the present frame, which are 0 where one begins."""
+        # A time is the end of its piece, or the start of the first one.
         ends = (times == path.stop[pieces])[:, None]
         x = np.where(ends, path.x_stop[pieces], path.x_start[pieces])
+        # A frame begins there: its local state is 0 after the origin has moved.
         if len(self.frame_times):
             x[np.isin(times, self.frame_times)] = 0.0
         return np.asarray(x)
@@ -66,7 +70,9 @@ class PathStates:
         """(n,) the local state just before ``frame_times[k]``; from now on its frame counts."""
         x, time = path.x_stop[piece], float(self.frame_times[k])
         with np.errstate(over="ignore", invalid="ignore"):
+            # The new origin: the old one moved to now, plus the local state.
             self._origin = self._moved(np.array([time]))[0] + x
+        # From now on times count from this frame.
         self._frame, self._begun = k + 1, time
         return np.asarray(x)
 
@@ -75,12 +81,14 @@ class PathStates:
     ) -> tuple[FloatArray, FloatArray]:
         """(T, n) local and absolute states at times in the present frame."""
         local = self.local(times, path, pieces)
+        # No frame has begun: local states are absolute.
         if not self._frame:
             return local, local
         with np.errstate(over="ignore", invalid="ignore"):
             return local, local + self._moved(times)
 
     def _moved(self, times: FloatArray) -> FloatArray:
+        # An origin of 0 stays 0, and its transition may overflow.
         if self._moves is None or not self._origin.any():
             return np.broadcast_to(self._origin, (len(times), len(self._origin)))
         moves = self._moves.transitions(times - self._begun)
