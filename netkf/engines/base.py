@@ -76,6 +76,7 @@ class Engine(ABC):
         """Yield the runs of consecutive ``replicas`` in order, as many at a time as suits the
         engine; each run is to the last bit what ``run`` gives for its replica.
         """
+        # Engines that have no batches run replicas one by one; only counts and samples are kept.
         for replica in replicas:
             sink = batch_sink(scenario, range(replica, replica + 1))
             recorder = Recorder([sink], counts_only=True)
@@ -85,7 +86,8 @@ class Engine(ABC):
 
 
 def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
-    """A sink for the samples of some recorded runs of a scenario."""
+    """Return a sink for the samples of some recorded runs of a scenario."""
+    # A pooled filter is sampled once, not once for each node.
     filters = 1 if scenario.hosted.pooled else len(scenario.nodes)
     return BatchSink(replicas, scenario.times, (filters, scenario.plant.n))
 
@@ -96,5 +98,6 @@ def broken(
     """The nodes whose estimate or covariance, (N, n) and (N, n, n), is not ``sound``; those
     ``without`` (N,) a covariance have none to be looked at. They end a run as diverged.
     """
+    # False broadcasts: every node then has a covariance to be looked at.
     intact = sound(xhat, P, False if without is None else without)
     return [scenario.nodes[k] for k in np.flatnonzero(~intact)]

@@ -50,6 +50,7 @@ def clock_processes(
     places = make[activation.at](*air)
     return [
         _ticking(scenario, streams, timeline, recorder, entity, k, activate)
+        # An entity's place is its index: it orders simultaneous ticks.
         for k, (entity, activate) in enumerate(places)
     ]
 
@@ -68,19 +69,24 @@ def _ticking(
     assert isinstance(clock, LinkClock)
     # A stream of its own: the ticks of one entity never depend on those of another.
     random = streams.generator("clock", *entity)
+    # A random phase is drawn from a stream of its own, and only if the clock asks for one.
     origin = clock.origin(entity, partial(stream, streams, entity, "phase"))
     now, index, count = 0.0, 0, FIRST_BLOCK
     while True:
+        # Ticks are drawn in blocks; a block never depends on how far the simulation has come.
         times = next_ticks(clock, entity, ClockPosition(origin, index, now), random, count).tolist()
         for now in times:
+            # Half open: a tick at the horizon does not happen.
             if now >= scenario.horizon:
                 return
             yield timeline.at(now, Rank.TICK, place)
             activate(now)
+        # A clock that gives no more ticks has stopped for good.
         if not times:
             return
         recorder.flush_if_full()
         index += len(times)
+        # Few numbers at first: a slow clock uses few, and a fast one soon draws long blocks.
         count = min(2 * count, LONGEST_BLOCK)
 
 
@@ -95,6 +101,7 @@ def _links(
 ) -> Places:
     """Return for each link an activation in which both ends exchange."""
 
+    # A factory for each link, so that the closure binds these ends and not those of the last link.
     def activation(link: tuple[int, int], entity: int) -> Activation:
         i, j = link
         exchange = LinkExchange(scenario, transmitter, nodes, link, entity)
@@ -123,6 +130,7 @@ def _directions(
 
         def activate(now: float) -> None:
             recorder.append((now, TICK, i, j, -1, -1, NAN))
+            # Drawn before the payload is made: even if nothing is sent, the channel takes its step.
             outcome = way.sampler.draw()
             transmitter.send(way, nodes[i].emit(now, (j,)), outcome)
 
@@ -155,6 +163,8 @@ def broadcasts(
             payload = nodes[node].emit(now, hearers)
             if payload is None:
                 return
+            # A broadcast is one transmission, numbered by sender; its messages are numbered by
+            # link.
             recorder.append((now, TRANSMIT, node, -1, sent, -1, NAN))
             sent += 1
             for way, outcome in zip(ways[node], outcomes, strict=True):
@@ -176,6 +186,7 @@ def _nodes(
 
     def activation(node: int) -> Activation:
         def activate(now: float) -> None:
+            # The tick has its own row; transmit() adds that of the broadcast if there is one.
             recorder.append((now, TICK, node, -1, -1, -1, NAN))
             transmit[node](now)
 
@@ -193,10 +204,13 @@ def _transmit_after_samples(
 ) -> None:
     """Make every node broadcast, at the rank of ticks, after it has used a sample."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
+    # Only nodes with sampled sensors have samples to transmit after.
     for node in scenario.sampled_sensors:
         carrier = nodes[node]
 
         def after(now: float, node: int = node, entity: int = carrier.entity) -> None:
+            # At the rank of ticks: every sample of this instant has been used by then, at all
+            # nodes.
             timeline.call_at(now, Rank.TICK, entity, lambda _: transmit[node](now))
 
         carrier.after_sample = after

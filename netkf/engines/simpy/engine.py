@@ -56,6 +56,7 @@ class SimpyEngine(Engine):
     ) -> str:
         """Simulate up to the horizon and return the status, "complete" or "diverged"."""
         simulation = _Simulation(scenario, streams, recorder, progress)
+        # Slots and clocks share the timeline, but no process.
         processes = simulation.slots() if scenario.slotted else simulation.clocks()
         timeline = simulation.timeline
         # Any order will do: every event has an explicit time, rank and entity.
@@ -67,6 +68,7 @@ class SimpyEngine(Engine):
             except DivergedError:
                 return "diverged"
             finally:
+                # Also after an error: the trace keeps what has happened.
                 recorder.stats = {"processes": timeline.processes, "events": timeline.events}
                 recorder.flush()
         return "complete"
@@ -90,6 +92,7 @@ class _Simulation:
         truth = scenario.continuous_truth(streams)
 
         def make(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
+            # A pooled filter carries the increment sensors of all nodes.
             carriers = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, carriers)
             common = (timeline, self._recorder, truth, sensors)
@@ -110,6 +113,7 @@ class _Simulation:
         """Record the states at the probe times."""
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
+            # Other events leave a node at its own time; a sample needs all of them at one.
             for node in distinct(nodes):
                 node.predict_to(time)
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
@@ -123,6 +127,7 @@ class _Simulation:
             yield self.timeline.at(time, Rank.REBASE, 0)
             for node in distinct(nodes):
                 node.predict_to(time)
+            # Estimates are lowered by the local state, which is the new origin.
             offset = -truth.rebase(k)
             for node in distinct(nodes):
                 node.shift(offset)
@@ -139,6 +144,7 @@ class _Simulation:
             return SlotNode(recorder, schedule, period, *_identity(scenario, node, entity))
 
         nodes = _nodes(scenario, make)
+        # Filters, readers and the clock are processes that meet by time and rank only.
         processes = [node.running(self.timeline) for node in distinct(nodes)]
         for node, placed in scenario.placed.items():
             sensors = [scenario.slot_path(streams, node, place) for place in placed]
@@ -161,20 +167,24 @@ class _Simulation:
             if schedule.sampled(slot):
                 time = schedule.start(slot)
                 self._record(time, truth.absolute(slot), truth.local(slot), nodes, sums)
+            # The origin moves after the sample, which still refers to the old one.
             if truth.frame_slots and slot and slot % truth.frame_slots == 0:
                 offset = -truth.rebase(slot)
                 for node in distinct(nodes):
                     node.shift(offset)
 
         while True:
+            # A slot at the horizon exists only if it is sampled.
             last = schedule.over(slot)
             if last and not schedule.sampled(slot):
                 return
+            # First rank of a slot: before its stages.
             yield self.timeline.at(schedule.start(slot), FIRST_RANK, 0)
             if predicts:
                 sample()
             elif last:
                 recorder.pause()  # the horizon is half open: this slot makes its sample only
+            # A filtered state is there only after all stages of the slot.
             if not predicts:
                 yield self.timeline.at(*schedule.end(slot), 0)
                 recorder.resume()
@@ -187,10 +197,12 @@ class _Simulation:
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
         """Record one sample; ``local`` is the state in the coordinates of the estimates."""
         scenario, recorder = self._scenario, self._recorder
+        # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         shown = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [shown[id(nodes[node])] for node in scenario.nodes]
         near = np.array([xhat for xhat, _ in estimates])
         nothing = np.full((len(x), len(x)), math.nan)
+        # Filters without a covariance show nan.
         P = np.array([nothing if P is None else P for _, P in estimates])
         without = np.array([P is None for _, P in estimates])
         # The trace shows absolute states; adding the origin loses digits, so the error is separate.
@@ -201,6 +213,7 @@ class _Simulation:
             recorder.sums = sums.pairs()
         recorder.flush_if_full()
         self._progress(time)
+        # A broken estimate ends the run, but only at a sample: between samples nobody looks.
         lost = broken(scenario, near, P, without)
         # Recorded after the sample, which shows the broken estimate.
         for node in lost:
@@ -220,6 +233,7 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 def _identity(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node: filter, id, index, model, start and NodeInfo."""
     model, first = scenario.believed_models[entity], scenario.nodes[entity]
+    # -1: the pooled filter is no node of the graph.
     if node < 0:
         model = scenario.believed_pooled_model
     return (
@@ -241,6 +255,7 @@ class _Sums:
 
     def _now(self) -> dict[str, float]:
         parts = [_terms(node.algorithm, node.state) for node in self._nodes]
+        # fsum: rounding of the check itself would look like a loss.
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
 
     def pairs(self) -> dict[str, tuple[float, float]]:

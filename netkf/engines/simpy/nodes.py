@@ -54,12 +54,14 @@ class Node:
         self.node, self.entity, self.info, self.model = node, entity, info, model
         self.algorithm = algorithm
         self.state = algorithm.init(model, *start, info)
+        # By sender: absorption is in the order of senders, whatever the order of arrival.
         self.inbox: dict[int, list[Envelope]] = {}
 
     def put(self, envelope: Envelope) -> None:
         """Put a message into the inbox, in place of an older one of that sender if newest_only."""
         known = self.inbox.setdefault(envelope.sender, [])
         if self.algorithm.newest_only and known:
+            # Delays may differ: a message that arrives later may have been sent earlier.
             if envelope.sent >= known[0].sent:
                 known[0] = envelope
         else:
@@ -97,6 +99,7 @@ class ClockedNode(Node):
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
         self._increments = increments
         self._now = 0.0
+        # The samples of the present instant, until the update that uses all of them.
         self._samples: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
         self.after_sample: Any = None
         """Called once the node has used its samples of an instant, with the nodes that sensed."""
@@ -115,12 +118,14 @@ class ClockedNode(Node):
             end = time
             interval = self.algorithm.max_measurement_interval(self.state)
             if interval < time - self._now:
+                # P changes too much over the whole gap: use the increments of a part of it.
                 end = stretch_end(self._now, time, max(interval, least))
                 least *= LONGER
             # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
             self.state = self.algorithm.predict(self.state, gap)
             moments = self._read(self._now, end)
+            # The two moments of the increments, with the gains for a gap of this length.
             self.state = self.algorithm.update(self.state, Increments(moments, gap))
             self._now = end
 
@@ -128,6 +133,7 @@ class ClockedNode(Node):
         truth = self._truth
         seen = truth.moments(start, end)
         parts = [sensor.moments(truth, seen, start, end) for sensor in self._increments]
+        # Stack the sensors: first moments of all rows, then the second ones.
         whole = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return np.asarray(whole.reshape(-1))
 
@@ -145,14 +151,17 @@ class ClockedNode(Node):
         sensing = sorted({node for node, *_ in samples})
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
+        # One update with all samples: R is block diagonal, since sensors have independent noise.
         y, H = (np.concatenate(part) for part in list(zip(*samples, strict=True))[1:3])
         R = block_diagonal([sample[3] for sample in samples])
         self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
+        # Under activation by readings the node transmits now.
         if self.after_sample is not None:
             self.after_sample(time)
 
     def emit(self, time: float, receivers: tuple[int, ...]) -> Any:
         """Return the payload that the node sends at ``time``, before it absorbs anything."""
+        # What is sent is the state of now, and not that of the last event.
         self.predict_to(time)
         exchange = Exchange(time=time, receivers=receivers)
         self.state, payload = self.algorithm.emit(self.state, exchange)

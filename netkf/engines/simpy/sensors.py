@@ -35,6 +35,7 @@ def sensor_processes(
     """Return all processes that read the truth."""
     index = scenario.topology.index
     processes = [
+        # One process for all increment sensors of a node: they are read at the same times.
         _increments(scenario, timeline, recorder, truth, nodes[node], node, index[node])
         for node in scenario.increment_sensors
     ]
@@ -42,9 +43,11 @@ def sensor_processes(
     for node, placed in scenario.sampled_sensors.items():
         for place in placed:
             samples = scenario.sample_path(streams, node, place)
+            # The filters' R, which may differ from that of the readings.
             R = scenario.noise(place.entry, believed=True)
             sensor = SamplingProcess(node, entity, times[node, place.ordinal], samples, R)
             processes.append(sensor.run(timeline, truth, nodes[node]))
+            # Entities number sampled sensors over all nodes: they order samples of one instant.
             entity += 1
     return processes
 
@@ -61,9 +64,11 @@ def _increments(
     """Make the node use its increments at each point of the sensing grid."""
     # Nothing is sensed at time 0: increments need a time that has passed.
     k = 1
+    # Half open: at the horizon nothing is sensed.
     while (time := truth.grid(k)) < scenario.horizon:
         yield timeline.at(time, Rank.SENSE, entity)
         recorder.append((time, SENSE, node, -1, -1, -1, NAN))
+        # predict_to() uses the increments up to now; nothing else is to be done here.
         carrier.predict_to(time)
         k += 1
 
@@ -95,6 +100,8 @@ def increment_sensors(
     for node, place in placed:
         sensor = scenario.sensors[place.entry]
         assert isinstance(sensor, LinearSensor)
+        # Noise on the grid and noise of cuts have streams of their own, so that the grid does not
+        # depend on the network.
         noise, cutting = (streams.generator(p, node, place.ordinal) for p in ("noise", "cut"))
         paths.append(sensor.path(noise, cutting))
     return paths

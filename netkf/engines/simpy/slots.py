@@ -57,10 +57,12 @@ class Schedule:
         self._algorithm, self._plant = scenario.hosted, scenario.slot_plant
         self.horizon = scenario.horizon
         phases = self._algorithm.schedule or ()
+        # Steps of each exchange; none if the filter does not talk.
         self._exchanges = [
             self._algorithm.steps(k) if self._algorithm.talks else 0
             for k in range(phases.count("exchange"))
         ]
+        # Exchanges without steps take no time.
         self._length = scenario.phase_length if any(self._exchanges) else 0.0
         self._samples = frozenset(scenario.slots)
         self._cache: dict[int, list[Stage]] = {}
@@ -99,13 +101,18 @@ class Schedule:
         # A filtered estimate starts from what is known before any reading.
         waits = slot == 0 and not algorithm.predicts
         talks = algorithm.talks and slot >= algorithm.first_slot
+        # Exchanges begin at the filter's first slot, and their numbers at 0 there.
         number = (slot - algorithm.first_slot) * sum(self._exchanges)
         for kind in algorithm.schedule or ():
             if kind == "exchange":
+                # Steps share the phase equally, and end at computed times: no sum of lengths
+                # drifts.
                 steps = self._exchanges[phase]
                 for step in range(steps if talks else 0):
                     yield Stage("send", now, rank, phase, step, number)
                     now = start + (phase + (step + 1) / steps) * self._length
+                    # Absorption has the next rank: a step may take no time, and then only ranks
+                    # order it.
                     yield Stage("absorb", now, rank + 1, phase, step, number)
                     rank, number = rank + 2, number + 1
                 phase += 1
@@ -124,6 +131,7 @@ class SlotNode(Node):
     def __init__(self, recorder: Recorder, schedule: Schedule, period: float, *rest: Any) -> None:
         super().__init__(*rest)
         self._recorder, self._schedule, self._period = recorder, schedule, period
+        # -1: no exchange is open, and every message is late.
         self._open = -1
         self._stopped = False
         self._samples: list[tuple[FloatArray, FloatArray]] = []
@@ -134,6 +142,7 @@ class SlotNode(Node):
         # Readers and the clock follow the same stages; ranks put the processes in order.
         while self._schedule.runs(slot):
             for stage in self._schedule.stages(slot):
+                # Reading and sending belong to other processes.
                 if stage.kind not in ("read", "send"):
                     yield timeline.at(stage.time, stage.rank, self.entity)
                     self._do(stage, slot)
@@ -154,10 +163,12 @@ class SlotNode(Node):
     def _update(self, time: float) -> None:
         """Use the readings of this slot; without sensors they have no rows."""
         model, samples = self.model, self._samples
+        # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
         H = np.concatenate([model.H[:0], *(H for _, H in samples)])
         present = np.concatenate([np.empty(0, dtype=bool), *(_rows(y, H) for y, H in samples)])
         R = model.R
+        # Rows without a value are left out of y, H and R alike.
         if not present.all():  # a recorded sensor without a row for this slot
             y, H, R = y[present], H[present], R[np.ix_(present, present)]
         self._samples = []
@@ -174,6 +185,7 @@ class SlotNode(Node):
 
     def in_time(self, envelope: Envelope) -> bool:
         """Return True if the inbox is still open for the exchange of the message."""
+        # A message carries the exchange it was sent in: a later one does not take it.
         return envelope.exchange == self._open
 
     def receive(self, envelope: Envelope) -> None:
@@ -188,6 +200,7 @@ class SlotNode(Node):
         self._open = -1
         exchange = Exchange(now, phase, stage.step, slot)
         self.state = self.algorithm.absorb(self.state, messages, exchange)
+        # A swap shows each message; other filters absorb all of them as one.
         if self.algorithm.pairwise:
             for envelope in envelopes:
                 peer, number, age = envelope.sender, envelope.number, envelope.age
@@ -195,12 +208,14 @@ class SlotNode(Node):
         elif messages:
             oldest = max(message.age for message in messages)
             append((now, ABSORB, self.node, -1, -1, phase, oldest))
+        # Recorded once, when it becomes true.
         if not self._stopped and self.algorithm.stopped(self.state):
             self._stopped = True
             append((now, STOP, self.node, -1, -1, phase, NAN))
 
 
 def _rows(y: FloatArray, H: FloatArray) -> np.ndarray:
+    # A reading without values has no row that counts.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
 
@@ -221,6 +236,7 @@ class Reader:
                 if stage.kind == "read":
                     yield timeline.at(stage.time, stage.rank, self._entity)
                     self._recorder.append((stage.time, SENSE, self._node, -1, -1, -1, NAN))
+                    # In the coordinates of the estimates, as H x is.
                     x = truth.local(slot)
                     for sensor in sensors:
                         self._carrier.read(sensor.reading(slot, x), sensor.matrix(slot))
@@ -241,9 +257,11 @@ class SlotClock:
     ) -> None:
         self._scenario, self._recorder, self._schedule = scenario, recorder, schedule
         self._nodes, self._algorithm = nodes, scenario.hosted
+        # A pooled filter appears once.
         self._distinct = distinct(nodes)
         self._matching_random = streams.generator("matching")
         links = scenario.topology.links if scenario.hosted.talks else ()
+        # Nodes without links send to nobody, and are not asked.
         self._talking = sorted({node for link in links for node in link})
         self._links = {
             link: LinkExchange(scenario, transmitter, nodes, link, k)
@@ -279,6 +297,7 @@ class SlotClock:
         for i, j in pairs:
             if not broadcast:
                 self._recorder.append((now, TICK, i, j, -1, phase, NAN))
+            # A link that is listed as down loses its messages, but draws all the same.
             here = up is None or (i, j) in up
             both = payloads[i], payloads[j]
             self._links[i, j].exchange(both, phase, stage.number, here, fresh)
@@ -288,6 +307,7 @@ class SlotClock:
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
         if isinstance(activation, Matching):
+            # Matchings are drawn from one stream for the whole network.
             return activation.draw(topology, self._matching_random), None
         if not isinstance(activation, RecordedSlots):
             return links, None
@@ -295,4 +315,5 @@ class SlotClock:
         if not broadcast:
             return listed, None
         up = set(listed)
+        # An undirected link is listed once, and is up in both directions.
         return links, up if topology.directed else up | {(j, i) for i, j in listed}

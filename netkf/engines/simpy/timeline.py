@@ -34,8 +34,11 @@ class Timeline(simpy.Environment):
         This is what simpy.Timeout does, with the time itself and an explicit priority.
         """
         event = simpy.Event(self)
+        # An event that has its value is triggered: SimPy calls its callbacks when it comes up.
         event._ok, event._value = True, None
         queue: list[Any] = self._queue  # simpy annotates its priorities as two constants
+        # Rank before entity in one integer: 48 bits hold any entity. The event number only breaks
+        # ties.
         heappush(queue, (time, rank << 48 | entity, next(self._eid), event))
         return event
 
@@ -44,6 +47,7 @@ class Timeline(simpy.Environment):
     ) -> None:
         """Make an event at ``time`` that calls ``callback``."""
         event = self.at(time, rank, entity)
+        # An event that is not processed yet has a list of callbacks.
         assert event.callbacks is not None
         event.callbacks.append(callback)
 

@@ -49,6 +49,7 @@ class DirectedLink:
         sampler: ChannelSampler,
     ) -> None:
         self.link, self.entity, self.sampler, self.receiver = link, entity, sampler, receiver
+        # Looked up once: table and weight do not change in a run.
         self.table_probability = scenario.table_probability(link)
         self.weight = scenario.weight(link[1], link[0])
         self.messages = 0
@@ -64,10 +65,12 @@ class Transmitter:
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
         self._horizon, self._until = scenario.horizon, scenario.ends
+        # Payloads under way, by link and number, because a move of the origin shifts them.
         self._flying: dict[tuple[Link, int], Envelope] = {}
 
     def sampler(self, link: Link) -> ChannelSampler:
         """Return the sampler of a link (symmetric channel) or of one direction of it."""
+        # The sampler makes its streams when it needs them, by purpose.
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
 
     def directed(
@@ -92,15 +95,18 @@ class Transmitter:
         append = self._recorder.append
         # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
+        # nan: the message is lost.
         delay = transit_time(self._channel, way.link, number, outcome, way.table_probability)
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
         envelope = Envelope(sender, number, way.weight, payload, now, exchange)
+        # No event for a message without delay: it arrives inside the tick.
         if delay == 0.0:
             self._arrive(way, phase, envelope, None)
         # A message that would arrive after the end is neither delivered nor lost.
         elif now + delay < self._until:
+            # Kept here and in the callback; the one here may be shifted meanwhile.
             self._flying[way.link, number] = envelope
             callback = partial(self._arrive, way, phase, envelope)
             self._timeline.call_at(now + delay, Rank.DELIVER, way.entity, callback)
@@ -111,6 +117,7 @@ class Transmitter:
         now, (sender, receiver) = self._timeline.now, way.link
         # The stored envelope may have been shifted since it was sent.
         envelope = self._flying.pop((way.link, envelope.number), envelope)
+        # Its age at arrival.
         envelope = envelope._replace(age=now - envelope.sent)
         arrives_in_time = way.receiver.in_time(envelope)
         # After the horizon only the last slot is finished, for its sample: it leaves no events.
@@ -124,6 +131,7 @@ class Transmitter:
         """Shift all messages under way: the origin of coordinates has moved by ``-offset``."""
         now = self._timeline.now
         for key, envelope in self._flying.items():
+            # A payload is of the time it was sent: the offset is moved back to then.
             earlier = self._scenario.moved_back(offset, now - envelope.sent)
             payload = algorithm.shift_payload(envelope.payload, earlier)
             self._flying[key] = envelope._replace(payload=payload)
@@ -146,8 +154,10 @@ class LinkExchange:
     ) -> None:
         i, j = link
         self._transmitter, self._shared = transmitter, scenario.network.channel.symmetric
+        # Outcomes of the last draw, for links that are held.
         self._outcomes: list[ChannelDraw] = []
         forth = transmitter.sampler((i, j))
+        # Entities 2 k and 2 k + 1: the order in which simultaneous messages arrive.
         self._ways = [transmitter.directed((i, j), 2 * entity, receivers[j], forth)]
         if not scenario.topology.directed:
             back = forth if self._shared else transmitter.sampler((j, i))
@@ -169,11 +179,13 @@ class LinkExchange:
         """
         if fresh or not self._outcomes:
             first, *others = self._ways
+            # The first direction draws; with a symmetric channel its draw serves both.
             drawn = first.sampler.draw()
             self._outcomes = [
                 drawn,
                 *(drawn if self._shared else way.sampler.draw() for way in others),
             ]
+        # Not strict: in a directed graph only the first end sends.
         for way, payload, outcome in zip(self._ways, payloads, self._outcomes, strict=False):
             self._transmitter.send(way, payload, outcome if up else LINK_DOWN, phase, exchange)
 
