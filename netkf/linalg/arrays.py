@@ -23,26 +23,30 @@ __all__ = [
 
 
 def readonly_array(value: ArrayLike) -> FloatArray:
-    """A read-only float64 copy."""
+    """Return a read-only float64 copy."""
+    # A copy: the caller may go on writing into its own array.
     array = np.array(value, dtype=np.float64)
     array.flags.writeable = False
     return array
 
 
 def symmetric(matrices: FloatArray) -> FloatArray:
-    """The symmetric part of one matrix or of a stack of them."""
+    """Return the symmetric part of one matrix (n, n) or of a stack of them (..., n, n)."""
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
 
 
 def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
-    """Whether a symmetric matrix has no eigenvalue below ``-tolerance`` times its largest one."""
+    """Return True if no eigenvalue of a symmetric matrix is below -tolerance times its largest."""
     values = np.linalg.eigvalsh(matrix)
+    # Relative to the largest eigenvalue; the smallest normal number admits the zero matrix.
     return bool(values[0] >= -tolerance * max(abs(values[-1]), np.finfo(float).tiny))
 
 
 def square_root(matrix: FloatArray) -> FloatArray:
-    """A factor ``S`` with ``S S' = matrix``; the matrix may be singular."""
+    """Return a factor ``S`` (n, n) with ``S S' = matrix``; the matrix may be singular."""
+    # Eigenvalues instead of Cholesky, which fails for singular matrices.
     values, vectors = np.linalg.eigh(matrix)
+    # Negative eigenvalues are rounding of zero.
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
@@ -58,6 +62,7 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
     """The blocks, possibly rectangular or empty, along the diagonal of one matrix."""
     rows = sum(b.shape[0] for b in blocks)
     columns = sum(b.shape[1] for b in blocks)
+    # Blocks may have no rows or no columns: slices of zeros take them too.
     whole = np.zeros((rows, columns))
     row = column = 0
     for block in blocks:

@@ -53,6 +53,7 @@ def kernel(
     ``@kernel(allocates=True)``. It runs without the interpreter's lock. ``inlined``: its code
     becomes part of each kernel that calls it, which pays for steps of a few hundred flops.
     """
+    # ``@kernel(...)`` with arguments comes without the function.
     if function is None:
         return lambda loops: _registered(loops, allocates, inlined)
     return _registered(function, allocates, inlined)
@@ -61,6 +62,7 @@ def kernel(
 def _registered(loops: Callable[..., Any], allocates: bool, inlined: bool) -> Callable[..., Any]:
     @wraps(loops)
     def call(*args: Any, **kwargs: Any) -> Any:
+        # Compiled with the first call: importing netkf must not import numba.
         return _compiled(loops)(*args, **kwargs)
 
     if allocates:
@@ -75,6 +77,7 @@ def _registered(loops: Callable[..., Any], allocates: bool, inlined: bool) -> Ca
 def _compiled(loops: Callable[..., Any]) -> Callable[..., Any]:
     import numba
 
+    # Before each compilation, since modules imported meanwhile may have more kernels.
     _overload_kernels()
     config: Any = numba.config
     before = config.CACHE_DIR
@@ -84,6 +87,7 @@ def _compiled(loops: Callable[..., Any]) -> Callable[..., Any]:
         made: Callable[..., Any] = numba.njit(cache=True, **_options(loops))(loops)
     finally:
         config.CACHE_DIR = before
+    # numba's level is global: it is set while this function compiles.
     _moderately_optimised(made, config)
     return made
 
@@ -96,6 +100,7 @@ def _moderately_optimised(made: Any, config: Any) -> None:
         before, began = config.OPT, time.perf_counter()
         config.OPT = type(before)(2)
         try:
+            # One link step for the function and all that it calls, see linking.
             with linked_once():
                 return compile_for(*args, **kwargs)
         finally:
@@ -112,6 +117,7 @@ def seconds_spent() -> float:
 
 def announce(function: Callable[..., Any]) -> None:
     """Say that a function will be compiled first, where its code is not kept on disk."""
+    # Once per function and process.
     if function in _said:
         return
     _said.add(function)
@@ -128,8 +134,10 @@ def _overload_kernels() -> None:
     from netkf.linalg import struct_types  # noqa: F401 - registers structs
 
     for call, loops in _kernels.items():
+        # An overload may be registered once only.
         if call not in _overloaded:
             _overloaded.add(call)
+            # The same options as for the function itself: inlining must be known to the caller.
             extending.overload(call, jit_options=_options(loops))(_always(loops))
 
 
@@ -150,11 +158,14 @@ def _always(loops: Callable[..., Any]) -> Callable[..., Any]:
 
 @cache
 def _folder(chosen: str) -> Path:
-    """Where compiled code is kept: a folder for each state of the sources."""
+    """Return the folder of compiled code: one for each state of the sources."""
     root = Path(__file__).parents[1]
     sources = hashlib.sha256()
+    # A kernel may hold constants and kernels of any of these folders, so each of their files
+    # counts.
     files = [file for room in ROOMS for file in (root / room).rglob("*.py")]
     for file in sorted(files):
+        # A change of any byte makes a new folder: compiled code is never out of date.
         sources.update(file.read_bytes())
     name = f"netkf-{sources.hexdigest()[:16]}"
     kept = _kept_in(chosen, root)
@@ -164,7 +175,8 @@ def _folder(chosen: str) -> Path:
 
 
 def _kept_in(chosen: str, root: Path) -> Path:
-    """Where numba was told to keep code, else beside the sources, else in the user's cache."""
+    """Return numba's folder if it was set, else one beside the sources or in the user's cache."""
+    # The user's choice, NUMBA_CACHE_DIR.
     if chosen:
         return Path(chosen)
     beside = root / "__pycache__"
@@ -173,6 +185,7 @@ def _kept_in(chosen: str, root: Path) -> Path:
         writable = os.access(beside, os.W_OK)
     except OSError:
         writable = False
+    # An installation may be read-only.
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return beside if writable else home / "netkf"
 
@@ -180,5 +193,6 @@ def _kept_in(chosen: str, root: Path) -> Path:
 def _make_room(folder: Path) -> None:
     """Remove what was compiled from sources that are long gone."""
     found = [path for path in folder.glob("netkf-*") if path.is_dir()]
+    # The newest states stay: switching between a few branches does not compile anew.
     for old in sorted(found, key=lambda path: path.stat().st_mtime)[: -MOST_STATES + 1]:
         shutil.rmtree(old, ignore_errors=True)

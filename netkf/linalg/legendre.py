@@ -17,9 +17,11 @@ MOMENTS = 2
 def forward_coefficients(terms: int) -> FloatArray:
     """(2, terms): ``int_0^1 u^k P_j(2 u - 1) du``, for ``exp(M (s - a))`` integrated from a."""
     k = np.arange(terms)
+    # P_0 = 1 and P_1 = 2 u - 1, so the second row is 2 / (k + 2) - 1 / (k + 1).
     return np.stack([1.0 / (k + 1), k / ((k + 1.0) * (k + 2.0))])
 
 
 def backward_coefficients(terms: int) -> FloatArray:
     """(2, terms): ``int_0^1 u^k P_j(1 - 2 u) du``, for ``exp(-M (b - s))`` integrated from b."""
+    # P_1 is odd about the middle: looking back from b changes its sign.
     return np.asarray(forward_coefficients(terms) * np.array([[1.0], [-1.0]]))

@@ -43,6 +43,8 @@ def linked_once() -> Iterator[None]:
 def _replaced() -> Iterator[None]:
     try:
         patches = _patches()
+        # All originals are looked up before the first is replaced: a numba without one of them is
+        # left as it is.
         before = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
     except (AttributeError, ImportError, KeyError):
         patches, before = [], []
@@ -56,13 +58,14 @@ def _replaced() -> Iterator[None]:
 
 
 def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
-    """What stands in for methods of numba meanwhile: class, name, method."""
+    """Return the replacements of numba's methods: class, name, method."""
     from numba.core.codegen import CPUCodeLibrary
     from numba.core.cpu import CPUContext
     from numba.core.dispatcher import Dispatcher
 
     library: Any = CPUCodeLibrary
     return [
+        # Depths tell the outermost function from those compiled on its way.
         (Dispatcher, "compile", _counted("compile", Dispatcher.compile)),
         (library, "finalize", _counted("finalize", library.finalize)),
         (
@@ -79,6 +82,7 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
             "_optimize_final_module",
             _only_outermost("finalize", _private(library._optimize_final_module), _nothing),
         ),
+        # An inner library keeps its functions as they are, and their names for _private().
         (
             library,
             "_finalize_final_module",
@@ -89,6 +93,7 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
 
 def _counted(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
     def counted(*args: Any, **kwargs: Any) -> Any:
+        # Threads have depths of their own; numba's compiler itself is locked.
         setattr(_DEPTH, what, getattr(_DEPTH, what) + 1)
         try:
             return original(*args, **kwargs)
@@ -115,13 +120,14 @@ def _stub(_: Any, library: Any, fndesc: Any, env: Any) -> Any:
     """Stands for a function that is linked in, and never called from Python (it would raise)."""
     from numba import _dynfunc  # type: ignore[attr-defined]
 
+    # Any function that raises will do, because nobody calls the stub.
     raising = ctypes.cast(ctypes.pythonapi.PyErr_NoMemory, ctypes.c_void_p).value
     module, name = fndesc.lookup_module(), fndesc.qualname.split(".")[-1]
     return _dynfunc.make_function(module, name, "linked in", raising, env, (library,))
 
 
 def _nothing(*_: Any, **__: Any) -> None:
-    """What Python needs to call a function, and what makes it fast alone, is left out."""
+    """Leave out wrappers for Python and optimisation of a function that is linked in."""
 
 
 def _private(optimize: Callable[..., Any]) -> Callable[..., Any]:
@@ -130,6 +136,8 @@ def _private(optimize: Callable[..., Any]) -> Callable[..., Any]:
     def optimize_all(library: Any) -> Any:
         for function in library._final_module.functions:
             if function.name in _DEPTH.inner and not function.is_declaration:
+                # "internal": LLVM may drop the function after inlining it, and need not keep its
+                # signature.
                 function.linkage = "internal"
         return optimize(library)
 
@@ -137,9 +145,11 @@ def _private(optimize: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _keep_as_it_is(library: Any) -> None:
-    """What numba does, without code for the machine."""
+    """Finalize a library as numba does, without machine code."""
     defined = library._final_module.functions
     _DEPTH.inner.update(f.name for f in defined if not f.is_declaration)
+    # What ``finalize`` does without optimising and generating code: the outermost library will do
+    # both.
     library._finalize_dynamic_globals()
     library._verify_declare_only_symbols()
     library._finalized = True

@@ -20,24 +20,32 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
     seconds, whose last column says for each k up to which gap what follows is below rounding. The
     number of terms is made odd.
     """
+    # fill_polynomial() takes two rows after the first at a time.
     if len(series) % 2 == 0:
         series = np.concatenate([series, np.zeros((1, series.shape[1]))])
     terms = len(series)
+    # Gaps in quarter octaves, from the longest down to 2^-8 of it.
     gaps = longest * 2.0 ** (-np.arange(OCTAVES * STEPS + 1)[::-1] / STEPS)
     sizes = np.abs(series) * (gaps[:, None] ** np.arange(terms))[:, :, None]
+    # Sum of the sizes of all later terms, for each gap, term and entry.
     left = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1] - sizes
     largest = sizes.max(axis=1)
+    # Rounding is relative to each entry, with a floor relative to the largest, for entries that
+    # vanish.
     most = ROUNDING * largest + NOTHING * largest.max(axis=1, initial=0.0)[:, None]
+    # Terms that a gap needs: those after which any entry still has more than rounding left.
     needed = (left > most[:, None]).any(axis=2).sum(axis=1)
+    # maximum.accumulate: a longer gap never needs fewer terms, whatever rounding says.
     counts = np.searchsorted(np.maximum.accumulate(needed), np.arange(terms), side="right")
     reach = np.concatenate([[0.0], gaps])[counts]
+    # The last row is always enough, so that loops end there.
     reach[-1:] = np.inf
     return np.column_stack([series, reach])
 
 
 @kernel
 def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
-    """Write the first entries of the sum into a vector."""
+    """Write the first len(out) entries of the sum at ``gap`` seconds into ``out``."""
     size, reach = len(out), series.shape[1] - 1
     for j in range(size):
         out[j] = series[0, j]

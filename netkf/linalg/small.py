@@ -49,6 +49,7 @@ def symmetrize(P: FloatArray) -> FloatArray:
     out = np.empty(P.shape)
     for i in range(P.shape[0]):
         for j in range(i + 1):
+            # Both entries from one expression, so that the result is exactly symmetric.
             out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
     return out
 
@@ -62,18 +63,21 @@ def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
     columns = out.shape[1]
     for k in range(n):
         best = largest_pivot(L, k, n)
+        # An exact zero only: a tiny pivot is an ill-conditioned matrix, and not an error.
         if L[best, k] == 0.0:
             out[:n] = np.nan
             return
         if best != k:
             swap_rows(L, k, best, k, n)
             swap_rows(out, k, best, 0, columns)
+        # Forward elimination of column k, in L and in the right-hand side alike.
         for i in range(k + 1, n):
             factor = L[i, k] / L[k, k]
             for j in range(k + 1, n):
                 L[i, j] -= factor * L[k, j]
             for j in range(columns):
                 out[i, j] -= factor * out[k, j]
+    # Back substitution.
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
             for j in range(columns):

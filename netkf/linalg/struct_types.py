@@ -49,17 +49,18 @@ class StructType(types.Type):
 
 
 register_model(StructType)(models.OpaqueModel)
+# One numba type per class: a type made anew would compile every kernel again.
 _known: dict[type[Struct], StructType] = {}
 
 
 @typeof_impl.register(Struct)
 def type_of(value: Struct, _: Any) -> StructType:
-    """The type of a struct."""
+    """Return the numba type of a struct."""
     return struct_type(type(value))
 
 
 def struct_type(cls: type[Struct]) -> StructType:
-    """The type of a derived class that has instances."""
+    """Return the numba type of a derived class that has instances."""
     if cls not in _known:
         fields = tuple(
             (name, WORD * cls.struct_offsets[name], _field_type(cls.struct_kinds[name]))
@@ -71,8 +72,10 @@ def struct_type(cls: type[Struct]) -> StructType:
 
 def _field_type(kind: Any) -> Any:
     if isinstance(kind, tuple):
+        # "C": strides follow from the shape, so that only the shape is stored.
         return types.Array(from_dtype(kind[0]), kind[1], "C")
     if isinstance(kind, int):
+        # A ``sized`` field: its length is part of the type, and it has no words.
         return types.UniTuple(types.int64, kind)
     if issubclass(kind, Struct):
         return struct_type(kind)
@@ -81,7 +84,8 @@ def _field_type(kind: Any) -> Any:
 
 @unbox(StructType)
 def unbox_struct(_: StructType, value: Any, c: Any) -> Any:
-    """The address of a struct."""
+    """Return the address of a struct."""
+    # The address is read from the object at each call.
     number = c.pyapi.object_getattr_string(value, "address")
     address = c.pyapi.long_as_voidptr(number)
     c.pyapi.decref(number)
@@ -92,10 +96,11 @@ def unbox_struct(_: StructType, value: Any, c: Any) -> Any:
 class Fields(AttributeTemplate):
     """The types of fields."""
 
+    # numba resolves ``struct.name`` in kernels by this template.
     key = StructType
 
     def generic_resolve(self, struct: StructType, name: str) -> Any:
-        """The type of a field, or None."""
+        """Return the type of a field, or None."""
         return next((kind for known, _, kind in struct.fields if known == name), None)
 
 
@@ -106,10 +111,12 @@ def _place(builder: Any, address: Any, offset: int, kind: Any) -> Any:
 
 @lower_getattr_generic(StructType)
 def load_field(context: Any, builder: Any, struct: StructType, address: Any, name: str) -> Any:
-    """A number, an address, or an array without an owner."""
+    """Load a number, an address, or an array without an owner."""
     offset, kind = struct.field(name)
+    # The values of a sized tuple are never read, only its length.
     if isinstance(kind, types.BaseTuple):
         return context.get_constant_null(kind)
+    # Numbers are loaded; a struct inside a struct is the address that is stored.
     if not isinstance(kind, types.Array):
         return builder.load(_place(builder, address, offset, context.get_value_type(kind)))
     itemsize = context.get_abi_sizeof(context.get_data_type(kind.dtype))
@@ -117,6 +124,7 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
     data = builder.load(_place(builder, address, offset, array.data.type))
     first = _place(builder, address, offset + WORD, I64)
     shape = [builder.load(builder.gep(first, [ir.Constant(I64, k)])) for k in range(kind.ndim)]
+    # Row-major strides from the last dimension to the first.
     strides = [ir.Constant(I64, itemsize)]
     for size in reversed(shape[1:]):
         strides.insert(0, builder.mul(strides[0], size))
@@ -126,6 +134,7 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
     array.data, array.nitems, array.itemsize = data, items, ir.Constant(I64, itemsize)
     array.shape = cgutils.pack_array(builder, shape, I64)
     array.strides = cgutils.pack_array(builder, strides, I64)
+    # No owner: numba counts no references, and Python keeps the array alive.
     array.meminfo = ir.Constant(array.meminfo.type, None)
     array.parent = ir.Constant(array.parent.type, None)
     return array._getvalue()
@@ -133,9 +142,10 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
 
 @lower_setattr_generic(StructType)
 def store_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """A number; arrays are put into place by Python."""
+    """Store a number; arrays are put into place by Python."""
     struct, (address, value) = sig.args[0], args
     offset, kind = struct.field(name)
+    # numba may have typed the value as another number: convert it to the field's type.
     number = context.cast(builder, value, sig.args[1], kind)
     builder.store(number, _place(builder, address, offset, number.type))
 
@@ -153,7 +163,7 @@ register_model(ClassType)(models.OpaqueModel)
 
 @typeof_impl.register(StructClass)
 def type_of_class(value: type[Struct], _: Any) -> ClassType:
-    """The type of a class that has instances."""
+    """Return the numba type of the class itself, if it has instances."""
     return ClassType(struct_type(value))
 
 
@@ -165,6 +175,7 @@ def nothing(context: Any, *_: Any) -> Any:
 
 @intrinsic
 def _at(_: Any, memory: Any, cls: ClassType) -> Any:
+    # The first word of the memory is where the struct begins.
     def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         array = context.make_array(sig.args[0])(context, builder, args[0])
         return builder.bitcast(array.data, cgutils.voidptr_t)

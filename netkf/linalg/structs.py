@@ -66,12 +66,15 @@ class Struct(metaclass=StructClass):
     @classmethod
     def of_size(cls, n: int) -> Any:
         """The class of structs for loops over n, which are unrolled if n is small."""
+        # Larger states share one compiled kernel, whatever their n.
         if n > MAX_UNROLLED:
             return cls
         known = _sized_classes.get((cls, n))
         if known is None:
+            # The same annotations, but a class of its own: its layout has the size in the type.
             body = {"__annotations__": cls.__annotations__, "__module__": cls.__module__}
             made = StructClass(f"{cls.__name__}{n}", (cls,), body)
+            # setdefault, because threads may make the same class at one time.
             known = _sized_classes.setdefault((cls, n), made)
         return known
 
@@ -80,6 +83,7 @@ class Struct(metaclass=StructClass):
         cls = type(self)
         if values.keys() != set(cls.struct_fields):
             raise TypeError(f"{cls.__name__} has the fields {', '.join(cls.struct_fields)}")
+        # The first instance decides the types of fields.
         if not cls.struct_offsets:
             cls._lay_out(values)
         object.__setattr__(self, "memory", np.zeros(cls.struct_words(), dtype=np.int64))
@@ -109,9 +113,11 @@ class Struct(metaclass=StructClass):
             elif isinstance(value, Struct):
                 kinds[name] = type(value)
             elif isinstance(value, tuple):
+                # A tuple takes no words: undo the one that is added below.
                 kinds[name], word = len(value), word - 1
             else:
                 kinds[name] = (value.dtype, value.ndim)
+                # A pointer, and one word for each dimension.
                 word += value.ndim
             word += 1
         cls.struct_kinds, cls.struct_offsets = kinds, offsets
@@ -119,12 +125,16 @@ class Struct(metaclass=StructClass):
     def __setattr__(self, name: str, value: Any) -> None:
         word, kind = self.struct_offsets[name], self.struct_kinds[name]
         if isinstance(kind, tuple):
+            # Compiled code assumes the type and computes strides itself: anything else would read
+            # wrong memory.
             if (value.dtype, value.ndim) != kind or not value.flags.c_contiguous:
                 raise TypeError(f"{type(self).__name__}.{name} is a C-contiguous array {kind}")
             self.memory[word] = value.ctypes.data
             self.memory[word + 1 : word + 1 + value.ndim] = value.shape
+            # The dictionary keeps the array alive, since the memory holds its address only.
             self.__dict__[name] = value
         elif kind is np.int64 or kind is np.float64:
+            # Integers and floats share the words, seen as one or the other type.
             self.memory.view(kind)[word] = value
         elif isinstance(kind, int):
             self.__dict__[name] = value
@@ -134,6 +144,7 @@ class Struct(metaclass=StructClass):
 
     def __reduce__(self) -> tuple[Any, ...]:
         cls, size = type(self), getattr(self, "size", None)
+        # A class made by of_size() has no importable name: its base and n are pickled.
         base, n = (cls.__base__, len(size)) if isinstance(size, tuple) else (cls, None)
         return _rebuilt, (base, n, {name: getattr(self, name) for name in self.struct_fields})
 
@@ -161,5 +172,5 @@ def sized(n: int) -> Size:
 
 
 def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:  # noqa: ARG001
-    """For kernels: the struct of a class that has this memory."""
+    """Return, in kernels, the struct of a class that has this memory; Python raises TypeError."""
     raise TypeError("struct_at is for kernels; Python has the struct itself")
