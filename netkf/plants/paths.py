@@ -58,7 +58,7 @@ class Block(NamedTuple):
     ends: FloatArray
 
     def of(self, k: int) -> Block:
-        """That of path ``k``."""
+        """Return the block of path ``k``, without the first axis."""
         return self._replace(
             x_start=self.x_start[k],
             x_end=self.x_end[k],
@@ -102,6 +102,7 @@ class DiffusionPaths:
         laws, (count, n), total = self.laws, self._x.shape, blocks * BLOCK
         x_start, x_end = (np.empty((count, total, n)) for _ in range(2))
         moments, cubic = np.empty((count, total, 2, n)), np.empty((count, total, 4, n))
+        # One kernel call draws all steps of all runs: end, moments and cubic.
         fill_steps(
             self._normals.draw((total, 3 * n)),
             laws.noise_factor,
@@ -113,6 +114,7 @@ class DiffusionPaths:
             np.empty(3 * n),
             (x_start, x_end, moments, cubic),
         )
+        # Grid times from their index, and not as sums of periods.
         times = laws.grid(self._drawn, total + 1)
         self._drawn += total
         block = Block(
@@ -125,9 +127,11 @@ class DiffusionPaths:
             step=np.arange(total),
             ends=times[1:],
         )
+        # One kind of cuts after the other: shown states are drawn given those that were sampled.
         for cuts in self._cuts:
             first, last = np.searchsorted(cuts.times, times[[0, -1]], side="right")
             shown = cuts.times[first:last]
+            # A time at the end of a piece needs no cut.
             inside = shown[~np.isin(shown, block.end)]
             if len(inside):
                 block = self._cut(block, inside, cuts.normals)
@@ -135,8 +139,10 @@ class DiffusionPaths:
 
     def _cut(self, block: Block, shown: FloatArray, source: Normals) -> Block:
         """The block with pieces that also end at the times ``shown``, inside its own pieces."""
+        # The piece that each time is in.
         owners = np.searchsorted(block.end, shown)
         normals = source.draw((len(shown), 3 * self.laws.n))
+        # A piece with m cuts becomes m + 1 rows, copies of it at first.
         counts = 1 + np.bincount(owners, minlength=len(block.end))
         # A piece cut twice is cut at the first time, and what is left of it at the second.
         turn = np.arange(len(shown)) - np.searchsorted(owners, owners)
@@ -151,10 +157,14 @@ class DiffusionPaths:
             step=block.step[which],
             ends=block.ends,
         )
+        # Row in which a time's piece is at its turn, and the end of the copies of its piece.
         firsts = np.cumsum(counts) - counts
         rows, stops = firsts[owners] + turn, (firsts + counts)[owners]
+        # The k-th cuts of all pieces at once.
         for k in range(int(turn.max()) + 1):
             chosen = turn == k
+            # The conditional law depends on the length and on the cut alone: equal ones are drawn
+            # together. Rounding unites lengths that differ by rounding.
             lengths = np.round(pieces.end[rows[chosen]] - pieces.start[rows[chosen]], 12)
             lefts = np.round(shown[chosen] - pieces.start[rows[chosen]], 12)
             laws = np.unique(np.stack([lengths, lefts]), axis=1, return_inverse=True)[1].ravel()
@@ -177,11 +187,14 @@ class DiffusionPaths:
         n, laws = self.laws.n, self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
         left = float(times[0] - pieces.start[rows[0]])
+        # Law of (state, moments) at the cut given (end, moments) of the piece, all without the
+        # response to its start.
         gain, spread = laws.conditional_law(length, left)
         x, end = pieces.x_start[:, rows], pieces.x_end[:, rows]
         known = np.concatenate([end[:, :, None], pieces.moments[:, rows]], axis=2)
         residual = (known - _moved(laws.responses(length), x)).reshape(*x.shape[:2], 3 * n)
         noise = (residual @ gain.T + normals @ spread.T).reshape(known.shape)
+        # Add the response to the start again.
         values = _moved(laws.responses(left), x) + noise
         middle, first = values[:, :, 0], values[:, :, 1:]
         share = left / length
@@ -191,9 +204,12 @@ class DiffusionPaths:
         tilted = known[:, :, 2] - (share - 1.0) * first[:, :, 0] - share * first[:, :, 1]
         second = np.stack([plain, (tilted - share * plain) / (1.0 - share)], axis=2)
         later = np.concatenate([end[:, :, None], second], axis=2)
+        # The rest starts from the state at the cut: what noise adds there is what the response to
+        # that state leaves.
         later -= _moved(laws.responses(length - left), middle)
         cubics = _cubics(left, noise[:, :, 0], noise[:, :, 1:])
         rest = _cubics(length - left, later[:, :, 0], later[:, :, 1:])
+        # The row itself becomes the part before the cut, and all rows after it the rest.
         pieces.end[rows], pieces.x_end[:, rows] = times, middle
         pieces.moments[:, rows], pieces.cubic[:, rows] = first, cubics
         for k, (row, stop) in enumerate(zip(rows.tolist(), stops.tolist(), strict=True)):
@@ -230,16 +246,20 @@ def fill_steps(
                 for j in range(i + 1):
                     noise[i] += factor[i, j] * normals[run, k, j]
             for i in range(n):
+                # The cubic starts at 0, ends at ``end`` and has the two moments: P_0 and P_1 follow
+                # from the moments, P_2 and P_3 from the ends.
                 end, mean, slope = noise[i], noise[n + i] / period, 3.0 * noise[2 * n + i] / period
                 cubic[run, k, 0, i], cubic[run, k, 1, i] = mean, slope
                 cubic[run, k, 2, i], cubic[run, k, 3, i] = 0.5 * end - mean, 0.5 * end - slope
                 x_start[run, k, i] = x[run, i]
                 x_end[run, k, i] = end
                 moments[run, k, 0, i], moments[run, k, 1, i] = noise[n + i], noise[2 * n + i]
+                # Response to the start of the step, exact for all three.
                 for j in range(n):
                     x_end[run, k, i] += response[0, i, j] * x[run, j]
                     moments[run, k, 0, i] += response[1, i, j] * x[run, j]
                     moments[run, k, 1, i] += response[2, i, j] * x[run, j]
+            # A frame ends with this step: the next one starts from 0 in its own coordinates.
             rebased = frame_steps > 0 and (drawn + k + 1) % frame_steps == 0
             for i in range(n):
                 x[run, i] = 0.0 if rebased else x_end[run, k, i]
@@ -263,8 +283,10 @@ class DiffusionPath:
 
     def _at(self, time: float) -> Step:
         """The piece that ``time`` is in; it may lie before the last one asked for, in its step."""
+        # Blocks are drawn when they are asked for: the path is never longer than it has to be.
         while self._block is None or time > self._block.ends[-1]:
             self._block, self._first, self._piece = self._paths.following().of(0), 0, -1
+        # From the first piece of the present step, since a node may lag behind the last call.
         block, k = self._block, self._first
         while block.end[k] < time:
             k += 1
@@ -276,7 +298,7 @@ class DiffusionPath:
         return self._step
 
     def step_end(self) -> float:
-        """Where the sensing step that was last asked for ends."""
+        """Time in seconds at which the sensing step that was last asked for ends."""
         return self._step_end
 
     def moments(self, start: float, end: float) -> FloatArray:
@@ -299,6 +321,7 @@ class DiffusionPath:
             part = seen(self.laws, step, first, last)
             # P_1 of the whole interval on this part of it.
             middle = ((first - start) - (end - last)) / gap
+            # Moment by moment: P_0 adds up, P_1 is shifted by the middle and scaled by the share.
             total[0] += part[0]
             total[1] += middle * part[0] + (last - first) / gap * part[1]
             if step.start <= start:
@@ -319,6 +342,7 @@ class DiffusionPath:
         """
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor shown"
+        # The step that ends at the frame time still has coordinates of the frame before.
         if self._begins_frame(time):
             return np.zeros(self.laws.n)
         return step.x_end if time == step.end else step.x_start
@@ -335,12 +359,14 @@ class DiffusionPath:
         step = self._at(time)
         start = 0.0 if k == 0 else float(self.frame_times[k - 1])
         with np.errstate(over="ignore", invalid="ignore"):
+            # The new origin: the old one moved to this time, plus the local state.
             self._origin = self._moved_origin(time - start) + step.x_end
         self._frame = k + 1
         return step.x_end
 
     def _moved_origin(self, gap: float) -> FloatArray:
         """(n,) the origin of the present frame so many seconds after its start."""
+        # An origin at 0 stays there.
         if self._moves is None or not self._origin.any():
             return self._origin
         return np.asarray(self._moves.transitions(np.array([gap]))[0] @ self._origin)
@@ -365,6 +391,8 @@ def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
     """(B, K, 4, n) Legendre coefficients of the cubics on [0, 1] that start at 0, end at ``end``
     (B, K, n) and have these moments (B, K, 2, n).
     """
+    # Legendre coefficients of P_0 and P_1 are the moments times 2 j + 1 over the length; those of
+    # P_2 and P_3 make the cubic 0 at the start and ``end`` at the end.
     mean, slope = moments[:, :, 0] / length, 3.0 * moments[:, :, 1] / length
     return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=2)
 
@@ -377,7 +405,9 @@ def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> 
     for m in range(2):
         for c in range(4):
             out[m, c] = 0.0
+    # Three nodes are exact up to degree 5: a cubic times P_1 has degree 4.
     for k in range(3):
+        # Node k of the gap, as a point z in [-1, 1] of the whole step.
         z = 2.0 * (since + 0.5 * gap * (1.0 + _THREE[k])) / length - 1.0
         square = z * z
         for m in range(2):
@@ -391,6 +421,7 @@ def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> 
 def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     """(2, n) moments of x over ``[start, end]`` inside a step."""
     n = len(step.x_start)
+    # The moments of a whole piece were drawn from their exact law: no cubic is needed.
     if start == step.start and end == step.end:
         return step.moments
     out, work = np.empty((2, n)), (np.empty(2 * n * n), np.empty(n), np.empty((2, 4)))
@@ -422,6 +453,8 @@ def fill_seen(
     n = len(x)
     for i in range(n):
         x[i] = x_start[k, i]
+    # x(since) by the response alone; the cubic below contains all that noise adds since the piece
+    # began.
     if since > 0.0:
         fill_polynomial(responses[: n * n], to_end, since)
         for i in range(n):
@@ -433,6 +466,7 @@ def fill_seen(
     for m in range(2):
         for i in range(n):
             total = 0.0
+            # Response to x over the gap, and the moments of the cubic.
             for j in range(n):
                 total += responses[(m * n + i) * n + j] * x[j]
             for c in range(4):

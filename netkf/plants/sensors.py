@@ -65,6 +65,7 @@ class Sensor(Component):
         """(K,) the times in continuous time at which one of the nodes samples, below the
         ``horizon``; sensors in slots and of increments have none.
         """
+        # None by default: only sensors with a clock sample.
         return np.empty(0)
 
     def samples(
@@ -94,6 +95,7 @@ class LinearSensor(Sensor):
         horizon: float,
     ) -> FloatArray:
         """(K,) from the streams "sampling" and "sampling phase"."""
+        # Only sensors with a clock are asked.
         assert self.sampling is not None
         entity, phase = (node, ordinal), partial(generator, "sampling phase")
         return all_ticks(self.sampling, entity, phase, generator("sampling"), horizon, "sampling")
@@ -126,11 +128,13 @@ class SensorPath:
         cutting: np.random.Generator,
     ) -> None:
         self.H = H
+        # Cholesky factor of R: the noise is drawn with unit intensity and multiplied by it.
         self._root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
         self._random, self._cutting = random, cutting
         self._drawn = np.empty((0, 2, len(R)))
         self._used = 0
         self._end = 0.0
+        # The noise of the present step that has not been read yet.
         self._rest = np.zeros((2, len(R)))
 
     def moments(
@@ -140,9 +144,12 @@ class SensorPath:
         the moments ``seen``; ``start`` is where the last call ended.
         """
         last = truth.step_end()
+        # A new step: what was left of the one before has been read to its end.
         if last != self._end:
             self._rest, self._end = self._draw(truth.period), last
         if end < last:
+            # Normals for cuts come from a second stream, so that the noise on the grid is the same
+            # whoever wakes whom.
             normals = self._cutting.standard_normal(self._rest.shape)
             length = last - start
             noise, self._rest = cut(self._rest, normals, (end - start) / length, length)
@@ -151,6 +158,7 @@ class SensorPath:
         return reading(seen, self.H, noise, self._root)
 
     def _draw(self, period: float) -> FloatArray:
+        # Blocks of normals: one call for many steps.
         if self._used == len(self._drawn):
             self._drawn = self._random.standard_normal((BLOCK, *self._drawn.shape[1:]))
             self._used = 0
@@ -188,6 +196,7 @@ def fill_reading(
     the first moments from ``out[row]`` on and the second ones half of ``out`` later.
     """
     half = len(out) // 2
+    # Both moments are linear: dy = H x dt + dv, moment by moment.
     for m in range(2):
         for i in range(rows):
             total = 0.0
@@ -204,6 +213,7 @@ def cut(
     """Moments (2, p) of the first share ``u`` of an interval of ``length`` seconds and of what is
     left, given those of the whole, from standard ``normals`` (2, p).
     """
+    # Copies, so that callers keep their arrays.
     first, left = np.empty(rest.shape), rest.copy()
     divide(first, left, normals, u, length)
     return first, left
@@ -220,15 +230,20 @@ def divide(
     two sums; written so that nothing cancels when a part is short.
     """
     w = 1.0 - u
+    # At least 1 / 4 for every u in [0, 1], so that the divisions below are safe.
     spread = 1.0 - 3.0 * u * w
     size_first = math.sqrt(u * w * spread * length)
     size_slope = math.sqrt(u * w / spread * length)
     size_other = math.sqrt(u * w / (3.0 * spread) * length)
     for k in range(rest.shape[1]):
+        # Given the sums the first moment has the mean u whole - 3 u w tilted; the rest gets the
+        # same noise with the other sign.
         whole, tilted = rest[0, k], rest[1, k]
+        # The noise of the first moment also tilts both parts: one normal for both.
         early, slope = size_first * normals[0, k], size_slope * normals[0, k]
         other = size_other * normals[1, k]
         first[0, k] = u * whole - 3.0 * u * w * tilted + early
         first[1, k] = u * u * (tilted + slope) + w * other
+        # Subtracted from the rest: both parts add up to the whole.
         rest[0, k] = w * whole + 3.0 * u * w * tilted - early
         rest[1, k] = w * w * (tilted + slope) - u * other

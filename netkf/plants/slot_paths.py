@@ -32,6 +32,7 @@ def draw_starts(
     for r in range(len(x)):
         for i in range(len(mean)):
             x[r, i] = mean[i]
+        # Column by column: each normal is used when it is drawn, and none is stored.
         for j in range(root.shape[1]):
             z = next_normal(states, r, ziggurat)
             for i in range(len(mean)):
@@ -53,12 +54,15 @@ def move_path(
     ``moved`` (n,) is scratch.
     """
     n = len(path.F)
+    # The state of this slot is written before the origin moves: it ends the frame.
     for i in range(n):
         local[i], absolute[i] = path.x[r, i], path.x[r, i] + path.origin[r, i]
+    # Slot 0 begins the first frame: its origin is already where it should be.
     if path.frame > 0 and slot > 0 and slot % path.frame == 0:
         for i in range(n):
             path.origin[r, i] += path.x[r, i]
             path.x[r, i] = 0.0
+    # x <- F x + root z, in local coordinates.
     for i in range(n):
         total = 0.0
         for j in range(n):
@@ -68,6 +72,7 @@ def move_path(
         moved[i] = total
     for i in range(n):
         path.x[r, i] = moved[i]
+    # The origin moves with the plant, without noise.
     if path.frame > 0:
         for i in range(n):
             total = 0.0
@@ -91,6 +96,7 @@ def draw_paths(
     """Fill ``local`` and ``absolute`` (R, S, n) from ``slot`` on with the next numbers of the
     streams ``states`` (R, >= 4); ``room`` (2, max(n, q)) is scratch.
     """
+    # Run by run, each from its own stream: a run is the same alone and in a batch.
     for r in range(local.shape[0]):
         for s in range(local.shape[1]):
             for j in range(path.root.shape[1]):
@@ -135,6 +141,8 @@ def draw_readings(
         for s in range(x.shape[1]):
             for m in range(count):
                 host, p, d = sensors.host[m], sensors.rows[m], sensors.driven[m]
+                # All normals of a sensor's reading before its rows, in the order that a single run
+                # takes them.
                 for i in range(p):
                     room[i] = next_normal(states, r * count + m, ziggurat)
                 for i in range(p):
@@ -146,9 +154,11 @@ def draw_readings(
                         weight = sensors.H[m, i, j]
                         if d >= 0:  # sensors.H holds the whitening factor of the one row then
                             weight = 0.0
+                            # The random row is C s, whitened.
                             for k in range(sensors.C.shape[2]):
                                 weight += sensors.C[d, j, k] * regressors[d, r, s, k]
                             weight *= sensors.H[m, i, 0]
                             H[r, s, host, row, j] = weight
+                        # Whitened reading: y = H x + noise with the weights of this row.
                         total += weight * x[r, s, j]
                     y[r, s, host, row] = total
