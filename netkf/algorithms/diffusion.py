@@ -73,6 +73,7 @@ def effective_weights(own: float, heard: float, keep_own: bool) -> tuple[float, 
     arrived, see ``DiffusionFilter.on_loss``.
     """
     total = own + heard
+    # "keep-own", or no weight at all: the own weight is what the others leave.
     if keep_own or total == 0.0:
         return max(0.0, 1.0 - heard), 1.0
     return own / total, total
@@ -92,16 +93,21 @@ def diffusion_slots(
     H = len(nodes.rows)
     for s in range(plan.up.shape[1]):
         for r in range(plan.up.shape[0]):
+            # Samples show predictions: before the reading of the slot.
             show(nodes, plan, samples, r, s)
             rebase(nodes, readings, r, s)
             for h in range(H if plan.sensed[s] else 0):
                 use_reading(nodes, r * H + h, readings, r, s, h, room.update)
+        # D (6) and (7): all filters of all runs adapted, then predicted.
         if plan.sensed[s]:
             predict(nodes, room)
         for r in range(plan.up.shape[0]):
             if plan.exchanged[s]:
+                # Copies and inverse roots of all before any is combined: everyone combines what was
+                # sent.
                 for h in range(H):
                     copy_estimate(nodes, r * H + h, room, h)
+                    # Once for each sender, however many hear it.
                     invert_root(weights.inverse[h], nodes.root, r * H + h, 1.0)
                 for h in range(H):
                     combine(nodes, plan, links, room, weights, r, s, h)
@@ -131,16 +137,20 @@ def combine(
         if plan.up[r, s, 0, links.way[m]] == 1:
             heard += links.weight[m]
     own, divisor = effective_weights(weights.own[h], heard, weights.keep_own)
+    # Weight 1: nothing heard counts, and the estimate stays to the last bit.
     if own == 1.0:
         return
     begin_intersection(room.update)
+    # The own term needs no merging: it is the first.
     whiten(room.update.total, own, weights.inverse, h, h, room)
+    # A weight of 0 adds no information.
     for m in range(links.first[h], links.first[h + 1]):
         if plan.up[r, s, 0, links.way[m]] == 1 and links.weight[m] > 0.0:
             weight = links.weight[m] / divisor
             whiten(room.update.whitened, weight, weights.inverse, links.sender[m], h, room)
             merge_information(room.update.total, room.update.whitened)
     place = r * len(nodes.rows) + h
+    # P = (sum w P^-1)^-1 and the mean, D (8) and (9).
     end_intersection(nodes.root, nodes.xhat, place, room.xhat, h, room.update)
 
 
@@ -154,6 +164,7 @@ def whiten(
     n, size = inverse.shape[1], math.sqrt(weight)
     for i in range(n):
         mean = 0.0
+        # sqrt(w) S^-1, a root of w P^-1.
         for j in range(i + 1):
             out[i, j] = size * inverse[sender, i, j]
             mean += out[i, j] * (room.xhat[sender, j] - room.xhat[h, j])
@@ -205,6 +216,7 @@ class DiffusionFilter(Filter):
         if isinstance(self.weights, str):
             return
         if (self.weights < 0.0).any():
+            # Weights come from files: the message names the entry.
             where = np.argwhere(self.weights < 0.0)[0].tolist()
             raise ScenarioError(
                 "weights[{}][{}]".format(*where),
@@ -212,6 +224,7 @@ class DiffusionFilter(Filter):
                 float(self.weights[tuple(where)]),
                 "give weights from 0 to 1",
             )
+        # Column i holds what node i gives, itself included.
         sums = self.weights.sum(axis=0)
         wrong = np.flatnonzero(np.abs(sums - 1.0) > 1e-9)
         if wrong.size:
@@ -236,11 +249,13 @@ class DiffusionFilter(Filter):
     ) -> DiffusionState:
         """Combine, D (8) and (9)."""
         own, heard = self.share(state.own, [message.weight for message in messages])
+        # Nothing to combine, or all weight at home.
         if own == 1.0 or not messages:
             return state
         pairs = [(state.xhat, state.root)]
         for message in messages:
             pair = message.payload
+            # Under clocks a message may be old: predicted to now without readings.
             pairs.append(state.model.extrapolate(pair.xhat, pair.root, message.age))
         means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
         xhat, root = intersect_roots(np.array([own, *heard]), means, roots)
@@ -252,5 +267,6 @@ class DiffusionFilter(Filter):
         """The own weight and those of the messages that arrived, which sum to 1, from the nominal
         ones.
         """
+        # fsum: the sum must not depend on the order of messages.
         kept, divisor = effective_weights(own, math.fsum(arrived), self.on_loss == "keep-own")
         return kept, [weight / divisor for weight in arrived]

@@ -79,14 +79,18 @@ def intermittent_slots(
     H = len(nodes.rows)
     for s in range(plan.up.shape[1]):
         for r in range(plan.up.shape[0]):
+            # Samples show predictions: before the reading of the slot.
             show(nodes, plan, samples, r, s)
             rebase(nodes, readings, r, s)
             for h in range(H if plan.sensed[s] else 0):
                 use_reading(nodes, r * H + h, readings, r, s, h, room.update)
+                # Readings of others are used one after the other: with independent noise that
+                # equals one update.
                 for m in range(links.first[h], links.first[h + 1]):
                     if plan.up[r, s, 0, links.way[m]] == 1:
                         use_reading(nodes, r * H + h, readings, r, s, links.sender[m], room.update)
         if plan.sensed[s]:
+            # R (15): all filters of all runs at once.
             predict(nodes, room)
 
 
@@ -124,6 +128,7 @@ class Intermittent(Filter):
     ) -> IntermittentState:
         """Return the state at time 0, before any reading."""
         root = first_root(cov)
+        # The start is the first entry of the past: every late reading has a state before it.
         start = Past(0.0, None, None, mean, root, None)
         span = self.history_span(node.max_delay)
         return IntermittentState(mean, root, model, None, 0.0, start, span)
@@ -137,6 +142,7 @@ class Intermittent(Filter):
 
     def history_span(self, max_delay: float) -> float:
         """Return the seconds of its past that a node must keep for late readings."""
+        # No message is older than the longest delay, so nothing older is kept.
         return SLACK * min(self.max_age, max_delay)
 
     def predict(self, state: IntermittentState, gap: float) -> IntermittentState:
@@ -151,7 +157,7 @@ class Intermittent(Filter):
     def emit(
         self, state: IntermittentState, exchange: Exchange
     ) -> tuple[IntermittentState, Reading | None]:
-        """The reading of this instant, from nodes that have one."""
+        """Return the reading of this instant, None from nodes that have none."""
         return state, state.unsent
 
     def absorb(
@@ -160,6 +166,7 @@ class Intermittent(Filter):
         """Use all that is of now as it comes, and what is late as if it had come in time."""
         for message in messages:
             reading: Reading = message.payload
+            # In slots a message of the exchange is always of now.
             if exchange.slot >= 0 or message.age <= 0.0:
                 state = _use(state, reading)
             else:
@@ -173,6 +180,7 @@ class Intermittent(Filter):
     def shift(self, state: IntermittentState, offset: FloatArray) -> IntermittentState:
         """Affine; the past is in the coordinates of its own time."""
         xhat = state.xhat + offset
+        # A late reading that goes back over this time must shift again on its way forward.
         if state.lag > 0.0:
             past = Past(state.time, None, offset, xhat, state.root, state.past)
             state = state._replace(past=past)
@@ -185,6 +193,7 @@ class Intermittent(Filter):
 
 def _use(state: IntermittentState, reading: Reading) -> IntermittentState:
     """Update with a reading of now."""
+    # A reading without rows says nothing, and is not kept.
     if not len(reading.y):
         return state
     xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
@@ -201,22 +210,27 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
     """Go back to before the reading's time, use it, and do again what came after it."""
     again: list[Past] = []
     past = state.past
+    # Entries after the reading's time are taken off; times that differ by rounding count as equal.
     while past.time > reading.time + SAME * now and past.before is not None:
         again.append(past)
         past = past.before
     model = state.model
+    # The late reading, with the state before it, takes its place in time.
     later = Past(reading.time, reading, None, *past[3:5], None)
+    # Forward again: predict to each event, and repeat it.
     for event in [later, *reversed(again)]:
         xhat, root = past.xhat, past.root
         if event.time > past.time:
             xhat, root = model.predict(xhat, root, event.time - past.time)
         if event.reading is not None:
+            # R (17) and (18) with this reading.
             r = event.reading
             xhat, root = sample_update(xhat, root, r.y, r.H, r.R)
         if event.offset is not None:
             xhat = xhat + event.offset
         past = Past(event.time, event.reading, event.offset, xhat, root, past)
     xhat, root = past.xhat, past.root
+    # From the last event to now.
     if now > past.time:
         xhat, root = model.predict(xhat, root, now - past.time)
     return state._replace(xhat=xhat, root=root, time=now, past=_recent(past, now - state.lag))
@@ -228,12 +242,15 @@ def _recent(past: Past, since: float) -> Past:
     event: Past | None = past
     while event is not None:
         kept.append(event)
+        # One entry before ``since`` stays: a reading of that time starts from it.
         if event.time < since:
             break
         event = event.before
     else:
+        # Everything is recent: no copy.
         return past
     trimmed = kept[-1]._replace(before=None)
+    # Entries are immutable, so the list is built anew from its oldest entry.
     for event in reversed(kept[:-1]):
         trimmed = event._replace(before=trimmed)
     return trimmed

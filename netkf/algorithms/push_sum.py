@@ -123,9 +123,11 @@ def push_sum_slots(
     """Carry push-sum filters through the slots of a plan, P Fig. 1."""
     H = len(nodes.rows)
     for s in range(plan.up.shape[1]):
+        # Step 3: with asymptotic gains the covariance is the limit, and only the mean is predicted.
         if plan.sensed[s] and not arrays.asymptotic:
             predict(nodes, room)
         for r in range(plan.up.shape[0]):
+            # Step 2 before the correction, so that the gain uses what the mass of this slot says.
             if plan.exchanged[s] and not arrays.asymptotic:
                 exchange_mass(arrays, plan, links, samples, room, r, s)
             if plan.sensed[s]:
@@ -133,9 +135,11 @@ def push_sum_slots(
                     correct(nodes, readings, room, arrays, r, s, h)
             if plan.exchanged[s]:
                 for step in range(arrays.gamma):
+                    # Row 0 of ``up`` is the exchange of mass; averaging has the rows after it.
                     up = plan.up[r, s, 1 + step]
                     average(nodes.xhat, r * H, links, up, room.xhat, arrays.delta)
             if plan.sample[s] >= 0:
+                # Conserved over the network: the weight sums to 1, and n~ to N.
                 for h in range(H):
                     samples.conserved[r, h, 0] = arrays.mass[r * H + h, 0]
                     samples.conserved[r, h, 1] = arrays.mass[r * H + h, 1]
@@ -155,17 +159,22 @@ def exchange_mass(
 ) -> None:
     """One exchange of mass, P steps 2.1 to 2.3."""
     H = len(arrays.degree)
+    # All shares before any mass changes: everyone sends what it had at the start of the exchange.
     for h in range(H):
         split_mass(arrays.mass, r * H + h, arrays.degree[h], arrays.share, h)
     if arrays.rule == PAPER:  # nodes that have stopped send no mass
+        # The same as a link that is down, so that receivers keep the mass conserved.
         for m in range(len(links.sender)):
             if samples.stopped[r, links.sender[m]] < plan.first + s:
                 plan.up[r, s, 0, links.way[m]] = 0
     for h in range(H):
         has_stopped = samples.stopped[r, h] < plan.first + s
         if has_stopped and arrays.rule == PAPER:
+            # By the paper's rule a stopped node leaves the exchange altogether; its mass stays with
+            # it.
             continue
         received = mix_mass(arrays, plan, links, r, s, h)
+        # The safe rule goes on mixing, since other nodes still need its mass, but learns no more.
         if has_stopped:
             continue
         if learn(arrays, r * H + h, h, received == arrays.degree[h], room.moved):
@@ -178,6 +187,7 @@ def mix_mass(
 ) -> int:
     """Take the mass that node ``h`` keeps and receives, P (3)-(5); return how many shares came."""
     received, k, mass, share = 0, r * len(arrays.degree) + h, arrays.mass, arrays.share
+    # The mass before is kept for the stop rule.
     for i in range(mass.shape[1]):
         arrays.before[i], mass[k, i] = mass[k, i], 0.0
     for m in range(links.first[h], links.first[h + 1]):
@@ -185,6 +195,7 @@ def mix_mass(
             received += 1
             for i in range(mass.shape[1]):
                 mass[k, i] += share[links.sender[m], i]
+    # Its own share, once for itself and once for each share that did not come.
     keep_share(mass, k, share, h, arrays.degree[h] + 1 - received)
     return received
 
@@ -195,6 +206,7 @@ def learn(arrays: PushSumArrays, k: int, h: int, whole: bool, work: FloatArray) 
     return True if the node stops.
     """
     learn_network(arrays.mass, k, arrays.alone, h, arrays.found, arrays.found_number)
+    # The stop rule compares with the former G and N, so they are replaced only afterwards.
     stops = has_stopped(
         arrays.rule,
         arrays.tolerance,
@@ -229,14 +241,17 @@ def correct(
     """Step 4 after the prediction, P (7) and (8); with asymptotic gains step 3 too."""
     k, n = r * len(nodes.rows) + h, nodes.xhat.shape[1]
     if arrays.asymptotic:
+        # Asymptotic gains: xhat <- F xhat, and P_inf for the root.
         predict_mean(nodes, k, room)
         for i in range(n):
             for j in range(i + 1):
                 nodes.root[k, i, j] = arrays.limit[i, j]
     else:
+        # P (7), from the prediction's root and what the node knows of the network.
         correct_root(nodes.root, k, arrays.information, k, room.moved, room.update)
     if nodes.rows[h] > 0:
         H = readings.H[r % readings.H.shape[0], s % readings.H.shape[1], h]
+        # P (8): N^(i) times the gain of the node's own reading.
         y, number = readings.y[r, s, h], arrays.number[k]
         add_gain(nodes.xhat, nodes.root, k, number, y, H, nodes.rows[h], room.vectors)
 
@@ -249,6 +264,7 @@ def average(
     1 / delta of the differences to the estimates that arrive; ``moves`` (H, n) is scratch.
     """
     H, n = len(links.first) - 1, z.shape[1]
+    # All differences before any estimate moves: the step is simultaneous.
     for h in range(H):
         for i in range(n):
             moves[h, i] = 0.0
@@ -258,6 +274,7 @@ def average(
                 for i in range(n):
                     moves[h, i] += z[sender, i] - z[first + h, i]
     for h in range(H):
+        # P (9): z <- z + (1 / delta) sum of the differences.
         for i in range(n):
             z[first + h, i] += moves[h, i] / delta
 
@@ -299,21 +316,24 @@ class PushSum(Filter):
     slot_kernel = staticmethod(push_sum_slots)
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """With asymptotic gains no mass is sent."""
+        """Return True unless the exchange is of mass and the gains are asymptotic."""
+        # Exchange MASS carries nothing if the gains are known beforehand.
         return phase == AVERAGE or not self.asymptotic
 
     def slot_stopping(self) -> tuple[int, bool]:
         """Nodes stop when they have exchanged mass; by the paper's rule they send none then."""
+        # Without exchanges of mass there is nothing to stop.
         stops = not self.asymptotic and self.stop != "never"
         return (MASS if stops else -1), stops and self.stop == "paper"
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PushSumArrays]:
-        """What the nodes know at the start."""
+        """Return the arrays of all nodes of all runs at the start."""
         known = [state.network for state in states]
         alone = np.stack([state.model.information for state in states])
         H, n = alone.shape[:2]
+        # Unused without asymptotic gains, but kernels need an array of the right shape.
         limit = np.zeros((n, n)) if known[0].root is None else known[0].root
         mass = np.stack([state.mass for state in states])
         return (
@@ -325,6 +345,7 @@ class PushSum(Filter):
                 alone=alone,
                 rule=RULES.index(self.stop),
                 tolerance=self.tolerance,
+                # In slots check_scenario() demands a delta.
                 delta=self.delta or math.inf,
                 gamma=self.steps(AVERAGE),
                 asymptotic=self.asymptotic,
@@ -339,11 +360,14 @@ class PushSum(Filter):
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Step 1: the leader gets the weight; with asymptotic gains every node knows the limits."""
         if not isinstance(model, SlotModel):
+            # A model without slots: clocks, where running sums are kept.
             return running_sums.start(model, mean, cov, node)
         information = model.information
+        # P step 1: w is 1 at the leader and 0 elsewhere, n~ = 1, C~ = the node's own information.
         weight = 1.0 if node.node == self.leader else 0.0
         mass = np.concatenate([[weight, 1.0], information.reshape(-1)])
         known = Network(information, 1.0)
+        # Everyone knows the whole network from the start.
         if self.asymptotic:
             root = asymptotic_root(model.F, model.Q, node.information)
             known = Network(node.information, float(node.nodes), root)
@@ -368,7 +392,9 @@ class PushSum(Filter):
         if isinstance(state, RunningSums):
             return running_sums.offer(state)
         if exchange.phase == AVERAGE:
+            # The average is of z, which is the corrected estimate.
             return state, state.xhat
+        # None: nothing is sent, but the links draw all the same.
         silent = self.asymptotic or (self.stop == "paper" and state.stopped)
         return state, None if silent else share(state.mass, state.degree)
 
@@ -377,16 +403,19 @@ class PushSum(Filter):
         if isinstance(state, RunningSums):
             return running_sums.hear(state, messages)
         received = [message.payload for message in messages]
+        # P step 5.2.
         if exchange.phase == AVERAGE:
             return state._replace(xhat=averaged(state.xhat, received, self.delta or math.inf))
         if self.asymptotic or (self.stop == "paper" and state.stopped):
             return state
+        # P steps 2.2, (3)-(5), and 2.3, (6) with the stop rule.
         mass = mixed(state.mass, received, state.degree)
         whole = len(received) == state.degree
         return self._learned(state._replace(mass=mass), state.mass, whole)
 
     def _learned(self, state: PushSumState, before: FloatArray, whole: bool) -> PushSumState:
         """P (6) and the stop rule; ``whole``: all links of the node were up."""
+        # Frozen by the safe rule: the mass was mixed, but is not read any more.
         if state.stopped:
             return state
         found, former = network(state.mass, state.model), state.network
@@ -410,6 +439,7 @@ class PushSum(Filter):
         if isinstance(state, RunningSums):
             return running_sums.add_reading(state, reading)
         root = state.network.root
+        # Without asymptotic gains P (7) with the node's G; with them P_inf.
         if root is None:
             root = corrected_root(state.root, state.network.information)
         y, H, R = reading[:3]
@@ -417,7 +447,7 @@ class PushSum(Filter):
         return state._replace(xhat=xhat, root=root)
 
     def stopped(self, state: Any) -> bool:
-        """Whether G^(i) and N^(i) are frozen."""
+        """Return True if G^(i) and N^(i) are frozen."""
         return not isinstance(state, RunningSums) and bool(state.stopped)
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
@@ -436,6 +466,7 @@ class PushSum(Filter):
         """Estimates move, mass does not."""
         if isinstance(payload, Offer):
             return running_sums.shift_offer(payload, offset)
+        # A mass is longer than an estimate: 2 + n^2 > n entries.
         return payload + offset if len(payload) == len(offset) else payload
 
     def check_scenario(self, scenario: Any) -> None:
@@ -456,6 +487,7 @@ class PushSum(Filter):
                     None,
                     "use linear sensors or another filter",
                 )
+        # P (12) may have no solution, as for an unstable plant that the sensors do not see.
         F, Q = scenario.slot_belief
         if self.asymptotic and asymptotic_root(F, Q, scenario.node_infos[0].information) is None:
             raise ScenarioError(
@@ -473,6 +505,8 @@ class PushSum(Filter):
             raise ScenarioError("filter.leader", words, self.leader, remedy)
 
     def _check_gain(self, radius: float) -> None:
+        # Averaging contracts if and only if all eigenvalues of I - L / delta but one lie inside
+        # (-1, 1).
         if self.delta <= 0.5 * radius * (1.0 + 1e-12):
             raise ScenarioError(
                 "filter.delta",
@@ -488,6 +522,7 @@ class PushSum(Filter):
             given = [f"filter.{f.name}" for f in fields if getattr(self, f.name) != f.default]
             words = "not used under clocks, where push-sum keeps running sums"
             return (f"{', '.join(given)}: {words}",) if given else ()
+        # Contraction is enough to run; the theorems ask for more.
         radius = scenario.topology.laplacian_radius
         if self.delta >= radius:
             return ()
@@ -510,13 +545,14 @@ def corrected(
     """
     x = predicted[None].copy()
     if len(y):
+        # The kernel takes readings whose noise has variance 1.
         y, H = whitened(y, H, R)
         add_gain(x, root[None], 0, number, y, H, len(y), np.empty((2, x.shape[1])))
     return np.asarray(x[0])
 
 
 def share(mass: FloatArray, degree: int) -> FloatArray:
-    """What a node of ``degree`` neighbours sends to each of them: its mass over degree + 1."""
+    """Return what a node of ``degree`` neighbours sends to each: its mass / (degree + 1)."""
     part = np.empty((1, mass.size))
     split_mass(mass.reshape(1, -1), 0, degree, part, 0)
     return part.reshape(mass.shape)
@@ -527,6 +563,7 @@ def mixed(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> Floa
     once for itself and once for each link of its ``degree`` that failed.
     """
     total = np.array(sum(received, np.zeros(mass.shape))).reshape(1, -1)
+    # The same kernels as in slots, on arrays of one place: both engines round alike.
     own = share(mass, degree).reshape(1, -1)
     keep_share(total, 0, own, 0, degree + 1 - len(received))
     return total.reshape(mass.shape)
@@ -552,6 +589,7 @@ def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
 
 def averaged(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
     """P (9): z plus 1 / delta of the differences to the estimates that arrived."""
+    # One receiver and its senders, as a star whose links are all up.
     x, count = np.stack([z, *received]), len(received)
     places = np.arange(count)
     links = SlotLinks(np.array([0, count]), places + 1, places, np.zeros(count))
@@ -566,18 +604,23 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
     By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
     Wang, Int. J. Control 77, 2004).
     """
+    # The iterates of the doubling, which begin with F', the information G and P = Q.
     A, G, P = F.T, information, Q
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(MOST_DOUBLINGS):
             try:
+                # One solve for (I + G P)^-1 [A, G].
                 solved = np.linalg.solve(np.eye(len(F)) + G @ P, np.concatenate([A, G], axis=1))
             except np.linalg.LinAlgError:
                 return None
             left, right = solved[:, : len(F)], solved[:, len(F) :]
+            # P grows towards the steady predicted covariance; it overflows if there is none.
             following = symmetric(P + A.T @ P @ left)
             if not np.isfinite(following).all():
                 return None
+            # Rounding would make G and P unsymmetric, and doubling would amplify that.
             A, G, step, P = A @ left, symmetric(G + A @ right @ A.T), following - P, following
             if np.abs(step).max() <= 1e-15 * np.abs(P).max():
+                # P is the predicted covariance: use the reading to get that of P (12).
                 return corrected_root(lower_root(square_root(P)), information)
     return None

@@ -209,9 +209,9 @@ class SlotEvents:
                 drawn = [next(draws) for draws in self._draws[i, j]]
                 # Both directions take the one draw of a symmetric channel.
                 self._last[i, j] = drawn if len(drawn) == len(ways) else drawn * 2
+            # A link that is down loses its messages whatever was drawn.
             here = up is None or (i, j) in up
             for way, draw in zip(ways, self._last[i, j], strict=True):
-                # A link that is down loses its messages whatever was drawn.
                 if self._setup.talks[step.step, way.place] and not self._is_silent(way, step):
                     self._send(step, way, draw if here else None)
 
