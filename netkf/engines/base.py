@@ -80,6 +80,8 @@ class Engine(ABC):
         for replica in replicas:
             sink = batch_sink(scenario, range(replica, replica + 1))
             recorder = Recorder([sink], counts_only=True)
+            # Streams depend on the seed and the replica alone: any division into calls gives the
+            # same runs.
             status = self.run(scenario, Streams(seed, replica), recorder, silent)
             sink.finish(recorder, status)
             yield sink.batch()

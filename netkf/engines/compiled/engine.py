@@ -57,7 +57,7 @@ class CompiledEngine(Engine):
         parts += [("filter", scenario.filter.algorithm)]
         known = {*KNOWN, *built_in_filters().values()}
         for family, part in parts:
-            # ``type`` and not ``isinstance``: a derived class may change what kernels do not know of.
+            # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
             if type(part) not in known:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
