@@ -64,8 +64,8 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
             return _run_by_run(scenario, workspace, sources, replicas)
         draws = BatchDraws(scenario, seed, replicas)
-        # Both have state outside the Simulation, which simulate_batch() does not carry. Python moves
-        # origins, run by run.
+        # Both have state outside the Simulation, which simulate_batch() does not carry. Origins are
+        # moved by Python, run by run.
         special = scenario.hosted.combination in ("sums", "readings")
         if len(draws.paths.frame_times) or special:
             return _run_by_run(scenario, workspace, draws.runs(), replicas)

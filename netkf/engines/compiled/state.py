@@ -259,7 +259,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # A pooled filter is one node with the id -1 and the sensors of all.
     ids, pooled = scenario.nodes, scenario.hosted.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
-    # Nodes that share a model share its table: identity is enough, as models are cached.
+    # Nodes that share a model share its table.
     distinct = list({id(model): model for model in models}.values())
     place = {id(model): k for k, model in enumerate(distinct)}
     starts = [scenario.start(node) for node in (ids[:1] if pooled else ids)]
