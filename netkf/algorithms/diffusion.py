@@ -98,7 +98,7 @@ def diffusion_slots(
             rebase(nodes, readings, r, s)
             for h in range(H if plan.sensed[s] else 0):
                 use_reading(nodes, r * H + h, readings, r, s, h, room.update)
-        # D (6) and (7): all filters of all runs adapted, then predicted.
+        # All filters of all runs have used their readings by now: predict them together.
         if plan.sensed[s]:
             predict(nodes, room)
         for r in range(plan.up.shape[0]):
