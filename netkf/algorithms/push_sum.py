@@ -53,6 +53,8 @@ MASS, AVERAGE = 0, 1
 
 MOST_STEPS = 100_000
 MOST_DOUBLINGS = 60
+MAX_SPREAD = 1e14
+"""The largest ``|G| |P|`` at which double precision still tells a steady covariance."""
 
 
 class Network(NamedTuple):
@@ -599,7 +601,7 @@ def averaged(z: FloatArray, received: Sequence[FloatArray], delta: float) -> Flo
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
     """Root of P_inf (n, n), P (12): the steady covariance of a filter that has all the
-    information (n, n) in each slot, after its reading; None where there is none.
+    information (n, n) in each slot, after its reading; None if there is none.
 
     By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
     Wang, Int. J. Control 77, 2004).
@@ -621,6 +623,9 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
             # Rounding would make G and P unsymmetric, and doubling would amplify that.
             A, G, step, P = A @ left, symmetric(G + A @ right @ A.T), following - P, following
             if np.abs(step).max() <= 1e-15 * np.abs(P).max():
+                # Without a steady state P doubles until rounding of G stops it: not a solution.
+                if np.abs(G).max() * np.abs(P).max() > MAX_SPREAD:
+                    return None
                 # P is the predicted covariance: use the reading to get that of P (12).
                 return corrected_root(lower_root(square_root(P)), information)
     return None

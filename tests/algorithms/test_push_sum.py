@@ -134,6 +134,12 @@ def test_the_asymptotic_covariance_is_the_centralised_one(seed):
 
 def test_no_asymptotic_covariance_where_a_growing_mode_is_not_seen():
     assert asymptotic_root(np.diag([1.1, 0.5]), np.eye(2), np.diag([0.0, 1.0])) is None
+    # The difference of the two states is never seen and walks away; rounding ends its doubling.
+    for scale in (1.0, 2.0, 3.0):
+        assert asymptotic_root(np.eye(2), np.eye(2), np.full((2, 2), scale)) is None
+    # Wide, yet there: an unstable mode behind a reading with a noise of 1e13.
+    P = asymptotic_root(np.array([[1.5]]), np.eye(1), np.array([[1e-13]]))
+    assert P is not None
 
 
 def test_averaging_keeps_the_mean_and_follows_the_laplacian():
