@@ -254,104 +254,98 @@ class Rows(NamedTuple):
     counts: np.ndarray
 
 
+class Drawn(NamedTuple):
+    """Messages of a block: ``up`` (R, S, E, W), links ``active`` in matchings (R, S, E, A), their
+    number ``pairs`` (R, S, E).
+    """
+
+    up: np.ndarray
+    active: np.ndarray
+    pairs: np.ndarray
+
+
+class Moment(NamedTuple):
+    """The circumstances of events: the ``run``, the ``slot`` by number and by place ``s`` in the
+    block, ``step`` and ``phase`` of the exchange (-1 where nodes read), the time ``t`` in seconds.
+    """
+
+    run: int
+    slot: int
+    s: int
+    step: int
+    phase: int
+    t: float
+
+
 @kernel
 def note(
-    rows: Rows,
-    r: int,
-    t: float,
-    kind: int,
-    node: int,
-    peer: int,
-    message: int,
-    phase: int,
-    age: float,
-    at: int,
+    rows: Rows, m: Moment, kind: int, node: int, peer: int, message: int, age: float, at: int
 ) -> int:
     """Count one event and write it into row ``at``; return the next row."""
     # Counting is cheap and always done; rows are written as long as there is room.
-    rows.counts[r, kind] += 1
+    rows.counts[m.run, kind] += 1
     if at < len(rows.t):
-        rows.t[at], rows.kind[at], rows.node[at], rows.peer[at] = t, kind, node, peer
-        rows.message[at], rows.phase[at], rows.age[at] = message, phase, age
+        rows.t[at], rows.kind[at], rows.node[at], rows.peer[at] = m.t, kind, node, peer
+        rows.message[at], rows.phase[at], rows.age[at] = message, m.phase, age
     return at + 1
 
 
 @kernel
-def make_rows(  # noqa: PLR0912 - the order of a slot
-    stages: Stages,
-    times: SlotTimes,
-    c: Channels,
-    h: Hearing,
-    up: np.ndarray,
-    active: np.ndarray,
-    count: np.ndarray,
-    pairwise: bool,
-    rows: Rows,
+def make_rows(
+    stages: Stages, times: SlotTimes, c: Channels, h: Hearing, d: Drawn, pairwise: bool, rows: Rows
 ) -> int:
     """Write the events of these slots in their order; return the number of rows of the last run."""
     at = 0
-    for r in range(up.shape[0]):
+    for r in range(d.up.shape[0]):
         # Rows are those of the last run: only a single run asks for them.
         at = 0
         for s in range(len(times.start)):
             # Filters that predict are sampled before anything happens in the slot.
-            if times.predicts and times.sample[s] >= 0 and times.sample[s] < len(rows.at_sample):
-                rows.at_sample[times.sample[s]] = at
-            now = times.start[s]
-            for k in range(len(stages.step)):
-                # At the horizon nothing is recorded but the sample.
-                if not times.noted[s]:
-                    break
-                e = stages.step[k]
-                if e < 0:
-                    if times.sensed[s]:
-                        for node in h.sensing:
-                            at = note(rows, r, now, SENSE, node, -1, -1, -1, NAN, at)
-                elif times.exchanged[s]:
-                    phase = stages.phase[k]
-                    if not pairwise:
-                        at = note(rows, r, now, ROUND, -1, -1, -1, phase, NAN, at)
-                    links = count[r, s, e] if pairwise else len(c.ends)
-                    for a in range(links):
-                        link = active[r, s, e, a] if pairwise else a
-                        if pairwise:
-                            i, j = h.nodes[c.ends[link, 0]], h.nodes[c.ends[link, 1]]
-                            at = note(rows, r, now, TICK, i, j, -1, phase, NAN, at)
-                        at = _sent(
-                            c,
-                            h,
-                            rows,
-                            r,
-                            times.first + s,
-                            e,
-                            phase,
-                            link,
-                            up[r, s, e],
-                            now,
-                            at,
-                            stages.stopping,
-                        )
-                    # Absorptions happen at the end of the step, when its inboxes close.
-                    now = times.start[s] + stages.end[k]
-                    at = _closed(
-                        h,
-                        rows,
-                        r,
-                        times.first + s,
-                        e,
-                        phase,
-                        up[r, s, e],
-                        now,
-                        at,
-                        pairwise,
-                        stages.stopping,
-                    )
-            if (
-                not times.predicts
-                and times.sample[s] >= 0
-                and times.sample[s] < len(rows.at_sample)
-            ):
-                rows.at_sample[times.sample[s]] = at
+            if times.predicts:
+                mark_sample(times, s, rows, at)
+            # At the horizon nothing is recorded but the sample.
+            if times.noted[s]:
+                at = _slot_rows(stages, times, c, h, d, pairwise, rows, r, s, at)
+            if not times.predicts:
+                mark_sample(times, s, rows, at)
+    return at
+
+
+@kernel
+def mark_sample(times: SlotTimes, s: int, rows: Rows, at: int) -> None:
+    """Keep how many rows come before the sample of a slot, if it has one."""
+    k = times.sample[s]
+    if k >= 0 and k < len(rows.at_sample):
+        rows.at_sample[k] = at
+
+
+@kernel
+def _slot_rows(
+    stages: Stages,
+    times: SlotTimes,
+    c: Channels,
+    h: Hearing,
+    d: Drawn,
+    pairwise: bool,
+    rows: Rows,
+    r: int,
+    s: int,
+    at: int,
+) -> int:
+    """Write the events of one slot of run ``r``; return the row."""
+    now = times.start[s]
+    for k in range(len(stages.step)):
+        m = Moment(r, times.first + s, s, stages.step[k], stages.phase[k], now)
+        if m.step < 0:
+            if times.sensed[s]:
+                for node in h.sensing:
+                    at = note(rows, m, SENSE, node, -1, -1, NAN, at)
+        elif times.exchanged[s]:
+            at = _sent(c, h, d, rows, m, pairwise, stages.stopping, at)
+            # Absorptions happen at the end of the step, when its inboxes close.
+            now = times.start[s] + stages.end[k]
+            closing = Moment(r, m.slot, s, m.step, m.phase, now)
+            at = _closed(h, d, rows, closing, pairwise, stages.stopping, at)
     return at
 
 
@@ -359,62 +353,65 @@ def make_rows(  # noqa: PLR0912 - the order of a slot
 def _sent(
     c: Channels,
     h: Hearing,
+    d: Drawn,
     rows: Rows,
-    r: int,
-    slot: int,
-    e: int,
-    phase: int,
-    link: int,
-    up: np.ndarray,
-    now: float,
-    at: int,
+    m: Moment,
+    pairwise: bool,
     stopping: int,
+    at: int,
+) -> int:
+    """Write what is sent in a step, after the tick of each pair or one round; return the row."""
+    if not pairwise:
+        at = note(rows, m, ROUND, -1, -1, -1, NAN, at)
+    links = d.pairs[m.run, m.s, m.step] if pairwise else len(c.ends)
+    for a in range(links):
+        link = d.active[m.run, m.s, m.step, a] if pairwise else a
+        if pairwise:
+            i, j = h.nodes[c.ends[link, 0]], h.nodes[c.ends[link, 1]]
+            at = note(rows, m, TICK, i, j, -1, NAN, at)
+        at = _link_rows(c, h, d, rows, m, link, stopping, at)
+    return at
+
+
+@kernel
+def _link_rows(
+    c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, link: int, stopping: int, at: int
 ) -> int:
     """Write the messages sent on a link, each followed by its arrival or loss; return the row."""
-    for d in range(c.ways):
-        w, i = link * c.ways + d, c.ends[link, d]
+    for end in range(c.ways):
+        w, i = link * c.ways + end, c.ends[link, end]
         # By the paper's rule a node that stopped in an earlier slot sends no more mass.
-        gone = h.silences and e == stopping and h.stopped[r, i] < slot
-        if c.talks[e, w] == 0 or gone:
+        gone = h.silences and m.step == stopping and h.stopped[m.run, i] < m.slot
+        if c.talks[m.step, w] == 0 or gone:
             continue
         # Messages of a direction are numbered from 0, lost ones included.
-        number, sender, receiver = h.sent[r, w], h.nodes[i], h.nodes[c.ends[link, 1 - d]]
-        h.sent[r, w] = number + 1
-        at = note(rows, r, now, SEND, sender, receiver, number, phase, NAN, at)
-        if up[w] == 1:
-            at = note(rows, r, now, DELIVER, receiver, sender, number, phase, 0.0, at)
+        number, sender, receiver = h.sent[m.run, w], h.nodes[i], h.nodes[c.ends[link, 1 - end]]
+        h.sent[m.run, w] = number + 1
+        at = note(rows, m, SEND, sender, receiver, number, NAN, at)
+        if d.up[m.run, m.s, m.step, w] == 1:
+            at = note(rows, m, DELIVER, receiver, sender, number, 0.0, at)
         else:
-            at = note(rows, r, now, LOST, sender, receiver, number, phase, NAN, at)
+            at = note(rows, m, LOST, sender, receiver, number, NAN, at)
     return at
 
 
 @kernel
 def _closed(
-    h: Hearing,
-    rows: Rows,
-    r: int,
-    slot: int,
-    e: int,
-    phase: int,
-    up: np.ndarray,
-    end: float,
-    at: int,
-    pairwise: bool,
-    stopping: int,
+    h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, stopping: int, at: int
 ) -> int:
     """Write who absorbs when a step ends, and who stops learning; return the row."""
     for i in range(len(h.nodes)):
         heard = False
         for k in range(h.first[i], h.first[i + 1]):
-            if up[h.way[k]] == 1:
+            if d.up[m.run, m.s, m.step, h.way[k]] == 1:
                 heard = True
                 if pairwise:
                     # The message of this step is the last one that was numbered.
-                    peer, number = h.nodes[h.sender[k]], h.sent[r, h.way[k]] - 1
-                    at = note(rows, r, end, SWAP, h.nodes[i], peer, number, phase, 0.0, at)
+                    peer, number = h.nodes[h.sender[k]], h.sent[m.run, h.way[k]] - 1
+                    at = note(rows, m, SWAP, h.nodes[i], peer, number, 0.0, at)
         if heard and not pairwise:
-            at = note(rows, r, end, ABSORB, h.nodes[i], -1, -1, phase, 0.0, at)
+            at = note(rows, m, ABSORB, h.nodes[i], -1, -1, 0.0, at)
         # A node that stops in this slot does so after it absorbed.
-        if e == stopping and h.stopped[r, i] == slot:
-            at = note(rows, r, end, STOP, h.nodes[i], -1, -1, phase, NAN, at)
+        if m.step == stopping and h.stopped[m.run, i] == m.slot:
+            at = note(rows, m, STOP, h.nodes[i], -1, -1, NAN, at)
     return at

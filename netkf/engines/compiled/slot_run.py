@@ -24,6 +24,7 @@ from netkf.engines.compiled.samples import recorded
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_messages import (
     Channels,
+    Drawn,
     Hearing,
     Matchings,
     Rows,
@@ -43,16 +44,6 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.schema import EVENT, KINDS
 
 NEVER = np.iinfo(np.int64).max
-
-
-class Drawn(NamedTuple):
-    """Messages of a block: ``up`` (R, S, E, W), links ``active`` in matchings (R, S, E, A), their
-    number ``pairs`` (R, S, E).
-    """
-
-    up: np.ndarray
-    active: np.ndarray
-    pairs: np.ndarray
 
 
 class SlotBlock(NamedTuple):
@@ -304,7 +295,7 @@ class SlotRuns:
             self._stopped, setup.silences,
         )  # fmt: skip
         count = make_rows(
-            setup.stages, block.times, self._channels, hearing, *block.drawn,
+            setup.stages, block.times, self._channels, hearing, block.drawn,
             setup.algorithm.pairwise, rows,
         )  # fmt: skip
         # Kernels fill plain columns, which become records here.
