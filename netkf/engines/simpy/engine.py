@@ -24,6 +24,7 @@ from netkf.engines.simpy.slots import (
 )
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import Transmitter
+from netkf.engines.soundness import stack_estimates
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -200,11 +201,7 @@ class _Simulation:
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         shown = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [shown[id(nodes[node])] for node in scenario.nodes]
-        near = np.array([xhat for xhat, _ in estimates])
-        nothing = np.full((len(x), len(x)), math.nan)
-        # Filters without a covariance show nan.
-        P = np.array([nothing if P is None else P for _, P in estimates])
-        without = np.array([P is None for _, P in estimates])
+        near, P, without = stack_estimates(estimates)
         # The trace shows absolute states; adding the origin loses digits, so the error is separate.
         far = near if x is local else near + (x - local)
         recorder.sample(time, x, far, P, local - near)
