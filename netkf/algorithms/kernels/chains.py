@@ -75,6 +75,37 @@ def advance(
     return moved
 
 
+def trace_path(
+    root: FloatArray, word: np.ndarray, F: FloatArray, root_Q: FloatArray, letters: Letters
+) -> FloatArray:
+    """Return the roots (T, n, n) of one chain after each letter of its word (T,)."""
+    n, path = len(F), np.empty((len(word), *root.shape))
+    lows = [np.ascontiguousarray(lower_triangular(one)) for one in (root, root_Q)]
+    work = np.empty((letters.H.shape[1] + n, 2 * n + letters.H.shape[1]))
+    run_path(lows[0][None], word, F, lows[1], *letters, work, path)
+    return path
+
+
+@kernel
+def run_path(
+    roots: FloatArray,
+    word: np.ndarray,
+    F: FloatArray,
+    root_Q: FloatArray,
+    H: FloatArray,
+    root_R: FloatArray,
+    rows: np.ndarray,
+    work: FloatArray,
+    path: FloatArray,
+) -> None:
+    """Move one root (1, n, n) in place along its word (T,) and keep every step in ``path``."""
+    for step in range(len(word)):
+        step_root(roots, 0, word[step], F, root_Q, H, root_R, rows, work)
+        for i in range(len(F)):
+            for j in range(len(F)):
+                path[step, i, j] = roots[0, i, j]
+
+
 @kernel(allocates=True)
 def run_words(
     roots: FloatArray,

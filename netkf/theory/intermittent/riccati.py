@@ -54,6 +54,13 @@ def _observation(H: ArrayLike, n: int) -> FloatArray:
     return array
 
 
+def check_delivery(delivery: float) -> float:
+    """Return the delivery probability; raises TheoryError unless it lies in (0, 1]."""
+    if as_numbers("delivery", delivery).size != 1 or not 0.0 < delivery <= 1.0:
+        raise TheoryError(f"delivery must lie in (0, 1], got {delivery!r}")
+    return float(delivery)
+
+
 def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
     """Return ``f_0(P) = F P F' + Q`` (n, n), R (15): a slot without a reading."""
     transition = as_square("F", F)
@@ -75,11 +82,12 @@ def riccati_step(
     start = as_covariance("P", P, len(system.F))
     modes = alphabet([(system.H, system.R)], len(start))
     first = np.zeros((1, 1), dtype=np.uint8)
-    root = advance(_root(start)[None], first, system.F, square_root(system.Q), modes)[0]
+    root = advance(covariance_root(start)[None], first, system.F, square_root(system.Q), modes)[0]
     return symmetric(root @ root.T)
 
 
-def _root(P: FloatArray) -> FloatArray:
+def covariance_root(P: FloatArray) -> FloatArray:
+    """Return a root (n, n) of a covariance, lower triangular if it is positive definite."""
     try:
         return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
     except np.linalg.LinAlgError:  # semidefinite: a root from eigenvalues
@@ -332,7 +340,7 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     """
     depth = as_whole("depth", depth, 0, MAX_DEPTH)
     F, Q, H, R = check_system(F, Q, H, R)
-    roots = _root(steady_covariance(F, Q, H, R))[None]
+    roots = covariance_root(steady_covariance(F, Q, H, R))[None]
     root_Q, modes = square_root(Q), alphabet([(H[:0], R[:0, :0]), (H, R)], len(F))
     for _ in range(depth):
         each = np.zeros((len(roots), 1), dtype=np.uint8), np.ones((len(roots), 1), dtype=np.uint8)
@@ -359,44 +367,45 @@ def invariant_samples(
     no invariant law exists or the ends do not meet.
     """
     F, Q, H, R = check_system(F, Q, H, R)
-    if as_numbers("delivery", delivery).size != 1 or not 0.0 < delivery <= 1.0:
-        raise TheoryError(f"delivery must lie in (0, 1], got {delivery!r}")
+    delivery = check_delivery(delivery)
     samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)
     n, P = len(F), steady_covariance(F, Q, H, R)
     random = Streams(seed).generator("arrivals")
     modes = alphabet([(H[:0], R[:0, :0]), (H, R)], n)
     # f_0 and f_1 are monotone: every start between these two ends between their ends.
-    starts = np.stack([_root(P), 1e3 * _root(P + np.trace(P) * np.eye(n))])
+    starts = np.stack([covariance_root(P), 1e3 * covariance_root(P + np.trace(P) * np.eye(n))])
     drawn = np.empty((samples, n, n))
     for first in range(0, samples, MAX_SAMPLES_AT_ONCE):
         some = min(MAX_SAMPLES_AT_ONCE, samples - first)
-        drawn[first : first + some] = _couple_from_the_past(
-            lambda K, T: random.random((K, T)) < delivery,
+        drawn[first : first + some], _ = couple_from_the_past(
+            lambda following, T: random.random((len(following), T)) < delivery,
             lambda roots, arrivals: advance(roots, arrivals, F, square_root(Q), modes),
             starts,
-            some,
+            np.zeros((some, 0), dtype=bool),
         )
     return drawn
 
 
-def _couple_from_the_past(
-    draw: Callable[[int, int], np.ndarray],
+def couple_from_the_past(
+    draw: Callable[[np.ndarray, int], np.ndarray],
     propagate: Callable[[FloatArray, np.ndarray], FloatArray],
     starts: FloatArray,
-    samples: int,
-) -> FloatArray:
-    """Return draws (samples, n, n) from the law that forward chains converge to.
+    nothing: np.ndarray,
+) -> tuple[FloatArray, np.ndarray]:
+    """Return draws (K, n, n) from the law that forward chains converge to, and their last modes.
 
-    ``draw(K, T)`` returns T arrivals, earlier than those drawn before, for K chains;
-    ``propagate(roots, arrivals)`` moves roots (K, n, n) through arrivals (K, T). Raises TheoryError
-    if chains from the two ``starts`` (2, n, n) do not meet within MAX_PAST slots.
+    ``draw(following, T)`` returns the T modes before those in ``following`` (K, S) of K chains;
+    ``propagate(roots, modes)`` moves roots (K, n, n) through modes (K, T); ``nothing`` is an array
+    (K, 0) of modes. Raises TheoryError if chains from the two ``starts`` (2, n, n) do not meet
+    within MAX_PAST slots.
     """
-    out = np.empty((samples, *starts.shape[1:]))
-    left = np.arange(samples)
-    arrivals = draw(samples, FIRST_PAST)
+    out = np.empty((len(nothing), *starts.shape[1:]))
+    last = np.empty(len(nothing), dtype=nothing.dtype)
+    left = np.arange(len(nothing))
+    modes = draw(nothing, FIRST_PAST)
     while len(left):
         ends = propagate(
-            np.repeat(starts, len(left), axis=0), np.concatenate([arrivals, arrivals])
+            np.repeat(starts, len(left), axis=0), np.concatenate([modes, modes])
         ).reshape(2, len(left), *starts.shape[1:])
         pair = ends @ np.swapaxes(ends, -1, -2)
         if not np.isfinite(pair).all():
@@ -404,12 +413,12 @@ def _couple_from_the_past(
         apart = np.abs(pair[0] - pair[1]).max(axis=(-1, -2))
         # Chains that met are finished; the others need a longer past.
         met = apart <= COALESCENCE_TOLERANCE * np.abs(pair[0]).max(axis=(-1, -2))
-        out[left[met]] = symmetric(pair[0, met])
-        left, arrivals = left[~met], arrivals[~met]
-        if 2 * arrivals.shape[1] > MAX_PAST:
+        out[left[met]], last[left[met]] = symmetric(pair[0, met]), modes[met, -1]
+        left, modes = left[~met], modes[~met]
+        if 2 * modes.shape[1] > MAX_PAST:
             break
-        # The past grows at its far end: arrivals that were used stay the last ones.
-        arrivals = np.concatenate([draw(*arrivals.shape), arrivals], axis=1)
+        # The past grows at its far end: modes that were used stay the last ones.
+        modes = np.concatenate([draw(modes, modes.shape[1]), modes], axis=1)
     if len(left):
         raise TheoryError("the equation does not forget its start: no invariant law was reached")
-    return out
+    return out, last

@@ -125,6 +125,34 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
     return _least_certified(certified, constants)
 
 
+class CorollaryTwo(NamedTuple):
+    """What P Corollary 2 says of a scenario, and what P Theorem 5 says.
+
+    gamma  : smallest one with P (44), with the same c_B as ``minimum_gamma``
+    radius : rho(A_R(gamma)) of P (36); the corollary says that it is below 1
+    needed : smallest gamma with rho(A_R) < 1, that of P Theorem 5
+    """
+
+    gamma: int
+    radius: float
+    needed: int
+
+
+def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
+    """Return gamma of P (44) beside that of P Theorem 5, from which it does not follow.
+
+    With ``a = sqrt(lambda)`` and ``t = theta^gamma``, rho(A_R) < 1 means
+    ``t < (1 - a) / (c_B (1 - a + c_B))``; P (44), ``t < ((1 - a) / c_B)^2``, is weaker where
+    ``(1 - a)^2 > a c_B``. ``sharp`` as for ``minimum_gamma``. Raises TheoryError as that does.
+    """
+    constants = gamma_constants(scenario)
+    bound = constants.sharp if sharp else max(constants.printed, constants.sharp)
+    limit = ((1.0 - constants.contraction**0.5) / bound) ** 2
+    gamma = _least_certified(lambda gamma: constants.mean**gamma < limit, constants)
+    needed = _least_certified(lambda gamma: theorem_5(constants, bound, gamma) < 1.0, constants)
+    return CorollaryTwo(gamma, theorem_5(constants, bound, gamma), needed)
+
+
 def _moment(moment: str) -> Moment:
     if moment not in ("mean", "mean-square"):
         raise TheoryError(f'moment must be "mean" or "mean-square", got {moment!r}')

@@ -11,7 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
 from netkf.theory.push_sum.averaging import Averaging
-from netkf.theory.push_sum.estimation_steps import estimation_steps
+from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
 from netkf.theory.push_sum.mean_square import (
     KRYLOV_VECTORS,
     MAX_DENSE,
@@ -19,6 +19,7 @@ from netkf.theory.push_sum.mean_square import (
     dense_mapping,
     mapping,
     push_sum_radius,
+    radius,
 )
 
 MAX_ROUNDS = 20
@@ -33,7 +34,16 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
     Theorem 2). The filters' Q and R may differ from the truth. Raises TheoryError if
     ``push_sum_radius`` is not below 1 or does not exist.
     """
-    found, steps = push_sum_radius(scenario), estimation_steps(scenario)
+    return _covariance(estimation_steps(scenario), push_sum_radius(scenario))
+
+
+def steady_error_covariance(steps: EstimationSteps) -> FloatArray:
+    """Return the covariance (N, n, n) of ``push_sum_error_covariance`` for given steps 4 and 5."""
+    return _covariance(steps, radius(steps))
+
+
+def _covariance(steps: EstimationSteps, found: float) -> FloatArray:
+    """Return the steady covariance (N, n, n) of steps with mean-square radius ``found``."""
     if not found < 1.0:
         raise TheoryError(
             f"no steady error covariance: the mean-square radius is {found:.6g}, not below 1; "

@@ -1,0 +1,93 @@
+"""The bound with constant gains, which the time-varying gains of H improve (H Remark 1, (15)).
+
+    dP_i/dt = (A - L_i H_i) P_i + P_i (A - L_i H_i)' + L_i R_i L_i' + Q + sum_j c_ij (P_j - P_i)
+
+With the gains ``L_i = P_i H_i' R_i^-1`` of H(12) itself the right-hand side is smallest, so that
+the solution for any other gains stays above that of H(12) from the same start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import ArrayLike, FloatArray, symmetric
+from netkf.scenario.scenario import Scenario
+from netkf.theory.hybrid.coupled import coupled_riccati
+from netkf.theory.hybrid.steady import steady_covariance_bound
+
+MAX_DENSE = 500  # unknowns up to which the exponential of the whole map is computed
+
+
+def constant_gain_bound(
+    scenario: Scenario, times: Any = None, gains: Sequence[ArrayLike] | None = None
+) -> FloatArray:
+    """Return the bound (T, N, n, n) on the mean covariance with constant ``gains``, at ``times``.
+
+    ``gains`` has L_i (n, p_i) for each node; by default those of the steady state of H(12). Times
+    in seconds, increasing; for None the steady state (N, n, n) is returned. It is the mean of P_i
+    itself if every node uses its L_i (derived). Raises TheoryError for sampled sensors, delays and
+    wrong shapes, and if there is no steady state.
+    """
+    A, right, start = _linear_equation(scenario, gains)
+    N, n, _ = start.shape
+    if times is None:
+        return symmetric(_steady(A, right, n).reshape(N, n, n))
+    moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    if not np.isfinite(moments).all() or (np.diff(moments, prepend=0.0) < 0.0).any():
+        raise TheoryError("times must be finite, increasing and not negative")
+    # An entry that stays 1 makes the constant term part of a linear map.
+    above = scipy.sparse.hstack([A, scipy.sparse.csr_array(right[:, None])])
+    below = scipy.sparse.csr_array((1, len(right) + 1))
+    whole = scipy.sparse.csc_array(scipy.sparse.vstack([above, below]))
+    y, found = np.append(start.reshape(-1), 1.0), []
+    for gap in np.diff(moments, prepend=0.0):
+        if whole.shape[0] <= MAX_DENSE:
+            y = scipy.linalg.expm(whole.toarray() * gap) @ y
+        elif gap > 0.0:
+            y = scipy.sparse.linalg.expm_multiply(whole * gap, y)
+        found.append(symmetric(y[:-1].reshape(N, n, n)))
+    return np.array(found)
+
+
+def _linear_equation(
+    scenario: Scenario, gains: Sequence[ArrayLike] | None
+) -> tuple[scipy.sparse.csr_array, FloatArray, FloatArray]:
+    """Return the matrix (N n^2, N n^2), the constant term (N n^2,) and the start (N, n, n)."""
+    equations = coupled_riccati(scenario)
+    if equations.samples or equations.jumps or equations.delay:
+        raise TheoryError("constant gains are for sensors in continuous time and no delay")
+    A, N, n = equations.A, len(equations.start), len(equations.A)
+    observed = [scenario.observation(node, believed=True) for node in scenario.nodes]
+    if gains is None:
+        P = steady_covariance_bound(scenario)
+        gains = [p @ np.linalg.solve(R, H).T for p, (H, R) in zip(P, observed, strict=True)]
+    chosen = [np.asarray(L, dtype=np.float64) for L in gains]
+    if [L.shape for L in chosen] != [(n, len(H)) for H, _ in observed]:
+        raise TheoryError("gains must have one (n, p_i) array for each node")
+    eye, blocks, right = np.eye(n), [], np.empty((N, n, n))
+    for i, (L, (H, R)) in enumerate(zip(chosen, observed, strict=True)):
+        closed = A - L @ H
+        blocks.append(np.kron(closed, eye) + np.kron(eye, closed))
+        right[i] = L @ R @ L.T + equations.Q
+    leaving = scipy.sparse.diags_array(np.asarray(equations.coupling.sum(axis=1)).reshape(-1))
+    exchange = scipy.sparse.csr_array(equations.coupling - leaving)
+    matrix = scipy.sparse.block_diag(blocks) + scipy.sparse.kron(exchange, np.eye(n * n))
+    return scipy.sparse.csr_array(matrix), right.reshape(-1), np.array(equations.start)
+
+
+def _steady(A: scipy.sparse.csr_array, right: FloatArray, n: int) -> FloatArray:
+    """Return the steady state (N n^2,); raises TheoryError if the gains do not stabilise."""
+    factors = scipy.sparse.linalg.splu(scipy.sparse.csc_array(A))
+    # The map generates positive maps: it is stable iff -A X = I has a positive definite solution.
+    eye = np.tile(np.eye(n).reshape(-1), len(right) // (n * n))
+    X = symmetric(factors.solve(-eye).reshape(-1, n, n))
+    if not np.isfinite(X).all() or not np.linalg.eigvalsh(X)[:, 0].min() > 0.0:
+        raise TheoryError("constant gains do not stabilise the filters: there is no steady state")
+    return np.asarray(factors.solve(-right))

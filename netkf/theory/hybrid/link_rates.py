@@ -1,0 +1,106 @@
+"""Link rates: for a steady bound H(12), and for a distance from the limit S (H Theorem 3)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
+from netkf.theory.hybrid.limits import limit_covariance
+from netkf.theory.hybrid.steady import steady_state, threshold_factor
+from netkf.theory.numerics.matrices import as_numbers
+
+MAX_FACTOR = 1e12
+NO_STEADY_STATE = 1e3  # stands for the logarithm of an infinite distance
+FACTOR_TOLERANCE = 1e-10
+
+
+class LinkRate(NamedTuple):
+    """The smallest link rates for a promise.
+
+    factor : by which all rates of the scenario are multiplied
+    rate   : that of every link, per second; nan if the links have different rates
+    """
+
+    factor: float
+    rate: float
+
+
+def link_rate_threshold(scenario: Scenario) -> LinkRate:
+    """Return the link rates from which on H(12) has a steady state.
+
+    Below them the bound grows without limit although all rates are positive and the graph is
+    connected, so that H Proposition 4 is false as printed. To 1e-6, or 1e-3 for large networks.
+    Raises TheoryError if H(12) does not apply or no rate suffices.
+    """
+    equations = _require_talk(scenario)
+    if _distance(equations, None, 1e-9) is not None:
+        return _with_rate(scenario, 0.0)
+    slow = 1.0
+    # The search goes upwards, so it starts from rates that are too slow.
+    while _distance(equations.scale_rates(slow), None, 1.0) is not None:
+        slow *= 0.1
+    factor = threshold_factor(equations.scale_rates(slow))
+    if factor is None:
+        raise TheoryError("H(12) has no steady state for any link rates")
+    return _with_rate(scenario, slow * factor)
+
+
+def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
+    """Return the smallest link rates for which the steady bound is within ``delta`` of S.
+
+    H Theorem 3 says that there are some: ``max_i |calP_i - S|_F <= delta`` in the steady state of
+    H(12), with all rates multiplied by one factor. The distance falls with the rates, in the end in
+    proportion to 1/rate; the factor is found to 1e-10. 0 if the nodes have S at any rate. Raises
+    TheoryError if H(12) or S do not apply or no rate up to 1e12 times the scenario's suffices.
+    """
+    if as_numbers("delta", delta).size != 1 or not 0.0 < delta < math.inf:
+        raise TheoryError(f"delta must be a positive number, got {delta!r}")
+    equations, S = _require_talk(scenario), limit_covariance(scenario)
+
+    def excess(log_factor: float) -> float:
+        apart = _distance(equations, S, math.exp(log_factor))
+        if apart is None:
+            return NO_STEADY_STATE
+        return math.log(max(apart, 1e-300) / delta)
+
+    step, low, high = math.log(4.0), 0.0, 0.0
+    while excess(high) > 0.0:
+        low, high = high, high + step
+        if high > math.log(MAX_FACTOR):
+            raise TheoryError(f"no rates up to {MAX_FACTOR:g} times those given come so close to S")
+    while low == high or excess(low) <= 0.0:
+        low, high = low - step, low if low != high else high
+        if low < -math.log(MAX_FACTOR):
+            return _with_rate(scenario, 0.0)
+    root = scipy.optimize.brentq(excess, low, high, xtol=FACTOR_TOLERANCE)
+    return _with_rate(scenario, math.exp(float(root)))
+
+
+def _require_talk(scenario: Scenario) -> CoupledRiccati:
+    equations = coupled_riccati(scenario)
+    if not equations.coupling.nnz:
+        raise TheoryError("no message ever arrives, so that rates of links change nothing")
+    return equations
+
+
+def _distance(equations: CoupledRiccati, S: FloatArray | None, factor: float) -> float | None:
+    """Return ``max_i |calP_i - S|_F``, or 0 if S is None; None if there is no steady state."""
+    P = steady_state(equations.scale_rates(factor))
+    if P is None or S is None:
+        return None if P is None else 0.0
+    return float(np.linalg.norm(P - S, axis=(1, 2)).max())
+
+
+def _with_rate(scenario: Scenario, factor: float) -> LinkRate:
+    clock = scenario.network.activation
+    rate = getattr(clock, "rate", None)
+    if rate is None or getattr(clock, "rates", None):
+        return LinkRate(factor, math.nan)
+    return LinkRate(factor, factor * float(rate))

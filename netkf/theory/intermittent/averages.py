@@ -1,0 +1,130 @@
+"""Averages of the random Riccati equation: over one path, and bounds on the mean over all paths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.kernels.chains import alphabet, trace_path
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
+from netkf.rng.streams import Streams
+from netkf.theory.intermittent.riccati import (
+    SlotSystem,
+    check_delivery,
+    check_system,
+    covariance_root,
+    lyapunov_step,
+    riccati_step,
+    steady_covariance,
+)
+from netkf.theory.numerics.matrices import as_covariance, as_whole
+
+BATCHES = 50  # of a path, whose averages are nearly independent
+MAX_ENTRIES = 2_000_000  # of the covariances that are kept at once
+
+
+class PathAverage(NamedTuple):
+    """The average of a function of P over the slots of one path.
+
+    mean  : of the function
+    error : standard error of ``mean``, from the averages of 50 successive parts of the path
+    slots : length of the path
+    """
+
+    mean: float
+    error: float
+    slots: int
+
+
+def path_average(
+    function: Callable[[FloatArray], ArrayLike],
+    F: ArrayLike,
+    Q: ArrayLike,
+    H: ArrayLike,
+    R: ArrayLike,
+    delivery: float,
+    slots: int,
+    seed: int,
+    start: ArrayLike | None = None,
+) -> PathAverage:
+    """Return the average of ``function`` over ``slots`` slots of one path, R (140).
+
+    By R Proposition 25 it converges to the integral of the function over the invariant law, for
+    almost every start by that law; R recommends a point of its support, and P* is the default
+    (``start`` is an (n, n) covariance). ``function`` maps covariances (K, n, n) to K numbers. It
+    must be integrable: below the critical probability the average of P itself diverges, and the
+    standard error says nothing then. Raises TheoryError for wrong arguments or if P* does not
+    exist.
+    """
+    system, g = check_system(F, Q, H, R), check_delivery(delivery)
+    slots, seed = as_whole("slots", slots, BATCHES), as_whole("seed", seed, 0)
+    n = len(system.F)
+    P = steady_covariance(*system) if start is None else as_covariance("start", start, n)
+    arrived = Streams(seed).generator("arrivals").random(slots) < g
+    values = np.concatenate(list(_evaluate(function, system, covariance_root(P), arrived)))
+    parts = [float(part.mean()) for part in np.array_split(values, BATCHES)]
+    error = float(np.std(parts, ddof=1)) / float(np.sqrt(BATCHES))
+    return PathAverage(float(values.mean()), error, slots)
+
+
+def _evaluate(
+    function: Callable[[FloatArray], ArrayLike],
+    system: SlotSystem,
+    root: FloatArray,
+    arrived: np.ndarray,
+) -> list[FloatArray]:
+    """Return the values of the function at P_0, P_1, ..., in pieces of limited size."""
+    F, Q, H, R = system
+    modes, root_Q = alphabet([(H[:0], R[:0, :0]), (H, R)], len(F)), square_root(Q)
+    piece, found = max(1, MAX_ENTRIES // len(F) ** 2), []
+    for first in range(0, len(arrived), piece):
+        word = arrived[first : first + piece].astype(np.uint8)
+        roots = trace_path(root, word, F, root_Q, modes)
+        # R (140) averages over P_0 .. P_{t-1}: each covariance before its own slot.
+        before = np.concatenate([root[None], roots[:-1]])
+        P, root = before @ np.swapaxes(before, 1, 2), roots[-1]
+        values = np.asarray(function(P), dtype=np.float64)
+        if values.shape != (len(P),):
+            raise TheoryError(
+                f"the function must give one number per covariance, not {values.shape}"
+            )
+        found.append(values)
+    return found
+
+
+class MeanBounds(NamedTuple):
+    """Bounds lower <= E[P_t] <= upper, (slots + 1, n, n) each, for t = 0 .. slots."""
+
+    lower: FloatArray
+    upper: FloatArray
+
+
+def mean_covariance_bounds(
+    F: ArrayLike,
+    Q: ArrayLike,
+    H: ArrayLike,
+    R: ArrayLike,
+    delivery: float,
+    slots: int,
+    start: ArrayLike,
+) -> MeanBounds:
+    """Return bounds on E[P_t] from the covariance ``start`` (n, n) on.
+
+    The lower one counts slots without a reading only, ``S+ = (1 - g) F S F' + Q``; the upper one
+    applies Jensen's inequality to the concave f_1, ``X+ = (1 - g) f_0(X) + g f_1(X)``. The lower
+    one grows without bound if (1 - g) alpha^2 >= 1 for the largest modulus alpha of the eigenvalues
+    of F, which is R (29) up to the probability (31); the upper one stays bounded above R (32).
+    Raises TheoryError for wrong arguments.
+    """
+    system, g = check_system(F, Q, H, R), check_delivery(delivery)
+    first = as_covariance("start", start, len(system.F))
+    lower, upper = [first], [first]
+    for _ in range(as_whole("slots", slots, 0)):
+        S, X = lower[-1], upper[-1]
+        lower.append(symmetric((1.0 - g) * system.F @ S @ system.F.T + system.Q))
+        arrived, lost = riccati_step(X, *system), lyapunov_step(X, system.F, system.Q)
+        upper.append(symmetric((1.0 - g) * lost + g * arrived))
+    return MeanBounds(np.array(lower), np.array(upper))

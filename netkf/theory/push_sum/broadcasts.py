@@ -1,0 +1,98 @@
+"""The remarks of P on its broadcasts: nominal degrees (Remark 1) and a leader (Remark 3)."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Literal
+
+import numpy as np
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import ArrayLike, FloatArray
+from netkf.network.graphs import Topology
+from netkf.scenario.scenario import Scenario
+from netkf.theory.numerics.matrices import as_whole
+from netkf.theory.push_sum.estimation_steps import averaging_law
+
+MAX_NODES = 12  # of a network whose informed sets are enumerated
+Degrees = Literal["nominal", "last"]
+
+
+def mass_totals(
+    graph: Scenario | Topology, up: ArrayLike, degrees: Degrees = "nominal"
+) -> FloatArray:
+    """Return the total mass (T + 1,) of all nodes after 0 .. T slots, from a total of 1.
+
+    ``up`` (T, E) says which links of the graph, in its order, are up in each slot, in both
+    directions. Every node starts with 1/N. ``degrees`` "nominal" divides by the degree in the whole
+    graph and replaces what does not arrive by a node's own share, P (3)-(5) corrected: the total
+    stays 1. "last" divides by the degree that a node saw in the slot before, the latest one that it
+    can know when it sends, as P (14) would need: then mass is lost or made where links change,
+    which is what P Remark 1 says cannot be synchronised. Raises TheoryError for wrong arguments.
+    """
+    topology = graph.topology if isinstance(graph, Scenario) else graph
+    links = np.array([[topology.index[a], topology.index[b]] for a, b in topology.links])
+    present, N = np.asarray(up, dtype=bool), len(topology.nodes)
+    if present.ndim != 2 or present.shape[1] != len(links):
+        raise TheoryError(f"up must have one column for each of {len(links)} links")
+    if degrees not in ("nominal", "last"):
+        raise TheoryError(f'degrees must be "nominal" or "last", got {degrees!r}')
+    nominal = np.bincount(links.reshape(-1), minlength=N) + 1.0
+    z, seen, totals = np.full(N, 1.0 / N), nominal, [1.0]
+    for row in present:
+        open_, closed = links[row], links[~row]
+        share = z / (nominal if degrees == "nominal" else seen)
+        z = share.copy()
+        np.add.at(z, open_[:, 0], share[open_[:, 1]])
+        np.add.at(z, open_[:, 1], share[open_[:, 0]])
+        if degrees == "nominal":
+            np.add.at(z, closed.reshape(-1), share[closed.reshape(-1)])
+        seen = np.bincount(open_.reshape(-1), minlength=N) + 1.0
+        totals.append(float(z.sum()))
+    return np.array(totals)
+
+
+def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) -> FloatArray:
+    """Return the probability (slots + 1,) that all nodes know the leader, from slot 0 on.
+
+    P Remark 3: every node broadcasts the largest id that it has heard of (max-consensus), and the
+    node whose id wins starts with w = 1; it is the largest one, or ``leader``. Links fail with the
+    probabilities of the channel, afresh in each slot. Exact, over all sets of nodes that may know.
+    Raises TheoryError for more than 12 nodes and for links that are not drawn independently.
+    """
+    law, slots = averaging_law(scenario), as_whole("slots", slots, 0)
+    if law.nodes > MAX_NODES:
+        raise TheoryError(f"sets of nodes are enumerated, and {law.nodes} nodes have too many")
+    chosen = max(scenario.nodes) if leader is None else leader
+    if chosen not in scenario.nodes:
+        raise TheoryError(f"the leader {leader!r} is not a node")
+    # missed[i, j]: the probability that i does not hear j in a slot
+    missed = np.ones((law.nodes, law.nodes))
+    for (i, j), (first, second) in zip(law.links.tolist(), law.hears.tolist(), strict=True):
+        missed[i, j], missed[j, i] = 1.0 - first, 1.0 - second
+    known = np.zeros(2**law.nodes)
+    known[1 << scenario.topology.index[chosen]] = 1.0
+    found = [known[-1]]
+    for _ in range(slots):
+        known = _spread(known, missed)
+        found.append(known[-1])
+    return np.array(found)
+
+
+def _spread(known: FloatArray, missed: FloatArray) -> FloatArray:
+    """Return the law (2^N,) of the set of informed nodes one slot later, from ``known`` (2^N,)."""
+    N, after = len(missed), np.zeros_like(known)
+    for informed in np.flatnonzero(known).tolist():
+        inside = [k for k in range(N) if informed >> k & 1]
+        outside = [k for k in range(N) if not informed >> k & 1]
+        # No link serves two nodes outside, so that they are informed independently of each other.
+        stays = {k: float(np.prod(missed[k, inside])) for k in outside}
+        frontier = [k for k in outside if stays[k] < 1.0]
+        for told in itertools.product((False, True), repeat=len(frontier)):
+            p = known[informed]
+            following = informed
+            for k, heard in zip(frontier, told, strict=True):
+                p *= 1.0 - stays[k] if heard else stays[k]
+                following |= heard << k
+            after[following] += p
+    return after

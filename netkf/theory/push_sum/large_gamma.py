@@ -1,0 +1,112 @@
+"""The push-sum filter with ever more averaging steps: P Lemma 4 and Theorem 4."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.scenario.scenario import Scenario
+from netkf.theory.numerics.matrices import as_whole
+from netkf.theory.push_sum.covariance import steady_error_covariance
+from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
+from netkf.theory.push_sum.limits import consensus_gain_bound
+
+
+class LargeGamma(NamedTuple):
+    """Limits for gamma to infinity, of the filter that averages without end in every slot.
+
+    noise      : (N n, N n) covariance of the transformed noise, P Lemma 4: zero but for the first
+                 block, that of the direction in which all nodes agree
+    covariance : (n, n) of the steady error of every node, P Theorem 4: P_inf of the central filter
+                 if the filters know the plant and the sensors
+    """
+
+    noise: FloatArray
+    covariance: FloatArray
+
+
+def large_gamma_limits(scenario: Scenario) -> LargeGamma:
+    """Return the limits of P Lemma 4 and P Theorem 4 for gamma to infinity.
+
+    The scenario's own gamma is ignored. Raises TheoryError where they do not hold: a graph that is
+    not connected, links that are held over the steps or fail in one direction, a delta at or below
+    half of rho(L).
+    """
+    steps = estimation_steps(scenario)
+    _require_averaging(scenario, steps)
+    N, n, _ = steps.closed.shape
+    # v' (x) I of the noise at all nodes, v = (1, .., 1) / sqrt(N): the rest is averaged away.
+    block = steps.noise.reshape(N, n, N, n).sum(axis=(0, 2)) / N
+    noise = np.zeros((N * n, N * n))
+    noise[:n, :n] = symmetric(block)
+    return LargeGamma(noise, _steady_mean(steps, block / N))
+
+
+def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
+    """Return the covariance (len(gammas), N n, N n) of the transformed noise of P (29), exactly.
+
+    ``(T' (x) I) E[(M (x) I) cov(h) (M (x) I)'] (T (x) I)`` with ``T = (v W)`` of P (75), v =
+    (1, .., 1) / sqrt(N) and W any orthonormal complement. P Lemma 4 says what it tends to. Raises
+    TheoryError as ``large_gamma_limits`` does.
+    """
+    steps = estimation_steps(scenario)
+    _require_averaging(scenario, steps)
+    N, n, _ = steps.closed.shape
+    # The orthogonal factor of (v, e_1, ..): its first column is v up to a sign.
+    first = np.column_stack([np.ones(N), np.eye(N)[:, : N - 1]])
+    T = np.linalg.qr(first)[0]
+    transform = np.kron(T * np.sign(T[0, 0]), np.eye(n))
+    found = []
+    for gamma in gammas:
+        moment = _with_gamma(steps, gamma).averaging.second_moment(steps.noise)
+        found.append(symmetric(transform.T @ moment @ transform))
+    return np.array(found)
+
+
+def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
+    """Return the exact steady error covariances (len(gammas), N, n, n) for several gamma.
+
+    As ``push_sum_error_covariance`` for the scenario with that gamma; nan where the mean-square
+    radius is not below 1. P Theorem 4 says that they tend to P_inf. Raises TheoryError if
+    asymptotic gains do not exist or the links are not drawn independently.
+    """
+    steps = estimation_steps(scenario)
+    N, n, _ = steps.closed.shape
+    found = np.full((len(gammas), N, n, n), np.nan)
+    for k, gamma in enumerate(gammas):
+        try:
+            found[k] = steady_error_covariance(_with_gamma(steps, gamma))
+        except TheoryError:
+            continue
+    return found
+
+
+def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
+    law = replace(steps.averaging, gamma=as_whole("gamma", gamma, 1))
+    return replace(steps, averaging=law)
+
+
+def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
+    """Raise TheoryError unless gamma steps come to the mean of all nodes as gamma grows."""
+    law = steps.averaging
+    if law.held and not law.deterministic:
+        raise TheoryError('P Theorem 4 needs links = "fresh": a draw that is held cuts the network')
+    if not np.array_equal(law.hears.min(axis=1), law.both):
+        raise TheoryError("P Theorem 4 needs failures of both directions together")
+    if law.nodes > 1 and not law.both.min(initial=1.0) > 0.0:
+        raise TheoryError("P Theorem 4 needs links that are up with a positive probability")
+    half = 0.5 * consensus_gain_bound(scenario).radius
+    if not law.delta > half:
+        raise TheoryError(f"averaging diverges: delta must be above rho(L)/2 = {half:.6g}")
+
+
+def _steady_mean(steps: EstimationSteps, noise: FloatArray) -> FloatArray:
+    """Return X (n, n) with ``X = A_C X A_C' + noise``, the error of the mean over nodes."""
+    central = steps.closed.mean(axis=0)
+    return symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(central, noise)))
