@@ -43,6 +43,7 @@ class Finding(NamedTuple):
 
     early   : the promise is about a limit and the horizon is too short to tell
     blurred : rounding of a large state has left no errors to judge by
+    horizon : seconds after which the limit would be reached, nan if that is not known
     """
 
     margin: tuple[float, float, float]
@@ -50,6 +51,7 @@ class Finding(NamedTuple):
     message: str
     early: bool = False
     blurred: bool = False
+    horizon: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -108,12 +110,12 @@ def _is_needed(promise: Promise, row: Assumption) -> bool:
 
 def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
     """Return the verdict that follows from the interval of a finding."""
-    (margin, low, high), tolerance, message, early, blurred = finding
+    (margin, low, high), tolerance, message = finding[:3]
     needed = None
-    if blurred:
+    if finding.blurred:
         verdict = UNDECIDED
-    elif early:
-        verdict, message = UNDECIDED, f"{message}; the horizon is too short to tell, lengthen it"
+    elif finding.early:
+        verdict, message = UNDECIDED, f"{message}; {_describe_horizon(finding.horizon)}"
     elif not high >= 0.0:  # also if all values are nan
         verdict = BROKEN
     elif low >= -tolerance:
@@ -135,6 +137,13 @@ def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
         needed,
         message,
     )
+
+
+def _describe_horizon(seconds: float) -> str:
+    """Return the remedy for a limit that the horizon does not reach."""
+    if math.isfinite(seconds):
+        return f"not reached in this horizon, one of about {seconds:.3g} s would do"
+    return "not reached in this horizon, lengthen it"
 
 
 def _reject(promise: Promise, why: str) -> Evidence:
@@ -162,3 +171,9 @@ def find_nothing(tolerance: float) -> Finding:
         "the horizon"
     )
     return Finding((nan, nan, nan), tolerance, message, blurred=True)
+
+
+def find_unknown(why: str, tolerance: float = 0.0) -> Finding:
+    """Return the finding of a test that has nothing to compare: undecided, with the reason."""
+    nan = math.nan
+    return Finding((nan, nan, nan), tolerance, why, blurred=True)

@@ -5,16 +5,16 @@ covariance of the errors must be, without the engine.
 from __future__ import annotations
 
 import dataclasses
-import math
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.registry import built_in_class, overridden
-from netkf.checks.evidence import Assumption, Finding, find_identity, find_nothing
+from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
 from netkf.checks.laws import NEES_TOLERANCE, compare_chi_square, find_largest
 from netkf.checks.points import sampled_indices
+from netkf.checks.rounding import compare_identities, largest_so_far
 from netkf.checks.samples import ReplicaSummary, RunSamples
 from netkf.checks.statistics import deviation_interval, scale_interval
 from netkf.core.errors import TheoryError
@@ -127,9 +127,10 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     P, Sigma = samples.runs.P[:MAX_REPLAYED], samples.runs.Sigma[:MAX_REPLAYED]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
-    least = np.linalg.eigvalsh(gap)[..., 0] / np.maximum(size, 1e-300)
-    message = f"least eigenvalue of P - Sigma relative to its trace in {least.size:,} covariances"
-    return find_identity(float(max(0.0, -least.min())), BOUND_TOLERANCE, message)
+    below = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
+    message = f"least eigenvalue of P - Sigma relative to its trace in {below.size:,} covariances"
+    terms = largest_so_far(samples.runs.replayed[:MAX_REPLAYED], samples.first_covariances)
+    return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
 
 
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
@@ -167,8 +168,7 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     if np.isnan(runs.e[:MAX_REPLAYED]).all():
         return find_nothing(NEES_TOLERANCE)
     if not len(known):
-        message = "NEES does not exist: P is singular or not finite"
-        return Finding((math.nan,) * 3, NEES_TOLERANCE, message)
+        return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)
     found = []
     for k in known.tolist():
         freedom = float(mean[k] ** 2 / square[k])

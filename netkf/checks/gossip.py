@@ -2,38 +2,40 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import Assumption, Finding, Promise, find_identity
+from netkf.checks.evidence import Assumption, Finding, Promise
 from netkf.checks.exact import check_error_covariance, few_errors, summarise_exactly
 from netkf.checks.laws import (
+    LAW_TOLERANCE,
     Pair,
+    compare_growth,
     compare_laws,
     diagonal_distances,
     exact_start,
     find_largest,
+    growth,
 )
 from netkf.checks.mode_sequences import (
+    MIN_CHAINS,
     gossip_modes,
     initial_roots,
     pair_sources,
     reference_count,
+    slots_until,
     token_positions,
     trace_tokens,
 )
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
-from netkf.checks.samples import (
-    ReplicaSummary,
-    RunSamples,
-    check_growth,
-    check_nees,
-    check_replay,
-)
+from netkf.checks.rounding import compare_identities, largest_so_far
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_replay
 from netkf.checks.statistics import deviation_interval, probability_interval
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -48,6 +50,8 @@ UNKNOWN = 1e9
 """Root of a covariance that is above all others: nothing is known of the state."""
 FAR_START = 30.0
 """Factor of the roots of P(0) in the other start, about a thousand times the covariance."""
+MIN_TOKENS = 100
+"""Chains that start at one node below which their law is not compared."""
 BOUND_TOLERANCE = 1e-8
 PROBABILITY_TOLERANCE = 0.05
 
@@ -57,7 +61,6 @@ class GossipSummary(ReplicaSummary):
     """Adds values at the K slots and at the last one; ``replayed`` is what G (10) makes of the
     swaps.
 
-    restarted : (N, n, n) P at the last slot by G (10) from another start
     bounds    : (K, N, n, n) bounds by the last readings of each pair, for any state before them
     tokens    : (N, n, n) covariance of each token at the last slot; arbitrary if pairs were copied
     moves     : number of slots, from slot 1 on, in which j handed its pair to i, for each pair of
@@ -65,7 +68,6 @@ class GossipSummary(ReplicaSummary):
     slots     : number of slots counted in ``moves``
     """
 
-    restarted: FloatArray
     bounds: FloatArray
     tokens: FloatArray
     moves: np.ndarray
@@ -86,11 +88,9 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
         bounds.append(table.covariances(unknown, recent, [recent.shape[1]])[0])
     positions = token_positions(sources, slots[-1])
     holders = np.full(len(starts), -1) if positions is None else positions
-    far = FAR_START * starts[origin] + np.eye(n)
     exact = vars(summarise_exactly(scenario, run)) | {"replayed": np.array(replayed)}
     return GossipSummary(
         **exact,
-        restarted=table.covariances(far, path, [slots[-1]])[0],
         bounds=np.array(bounds),
         tokens=run.P[-1, holders[sampled]],
         moves=_count_moves(scenario, sources[1 : slots[-1]]),
@@ -147,14 +147,21 @@ class GossipSamples(RunSamples):
     @cached_property
     def reference(self) -> ChainSamples:
         """Samples of the switched chain of G (20)."""
-        slots, starts = list(check_slots(self.scenario)), initial_roots(self.scenario)
-        random = Streams(self.seed).generator("switched chain")
         count = reference_count(self.scenario, 1)
+        return self._draw("switched chain", list(check_slots(self.scenario)), count)
+
+    def _draw(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
+        """Return samples of the chain after the given numbers of slots."""
+        starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
         table, first = gossip_modes(self.scenario), starts[positions[:, 0]]
         far = FAR_START * first + np.eye(first.shape[-1])
         restarted = table.covariances(far, positions, slots[-1:])[0]
         return ChainSamples(table.covariances(first, positions, slots), restarted, positions)
+
+    def later(self, slots: int) -> ChainSamples:
+        """Return a few samples after half of ``slots`` and after all of them."""
+        return self._draw("later chain", [slots // 2, slots], MIN_CHAINS // 4)
 
 
 def _draw_chains(
@@ -179,15 +186,17 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(P), bound - P, -np.inf)
         finite = np.isfinite(gap).all(axis=(-1, -2))
-    least = np.full(finite.shape, -np.inf)
-    least[finite] = np.linalg.eigvalsh(gap[finite])[..., 0] / size[finite]
+    below = np.full(finite.shape, np.inf)
+    below[finite] = np.maximum(-np.linalg.eigvalsh(gap[finite])[..., 0], 0.0)
     detected = size < UNKNOWN
     largest = f"{size[detected].max():.4g}" if detected.any() else "none"
     message = (
         f"in {detected.mean():.0%} of all cases the last {WINDOW} readings detect the state; "
         f"largest trace of the bounds that they give: {largest}"
     )
-    return find_identity(float(max(0.0, -least.min())), BOUND_TOLERANCE, message)
+    # The root of the bound is computed from one of size UNKNOWN, and has the roundings of that.
+    terms = np.maximum(UNKNOWN * np.sqrt(size), largest_so_far(P, samples.first_covariances))
+    return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
 
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
@@ -230,28 +239,72 @@ def _each_sensor(samples: GossipSamples, level: float) -> Finding:
 
 
 def _tokens(samples: GossipSamples, level: float) -> Finding:
-    """Compare each token at the end with the stationary switched chain.
-
-    Both may still depend on the start; the distance that the chain shows for it is subtracted.
+    """Compare each token at the end with the stationary switched chain, and to see if the horizon
+    is too short with the chain that starts where the token does.
     """
     last, pairs = len(check_slots(samples.scenario)) - 1, []
     everywhere, origin = samples.reference.P[last], samples.reference.positions[:, 0]
     for i, node in enumerate(samples.nodes):
         own = samples.runs.tokens[:, i]
-        known = diagonal_distances(everywhere[origin == i], everywhere)
-        pairs.append(Pair(f"token {node}", own, everywhere, known))
-    return compare_laws(pairs, level)
+        pairs.append(Pair(f"token {node}", own, everywhere, everywhere[origin == i]))
+    found = compare_laws(pairs, level)
+    return _with_horizon(samples, found, _token_memory) if found.early else found
 
 
 def _initial_condition_forgotten(samples: GossipSamples, level: float) -> Finding:
-    """Compare the runs with their own swaps from a start a thousand times larger."""
-    runs, (P, restarted, positions) = samples.runs, samples.reference
+    """Compare each sensor at the end with the chain that is there and started a thousand times
+    larger.
+    """
+    P, restarted, positions = samples.reference
     pairs = []
     for i, node in enumerate(samples.nodes):
         here = positions[:, -1] == i
-        known = diagonal_distances(P[-1, here], restarted[here])
-        pairs.append(Pair(f"node {node}", runs.P[:, -1, i], runs.restarted[:, i], known))
-    return compare_laws(pairs, level)
+        pairs.append(Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[here], P[-1, here]))
+    found = compare_laws(pairs, level)
+    return _with_horizon(samples, found, _start_memory) if found.early else found
+
+
+def _bounded(samples: GossipSamples, level: float) -> Finding:
+    """Compare the growth of the law of P at each sensor with that of the chain that is there."""
+    runs, (drawn, _, positions) = samples.runs.P, samples.reference
+    half = check_slots(samples.scenario)[-2]
+    pairs, expected = [], []
+    for i, node in enumerate(samples.nodes):
+        pairs.append(Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]))
+        before, after = positions[:, half - 1] == i, positions[:, -1] == i
+        expected.append((drawn[-2, before], drawn[-1, after]))
+    found = compare_growth(pairs, expected, level)
+    return _with_horizon(samples, found, _growth_of) if found.early else found
+
+
+def _growth_of(chain: ChainSamples) -> float:
+    """Return the growth of the law at a random sensor."""
+    return max(interval.value for interval in growth(chain.P[-2], chain.P[-1], 0.5))
+
+
+def _start_memory(chain: ChainSamples) -> float:
+    """Return the distance of the law at a random sensor from that of another start."""
+    return float(diagonal_distances(chain.P[-1], chain.restarted).max())
+
+
+def _token_memory(chain: ChainSamples) -> float:
+    """Return the largest distance of the law of a token from that of all."""
+    last, origin = chain.P[-1], chain.positions[:, 0]
+    starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
+    return max(
+        (float(diagonal_distances(last[origin == k], last).max()) for k in starts), default=math.nan
+    )
+
+
+def _with_horizon(
+    samples: GossipSamples, found: Finding, apart: Callable[[ChainSamples], float]
+) -> Finding:
+    """Return the finding with the horizon at which the law of the chain is settled."""
+    slots = check_slots(samples.scenario)[-1]
+    enough = slots_until(
+        lambda count: apart(samples.later(count)), slots, samples.scenario.plant.n, LAW_TOLERANCE
+    )
+    return found._replace(horizon=enough * samples.scenario.slot_plant.period)
 
 
 CHAIN = ("every exchange is a swap", "slots are independent")
@@ -301,7 +354,7 @@ PROMISES = (
         "covariances are stochastically bounded: their laws do not grow any more",
         "G Theorem 10 [iii], (26)",
         STABLE,
-        check_growth,
+        _bounded,
     ),
     Promise(
         "the law in the end does not depend on the start",

@@ -2,44 +2,44 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import Assumption, Finding, Promise, find_identity
+from netkf.checks.evidence import Assumption, Finding, Promise
 from netkf.checks.exact import check_error_covariance, few_errors, summarise_exactly
 from netkf.checks.laws import (
     LAW_TOLERANCE,
     Pair,
+    compare_growth,
     compare_laws,
     diagonal_distances,
     exact_start,
     find_largest,
+    growth,
 )
 from netkf.checks.mode_sequences import (
+    MIN_CHAINS,
     all_arrivals,
     find_arrivals,
     initial_roots,
     intermittent_modes,
     reference_count,
     sensing_neighbours,
+    slots_until,
 )
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
-from netkf.checks.samples import (
-    ReplicaSummary,
-    RunSamples,
-    check_growth,
-    check_nees,
-    check_replay,
-)
+from netkf.checks.rounding import compare_identities, largest_so_far
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_replay
 from netkf.checks.statistics import (
     deviation_interval,
     distance_to_law,
-    pearson_test,
     probability_interval,
 )
 from netkf.core.errors import TheoryError
@@ -66,13 +66,14 @@ class IntermittentSummary(ReplicaSummary):
     """Adds values at the last slot and counts of the D directions that can carry readings;
     ``replayed`` is what R (15)-(18) makes of the arrivals.
 
-    restarted  : (N, n, n) P by the same arrivals from another start
     in_support : (N, n, n) P by the same arrivals from P* of each node
+    spread     : (N,) trace of the difference between P by the same arrivals from a start above all
+                 others and from 0: every other start leads between these two
     sent, arrived : (D,) readings sent and delivered in time
     """
 
-    restarted: FloatArray
     in_support: FloatArray
+    spread: FloatArray
     sent: np.ndarray
     arrived: np.ndarray
 
@@ -103,18 +104,28 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 
 def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
-    slots = list(check_slots(scenario))
-    starts = initial_roots(scenario)[sampled_indices(scenario)]
+    slots, n = list(check_slots(scenario)), scenario.plant.n
+    starts, least = initial_roots(scenario)[sampled_indices(scenario)], _least_roots(scenario)
     table, sequences, _ = find_arrivals(scenario, run, slots[-1])
-    far = FAR_START * starts + np.eye(scenario.plant.n)
+    far = _roots_above(starts, np.nan_to_num(least))
+    last = slots[-1:]
+    above = table.covariances(far, sequences, last)[0]
+    below = table.covariances(np.zeros((len(starts), n, n)), sequences, last)[0]
     replayed = table.covariances(starts, sequences, slots)
     return IntermittentSummary(
         **vars(summarise_exactly(scenario, run)) | {"replayed": replayed},
-        restarted=table.covariances(far, sequences, slots[-1:])[0],
-        in_support=table.covariances(_least_roots(scenario), sequences, slots[-1:])[0],
+        in_support=table.covariances(least, sequences, last)[0],
+        spread=np.trace(above - below, axis1=-2, axis2=-1),
         sent=_count(scenario, run, "send", slots[-1]),
         arrived=_count(scenario, run, "deliver", slots[-1]),
     )
+
+
+def _roots_above(*roots: FloatArray) -> FloatArray:
+    """Return roots (W, n, n) of covariances that are larger than those of all given roots."""
+    total = sum(root @ np.swapaxes(root, -1, -2) for root in roots)
+    above = FAR_START**2 * total + np.eye(roots[0].shape[-1])
+    return np.asarray(np.linalg.cholesky(above), dtype=np.float64)
 
 
 def _count(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
@@ -143,16 +154,23 @@ class IntermittentSamples(RunSamples):
     @cached_property
     def reference(self) -> ArrivalSamples:
         """Samples of filters with independent arrivals, R (12)."""
-        found = [self._reference_of(k) for k in sampled_indices(self.scenario).tolist()]
+        samples = reference_count(self.scenario, len(self.nodes))
+        return self._draw("arrivals", list(check_slots(self.scenario)), samples)
+
+    def _draw(self, purpose: str, slots: list[int], samples: int) -> ArrivalSamples:
+        """Return samples of all nodes after the given numbers of slots."""
+        sampled = sampled_indices(self.scenario).tolist()
+        found = [self._draw_node(purpose, k, slots, samples) for k in sampled]
         return ArrivalSamples(*(np.array(values) for values in zip(*found, strict=True)))
 
-    def _reference_of(self, k: int) -> ArrivalSamples:
+    def _draw_node(
+        self, purpose: str, k: int, slots: list[int], samples: int
+    ) -> tuple[FloatArray, FloatArray]:
         """Return samples (K, S, n, n) and (S, n, n) of the k-th node."""
-        scenario, slots = self.scenario, list(check_slots(self.scenario))
+        scenario = self.scenario
         node = scenario.nodes[k]
-        samples = reference_count(scenario, len(self.nodes))
         senders = sensing_neighbours(scenario)[node]
-        random = Streams(self.seed).generator("arrivals", node)
+        random = Streams(self.seed).generator(purpose, node)
         probabilities = np.array([_delivery(scenario, (sender, node)) for sender in senders])
         arrived = random.random((samples, slots[-1], len(senders))) < probabilities
         # Only the sets of readings that occur become modes: there may be 2^len(senders).
@@ -167,7 +185,11 @@ class IntermittentSamples(RunSamples):
         first = np.repeat(initial_roots(scenario)[k : k + 1], samples, axis=0)
         far = FAR_START * first + np.eye(first.shape[-1])
         restarted = table.covariances(far, sequences, slots[-1:])[0]
-        return ArrivalSamples(table.covariances(first, sequences, slots), restarted)
+        return table.covariances(first, sequences, slots), restarted
+
+    def later(self, slots: int) -> ArrivalSamples:
+        """Return a few samples after half of ``slots`` and after all of them."""
+        return self._draw("later arrivals", [slots // 2, slots], MIN_CHAINS // 4)
 
 
 def _delivery(scenario: Scenario, direction: Direction) -> float:
@@ -191,27 +213,39 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
     size = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
         gap = np.linalg.eigvalsh(np.nan_to_num(samples.runs.P - least, nan=-np.inf, posinf=-1e300))
-    below = float(np.max(-gap[..., 0] / size))
+    below = np.maximum(-gap[..., 0], 0.0)
     message = f"{size.size:,} covariances against the path without losses"
-    return find_identity(max(0.0, below), BOUND_TOLERANCE, message)
+    terms = largest_so_far(samples.runs.P, samples.first_covariances)
+    return compare_identities(below, np.nan_to_num(size), terms, BOUND_TOLERANCE, message)
 
 
 def _in_support(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P at the end with the point of the support that its own arrivals lead to, where the
-    arrivals have made P independent of its start.
+    """Compare P at the end with the point of the support that its own arrivals lead to.
+
+    Both lie between what the same arrivals make of a start above all others and of 0, and may
+    differ by the spread of these, which vanishes once the arrivals have made P independent of its
+    start.
     """
-    P, point, other = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.restarted
+    P, point, spread = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread
     known = np.isfinite(point).all(axis=(0, -1, -2))
-    size = np.trace(point, axis1=-2, axis2=-1)
-    spread = np.abs(other - point).max(axis=(-1, -2)) / size
-    apart = np.abs(P - point).max(axis=(-1, -2)) / size
-    forgotten = (spread < SUPPORT_TOLERANCE) & known
-    largest = float(apart[forgotten].max()) if forgotten.any() else 0.0
+    size = np.trace(point, axis1=-2, axis2=-1)[:, known]
+    forgotten = spread[:, known] < SUPPORT_TOLERANCE * size
     message = (
-        f"{forgotten.mean():.0%} of the covariances at the end have forgotten their start and are "
-        "points of the support"
+        f"{forgotten.sum() / max(1, spread.size):.0%} of the covariances at the end have forgotten "
+        "their start and are points of the support"
     )
-    return find_identity(largest, SUPPORT_TOLERANCE, message)
+    gap = np.maximum(np.abs(P - point).max(axis=(-1, -2)) - np.maximum(spread, 0.0), 0.0)[:, known]
+    least = np.nan_to_num(_least_roots(samples.scenario))
+    starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
+    terms = np.sum(_roots_above(starts, least)[known] ** 2, axis=(-2, -1))
+    found = compare_identities(gap, size, terms, SUPPORT_TOLERANCE, message)
+    if forgotten.any() or found.margin[0] < 0.0:
+        return found
+    end = samples.scenario.horizon
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left = np.log(FAR_START**2 / np.median(spread[:, known] / size)) if known.any() else 0.0
+    share = math.log(FAR_START**2 / SUPPORT_TOLERANCE) / left if left > 0.0 else math.inf
+    return found._replace(early=True, horizon=1.2 * share * end)
 
 
 def _arrivals_counted(samples: IntermittentSamples, level: float) -> Finding:
@@ -237,19 +271,48 @@ def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
     return compare_laws(pairs, level)
 
 
+def _bounded(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare the growth of the law of P with that of filters with independent arrivals."""
+    runs, drawn = samples.runs.P, samples.reference.P
+    pairs = [
+        Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]) for i, node in enumerate(samples.nodes)
+    ]
+    expected = [(drawn[i, -2], drawn[i, -1]) for i in range(len(pairs))]
+    found = compare_growth(pairs, expected, level)
+    return _with_horizon(samples, found, _growth_of) if found.early else found
+
+
 def _initial_condition_forgotten(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the runs with their own arrivals from a start a thousand times larger."""
+    """Compare the law of P at the end with that from a start a thousand times larger."""
     P, restarted = samples.reference
     pairs = [
-        Pair(
-            f"node {node}",
-            samples.runs.P[:, -1, i],
-            samples.runs.restarted[:, i],
-            diagonal_distances(P[i, -1], restarted[i]),
-        )
+        Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
         for i, node in enumerate(samples.nodes)
     ]
-    return compare_laws(pairs, level)
+    found = compare_laws(pairs, level)
+    return _with_horizon(samples, found, _memory_of) if found.early else found
+
+
+def _growth_of(drawn: ArrivalSamples) -> float:
+    """Return the largest growth of a law from the last but one to the last number of slots."""
+    return max(g.value for P in drawn.P for g in growth(P[-2], P[-1], 0.5))
+
+
+def _memory_of(drawn: ArrivalSamples) -> float:
+    """Return the largest distance of a law from that of another start."""
+    pairs = zip(drawn.P, drawn.restarted, strict=True)
+    return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
+
+
+def _with_horizon(
+    samples: IntermittentSamples, found: Finding, apart: Callable[[ArrivalSamples], float]
+) -> Finding:
+    """Return the finding with the horizon at which the law of independent arrivals is settled."""
+    slots = check_slots(samples.scenario)[-1]
+    enough = slots_until(
+        lambda count: apart(samples.later(count)), slots, samples.scenario.plant.n, LAW_TOLERANCE
+    )
+    return found._replace(horizon=enough * samples.scenario.slot_plant.period)
 
 
 def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
@@ -272,28 +335,33 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
 
 
 def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare counts of P between the holes of the support with the probabilities of outages.
+    """Compare counts of P between the holes of the support with the exact probabilities.
 
-    An outage of k slots has probability g (1 - g)^k, R Proposition 24.
+    An outage of k slots has probability g (1 - g)^k, R Proposition 24; after few slots from a start
+    below P* the law of P at that time says how often P lies in which cell.
     """
     laws, found = _scalar_laws(samples.scenario), []
+    share = level / (len(laws) * (CELLS + 1))
     for k, law in laws.items():
-        cells = np.searchsorted(_outage_edges(law), samples.runs.P[:, -1, k, 0, 0])
+        edges = _outage_edges(law)
+        cells = np.searchsorted(edges, samples.runs.P[:, -1, k, 0, 0])
         counts = np.bincount(cells, minlength=CELLS + 1)
-        g = law.delivery
-        probabilities = np.append(g * (1.0 - g) ** np.arange(CELLS), (1.0 - g) ** CELLS)
-        p, used = pearson_test(counts, probabilities)
-        found.append((p, used, counts, probabilities, samples.nodes[k]))
-    p, used, counts, probabilities, node = min(found, key=lambda item: item[0])
-    share = level / len(probabilities)
-    off = [
-        deviation_interval(probability, probability_interval(int(count), int(counts.sum()), share))
-        for count, probability in zip(counts, probabilities, strict=True)
-    ]
-    largest, widest = max(o.value for o in off), max(o.high for o in off)
-    low = -largest if p < level / len(laws) else 0.0
-    message = f"chi-square of {used} cells between holes at node {node}: p = {p:.3g}"
-    return Finding((-largest, -widest, low), PROBABILITY_TOLERANCE * 2, message)
+        below = np.concatenate([[0.0], _law_at_end(samples, k, law)(edges), [1.0]])
+        for cell, probability in enumerate(np.diff(below).tolist()):
+            interval = probability_interval(int(counts[cell]), int(counts.sum()), share)
+            label = f"{cell} slots without a reading, node {samples.nodes[k]}"
+            found.append((deviation_interval(probability, interval), label))
+    message = "largest difference of the share of P between two holes from its probability"
+    return find_largest(found, PROBABILITY_TOLERANCE * 2, message)
+
+
+def _law_at_end(
+    samples: IntermittentSamples, k: int, law: ScalarLaw
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the exact distribution function of P at the k-th sampled node in the last slot."""
+    node = int(sampled_indices(samples.scenario)[k])
+    start = float(samples.first_covariances[node, 0, 0])
+    return partial(law.cdf_after, slots=check_slots(samples.scenario)[-1], start=start)
 
 
 def _outage_edges(law: ScalarLaw) -> FloatArray:
@@ -307,15 +375,13 @@ def _outage_edges(law: ScalarLaw) -> FloatArray:
 
 
 def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P at the end with its exact distribution function."""
+    """Compare P at the end with its exact distribution function at that time."""
     laws = _scalar_laws(samples.scenario)
-    found = [
-        (
-            distance_to_law(known.cdf, samples.runs.P[:, -1, k, 0, 0], level / len(laws)),
-            f"at node {samples.nodes[k]}",
-        )
-        for k, known in laws.items()
-    ]
+    found = []
+    for k, law in laws.items():
+        cdf, P = _law_at_end(samples, k, law), samples.runs.P[:, -1, k, 0, 0]
+        apart = distance_to_law(cdf, P, level / len(laws))
+        found.append((apart, f"at node {samples.nodes[k]}"))
     return find_largest(found, LAW_TOLERANCE, "distance from the exact distribution function")
 
 
@@ -354,7 +420,7 @@ PROMISES = (
         "P is stochastically bounded: its law does not grow any more",
         "R Proposition 8, Theorem 9 [i]",
         LIMIT,
-        check_growth,
+        _bounded,
     ),
     Promise(
         "the law in the end does not depend on the start",

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import Assumption, Finding
+from netkf.checks.evidence import Assumption, Finding, find_unknown
 from netkf.checks.statistics import (
     Interval,
     deviation_interval,
@@ -28,14 +28,15 @@ GROWTH = 4.0
 class Pair(NamedTuple):
     """Two samples of covariances (S, n, n) and (S', n, n) that should have one law.
 
-    They may depend on each other. ``known`` (n,) is the distance of their laws that is known
-    beforehand, since the promise is about later times; it is subtracted.
+    They may depend on each other. If the promise is about a limit, ``expected`` (S'', n, n) is a
+    sample of the law that ``one`` must have at its own time: only a difference from that breaks
+    the promise, while its distance from ``other`` says how far the limit still is.
     """
 
     label: str
     one: FloatArray
     other: FloatArray
-    known: FloatArray | None = None
+    expected: FloatArray | None = None
 
 
 def find_largest(
@@ -50,22 +51,27 @@ def find_largest(
     return Finding((-chosen.value, -widest, -chosen.low), tolerance, text)
 
 
-def compare_laws(pairs: Sequence[Pair], level: float) -> Finding:
+def compare_laws(pairs: Sequence[Pair], level: float, horizon: float = math.nan) -> Finding:
     """Compare the laws of pairs of samples, entry by entry of the diagonal: ranks need no moments
-    of the covariances.
+    of the covariances. ``horizon`` is that of a finding on a limit that is not reached.
     """
-    share = level / sum(pair.one.shape[-1] for pair in pairs)
+    share, early = level / sum(pair.one.shape[-1] for pair in pairs), False
     found = []
     for pair in pairs:
         for k in range(pair.one.shape[-1]):
-            apart = law_distance(pair.one[:, k, k], pair.other[:, k, k], share)
-            if pair.known is not None:
-                value, low, high = (max(0.0, end - float(pair.known[k])) for end in apart)
-                apart = Interval(value, low, high)
+            one, other = pair.one[:, k, k], pair.other[:, k, k]
+            if pair.expected is None:
+                apart = law_distance(one, other, share)
+            else:
+                known = pair.expected[:, k, k]
+                low = law_distance(one, known, share / 2.0).low
+                apart = law_distance(one, other, share / 2.0)
+                apart = Interval(apart.value, low, max(apart.high, low))
+                early |= law_distance(known, other, 0.5).value > LAW_TOLERANCE
             found.append((apart, f"at {pair.label}, entry {k}"))
-    early = any(pair.known is not None and pair.known.max() > LAW_TOLERANCE for pair in pairs)
-    message = "largest distance of distribution functions"
-    return find_largest(found, LAW_TOLERANCE, message)._replace(early=early)
+    finding = find_largest(found, LAW_TOLERANCE, "largest distance of distribution functions")
+    differs = any(apart.low > 0.0 for apart, _ in found)
+    return finding._replace(early=early and not differs, horizon=horizon)
 
 
 def diagonal_distances(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -77,21 +83,41 @@ def diagonal_distances(one: FloatArray, other: FloatArray) -> FloatArray:
     )
 
 
-def compare_growth(pairs: Sequence[Pair], level: float) -> Finding:
+def growth(before: FloatArray, after: FloatArray, level: float) -> list[Interval]:
+    """Return intervals for how far the law of each diagonal entry of ``after`` (S', n, n) exceeds
+    GROWTH times that of ``before`` (S, n, n): largest P(after > GROWTH x) - P(before > x).
+    """
+    return [
+        law_excess(GROWTH * before[:, k, k], after[:, k, k], level) for k in range(before.shape[-1])
+    ]
+
+
+def compare_growth(
+    pairs: Sequence[Pair],
+    expected: Sequence[tuple[FloatArray, FloatArray] | None],
+    level: float,
+    horizon: float = math.nan,
+) -> Finding:
     """Test that the later sample of each pair is stochastically at most GROWTH times the earlier
     one.
+
+    ``expected``: samples of the laws that both must have, since laws may still grow in a short
+    horizon: only what grows faster than these breaks the promise; None if they are not known, and
+    then nothing does. ``horizon`` is that of a finding on laws that still grow.
     """
-    share = level / sum(pair.one.shape[-1] for pair in pairs)
-    found = [
-        (
-            law_excess(GROWTH * pair.one[:, k, k], pair.other[:, k, k], share),
-            f"at {pair.label}, entry {k}",
-        )
-        for pair in pairs
-        for k in range(pair.one.shape[-1])
-    ]
+    share, early = 0.5 * level / sum(pair.one.shape[-1] for pair in pairs), False
+    found = []
+    for pair, laws in zip(pairs, expected, strict=True):
+        seen = growth(pair.one, pair.other, share)
+        known = growth(*laws, share) if laws is not None else [None] * len(seen)
+        for k, (run, law) in enumerate(zip(seen, known, strict=True)):
+            low = max(0.0, run.low - law.high) if law is not None else 0.0
+            early |= (law.value if law is not None else run.low) > LAW_TOLERANCE
+            found.append((Interval(run.value, low, run.high), f"at {pair.label}, entry {k}"))
     message = f"largest excess of P(P > {GROWTH:g} J) at the end over P(P > J) at half of the time"
-    return find_largest(found, LAW_TOLERANCE, message)
+    finding = find_largest(found, LAW_TOLERANCE, message)
+    differs = any(apart.low > 0.0 for apart, _ in found)
+    return finding._replace(early=early and not differs, horizon=horizon)
 
 
 def compare_chi_square(
@@ -103,8 +129,7 @@ def compare_chi_square(
     """
     kept = np.flatnonzero(np.isfinite(ratios).all(axis=0))
     if not len(kept):
-        message = f"{name} does not exist: singular or not finite"
-        return Finding((math.nan,) * 3, NEES_TOLERANCE, message)
+        return find_unknown(f"{name} does not exist: singular or not finite", NEES_TOLERANCE)
     found = []
     for k in kept.tolist():
         total = float(ratios[:, k].mean()) * freedom[k]

@@ -8,6 +8,8 @@ them to a start covariance.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +58,22 @@ def reference_count(scenario: Scenario, laws: int) -> int:
     budget = MAX_OPERATIONS if len(scenario.nodes) <= MAX_NODES else 0.1 * MAX_OPERATIONS
     wanted = budget / (laws * check_slots(scenario)[-1] * step)
     return int(np.clip(wanted, MIN_CHAINS, MAX_CHAINS))
+
+
+def slots_until(apart: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:
+    """Return a number of slots after which ``apart`` is at most half of ``tolerance``, found by
+    doubling; nan if chains of n states that long would take seconds.
+
+    ``apart`` takes a number of slots and draws about MIN_CHAINS / 4 chains.
+    """
+    spent, longer = 0.0, slots
+    while True:
+        longer *= 2
+        spent += 0.25 * MIN_CHAINS * longer * (3 * n) ** 3
+        if spent > 0.1 * MAX_OPERATIONS:
+            return math.nan
+        if apart(longer) <= 0.5 * tolerance:
+            return float(longer)
 
 
 def initial_roots(scenario: Scenario) -> FloatArray:

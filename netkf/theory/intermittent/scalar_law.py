@@ -71,6 +71,35 @@ class ScalarLaw:
             point = np.where(above, reduced, before)
         return total
 
+    def cdf_after(self, x: ArrayLike, slots: int, start: float) -> FloatArray:
+        """Return P(P_t <= x) after ``slots`` slots from P_0 = ``start``, exact, elementwise.
+
+        P_t is f_0 of the value before with probability 1 - g and f_1 of it with probability g, so
+        that the distribution function obeys a recursion with two branches. One of them is empty
+        from P* on; below P*, where only a smaller start leads, both may count.
+        """
+        x = np.asarray(x, dtype=np.float64)
+        point, owner = x.reshape(-1), np.arange(x.size)
+        share, total = np.ones(x.size), np.zeros(x.size)
+        # All values after s slots lie between those without losses and those without readings.
+        lowest, highest = [np.array(start)], [np.array(start)]
+        for _ in range(slots):
+            lowest.append(self.with_reading(lowest[-1]))
+            highest.append(self.without(highest[-1]))
+        for left in range(slots, -1, -1):
+            above = point >= highest[left] * (1.0 - 1e-15)
+            np.add.at(total, owner[above], share[above])
+            open_ = ~above & (point >= lowest[left] * (1.0 - 1e-15)) & (share > NEGLIGIBLE)
+            point, owner, share = point[open_], owner[open_], share[open_]
+            reduced = (point - self.Q) / self.F**2
+            room = self.R - self.H**2 * reduced
+            with np.errstate(divide="ignore", invalid="ignore"):
+                before = np.where(room > 0.0, reduced * self.R / room, np.inf)
+            point = np.concatenate([reduced, before])
+            owner = np.concatenate([owner, owner])
+            share = np.concatenate([share * (1.0 - self.delivery), share * self.delivery])
+        return total.reshape(x.shape)
+
     def quantile(self, u: ArrayLike) -> FloatArray:
         """Return the least x with P(X <= x) >= u, elementwise; raises TheoryError for other u.
 
