@@ -11,8 +11,11 @@ if TYPE_CHECKING:
     from netkf.testing.channels import check_channel
     from netkf.testing.clocks import check_clock
     from netkf.testing.filters import check_filter
+    from netkf.testing.matchings import check_matching
     from netkf.testing.matrices import assert_dominated
+    from netkf.testing.plants import check_plant
     from netkf.testing.scenarios import assert_promises, scenario_files
+    from netkf.testing.sensors import check_sensor
 
 _WHERE = {
     "assert_dominated": "matrices",
@@ -20,6 +23,9 @@ _WHERE = {
     "check_channel": "channels",
     "check_clock": "clocks",
     "check_filter": "filters",
+    "check_matching": "matchings",
+    "check_plant": "plants",
+    "check_sensor": "sensors",
     "scenario_files": "scenarios",
 }
 
@@ -29,6 +35,9 @@ __all__ = [
     "check_channel",
     "check_clock",
     "check_filter",
+    "check_matching",
+    "check_plant",
+    "check_sensor",
     "scenario_files",
 ]
 

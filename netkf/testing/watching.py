@@ -6,7 +6,8 @@ import dataclasses
 import inspect
 import pickle
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, NoReturn
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.plugins import in_words
 
 Leaves = dict[str, Any]
@@ -143,7 +145,7 @@ class Watched:
         """The result of a method; ``repeatable`` where it draws nothing."""
         where = f"{self.name}.{self.spoken(method)}"
         before = [dict(leaves(argument)) for argument in arguments]
-        itself = self._attributes()
+        itself = self.attributes()
         results = [self._result(where, method, arguments) for _ in range(1 + repeatable)]
         for argument, old, name in zip(
             arguments, before, self._names(method, len(arguments)), strict=True
@@ -157,7 +159,7 @@ class Watched:
                     None,
                     remedy,
                 )
-        path = difference(itself, self._attributes())
+        path = difference(itself, self.attributes())
         demand(
             path is None,
             where,
@@ -181,7 +183,7 @@ class Watched:
         """Return the same component with unchecked calls, to compare with checked ones."""
         return _Once(self.part, self._owner, self._former)
 
-    def _attributes(self) -> Leaves:
+    def attributes(self) -> Leaves:
         """Return the attributes of the component, except for cached properties."""
         cls, own = type(self._owner), vars(self._owner)
         kept = {k: v for k, v in own.items() if not isinstance(_static(cls, k), cached_property)}
@@ -223,6 +225,17 @@ class Watched:
                 "return copies, share no buffers",
             )
 
+    def demand_unchanged(self, before: Leaves) -> None:
+        """Check that the attributes of the component are still those from ``before``."""
+        path = difference(before, self.attributes())
+        demand(
+            path is None,
+            self.name,
+            f"must not change its own object, and changed {path}",
+            None,
+            "keep what changes in the paths and states that its methods return",
+        )
+
     def pickled(self) -> Any:
         """A copy of the part that went through pickle, as one that goes to a worker process."""
         try:
@@ -245,3 +258,43 @@ class _Once(Watched):
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """The result of a method."""
         return self._result(f"{self.name}.{self.spoken(method)}", method, arguments)
+
+
+@contextmanager
+def user_code(where: str) -> Iterator[None]:
+    """Turn errors of a user's class into one line, and check that no global generator is used."""
+    before = global_randomness()
+    try:
+        yield
+    except AssertionError:
+        raise
+    except Exception as error:
+        raise AssertionError(f"{where}: failed with {in_words(error)}") from error
+    demand(
+        global_randomness() == before,
+        where,
+        "must not use or seed global generators (numpy.random.*, random.*)",
+        None,
+        "draw from the generator that is handed in",
+    )
+
+
+def attempt(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """The result of a function of a user's class, see ``user_code``."""
+    with user_code(where):
+        return function(*arguments)
+
+
+def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Return a float64 array of that shape with finite numbers; fail otherwise."""
+    array = np.asarray(value)
+    demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
+    demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
+    demand(np.isfinite(array).all(), where, f"{name} must be finite", "nan or inf")
+    return array
+
+
+def distance(one: FloatArray, other: FloatArray) -> float:
+    """The largest difference of two arrays of one shape, in units of 1 + their largest entry."""
+    size = 1.0 + max(np.abs(a).max(initial=0.0) for a in (one, other))
+    return float(np.abs(one - other).max(initial=0.0) / size)
