@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.rng.streams import Streams
-from netkf.testing.noise import largest_deviation, log_level
+from netkf.testing.noise import divergence, largest_deviation, log_level
 from netkf.testing.topologies import edge_transitive, small_networks
 from netkf.testing.watching import Watched, demand, demand_array, fail, made, user_code
 
@@ -170,17 +169,6 @@ def _check_frequencies(
         words = f"{found[k]:.4g} for link {list(topology.links[k])} in {slots:,} slots"
         graph = f"on {len(topology.nodes)} nodes and {len(topology.links)} links"
         fail(f"{watched.name}.draw", rule, f"{words} instead of {mean[k]:.4g}, {graph}")
-
-
-def divergence(found: FloatArray, stated: FloatArray) -> FloatArray:
-    """Return the Kullback-Leibler divergence of frequencies from probabilities: a frequency of N
-    trials lies so far off with a probability of at most ``exp(-N divergence)`` (Chernoff).
-    """
-    total = np.zeros(np.broadcast(found, stated).shape)
-    for f, p in ((found, stated), (1.0 - found, 1.0 - stated)):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            total += np.where(f > 0.0, f * np.log(f / np.maximum(p, 0.0)), 0.0)
-    return np.where(np.isnan(total), math.inf, total)
 
 
 def _check_slots_independent(where: str, topology: Topology, drawn: np.ndarray) -> None:

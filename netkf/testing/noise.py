@@ -37,12 +37,13 @@ def standard_errors(count: int) -> float:
     return float(-ndtri(0.5 * LEVEL / (FAMILIES * max(count, 1))))
 
 
-def largest_deviation(values: FloatArray) -> Deviation | None:
+def largest_deviation(values: FloatArray, fewest: int = FEWEST) -> Deviation | None:
     """Return the mean of ``values`` (N, ...) over the first axis that is significantly not zero,
-    the most significant one, or None. Values must be uncorrelated along the first axis.
+    the most significant one, or None (always with less than ``fewest`` values). Values must be
+    uncorrelated along the first axis.
     """
     count = len(values)
-    if count < FEWEST or not values[0].size:
+    if count < fewest or not values[0].size:
         return None
     mean = np.asarray(values.mean(axis=0))
     error = np.asarray(values.std(axis=0)) / math.sqrt(count)
@@ -170,3 +171,14 @@ def check_unrelated(e: FloatArray, known: FloatArray, stated: Stated, what: str)
 def log_level(count: int) -> float:
     """Return minus the logarithm of the level of each of ``count`` two-sided tests of a family."""
     return math.log(2.0 * FAMILIES * max(count, 1) / LEVEL)
+
+
+def divergence(found: FloatArray, stated: FloatArray) -> FloatArray:
+    """Return the Kullback-Leibler divergence of frequencies from probabilities: a frequency of N
+    trials lies so far off with a probability of at most ``exp(-N divergence)`` (Chernoff).
+    """
+    total = np.zeros(np.broadcast(found, stated).shape)
+    for f, p in ((found, stated), (1.0 - found, 1.0 - stated)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            total += np.where(f > 0.0, f * np.log(f / np.maximum(p, 0.0)), 0.0)
+    return np.where(np.isnan(total), math.inf, total)
