@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.checks.evidence import Assumption, Finding, Promise
+from netkf.checks.evidence import Assumption, Finding, Promise, find_unknown
 from netkf.checks.exact import (
     MAX_REPLAYED,
     check_error_covariance,
@@ -59,8 +59,10 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
         f"computed, not simulated: least level over the pasts looked at {network['level']:.3g} "
         f"with windows of {int(network['window'])} slots; the best sensor alone {alone:.3g}"
     )
-    low = float(network["low"])
-    return Finding((float(network["level"]), low, float(network["high"])), 0.0, message)
+    if not network["low"] > 0.0:  # what is computed about a scenario cannot break a promise
+        return find_unknown(message)
+    ends = float(network["level"]), float(network["low"]), float(network["high"])
+    return Finding(ends, 0.0, message)
 
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:

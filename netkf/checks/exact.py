@@ -16,7 +16,7 @@ from netkf.checks.laws import NEES_TOLERANCE, compare_chi_square, find_largest
 from netkf.checks.points import sampled_indices
 from netkf.checks.rounding import compare_identities, largest_so_far
 from netkf.checks.samples import ReplicaSummary, RunSamples
-from netkf.checks.statistics import deviation_interval, scale_interval
+from netkf.checks.statistics import deviation_interval, quadratic_interval
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -107,14 +107,20 @@ def promised_filter(algorithm: Any) -> Any:
     """Return the built-in filter whose promises are checked: the given one, or one of the class
     that it derives from, with the same parameters.
 
-    Raises TheoryError for a class that derives from none: nothing is promised of it.
+    Raises TheoryError for a class that derives from none: nothing is promised of it; and for one
+    that declares not to talk although its base does, since promises about its base are about what
+    nodes hear.
     """
-    known = built_in_class(algorithm)
+    known, name = built_in_class(algorithm), type(algorithm).__name__
     if known is None:
-        name = type(algorithm).__name__
         raise TheoryError(
             f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which "
             "one it should be"
+        )
+    if known.talks and not algorithm.talks:
+        raise TheoryError(
+            f"nothing is promised of {name}: it declares talks = False, and what is promised of "
+            f"{known.__name__} is about exchanges; derive it from netkf.parts.Local"
         )
     if not overridden(algorithm):
         return algorithm
@@ -154,16 +160,15 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     """Compare the mean NEES with its expected value given the events of each run.
 
-    NEES is then a quadratic form of Gaussian errors with mean tr(M) and variance 2 tr(M^2), where
-    M = P^-1 Sigma. Sums over runs are compared with a scaled chi-square variable of the same two
-    moments, so nothing is estimated.
+    NEES is then a quadratic form of Gaussian errors, whose weights are the eigenvalues of
+    P^-1 Sigma, and so is its sum over runs: nothing is estimated.
     """
     runs, n = samples.runs, samples.scenario.plant.n
-    M = np.linalg.pinv(runs.replayed[:MAX_REPLAYED]) @ runs.Sigma[:MAX_REPLAYED]
-    mean = np.trace(M, axis1=-2, axis2=-1)
-    square = np.trace(M @ M, axis1=-2, axis2=-1)
-    mean, square = (values.reshape(len(M), -1).sum(axis=0) for values in (mean, square))
-    nees = runs.nees[:MAX_REPLAYED].reshape(len(M), -1)
+    P, Sigma = runs.replayed[:MAX_REPLAYED], runs.Sigma[:MAX_REPLAYED]
+    weights = np.linalg.eigvals(np.linalg.pinv(P) @ Sigma).real
+    weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)
+    mean = weights.sum(axis=(0, 2))
+    nees = runs.nees[:MAX_REPLAYED].reshape(len(P), -1)
     known = np.flatnonzero(np.isfinite(nees).all(axis=0) & (mean > 0.0))
     if np.isnan(runs.e[:MAX_REPLAYED]).all():
         return find_nothing(NEES_TOLERANCE)
@@ -171,13 +176,12 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
         return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)
     found = []
     for k in known.tolist():
-        freedom = float(mean[k] ** 2 / square[k])
-        total = freedom * nees[:, k].sum() / float(mean[k])
-        ratio = scale_interval(total, freedom, level / len(known))
+        total, share = float(nees[:, k].sum()), level / len(known)
+        ratio = quadratic_interval(total, weights[:, k].ravel(), share)
         found.append((deviation_interval(1.0, ratio), f"at {samples.point_labels[k]}"))
     message = (
         f"mean NEES {nees[:, known].mean():.4g}, exact errors say "
-        f"{mean[known].mean() / len(M):.4g}, n is {n}; largest relative difference"
+        f"{mean[known].mean() / len(P):.4g}, n is {n}; largest relative difference"
     )
     finding = find_largest(found, NEES_TOLERANCE, message)
     return finding._replace(message=finding.message + samples.blurred_note)

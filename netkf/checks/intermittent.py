@@ -40,6 +40,7 @@ from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_r
 from netkf.checks.statistics import (
     deviation_interval,
     distance_to_law,
+    pearson_test,
     probability_interval,
 )
 from netkf.core.errors import TheoryError
@@ -340,7 +341,7 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
     An outage of k slots has probability g (1 - g)^k, R Proposition 24; after few slots from a start
     below P* the law of P at that time says how often P lies in which cell.
     """
-    laws, found = _scalar_laws(samples.scenario), []
+    laws, found, tests = _scalar_laws(samples.scenario), [], []
     share = level / (len(laws) * (CELLS + 1))
     for k, law in laws.items():
         edges = _outage_edges(law)
@@ -351,7 +352,9 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
             interval = probability_interval(int(counts[cell]), int(counts.sum()), share)
             label = f"{cell} slots without a reading, node {samples.nodes[k]}"
             found.append((deviation_interval(probability, interval), label))
-    message = "largest difference of the share of P between two holes from its probability"
+        p, used = pearson_test(counts, np.diff(below))
+        tests.append(f"chi-square of {used} cells at node {samples.nodes[k]}: p = {p:.3g}")
+    message = f"{'; '.join(tests[:3])}; largest difference of a share from its probability"
     return find_largest(found, PROBABILITY_TOLERANCE * 2, message)
 
 

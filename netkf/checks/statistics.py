@@ -116,29 +116,76 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
     return Interval(total / freedom, total / upper, total / lower)
 
 
-def mean_interval(values: FloatArray, level: float) -> Interval:
-    """Return an interval for the mean of positive values (R,) with a variance.
+def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:
+    """Return an interval for c if ``total`` is c times a sum of squares of independent standard
+    Gaussian numbers with ``weights`` (K,), at least 0.
 
-    Their sum is taken for a scaled chi-square variable, since a normal one has no skewness, with at
-    most one degree of freedom per value, since a small sample does not show its tail.
+    Its ends are quantiles of the sum by the saddle-point formula of Lugannani and Rice, whose
+    relative error in the tails is a few per cent for any weights; it is exact where all are equal,
+    since the sum is then taken for the chi-square variable that it is.
     """
-    mean, variance = float(values.mean()), float(values.var(ddof=1)) if len(values) > 1 else 0.0
-    if variance <= 0.0 or not mean > 0.0:
-        return Interval(mean, mean, mean)
-    freedom = len(values) * min(1.0, 2.0 * mean * mean / variance)
-    ratio = scale_interval(freedom, freedom, level)
-    return Interval(mean, mean * ratio.low, mean * ratio.high)
+    weights = weights[weights > 1e-12 * weights.max(initial=0.0)]
+    if not len(weights):
+        return Interval(math.nan, 0.0, math.inf)
+    mean = float(weights.sum())
+    if np.ptp(weights) <= 1e-9 * weights.max():
+        return scale_interval(total / float(weights[0]), float(len(weights)), level)
+    upper, lower = (_quadratic_quantile(weights, level / 2.0, up) for up in (True, False))
+    return Interval(total / mean, total / upper, total / lower)
+
+
+def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
+    """Return the value that the sum of :func:`quadratic_interval` exceeds (``upper``), or stays
+    below, with probability ``tail``.
+    """
+    # K'(s) = sum w / (1 - 2 s w) grows with s, which therefore stands for the value in the search.
+    far = 0.5 / float(weights.max())
+    wanted = math.log(tail)
+    low, high = (0.0, far) if upper else (-1e12 * far, 0.0)
+    for _ in range(200):
+        if upper:
+            middle = 0.5 * (low + high)
+        else:  # over many orders of magnitude
+            middle = -math.sqrt(max(-low, 1e-300) * max(-high, 1e-12 * far))
+        inside = _log_tail(weights, middle) > wanted
+        if inside == upper:
+            low = middle
+        else:
+            high = middle
+        if abs(high - low) <= 1e-10 * max(abs(high), abs(low)):
+            break
+    return float((weights / (1.0 - 2.0 * low * weights)).sum())
+
+
+def _log_tail(weights: FloatArray, s: float) -> float:
+    """Return the logarithm of the probability beyond K'(s), above it for s > 0 and below for
+    s < 0, by Lugannani and Rice.
+    """
+    shrunk = 1.0 - 2.0 * s * weights
+    value, curvature = float((weights / shrunk).sum()), float((2.0 * (weights / shrunk) ** 2).sum())
+    cumulant = -0.5 * float(np.log(shrunk).sum())
+    root = math.sqrt(max(2.0 * (s * value - cumulant), 0.0))
+    if root < 1e-4:
+        return math.log(0.5)
+    slope = abs(s) * math.sqrt(curvature)
+    density = math.exp(-0.5 * root * root) / math.sqrt(2.0 * math.pi)
+    normal = 0.5 * math.erfc(root / math.sqrt(2.0))
+    return math.log(max(normal + density * (1.0 / slope - 1.0 / root), 1e-300))
 
 
 def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
     """Return an interval for the largest eigenvalue of the mean of symmetric samples (R, n, n) with
-    a variance: all directions at once, by Scheffe's method for the n (n + 1) / 2 entries.
+    a variance: all directions at once, by Scheffe's method for the n (n + 1) / 2 entries, with
+    Student's law of a mean of R samples for each.
     """
     count, n = len(samples), samples.shape[-1]
     mean = samples.mean(axis=0)
     values, vectors = np.linalg.eigh(mean)
     entries = n * (n + 1) // 2
-    reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(entries / 2.0, level)) / count)
+    # Hotelling's T squared allows for variances that are estimated from few samples.
+    freedom = max(count - entries, 1)
+    ratio = float(scipy.special.fdtri(entries, freedom, 1.0 - level))
+    reach = math.sqrt(entries * (count - 1) / freedom * ratio / count)
     # Any direction bounds the largest eigenvalue from below, here the eigenvectors of the mean.
     along = np.einsum("ia,rij,ja->ra", vectors, samples, vectors).std(axis=0, ddof=1)
     low = float((values - reach * along).max())

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit status.
 
     0: done. 1: a promise is broken or a target is not reached. 2: bad usage, a bad file, or a
-    failure that is reported in one line. 130: interrupted.
+    failure: reported in one line, or with a traceback where nobody foresaw it. 130: interrupted.
     """
     options = make_parser().parse_args(arguments)
     try:
@@ -43,6 +44,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         path = f" ({error.filename})" if error.filename else ""
         print(f"netkf: cannot write: {error.strerror or error}{path}", file=sys.stderr)
         _discard_output()
+        return BAD_USAGE
+    except Exception as error:
+        # Python's own exit status would be 1, which says that a promise is broken.
+        traceback.print_exc()
+        print(f"netkf: failed with {type(error).__name__}, see above", file=sys.stderr)
         return BAD_USAGE
     return status
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import quote
@@ -130,11 +131,15 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
     return {key: typed_value("--set", key, text) for key, text in pairs}
 
 
-def load_scenario(options: argparse.Namespace) -> Scenario:
-    """Return the scenario of the command line, with ``--set`` and ``--seed`` applied."""
+def load_scenario(
+    options: argparse.Namespace, ignored: Mapping[str, Any] = MappingProxyType({})
+) -> Scenario:
+    """Return the scenario of the command line, with ``--set`` and ``--seed`` applied, and then the
+    values of keys that the command ignores.
+    """
     from netkf.scenario.reading import load
 
-    changes = parse_changes(options.set)
+    changes = {**parse_changes(options.set), **ignored}
     if getattr(options, "seed", None) is not None:
         changes["seed"] = options.seed
     return load(options.scenario, changes)
