@@ -73,7 +73,7 @@ PROMISES = (
         check_expected_nees,
     ),
 )
-MASS_CONSERVED = Promise("mass is conserved", "P Lemma 1, derived", (), _mass_conserved, exact=True)
+MASS_CONSERVED = Promise("mass is conserved", "P (67), derived", (), _mass_conserved, exact=True)
 UPPER_BOUND = Promise(
     "P is at least the covariance of the error, given the events",
     "derived",

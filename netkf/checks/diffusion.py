@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.checks.evidence import Assumption, Finding, Promise, find_unknown
+from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing, find_unknown
 from netkf.checks.exact import (
     MAX_REPLAYED,
     check_error_covariance,
@@ -18,20 +19,23 @@ from netkf.checks.exact import (
     summarise_exactly,
     with_promised_filter,
 )
-from netkf.checks.laws import exact_start
+from netkf.checks.laws import LAW_TOLERANCE, Pair, compare_growth, exact_start
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import sampled_indices
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_growth, check_replay
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
-from netkf.theory import error_covariance, information_level
+from netkf.theory import error_covariance, information_level, tracking_level
 from netkf.theory.diffusion.information import MAX_REGRESSORS, few_regressors
 from netkf.trace.run import Run
 
 PASTS = 400
 """Pasts of the regressors from which the level of D (19) is computed."""
+DRAWS = 20
+"""Errors that are drawn for each exact covariance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,36 @@ def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
     return Finding((margin, margin, margin), 0.0, message, early=margin < 0.0)
 
 
+def _errors_bounded(samples: RunSamples, level: float) -> Finding:
+    """Compare the growth of the law of squared errors in the second half of the horizon with that
+    of Gaussian errors that have the exact covariances.
+    """
+    e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[:MAX_REPLAYED, -2:]
+    if np.isnan(e).all():
+        return find_nothing(LAW_TOLERANCE)
+    square = e[..., :, None] * e[..., None, :]
+    random = Streams(samples.seed).generator("tracking errors")
+    pairs, expected = [], []
+    for i, node in enumerate(samples.nodes):
+        pairs.append(Pair(f"node {node}", square[:, 0, i], square[:, 1, i]))
+        half, end = (_draw_squares(Sigma[:, k, i], random) for k in (0, 1))
+        expected.append((half, end) if np.isfinite(Sigma[:, :, i]).all() else None)
+    found = compare_growth(pairs, expected, level)
+    message = found.message.replace("P(P > ", "P(e^2 > ")
+    with contextlib.suppress(TheoryError):
+        sigma = tracking_level(samples.scenario).sigma
+        message += f"; sigma_p of D (29) is {sigma:.3g} for p = 2"
+    return found._replace(message=message)
+
+
+def _draw_squares(Sigma: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Return e e' (DRAWS R, n, n) of Gaussian errors with each of the covariances (R, n, n)."""
+    deviations = np.sqrt(np.maximum(np.diagonal(Sigma, axis1=1, axis2=2), 0.0))
+    e = random.standard_normal((DRAWS, *deviations.shape)) * deviations
+    e = e.reshape(-1, deviations.shape[1])
+    return np.asarray(e[:, :, None] * e[:, None, :])
+
+
 STABLE = ("D Assumption 3.1", "D Assumption 3.2")
 REACH = "exact errors are within reach"
 PROMISES = (
@@ -116,9 +150,15 @@ PROMISES = (
     ),
     Promise(
         "P is stochastically bounded: its law does not grow any more",
-        "D Theorem 4.1, 4.2",
+        "D Lemma 4.1, Corollary 4.1",
         STABLE,
         check_growth,
+    ),
+    Promise(
+        "tracking errors stay bounded: their law does not grow any more",
+        "D Theorem 4.2",
+        STABLE,
+        _errors_bounded,
     ),
     Promise(
         "neighbours help: the worst node does better than the worst one alone",
@@ -131,7 +171,7 @@ PROMISES = (
 
 
 class DiffusionChecks(PaperChecks):
-    """Promises of D, Algorithm 1 and Theorems 4.1, 4.2."""
+    """Promises of D, Algorithm 1, Lemma 4.1 and Theorem 4.2."""
 
     def summarise(self, scenario: Scenario, run: Run) -> DiffusionSummary:
         """Return the summary of a run whose samples are at ``check_times``."""

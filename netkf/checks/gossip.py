@@ -36,7 +36,13 @@ from netkf.checks.paper import PaperChecks
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities, largest_so_far
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_replay
-from netkf.checks.statistics import deviation_interval, probability_interval
+from netkf.checks.statistics import (
+    Interval,
+    band_width,
+    deviation_interval,
+    probability_interval,
+    round_digits,
+)
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.rng.streams import Streams
@@ -238,6 +244,38 @@ def _each_sensor(samples: GossipSamples, level: float) -> Finding:
     return compare_laws(pairs, level)
 
 
+def _sensors_together(samples: GossipSamples, level: float) -> Finding:
+    """Compare P(tr P_n >= x) at all sensors with the switched chain, at every time and for all x.
+
+    Their mean over the sensors is that of the chain, G (67), which gives (28) and (29) in the
+    limit; so none exceeds N times that of the chain, (27).
+    """
+    traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
+    expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)
+    N, share = traces.shape[2], level / (2 * traces.shape[1])
+    widths = band_width(len(traces), share / N), band_width(expected.shape[1], share)
+    found = []
+    for k, slot in enumerate(check_slots(samples.scenario)):
+        points = round_digits(np.concatenate([traces[:, k].ravel(), expected[k]]))
+        law = _share_from(expected[k], points)
+        each = np.array([_share_from(traces[:, k, i], points) for i in range(N)])
+        together = float(np.abs(each.mean(axis=0) - law).max())
+        most = float(np.maximum(each / N - law, 0.0).max())
+        for value, width, name in (
+            (together, sum(widths), "all sensors together"),
+            (most, widths[0] / N + widths[1], "one sensor's over N"),
+        ):
+            interval = Interval(value, max(0.0, value - width), min(1.0, value + width))
+            found.append((interval, f"at slot {slot}, {name}"))
+    return find_largest(found, LAW_TOLERANCE, "largest excess of P(tr P_n >= x)")
+
+
+def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the shares of a sample (S,) that are at least each of the points (K,)."""
+    below = np.searchsorted(np.sort(round_digits(values)), points, "left")
+    return np.asarray(1.0 - below / len(values))
+
+
 def _tokens(samples: GossipSamples, level: float) -> Finding:
     """Compare each token at the end with the stationary switched chain, and to see if the horizon
     is too short with the chain that starts where the token does.
@@ -334,9 +372,15 @@ PROMISES = (
     ),
     Promise(
         "a random sensor has the law of the switched chain, at every time",
-        "G (67), Theorems 8 and 10 [i]",
+        "G (67), Theorems 8 and 10 [i], Remark 9",
         LAWS,
         _random_sensor,
+    ),
+    Promise(
+        "no sensor has more than N times the law of the switched chain, and all together have it",
+        "G (27), (28), (29)",
+        LAWS,
+        _sensors_together,
     ),
     Promise(
         "each sensor has the law of the switched chain that is there",
@@ -346,7 +390,7 @@ PROMISES = (
     ),
     Promise(
         "every token has the same law in the end",
-        "G Theorem 10 [ii], (25), (28)",
+        "G Theorem 10 [ii], (25)",
         ERGODIC,
         _tokens,
     ),

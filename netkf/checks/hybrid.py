@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from netkf.checks.evidence import Assumption, Finding, Promise, find_unknown
+from netkf.checks.evidence import Assumption, Finding, Promise, find_identity, find_unknown
 from netkf.checks.exact import (
     check_error_covariance,
     check_expected_nees,
@@ -28,9 +28,15 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import Poisson, Renewal
 from netkf.scenario.scenario import Scenario
-from netkf.theory import covariance_bound, limit_covariance, steady_covariance_bound
+from netkf.theory import (
+    constant_gain_bound,
+    covariance_bound,
+    limit_covariance,
+    steady_covariance_bound,
+)
 from netkf.theory.hybrid.coupled import coupling, reason_without_bound
 from netkf.theory.hybrid.second_moments import second_moment_rate
+from netkf.theory.hybrid.steady import has_steady_state
 from netkf.theory.numerics.matrices import undetectable_mode
 
 BOUND_TOLERANCE, SLOPE_TOLERANCE = 0.1, 0.3
@@ -39,6 +45,9 @@ DISTANCE_TOLERANCE = 1e-7
 """Relative distance of the steady bound from S to which both are computed."""
 STEADY_TOLERANCE, MAX_TIME = 0.01, 1e5
 """Relative distance from the steady bound that counts as reached, and seconds to wait for it."""
+
+GAIN_TOLERANCE = 1e-6
+"""Relative distance below zero that the numerical integration of two bounds explains."""
 
 MAX_DENSE = 200
 """Nodes up to which all eigenvalues of the coupling are computed."""
@@ -153,6 +162,23 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
     return Finding((margin, margin, 0.0), SLOPE_TOLERANCE, message)
 
 
+def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
+    """Compare the bound of H (12) with the bound for the constant gains of its steady state."""
+    promised, times = (
+        with_promised_filter(samples.scenario),
+        np.array(check_times(samples.scenario)),
+    )
+    ours, constant = covariance_bound(promised, times), constant_gain_bound(promised, times)
+    size = np.trace(ours, axis1=-2, axis2=-1)
+    least = np.linalg.eigvalsh(constant - ours)[..., 0] / np.maximum(size, 1e-300)
+    more = np.trace(constant, axis1=-2, axis2=-1) / np.maximum(size, 1e-300) - 1.0
+    message = (
+        f"computed, not simulated: constant gains have a trace larger by up to {more.max():.2%} "
+        "at the times looked at, and the same steady state"
+    )
+    return find_identity(float(max(0.0, -least.min())), GAIN_TOLERANCE, message)
+
+
 def _mixing_factor(scenario: Scenario) -> float:
     """Return a factor of the rates that makes mixing 100 times faster than all else."""
     S, slowest = limit_covariance(scenario), _slowest_mixing(coupling(scenario))
@@ -236,8 +262,16 @@ PROMISES = (
         _mean_below_bound,
     ),
 )
+SETTLES = ("H(12) speaks", "H(12) has a steady state")
 COMPUTED = (
-    Promise("the bound settles", "H Proposition 4", ("H(12) speaks",), _bound_settles, exact=True),
+    Promise("the bound settles", "H Proposition 4", SETTLES, _bound_settles, exact=True),
+    Promise(
+        "time-varying gains have a smaller bound than constant ones",
+        "H Remark 1, (15)",
+        SETTLES,
+        _constant_gains_are_worse,
+        exact=True,
+    ),
     Promise(
         "the steady bound approaches S as one over the rate of the links",
         "H Theorem 3, (13)",
@@ -264,12 +298,13 @@ class HybridChecks(PaperChecks):
             exact_start(scenario),
             few_errors(scenario),
             _variance_exists(promised),
+            *_settling_rows(promised),
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario; those on limits only if the limits exist."""
         listed, promised = list(PROMISES), with_promised_filter(scenario)
-        for promise, compute in zip(COMPUTED, (_steady_state, _limit), strict=True):
+        for promise, compute in zip(COMPUTED, (_decided, _constant_gains, _limit), strict=True):
             try:
                 compute(promised)
             except TheoryError:
@@ -278,9 +313,32 @@ class HybridChecks(PaperChecks):
         return tuple(listed)
 
 
-def _steady_state(scenario: Scenario) -> None:
-    """Raise TheoryError if the bound has no steady state."""
-    steady_covariance_bound(scenario)
+def _settling_rows(scenario: Scenario) -> list[Assumption]:
+    """Return the assumption that H(12) has a steady state, or nothing if that is not known."""
+    try:
+        settles = has_steady_state(scenario)
+    except TheoryError:
+        return []
+    why = "links are fast enough"
+    if not settles:
+        try:
+            steady_covariance_bound(scenario)
+        except TheoryError as error:
+            why = f"the proposition is false here: {error}"
+    return [Assumption("H(12) has a steady state", "H (12), (16)", settles, why)]
+
+
+def _decided(scenario: Scenario) -> None:
+    """Raise TheoryError if it is not known whether the bound has a steady state."""
+    has_steady_state(scenario)
+
+
+def _constant_gains(scenario: Scenario) -> None:
+    """Raise TheoryError if there is no bound with constant gains to compare with."""
+    if not scenario.filter.algorithm.talks:
+        raise TheoryError("without messages the gains are those of Kalman-Bucy filters")
+    if has_steady_state(scenario):
+        constant_gain_bound(scenario)
 
 
 def _limit(scenario: Scenario) -> None:

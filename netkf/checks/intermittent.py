@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.kernels.chains import trace_path
 from netkf.checks.evidence import Assumption, Finding, Promise
 from netkf.checks.exact import check_error_covariance, few_errors, summarise_exactly
 from netkf.checks.laws import (
@@ -25,6 +26,7 @@ from netkf.checks.laws import (
 )
 from netkf.checks.mode_sequences import (
     MIN_CHAINS,
+    ModeTable,
     all_arrivals,
     find_arrivals,
     initial_roots,
@@ -40,6 +42,7 @@ from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_r
 from netkf.checks.statistics import (
     deviation_interval,
     distance_to_law,
+    law_distance,
     pearson_test,
     probability_interval,
 )
@@ -48,6 +51,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.matchings import Broadcast
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.intermittent.averages import mean_covariance_bounds
 from netkf.theory.intermittent.riccati import steady_covariance
 from netkf.theory.intermittent.scalar_law import ScalarLaw, scalar_law
 from netkf.trace.run import Run
@@ -57,6 +61,8 @@ FAR_START = 30.0
 """Factor of the roots of P(0) in the other start, about a thousand times the covariance."""
 BOUND_TOLERANCE, SUPPORT_TOLERANCE = 1e-8, 1e-6
 PROBABILITY_TOLERANCE = 0.05
+MAX_PATHS = 2000
+"""Paths with independent arrivals whose averages over the slots are compared."""
 CELLS = 12
 """Cells between the holes of the scalar law that are counted; longer outages are one cell."""
 Direction = tuple[int, int]
@@ -70,11 +76,14 @@ class IntermittentSummary(ReplicaSummary):
     in_support : (N, n, n) P by the same arrivals from P* of each node
     spread     : (N,) trace of the difference between P by the same arrivals from a start above all
                  others and from 0: every other start leads between these two
+    averages   : (N,) averages of 1 / (1 + tr P) over the second half of the slots, by the same
+                 arrivals
     sent, arrived : (D,) readings sent and delivered in time
     """
 
     in_support: FloatArray
     spread: FloatArray
+    averages: FloatArray
     sent: np.ndarray
     arrived: np.ndarray
 
@@ -117,6 +126,7 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
         **vars(summarise_exactly(scenario, run)) | {"replayed": replayed},
         in_support=table.covariances(least, sequences, last)[0],
         spread=np.trace(above - below, axis1=-2, axis2=-1),
+        averages=_path_averages(table, starts, sequences),
         sent=_count(scenario, run, "send", slots[-1]),
         arrived=_count(scenario, run, "deliver", slots[-1]),
     )
@@ -139,13 +149,26 @@ def _count(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
     return np.array([counts[pair] for pair in _directions(scenario)], dtype=int)
 
 
+def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
+    """Return the averages (K,) of ``1 / (1 + tr P)``, a bounded function with a mean for every law,
+    over the second half of the slots, along each of K sequences of modes.
+    """
+    first, found = sequences.shape[1] // 2, []
+    for root, sequence in zip(roots, sequences, strict=True):
+        path = trace_path(root, sequence, *table)[first:]
+        found.append(float((1.0 / (1.0 + np.einsum("tab,tab->t", path, path))).mean()))
+    return np.array(found)
+
+
 class ArrivalSamples(NamedTuple):
     """S filters of each node with arrivals drawn by the stated probabilities: ``P`` (N, K, S, n, n)
-    and ``restarted`` (N, S, n, n) at the last slot from another start.
+    and ``restarted`` (N, S, n, n) at the last slot from another start, ``averages`` (N, S') over
+    the slots.
     """
 
     P: FloatArray
     restarted: FloatArray
+    averages: FloatArray
 
 
 @dataclass(frozen=True)
@@ -166,8 +189,8 @@ class IntermittentSamples(RunSamples):
 
     def _draw_node(
         self, purpose: str, k: int, slots: list[int], samples: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return samples (K, S, n, n) and (S, n, n) of the k-th node."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return samples (K, S, n, n), (S, n, n) and (S',) of the k-th node."""
         scenario = self.scenario
         node = scenario.nodes[k]
         senders = sensing_neighbours(scenario)[node]
@@ -186,7 +209,8 @@ class IntermittentSamples(RunSamples):
         first = np.repeat(initial_roots(scenario)[k : k + 1], samples, axis=0)
         far = FAR_START * first + np.eye(first.shape[-1])
         restarted = table.covariances(far, sequences, slots[-1:])[0]
-        return table.covariances(first, sequences, slots), restarted
+        averages = _path_averages(table, first[:MAX_PATHS], sequences[:MAX_PATHS])
+        return table.covariances(first, sequences, slots), restarted, averages
 
     def later(self, slots: int) -> ArrivalSamples:
         """Return a few samples after half of ``slots`` and after all of them."""
@@ -285,7 +309,7 @@ def _bounded(samples: IntermittentSamples, level: float) -> Finding:
 
 def _initial_condition_forgotten(samples: IntermittentSamples, level: float) -> Finding:
     """Compare the law of P at the end with that from a start a thousand times larger."""
-    P, restarted = samples.reference
+    P, restarted, _ = samples.reference
     pairs = [
         Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
         for i, node in enumerate(samples.nodes)
@@ -314,6 +338,60 @@ def _with_horizon(
         lambda count: apart(samples.later(count)), slots, samples.scenario.plant.n, LAW_TOLERANCE
     )
     return found._replace(horizon=enough * samples.scenario.slot_plant.period)
+
+
+def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
+    """Compare averages over the slots of one path with those of paths with independent arrivals."""
+    averages, expected = samples.runs.averages, samples.reference.averages
+    found = [
+        (
+            law_distance(averages[:, i], expected[i], level / len(samples.nodes)),
+            f"at node {node}",
+        )
+        for i, node in enumerate(samples.nodes)
+    ]
+    message = (
+        f"averages of 1/(1 + tr P) over one path: {averages.mean():.4g} +- "
+        f"{averages.std(axis=0).mean():.2g} in the runs, {expected.mean():.4g} +- "
+        f"{expected.std(axis=1).mean():.2g} by the stated law; distance of their laws"
+    )
+    return find_largest(found, LAW_TOLERANCE, message)
+
+
+def _silence(scenario: Scenario) -> dict[int, float]:
+    """Return for each sampled node the factor (1 - g) alpha^2 by which outages let E[P] grow."""
+    factors, neighbours = {}, sensing_neighbours(scenario)
+    alpha = float(np.abs(np.linalg.eigvals(scenario.slot_belief[0])).max())
+    for node in sampled_nodes(scenario):
+        if node in scenario.placed:
+            continue
+        try:
+            missed = [1.0 - _delivery(scenario, (sender, node)) for sender in neighbours[node]]
+        except TheoryError:
+            continue
+        factors[node] = float(np.prod(missed)) * alpha**2
+    return factors
+
+
+def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
+    """Compute the lower bound on E[P] of the node that misses most, at the horizon and later."""
+    scenario, factors = samples.scenario, _silence(samples.scenario)
+    node = max(factors, key=lambda k: factors[k])
+    F, Q = scenario.slot_belief
+    alpha = float(np.abs(np.linalg.eigvals(F)).max())
+    slots, nothing = check_slots(scenario)[-1], np.zeros((0, len(F)))
+    g = 1.0 - factors[node] / alpha**2
+    start = scenario.start(node)[1]
+    lower = mean_covariance_bounds(F, Q, nothing, nothing[:, :0], g, 2 * slots, start).lower
+    traces = np.trace(lower, axis1=1, axis2=2)
+    median = np.median(np.trace(samples.runs.P[:, -1, samples.nodes.index(node)], axis1=1, axis2=2))
+    message = (
+        f"computed, not simulated: at node {node} outages alone multiply mean squares by "
+        f"{factors[node]:.4g} a slot; E[tr P] is at least {traces[slots]:.3g} at the end and "
+        f"{traces[-1]:.3g} at twice the horizon, while the median of the runs is {median:.3g}"
+    )
+    margin = float(np.log(traces[-1] / traces[slots]))
+    return Finding((margin, margin, margin), 0.0, message)
 
 
 def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
@@ -432,12 +510,18 @@ PROMISES = (
         _initial_condition_forgotten,
     ),
     Promise(
+        "averages over one path are those of the law of independent arrivals",
+        "R Proposition 25, (140)",
+        FRESH,
+        _averages_of_paths,
+    ),
+    Promise(
         "errors have the covariance that the readings give them",
         "R (15)-(18), derived",
         ("the filters start", "exact errors are within reach"),
         check_error_covariance,
     ),
-    Promise("errors are as large as P says: the mean NEES is n", "R (15)", KNOWN, check_nees),
+    Promise("errors are as large as P says: the mean NEES is n", "R (14)", KNOWN, check_nees),
 )
 SCALAR = (
     Promise(
@@ -450,8 +534,17 @@ SCALAR = (
 )
 
 
+DIVERGES = Promise(
+    "E[P] grows without bound, below the critical probability",
+    "R (29), (31)",
+    FRESH,
+    _mean_diverges,
+    exact=True,
+)
+
+
 class IntermittentChecks(PaperChecks):
-    """Promises of R, Theorems 9, 10 and Propositions 8, 24."""
+    """Promises of R, Theorems 9, 10, Propositions 8, 24, 25 and (29)."""
 
     slots_only = True
 
@@ -483,7 +576,9 @@ class IntermittentChecks(PaperChecks):
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario; more if the exact law of a node is known."""
-        return PROMISES + (SCALAR if _scalar_laws(scenario) else ())
+        grows = max(_silence(scenario).values(), default=0.0) >= 1.0
+        more = (DIVERGES,) if grows else ()
+        return PROMISES + more + (SCALAR if _scalar_laws(scenario) else ())
 
 
 CHECKS = IntermittentChecks()

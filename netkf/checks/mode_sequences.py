@@ -159,7 +159,7 @@ def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:
-    """Return the modes of an intermittent filter: mode m is all readings of ``sets[m]``, R (16)."""
+    """Return the modes of an intermittent filter: mode m is all readings of ``sets[m]``, R (17)."""
     F, Q = scenario.slot_belief
     index = scenario.topology.index
     readings = []

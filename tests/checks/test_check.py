@@ -174,8 +174,8 @@ def test_broken_filters_in_continuous_time_are_caught(kind, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "source", "runs"),
     [
-        ("LosesMass", "P Lemma 1, (3)-(5) corrected", 20),
-        ("SendsTooMuch", "P Lemma 1, (3)-(5) corrected", 20),
+        ("LosesMass", "P (67), (3)-(5) corrected", 20),
+        ("SendsTooMuch", "P (67), (3)-(5) corrected", 20),
         ("NeverAverages", "P Theorem 6, Lemma 10, Figs. 4, 5, derived", 60),
         ("Overshoots", "P (7)-(9), derived", 40),
         ("ForgetsN", "P (7)-(9), derived", 40),

@@ -1,7 +1,7 @@
 """Random Riccati recursions of many chains side by side, in square-root form.
 
 A letter says which of several readings a chain gets in a slot: ``f_m(P) = F P F' + Q - F P H_m'
-(H_m P H_m' + R_m)^-1 H_m P F'``, R (16) and G (11); a reading of no rows is ``f_0``, R (15).
+(H_m P H_m' + R_m)^-1 H_m P F'``, R (17) and G (11); a reading of no rows is ``f_0``, R (16).
 """
 
 from __future__ import annotations

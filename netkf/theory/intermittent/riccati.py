@@ -41,7 +41,7 @@ def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Slot
     n = len(F_)
     H_ = _observation(H, n)
     R_ = as_covariance("R", R, len(H_))
-    # R (16) inverts H P H' + R also where P is singular.
+    # R (17) inverts H P H' + R also where P is singular.
     if len(R_) and not np.linalg.eigvalsh(R_)[0] > 0.0:
         raise TheoryError("R must be positive definite")
     return SlotSystem(F_, as_covariance("Q", Q, n), H_, R_)
@@ -62,7 +62,7 @@ def check_delivery(delivery: float) -> float:
 
 
 def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
-    """Return ``f_0(P) = F P F' + Q`` (n, n), R (15): a slot without a reading."""
+    """Return ``f_0(P) = F P F' + Q`` (n, n), R (16): a slot without a reading."""
     transition = as_square("F", F)
     n = len(transition)
     return symmetric(
@@ -73,7 +73,7 @@ def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
 def riccati_step(
     P: ArrayLike, F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike
 ) -> FloatArray:
-    """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), R (16).
+    """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), R (17).
 
     A slot with a reading. Computed from square roots by an orthogonal triangularisation, which
     subtracts nothing. Raises TheoryError if shapes or definiteness are wrong.
