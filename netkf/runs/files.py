@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -59,17 +60,36 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file; numbers that are not finite become null."""
-    write_text(path, json.dumps(finite(value), indent=2) + "\n")
+    write_text(path, json_text(value) + "\n")
+
+
+def json_text(value: Any, margin: str = "\n") -> str:
+    """Return ``json.dumps(finite(value), indent=2)`` for a value whose lines begin with ``margin``.
+
+    The standard library indents in plain Python, a call for each number. Here each dictionary and
+    list without others in it, such as the row of a node, is one call of its compiled encoder.
+    """
+    if not isinstance(value, (dict, list, tuple)) or not value:
+        return json.dumps(finite(value))
+    inner = margin + "  "
+    parts = value.values() if isinstance(value, dict) else value
+    if not any(isinstance(part, (dict, list, tuple)) for part in parts):
+        text = json.JSONEncoder(separators=("," + inner, ": ")).encode(finite(value))
+        return text[0] + inner + text[1:-1] + margin + text[-1]
+    if isinstance(value, dict):
+        named = (f"{json.dumps(str(key))}: {json_text(item, inner)}" for key, item in value.items())
+        return "{" + inner + ("," + inner).join(named) + margin + "}"
+    return "[" + inner + ("," + inner).join(json_text(item, inner) for item in value) + margin + "]"
 
 
 def finite(value: Any) -> Any:
     """Return a plain JSON value: numpy numbers become Python ones, and None if not finite."""
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [finite(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
 
 
