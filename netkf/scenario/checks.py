@@ -275,7 +275,8 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
         )
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_model] if pooled else scenario.models
-    longest = min((_longest(scenario, model) for model in models if len(model.H)), default=period)
+    distinct = {id(model): model for model in models if len(model.H)}.values()
+    longest = min((_longest(scenario, model) for model in distinct), default=period)
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return
     if getattr(scenario.plant, "sensing_period", None) is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.filter import NodeInfo, commutes
-from netkf.algorithms.kernels.gains import longest_interval
+from netkf.algorithms.kernels.gains import longest_interval_for
 from netkf.algorithms.models import FlowModel, SlotModel
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
@@ -99,13 +100,20 @@ class DerivedScenario(ScenarioModel):
         filled = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
         if filled.sensing_period is not None or not uses_grid(self):
             return filled
-        seen = (self.observation(node) for node in self.increment_sensors)
-        distinct = {(H.tobytes(), R.tobytes()): (H, R) for H, R in seen}.values()
-        informations = [H.T @ np.linalg.solve(R, H) for H, R in distinct]
-        everything = self._stacked(self._everywhere, believed=False)
-        longest = longest_interval(plant.A, plant.Q, *everything)
+        sensing = Counter(
+            tuple(place.entry for place in placed) for placed in self.increment_sensors.values()
+        )
+        informations = [self._true_information(entries) for entries in sensing]
+        # A matrix of all readings at once would grow with the square of the network.
+        G = sum((k * g for k, g in zip(sensing.values(), informations, strict=True)), 0.0 * plant.A)
+        longest = longest_interval_for(plant.A, plant.Q, G)
         period = default_sensing_period(filled, informations, longest)
         return dataclasses.replace(filled, sensing_period=period)
+
+    def _true_information(self, entries: tuple[int, ...]) -> FloatArray:
+        """Return ``H' R^-1 H`` (n, n) of the increments of a node with these sensors."""
+        H, R = self._stack(entries, believed=False)
+        return np.asarray(H.T @ np.linalg.solve(R, H))
 
     def continuous_truth(self, streams: Streams, frames: bool | None = None) -> Any:
         """Return the state of one run in continuous time.
@@ -167,10 +175,20 @@ class DerivedScenario(ScenarioModel):
     def _stacked(
         self, placed: tuple[PlacedSensor, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        H = [self.sensors[place.entry].H for place in placed]
-        R = [self.noise(place.entry, believed) for place in placed]
-        empty = np.zeros((0, self.plant.n))
-        return np.concatenate([empty, *H]), block_diagonal(R)
+        return self._stack(tuple(place.entry for place in placed), believed)
+
+    def _stack(self, entries: tuple[int, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
+        # Thousands of nodes may have the sensors of one [[sensors]] entry.
+        if (entries, believed) not in self._stacks:
+            H = [self.sensors[entry].H for entry in entries]
+            R = [self.noise(entry, believed) for entry in entries]
+            empty = np.zeros((0, self.plant.n))
+            self._stacks[entries, believed] = np.concatenate([empty, *H]), block_diagonal(R)
+        return self._stacks[entries, believed]
+
+    @cached_property
+    def _stacks(self) -> dict[tuple[tuple[int, ...], bool], tuple[FloatArray, FloatArray]]:
+        return {}
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
         """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
@@ -271,6 +289,10 @@ class DerivedScenario(ScenarioModel):
 
         Keys are (sender, receiver); values are nan if they are unknown before a run.
         """
+        return dict(self._effective_rates)
+
+    @cached_property
+    def _effective_rates(self) -> dict[Link, float]:
         clock, loss = self.network.activation, self.network.channel.loss
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
             return {}

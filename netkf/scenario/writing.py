@@ -13,13 +13,13 @@ from netkf.network.graphs import RandomGraph
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.model import Filtering
+from netkf.scenario.model import Filtering, Network
 from netkf.scenario.registry import name_of
 
 
 def as_table(scenario: DerivedScenario) -> dict[str, Any]:
     """Return the tables of a scenario file without fields at their defaults."""
-    return _scenario(scenario, defaults=False)
+    return _scenario(scenario, scenario.plant, scenario.network, scenario.filter, defaults=False)
 
 
 def resolved(scenario: DerivedScenario) -> dict[str, Any]:
@@ -28,19 +28,14 @@ def resolved(scenario: DerivedScenario) -> dict[str, Any]:
     if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
         graph = dataclasses.replace(network.graph, seed=scenario.seed)
         network = dataclasses.replace(network, graph=graph)
-    filled = dataclasses.replace(
-        scenario,
-        plant=_filled(scenario),
-        network=network,
-        filter=dataclasses.replace(
-            scenario.filter,
-            mean=scenario.plant.start_mean
-            if scenario.filter.mean is None
-            else scenario.filter.mean,
-            cov=scenario.plant.start_cov if scenario.filter.cov is None else scenario.filter.cov,
-        ),
+    filtering, plant = scenario.filter, scenario.plant
+    filtering = dataclasses.replace(
+        filtering,
+        mean=plant.start_mean if filtering.mean is None else filtering.mean,
+        cov=plant.start_cov if filtering.cov is None else filtering.cov,
     )
-    return _scenario(filled, defaults=True)
+    # No second scenario is made of the parts: it would build and check the whole network again.
+    return _scenario(scenario, _filled(scenario), network, filtering, defaults=True)
 
 
 def _filled(scenario: DerivedScenario) -> Plant:
@@ -48,9 +43,11 @@ def _filled(scenario: DerivedScenario) -> Plant:
     return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
 
 
-def _scenario(scenario: DerivedScenario, defaults: bool) -> dict[str, Any]:
-    network, table = scenario.network, _fields(scenario, defaults)
-    table["plant"] = _kind("plant", scenario.plant, defaults)
+def _scenario(
+    scenario: DerivedScenario, plant: Plant, network: Network, filtering: Filtering, defaults: bool
+) -> dict[str, Any]:
+    table = _fields(scenario, defaults)
+    table["plant"] = _kind("plant", plant, defaults)
     table["sensors"] = [_sensor(sensor, defaults) for sensor in scenario.sensors]
     table["network"] = {"graph": _kind("graph", network.graph, defaults)}
     if network.activation is not None:
@@ -59,7 +56,7 @@ def _scenario(scenario: DerivedScenario, defaults: bool) -> dict[str, Any]:
     channel["loss"] = _kind("loss", network.channel.loss, defaults)
     channel["delay"] = _kind("delay", network.channel.delay, defaults)
     table["network"]["channel"] = channel
-    table["filter"] = _filtering(scenario.filter, defaults)
+    table["filter"] = _filtering(filtering, defaults)
     return {"format": 1, **table}
 
 

@@ -75,7 +75,12 @@ def gain_table(
 
 def longest_interval(A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> float:
     """Seconds; the longest interval whose reading the gains can use."""
-    M, _ = hamiltonian(A, Q, H.T @ np.linalg.solve(R, H))
+    return longest_interval_for(A, Q, H.T @ np.linalg.solve(R, H))
+
+
+def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
+    """Return the longest interval (s) whose reading with ``G = H' R^-1 H`` the gains can use."""
+    M, _ = hamiltonian(A, Q, G)
     norm = float(np.abs(M).sum(axis=0).max())
     # No dynamics and no information: every interval is short enough.
     return LONGEST_INTERVAL / norm if norm > 0.0 else math.inf

@@ -12,7 +12,6 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
-from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import (
     sample_path,
     sample_times,
@@ -32,20 +31,27 @@ def nodes_by_host(scenario: Scenario) -> list[tuple[int, ...]]:
     return [(node,) for node in scenario.nodes]
 
 
-def _observation(scenario: Scenario, sensor: PlacedSensor, H: FloatArray) -> Observation:
-    R, true = (scenario.noise(sensor.entry, believed) for believed in (True, False))
+def _observation(scenario: Scenario, entry: int, H: FloatArray) -> Observation:
+    R, true = (scenario.noise(entry, believed) for believed in (True, False))
     # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
     return Observation(H, R, np.asarray(np.linalg.cholesky(true), dtype=np.float64))
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
-    """Return the continuous readings of each host; p is 0 for hosts without any."""
+    """Return the continuous readings of each host; p is 0 for hosts without any.
+
+    Hosts with the sensors of the same ``[[sensors]]`` entries share one object.
+    """
     placed, n = scenario.increment_sensors, scenario.plant.n
-    nothing, found = stack_observations([], n), []
+    used = {sensor.entry for sensors in placed.values() for sensor in sensors}
+    single = {k: _observation(scenario, k, scenario.sensors[k].H) for k in used}
+    stacked: dict[tuple[int, ...], Observation] = {}
+    found = []
     for nodes in nodes_by_host(scenario):
-        sensors = [sensor for node in nodes for sensor in placed.get(node, ())]
-        readings = [_observation(scenario, s, scenario.sensors[s.entry].H) for s in sensors]
-        found.append(stack_observations(readings, n) if readings else nothing)
+        entries = tuple(sensor.entry for node in nodes for sensor in placed.get(node, ()))
+        if entries not in stacked:
+            stacked[entries] = stack_observations([single[k] for k in entries], n)
+        found.append(stacked[entries])
     return found
 
 
@@ -68,7 +74,7 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], HostObser
                 continue
             rows = [(sensor, path.matrix(slot)) for sensor, path in paths]
             # A sensor without a reading in this slot has a matrix without rows.
-            readings = [_observation(scenario, sensor, H) for sensor, H in rows if len(H)]
+            readings = [_observation(scenario, sensor.entry, H) for sensor, H in rows if len(H)]
             found[host] = stack_observations(readings, n)
         return found
 
@@ -94,7 +100,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservat
                 for k, time in enumerate(times[node, place.ordinal].tolist()):
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
                     at_time = found.setdefault(time, {})
-                    at_time.setdefault(host, []).append(_observation(scenario, place, H))
+                    at_time.setdefault(host, []).append(_observation(scenario, place.entry, H))
     return {
         time: {host: stack_observations(readings, n) for host, readings in at_time.items()}
         for time, at_time in found.items()

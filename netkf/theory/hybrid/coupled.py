@@ -137,13 +137,15 @@ def increment_informations(scenario: Scenario) -> FloatArray:
     A pooled filter has the same G, of all sensors, at every node.
     """
     observations, n = increment_observations(scenario), scenario.plant.n
-    found = [
-        one.H.T @ np.linalg.solve(one.R, one.H) if len(one.H) else np.zeros((n, n))
-        for one in observations
-    ]
+    distinct = {id(one): one for one in observations}  # nodes with equal sensors share one
+    found = {
+        key: one.H.T @ np.linalg.solve(one.R, one.H) if len(one.H) else np.zeros((n, n))
+        for key, one in distinct.items()
+    }
+    informations = [found[id(one)] for one in observations]
     if scenario.filter.algorithm.pooled:
-        found = found * len(scenario.nodes)
-    return np.stack(found)
+        informations = informations * len(scenario.nodes)
+    return np.stack(informations)
 
 
 @lru_cache(maxsize=4)
@@ -178,7 +180,10 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
         table = riccati_table(A, Q, np.zeros((n, n)), delay)
         q, _ = propagate_riccati(table, q, np.zeros(n), delay)
         T = np.column_stack([propagate_riccati(table, q, e, delay)[1] for e in np.eye(n)])
-    start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
+    spread = scenario.start(scenario.nodes[0])[1]
+    start = np.broadcast_to(spread, (len(scenario.nodes), n, n)).copy()
+    if isinstance(scenario.filter.cov, tuple):
+        start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
     return CoupledRiccati(
         A,
         Q,
