@@ -23,7 +23,7 @@ from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95
 MAX_BOUND_BYTES, SERIES_TERMS = 1.5 * 2**30, 30
-MAX_STEADY_ENTRIES = 400_000
+MAX_STEADY_ENTRIES = 100_000
 """Entries of the covariances of all nodes up to which a run looks for the steady state."""
 
 
@@ -185,8 +185,11 @@ def _steady_note(scenario: Scenario) -> str:
             f"whether the bound has a steady state is not looked into beyond {size:,} nodes; see "
             "netkf theory"
         )
-    if has_steady_state(scenario):
-        return ""
+    try:
+        if has_steady_state(scenario):
+            return ""
+    except TheoryError as error:
+        return f"steady state of the bound: {error}"
     if not scenario.filter.algorithm.talks:
         return "at some nodes P has no steady state, it grows without end; see netkf theory"
     return "the bound has no steady state, it grows without end; see netkf theory"
@@ -238,16 +241,18 @@ def _average_rows(
     square = _mean(sink.sq_error, used.errors, scenario)
     trace = _mean(sink.trace, used.covariances, scenario)
     nees = _mean(sink.nees, used.errors, scenario)
-    bound = np.full(len(scenario.nodes), None)
+    columns = [square, trace, nees]
     with np.errstate(all="ignore"):  # ratios to a bound of 0, and diverged runs
         if promised.bound is not None:
-            bound = promised.bound[used.covariances].mean(axis=0)
-        overall = _row(
-            square.mean(), trace.mean(), nees.mean(), None if bound[0] is None else bound.mean()
-        )
-        columns = zip(scenario.nodes, square, trace, nees, bound, strict=True)
-        nodes = [{"node": node, **_row(*values)} for node, *values in columns]
-    return nodes, overall
+            columns.append(promised.bound[used.covariances].mean(axis=0))
+        averages = _averages(*columns)
+        means = _averages(*(np.array([column.mean()]) for column in columns))
+    rows = zip(*averages.values(), strict=True)
+    nodes = [
+        {"node": node, **dict(zip(averages, row, strict=True))}
+        for node, row in zip(scenario.nodes, rows, strict=True)
+    ]
+    return nodes, {name: value for name, (value,) in means.items()}
 
 
 def _mean(values: list[FloatArray], indices: np.ndarray, scenario: Scenario) -> FloatArray:
@@ -281,11 +286,15 @@ def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
     }
 
 
-def _row(mean_square: Any, trace: Any, nees: Any, bound: Any) -> dict[str, Any]:
+def _averages(
+    mean_square: FloatArray, trace: FloatArray, nees: FloatArray, bound: FloatArray | None = None
+) -> dict[str, list[Any]]:
+    """Return the averages of summary.json, a list of N numbers each; None without a bound."""
+    none = [None] * len(trace)
     return {
-        "rms_error": float(np.sqrt(mean_square)),
-        "mean_trace": float(trace),
-        "bound": None if bound is None else float(bound),
-        "ratio": None if bound is None else float(trace / bound),
-        "mean_nees": float(nees),
+        "rms_error": np.sqrt(mean_square).tolist(),
+        "mean_trace": trace.tolist(),
+        "bound": none if bound is None else bound.tolist(),
+        "ratio": none if bound is None else (trace / bound).tolist(),
+        "mean_nees": nees.tolist(),
     }

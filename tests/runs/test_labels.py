@@ -6,7 +6,9 @@ import pytest
 import netkf
 from netkf.runs.promises import compute_promises, promises_text
 from netkf.runs.run import run_to_directory
+from netkf.runs.summary import promise_traces
 from netkf.runs.tables import summary_table
+from tests.benchmarks.cases import load
 
 UNSTABLE = {"kind": "diffusion", "A": [[0.5]], "B": [[1.0]], "cov": [[1.0]]}
 ONE_WAY = {"loss": {"kind": "per-link"}, "symmetric": False}
@@ -112,3 +114,13 @@ def test_rates_are_shown_as_they_are(ring):
     for scenario, words in ((ring, "2 per second on every link"), (uneven, "2 .. 5 per second")):
         rows = netkf.theory.assumptions(scenario).set_index("assumption")
         assert rows.evidence["all links have one rate"].startswith(words)
+
+
+def test_a_run_with_samples_at_known_times_says_that_its_bound_has_a_cycle():
+    sampled = {"sensors.0.sampling": {"kind": "periodic", "period": 0.5}, "horizon": 2.0}
+    scenario = load("poisson_ring").replace(sampled)
+    promised = promise_traces(scenario, scenario.times)
+    assert promised.bound is not None
+    assert promised.notes[0] == (
+        "steady state of the bound: samples at known times lead to a cycle, not to a steady state"
+    )

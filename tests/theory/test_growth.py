@@ -9,9 +9,13 @@ import netkf
 from netkf import theory
 from netkf.checks.points import MAX_NODES, sampled_indices, sampling_note
 from netkf.core.errors import TheoryError
+from netkf.network import graphs
 from netkf.runs import plots
+from netkf.runs.files import write_scenario
 from netkf.runs.promises import compute_promises, promises_text
-from netkf.theory.hybrid import coupled, steady
+from netkf.theory.common.observations import increment_observations
+from netkf.theory.hybrid import coupled, linearised, steady
+from netkf.theory.hybrid.packed import PackedRiccati
 
 FLOW = """
 format = 1
@@ -135,3 +139,51 @@ def test_checks_of_large_networks_watch_some_nodes_and_say_so(tmp_path):
     large = ring(1000, tmp_path)
     assert len(sampled_indices(large)) <= MAX_NODES
     assert "looked at 50 of 1,000 nodes" in sampling_note(large)
+
+
+def test_a_scenario_with_thousands_of_sensors_makes_no_matrix_of_all_readings(tmp_path):
+    nodes = 6000
+    scenario = ring(nodes, tmp_path)
+    changes = {"sensors.0.nodes": list(range(nodes))}
+
+    def build():
+        return scenario.replace(changes).truth.sensing_period
+
+    # R of all readings together would take 8 nodes^2 bytes.
+    assert peak(build) < nodes**2
+    # A larger network with the same sensor in every place asks for a period no longer.
+    assert build() <= scenario.truth.sensing_period
+
+
+def test_nodes_with_equal_sensors_share_their_observation_and_their_information(tmp_path):
+    scenario = ring(60, tmp_path).replace({"sensors.0.nodes": list(range(0, 60, 3))})
+    observations = increment_observations(scenario)
+    assert len({id(one) for one in observations}) == 2
+    informations = coupled.increment_informations(scenario)
+    np.testing.assert_array_equal(informations[::3], [[[4.0, 0.0], [0.0, 0.0]]] * 20)
+    assert not informations[1::3].any()
+    assert not informations[2::3].any()
+
+
+def test_the_tables_of_a_scenario_build_the_network_once(tmp_path, monkeypatch):
+    built = []
+    build = graphs.Cycle.build
+    monkeypatch.setattr(
+        graphs.Cycle, "build", lambda self, seed: built.append(1) or build(self, seed)
+    )
+    scenario = ring(50, tmp_path)
+    write_scenario(tmp_path, scenario, 3)
+    assert len(built) == 1
+    assert netkf.load(tmp_path / "scenario.toml").seed == 3
+
+
+def test_elimination_is_refused_where_its_fill_in_has_no_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(linearised, "_solve_by_gmres", lambda linear, right: None)
+    graph = {"kind": "regular", "nodes": 3000, "degree": 4}
+    packed = PackedRiccati(
+        coupled.coupled_riccati(
+            ring(6, tmp_path).replace({"network.graph": graph, "filter.epsilon": 0.1})
+        )
+    )
+    with pytest.raises(TheoryError, match="GMRES did not converge for 9,000 unknowns"):
+        linearised.solve_linearised(packed, packed.equations.start, packed.start)

@@ -4,7 +4,7 @@ Few unknowns are eliminated, and many if the network has small cuts (rings, rows
 In other networks the fill-in is large (1000 nodes of a random graph would take minutes): GMRES
 solves for many unknowns, preconditioned by each node's own block and by that of all nodes together
 (fast links make all nodes change together, slowly), and elimination only if GMRES does not
-converge.
+converge and the unknowns are not too many for it.
 """
 
 from __future__ import annotations
@@ -14,21 +14,31 @@ import warnings
 import numpy as np
 import scipy.sparse.linalg
 
+from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
 
 FEW_UNKNOWNS = 2000
+MAX_ELIMINATED = 6000  # unknowns of a network without small cuts, whose fill-in is nearly full
 ROUNDS, ROUND_TOLERANCE = 4, 1e-7  # each round reduces the residual by this factor
 RESIDUAL_TOLERANCE = 1e-14
 RESTART, RESTARTS = 60, 3  # of GMRES
 
 
 def solve_linearised(packed: PackedRiccati, P: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution X (N, m) for the gains of P (N, n, n); nan if the map is singular."""
+    """Return the solution X (N, m) for the gains of P (N, n, n); nan if the map is singular.
+
+    Raises TheoryError if neither method can solve for so many unknowns.
+    """
     linear = packed.linear(P)
     few = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
     with np.errstate(all="ignore"):
         X = None if few else _solve_by_gmres(linear, right)
+        if X is None and not few and right.size > MAX_ELIMINATED:
+            raise TheoryError(
+                f"not computed: GMRES did not converge for {right.size:,} unknowns, and the "
+                "network has no small cuts to eliminate them by"
+            )
         return _eliminate(linear, right) if X is None else X
 
 
