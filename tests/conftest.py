@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import netkf
-from netkf.engines.compiled.event_loop import event_loop
+from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.linalg import compiling
 from netkf.scenario.reading import from_table
 
@@ -19,7 +19,7 @@ SLOT_FILTERS = (
     netkf.parts.PushSum,
     netkf.parts.Local,
 )
-ONCE = {event_loop, *(kind.slot_kernel for kind in SLOT_FILTERS)}
+ONCE = {simulate_runs, *(kind.slot_kernel for kind in SLOT_FILTERS)}
 
 
 def scenario_files():

@@ -31,6 +31,7 @@ _kernels: dict[Callable[..., Any], Callable[..., Any]] = {}
 """The loops of each kernel."""
 _allocating: set[Callable[..., Any]] = set()
 _inlined: set[Callable[..., Any]] = set()
+_fused: set[Callable[..., Any]] = set()
 _overloaded: set[Callable[..., Any]] = set()
 _said: set[Callable[..., Any]] = set()
 _spent: list[float] = []
@@ -41,25 +42,34 @@ def kernel(function: Function) -> Function: ...
 
 
 @overload
-def kernel(*, allocates: bool = False, inlined: bool = False) -> Callable[[Function], Function]: ...
+def kernel(
+    *, allocates: bool = False, inlined: bool = False, fused: bool = False
+) -> Callable[[Function], Function]: ...
 
 
 def kernel(
-    function: Callable[..., Any] | None = None, *, allocates: bool = False, inlined: bool = False
+    function: Callable[..., Any] | None = None,
+    *,
+    allocates: bool = False,
+    inlined: bool = False,
+    fused: bool = False,
 ) -> Any:
     """Mark a numerical function, written as loops over arrays, that is always run compiled.
 
     It may call kernels, works in place and makes no arrays, or is marked
     ``@kernel(allocates=True)``. It runs without the interpreter's lock. ``inlined``: its code
     becomes part of each kernel that calls it, which pays for steps of a few hundred flops.
+    ``fused``: a product and a sum may be one instruction, which rounds once.
     """
     # ``@kernel(...)`` with arguments comes without the function.
     if function is None:
-        return lambda loops: _registered(loops, allocates, inlined)
-    return _registered(function, allocates, inlined)
+        return lambda loops: _registered(loops, allocates, inlined, fused)
+    return _registered(function, allocates, inlined, fused)
 
 
-def _registered(loops: Callable[..., Any], allocates: bool, inlined: bool) -> Callable[..., Any]:
+def _registered(
+    loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool
+) -> Callable[..., Any]:
     @wraps(loops)
     def call(*args: Any, **kwargs: Any) -> Any:
         # Compiled with the first call: importing netkf must not import numba.
@@ -69,6 +79,8 @@ def _registered(loops: Callable[..., Any], allocates: bool, inlined: bool) -> Ca
         _allocating.add(loops)
     if inlined:
         _inlined.add(loops)
+    if fused:
+        _fused.add(loops)
     _kernels[call] = loops
     return call
 
@@ -131,7 +143,7 @@ def _overload_kernels() -> None:
     """Let compiled code call all kernels known so far."""
     from numba import extending
 
-    from netkf.linalg import struct_types  # noqa: F401 - registers structs
+    from netkf.linalg import local_types, struct_types  # noqa: F401 - register what kernels use
 
     for call, loops in _kernels.items():
         # An overload may be registered once only.
@@ -142,8 +154,12 @@ def _overload_kernels() -> None:
 
 
 def _options(loops: Callable[..., Any]) -> Any:
-    options = _OPTIONS if loops in _allocating else _WITHOUT_ARRAYS
-    return {**options, "forceinline": True} if loops in _inlined else options
+    options = dict(_OPTIONS if loops in _allocating else _WITHOUT_ARRAYS)
+    if loops in _inlined:
+        options["forceinline"] = True
+    if loops in _fused:
+        options["fastmath"] = {"contract"}
+    return options
 
 
 def _always(loops: Callable[..., Any]) -> Callable[..., Any]:

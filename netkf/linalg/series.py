@@ -12,6 +12,7 @@ from netkf.linalg.compiling import kernel
 
 ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
 NOTHING = 1e-30  # of the largest entry
+ORDER_8, ORDER_12, ORDER_16 = (0,) * 8, (0,) * 12, (0,) * 16
 OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in steps of an octave
 
 
@@ -20,7 +21,7 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
     seconds, whose last column says for each k up to which gap what follows is below rounding. The
     number of terms is made odd.
     """
-    # fill_polynomial() takes two rows after the first at a time.
+    # add_terms() takes two rows after the first at a time.
     if len(series) % 2 == 0:
         series = np.concatenate([series, np.zeros((1, series.shape[1]))])
     terms = len(series)
@@ -46,14 +47,53 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
 @kernel
 def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
     """Write the first len(out) entries of the sum at ``gap`` seconds into ``out``."""
-    size, reach = len(out), series.shape[1] - 1
-    for j in range(size):
+    fill_series(out, len(out), series, series[:, series.shape[1] - 1], gap)
+
+
+@kernel
+def fill_series(
+    out: FloatArray, width: int, series: FloatArray, reach: FloatArray, gap: float
+) -> None:
+    """Write the first ``width`` entries of ``sum_k gap^k series[k]`` into ``out``; ``reach``
+    (terms,) says up to which abs(gap) the terms so far are enough.
+    """
+    terms, distance = len(reach), abs(gap)
+    # Numbers of terms that are known when this is compiled: the sum of an entry stays in a register.
+    if terms > 8 and distance <= reach[8]:
+        horner(ORDER_8, out, width, series, gap)
+    elif terms > 12 and distance <= reach[12]:
+        horner(ORDER_12, out, width, series, gap)
+    elif terms > 16 and distance <= reach[16]:
+        horner(ORDER_16, out, width, series, gap)
+    else:
+        add_terms(out, width, series, reach, gap)
+
+
+@kernel(inlined=True, fused=True)
+def horner(
+    order: tuple[int, ...], out: FloatArray, width: int, series: FloatArray, gap: float
+) -> None:
+    """``fill_series`` with the terms up to ``len(order)``."""
+    # Entries are the outer loop, which becomes a loop over vectors.
+    for j in range(width):
+        total = series[len(order), j]
+        for k in range(len(order) - 1, -1, -1):
+            total = series[k, j] + gap * total
+        out[j] = total
+
+
+@kernel
+def add_terms(
+    out: FloatArray, width: int, series: FloatArray, reach: FloatArray, gap: float
+) -> None:
+    """``fill_series`` with as many terms as ``reach`` asks for."""
+    for j in range(width):
         out[j] = series[0, j]
     k, even = 0, 1.0
-    while gap > series[k, reach]:  # two rows at a time: ``out`` is gone through half as often
+    while abs(gap) > reach[k]:  # two rows at a time: ``out`` is gone through half as often
         odd = even * gap
         even = odd * gap
-        for j in range(size):
+        for j in range(width):
             out[j] += odd * series[k + 1, j] + even * series[k + 2, j]
         k += 2
 

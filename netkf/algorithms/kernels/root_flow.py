@@ -42,15 +42,18 @@ import numpy as np
 from netkf.algorithms.kernels.gains import GainTable
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
 from netkf.algorithms.kernels.root_update import rotate_out
+from netkf.algorithms.kernels.square_root import reflect_row
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
-from netkf.linalg.series import fill_polynomial, with_reach
+from netkf.linalg.local import local_matrix, local_vector
+from netkf.linalg.series import fill_series, with_reach
 from netkf.linalg.structs import Size, Struct, sized, struct_at
 
-CELLS, CELL_BYTES = 16, 1 << 17  # of one model at most
+CELLS, CELL_BYTES = 32, 1 << 18  # of one model at most
 NARROW = 64.0  # trace(P) trace(G) of a gap up to which rounding of G is harmless
 TERMS = 27  # of the power series: enough for |M| unit <= UNIT, odd
-UNIT = 0.25
+CELL_TERMS = 13  # about as many as a cell needs
+UNIT = 0.125
 BLOCKS = 13  # Legendre coefficients at most: what is left is below 1e-40 of the first
 UNSEEN = 1e-18  # trace(P dG) of information that may be left out
 GROWTH = 2.0**8  # of F over one level at most, where something is observed
@@ -89,13 +92,14 @@ class FlowTable(Struct):
 
 class FlowScratch(Struct):
     """The ``size`` n of states, and scratch arrays: values of the series, ``wide`` (n, n), ``T``
-    (n, n), rows (q, n), an observation (1, n), its gain (1, n).
+    (n, n), ``mean`` (n,), rows (q, n), an observation (1, n), its gain (1, n).
     """
 
     size: Size
     values: FloatArray
     wide: FloatArray
     T: FloatArray
+    mean: FloatArray
     rows: FloatArray
     observed: FloatArray
     gain: FloatArray
@@ -114,6 +118,7 @@ def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
         values=np.zeros(table.series.shape[3]),
         wide=np.zeros((n, n)),
         T=np.zeros((n, n)),
+        mean=np.zeros(n),
         rows=np.zeros(max(q, 1) * n),
         observed=np.zeros((1, n)),
         gain=np.zeros((1, n)),
@@ -149,7 +154,7 @@ def flow_table(
     # Entries of a packed Q_g and exp(A g), and of F and a packed G_g where something is observed.
     width = n * (n + 1) // 2 * (1 + (len(seen) > 0)) + n * n * (1 + (len(seen) > 0))
     # As many cells as fit the cache budget, and none beyond the longest level.
-    most = min(CELLS, CELL_BYTES // (8 * TERMS * width), 2 ** (len(levels) - 1))
+    most = min(CELLS, CELL_BYTES // (8 * CELL_TERMS * width), 2 ** (len(levels) - 1))
     octaves = max(0, most.bit_length() - 1)
     if octaves:
         # Cell k covers [k, k + 1) units around its middle. The first is expanded at 0, where Q_g =
@@ -166,13 +171,18 @@ def flow_table(
     series = np.stack(
         [with_reach(cell, unit if k == 0 else 0.5 * unit) for k, cell in enumerate(cells)]
     )
+    series, reach = series[:, :, :-1], series[:, :, -1]
+    # Terms behind the last that a gap in any cell needs would only take memory.
+    last = max(int(np.searchsorted(row[:-1], row[:-1].max(initial=0.0))) for row in reach)
+    last += last % 2  # two terms at a time, see linalg/series
+    reach[:, last] = np.inf
     sizes = (len(seen), len(blocks), int(bool(np.any(Q))), len(levels), octaves)
     return FlowTable(
         unit=np.array([unit]),
         sizes=np.array([sizes], dtype=np.int64),
         size=np.array([float((seen * seen).sum())]),
-        reach=series[None, :, :, -1].copy(),
-        series=series[None, :, :, :-1].copy(),
+        reach=reach[None, :, : last + 1].copy(),
+        series=series[None, :, : last + 1].copy(),
         gamma=np.array(gamma).reshape(1, len(gamma), TERMS, len(seen) * n + 1),
         bound=bound[None],
         levels=levels[None],
@@ -495,16 +505,15 @@ def move_level(
                     total += levels[m, level, 2, r, i] * root[k, i, j]
                 observed[0, j] = total
             rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
+    # exp(A g) where nothing is observed, else F.
+    flow = 0 if table.sizes[m, 1] == 0 else 1
     # A copy: transform() uses T up.
     for i in range(n):
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
-    # The rows of exp(A g) where nothing is observed, else of F.
-    values, flow = scratch.values, 0 if table.sizes[m, 1] == 0 else 1
-    for i in range(n):
         for j in range(n):
-            values[i * n + j] = levels[m, level, flow, i, j]
-    transform(scratch.size, root, k, values, 0, scratch.wide, T, table.sizes[m, 2] > 0)
+            scratch.values[i * n + j] = levels[m, level, flow, i, j]
+    transform(scratch.size, root, k, scratch.values, 0, scratch.wide, T)
     # The estimate moves open loop, by exp(A g): gain_root() corrects it when the readings are used.
     for i in range(n):
         total = 0.0
@@ -564,22 +573,21 @@ def move_by_series(
     table: FlowTable, m: int, root: FloatArray, x: FloatArray, k: int, scratch: FlowScratch
 ) -> None:
     """``x = exp(A g) x`` and ``P = Q_g + F P F'``, with what is in ``values``."""
-    n, values, T = len(scratch.size), scratch.values, scratch.T
-    begin = n * (n + 1) // 2
+    size, n, values = scratch.size, len(scratch.size), scratch.values
+    begin, moved = n * (n + 1) // 2, local_vector(size, scratch.mean)
     for i in range(n):
         total = 0.0
         for j in range(n):
             total += values[begin + i * n + j] * x[k, j]
-        scratch.gain[0, i] = total
+        moved[i] = total
     for i in range(n):
-        x[k, i] = scratch.gain[0, i]
-    noisy = table.sizes[m, 2] > 0
-    if noisy:
-        take_root(scratch.size, T, values)
+        x[k, i] = moved[i]
     # Without sensors F = exp(A g), and the series holds it once.
     if table.sizes[m, 1] > 0:
         begin += n * n
-    transform(scratch.size, root, k, values, begin, scratch.wide, T, noisy)
+    T = local_matrix(size, scratch.T)
+    take_root(size, T, values)
+    transform(size, root, k, values, begin, scratch.wide, T)
 
 
 @kernel
@@ -589,28 +597,17 @@ def fill_cell(
     """Write the first ``width`` values of the series of a cell, ``since`` seconds from its middle,
     see linalg/series.
     """
-    series, reach, distance = table.series, table.reach, abs(since)
-    for j in range(width):
-        out[j] = series[m, cell, 0, j]
-    k, even = 0, 1.0
-    # Two terms at a time: ``out`` is gone through half as often. Terms end where the reach says
-    # that the rest is below rounding.
-    while distance > reach[m, cell, k]:
-        odd = even * since
-        even = odd * since
-        for j in range(width):
-            out[j] += odd * series[m, cell, k + 1, j] + even * series[m, cell, k + 2, j]
-        k += 2
+    fill_series(out, width, table.series[m, cell], table.reach[m, cell], since)
 
 
-@kernel
+@kernel(fused=True)
 def shrink_root(
-    size: Size, root: FloatArray, k: int, G: FloatArray, begin: int, V: FloatArray
+    size: Size, root: FloatArray, k: int, G: FloatArray, begin: int, scratch: FloatArray
 ) -> None:
     """Make place ``k`` the root of ``P (I + G P)^-1``; G is packed by rows of its lower triangle,
-    from ``begin`` on.
+    from ``begin`` on; ``scratch`` is (n, n).
     """
-    n = len(size)
+    n, V = len(size), local_matrix(size, scratch)
     # V = I + S' G S by columns: G S first, whose column j is not needed by the ones before.
     for j in range(n):
         for i in range(n):
@@ -680,7 +677,7 @@ def use_readings(
         factor *= gap
 
 
-@kernel
+@kernel(inlined=True, fused=True)
 def take_root(size: Size, T: FloatArray, packed: FloatArray) -> None:
     """Cholesky's root of a lower triangle packed by rows; pivots that are rounding count as 0."""
     n = len(size)
@@ -699,21 +696,20 @@ def take_root(size: Size, T: FloatArray, packed: FloatArray) -> None:
             T[i, j] *= inverse
 
 
-@kernel
-def transform(  # noqa: PLR0912 - loops are what the compiler wants
+@kernel(inlined=True, fused=True)
+def transform(
     size: Size,
     root: FloatArray,
     k: int,
     F: FloatArray,
     begin: int,
-    wide: FloatArray,
+    scratch: FloatArray,
     T: FloatArray,
-    noisy: bool,
 ) -> None:
     """Make place ``k`` the lower triangular root of ``F P F' + T T'``; F lies by rows from
-    ``begin`` on, T is used up.
+    ``begin`` on, T (n, n) is lower triangular and used up; ``scratch`` is (n, n).
     """
-    n = len(size)
+    n, wide = len(size), local_matrix(size, scratch)
     # F S; S is lower triangular, so the sum begins at r = j.
     for i in range(n):
         for j in range(n):
@@ -721,47 +717,14 @@ def transform(  # noqa: PLR0912 - loops are what the compiler wants
             for r in range(j, n):
                 total += F[begin + i * n + r] * root[k, r, j]
             wide[i, j] = total
-    # Householder's reflections, row by row, of F S and of the columns of T that reach the row.
     for i in range(n):
-        rest = 0.0
-        for j in range(i + 1, n):
-            rest += wide[i, j] * wide[i, j]
-        # T is lower triangular: its columns beyond i do not reach row i yet.
-        if noisy:
-            for j in range(i + 1):
-                rest += T[i, j] * T[i, j]
-        pivot = wide[i, i]
-        length = math.sqrt(pivot * pivot + rest)
-        root[k, i, i] = length
-        if length > 0.0:
-            # The sign that does not cancel.
-            first = pivot + length if pivot >= 0.0 else pivot - length
-            sign = -1.0 if pivot >= 0.0 else 1.0
-            scale = 1.0 / (length * abs(first))
-            # Apply the reflection to the rows below.
-            for r in range(i + 1, n):
-                total = first * wide[r, i]
-                for j in range(i + 1, n):
-                    total += wide[i, j] * wide[r, j]
-                if noisy:
-                    for j in range(i + 1):
-                        total += T[i, j] * T[r, j]
-                total *= scale
-                # The reflection turns the pivot into -sign(pivot) length; the column is flipped so
-                # that the diagonal stays nonnegative.
-                root[k, r, i] = sign * (wide[r, i] - total * first)
-                for j in range(i + 1, n):
-                    wide[r, j] -= total * wide[i, j]
-                if noisy:
-                    for j in range(i + 1):
-                        T[r, j] -= total * T[i, j]
-        else:
-            # A zero row needs no reflection.
-            for r in range(i + 1, n):
-                root[k, r, i] = wide[r, i]
+        reflect_row(size, i, n, wide, T)
+    for i in range(n):
+        for j in range(i + 1):
+            root[k, i, j] = wide[i, j]
 
 
-@kernel
+@kernel(fused=True)
 def information_rate(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
     """``trace(P G)`` in 1/s."""
     # |R^-1/2 H S|_F^2 = trace(S' G S).
@@ -775,11 +738,12 @@ def information_rate(size: Size, table: FlowTable, m: int, root: FloatArray, k: 
     return rate
 
 
-@kernel
+@kernel(fused=True)
 def gain_root(
     size: Size,
     moments: FloatArray,
     series: FloatArray,
+    reach: FloatArray,
     root: FloatArray,
     x: FloatArray,
     k: int,
@@ -787,10 +751,11 @@ def gain_root(
     values: FloatArray,
 ) -> None:
     """Use the ``moments`` (2p,) of the readings of a gap, which become innovations, at its end:
-    ``x += (U + S S' W) innovations``. ``series`` is that of a GainTable, ``values`` room for a row.
+    ``x += (U + S S' W) innovations``. ``series`` and ``reach`` are those of a GainTable, ``values``
+    room for a row.
     """
     n, q = len(size), len(moments)
-    fill_polynomial(values, series, gap)
+    fill_series(values, 3 * n * q, series, reach, gap)
     # Innovations: the moments minus C x.
     for m in range(q):
         for j in range(n):
@@ -862,5 +827,6 @@ def gain_update_root(
         return x
     n = len(x)
     means, values = x.reshape(1, n).copy(), np.zeros(table.series.shape[1] - 1)
-    gain_root(x, moments.copy(), table.series, root.reshape(1, n, n), means, 0, gap, values)
+    series, reach = table.series, table.series[:, -1]
+    gain_root(x, moments.copy(), series, reach, root.reshape(1, n, n), means, 0, gap, values)
     return np.asarray(means[0])

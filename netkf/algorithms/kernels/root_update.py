@@ -28,9 +28,10 @@ import threading
 
 import numpy as np
 
-from netkf.algorithms.kernels.square_root import lower_triangular
+from netkf.algorithms.kernels.square_root import lower_triangular, reflect_row
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.local import local_matrix
 from netkf.linalg.structs import Size, Struct, sized
 
 SINGULAR = 2.0**-25
@@ -43,14 +44,15 @@ TINY = 1e-200
 
 class UpdateScratch(Struct):
     """The ``size`` n of states, and scratch arrays: C (p, p), HS (p, n) and gains (p, n) of a
-    sample, with p >= 1 its largest number of rows; ``wide`` (n, n), ``whitened`` (n, n + 1) and
-    ``total`` (n, n + 1) of combinations.
+    sample, with p >= 1 its largest number of rows; ``S`` and ``wide`` (n, n), ``whitened``
+    (n, n + 1) and ``total`` (n, n + 1) of combinations.
     """
 
     size: Size
     C: FloatArray
     HS: FloatArray
     gains: FloatArray
+    S: FloatArray
     wide: FloatArray
     whitened: FloatArray
     total: FloatArray
@@ -62,7 +64,7 @@ def update_scratch(n: int, p: int, unrolled: bool = False) -> UpdateScratch:
     """
     p = max(p, 1)
     shapes = {
-        **{"C": (p, p), "HS": (p, n), "gains": (p, n), "wide": (n, n)},
+        **{"C": (p, p), "HS": (p, n), "gains": (p, n), "S": (n, n), "wide": (n, n)},
         **{"whitened": (n, n + 1), "total": (n, n + 1)},
     }
     # A struct sized by n makes numba compile loops of constant length; the plain one serves any n.
@@ -217,7 +219,7 @@ def update_with_sample(
 # Convex combinations.
 
 
-@kernel
+@kernel(inlined=True)
 def scale_root(size: Size, root: FloatArray, x: FloatArray, k: int, weight: float) -> None:
     """Weigh place ``k`` alone: ``weight`` >= 0 times P and x."""
     # sqrt(w) S is a root of w P.
@@ -228,7 +230,7 @@ def scale_root(size: Size, root: FloatArray, x: FloatArray, k: int, weight: floa
             root[k, i, j] *= factor
 
 
-@kernel
+@kernel(fused=True)
 def add_root(
     root: FloatArray,
     x: FloatArray,
@@ -240,43 +242,31 @@ def add_root(
     scratch: UpdateScratch,
 ) -> None:
     """Add ``weight`` >= 0 times P and x of place ``m`` of ``other`` (M, n, n), ``other_x``."""
-    n, factor, wide = len(scratch.size), math.sqrt(weight), scratch.wide
+    size, n, factor = scratch.size, len(scratch.size), math.sqrt(weight)
+    # [S, sqrt(w) S_m]: the convex combination of H (7), one term at a time.
+    S, wide = local_matrix(size, scratch.S), local_matrix(size, scratch.wide)
     for i in range(n):
         x[k, i] += weight * other_x[m, i]
         for j in range(i + 1):
-            wide[i, j] = factor * other[m, i, j]
-    # [S, sqrt(w) S_m]: the convex combination of H (7), one term at a time.
-    absorb_columns(scratch.size, root, k, wide)
-
-
-@kernel
-def absorb_columns(size: Size, root: FloatArray, k: int, wide: FloatArray) -> None:
-    """Make place ``k`` the root of ``S S' + wide wide'``; ``wide`` (n, n) is lower triangular and
-    is used up.
-    """
-    # Householder's reflections of a column of S with the columns of ``wide`` that reach its row.
-    n = len(size)
+            S[i, j], wide[i, j] = root[k, i, j], factor * other[m, i, j]
+    absorb_columns(size, S, wide)
     for i in range(n):
+        for j in range(i + 1):
+            root[k, i, j] = S[i, j]
+
+
+@kernel(inlined=True, fused=True)
+def absorb_columns(size: Size, S: FloatArray, wide: FloatArray) -> None:
+    """Make S (n, n) the root of ``S S' + wide wide'``; both are lower triangular, and ``wide`` is
+    used up.
+    """
+    for i in range(len(size)):
         below = 0.0
         for j in range(i + 1):
             below += wide[i, j] * wide[i, j]
-        pivot = root[k, i, i]
-        if below <= NEGLIGIBLE * pivot * pivot + TINY:
-            continue
-        length = math.sqrt(pivot * pivot + below)
-        # pivot - length without cancellation.
-        first = -below / (pivot + length) if pivot >= 0.0 else pivot - length
-        root[k, i, i] = length
-        scale = 2.0 / (first * first + below)
-        # Apply the reflection to the rows below; row i itself is known to be [length, 0].
-        for r in range(i + 1, n):
-            total = first * root[k, r, i]
-            for j in range(i + 1):
-                total += wide[i, j] * wide[r, j]
-            total *= scale
-            root[k, r, i] -= total * first
-            for j in range(i + 1):
-                wide[r, j] -= total * wide[i, j]
+        if below > NEGLIGIBLE * S[i, i] * S[i, i] + TINY:
+            # Column i of S with the columns of ``wide`` that reach row i.
+            reflect_row(size, i, i + 1, S, wide)
 
 
 def combine_roots(

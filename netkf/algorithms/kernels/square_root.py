@@ -14,6 +14,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Size
 
 
 def lower_triangular(array: FloatArray) -> FloatArray:
@@ -46,6 +47,43 @@ def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
         for j in range(i, columns):
             work[r, j] -= total * work[i, j]
     work[i, i] = pivot
+
+
+@kernel(inlined=True, fused=True)
+def reflect_row(size: Size, i: int, end: int, wide: FloatArray, T: FloatArray) -> None:
+    """Apply the reflection from the right that leaves row ``i`` of [wide, T] its diagonal alone, to
+    the rows from ``i`` on; row ``i`` of ``wide`` has entries from column ``i`` up to ``end``, T is
+    lower triangular, and both are (n, n). Entry (i, i) becomes nonnegative.
+    """
+    n, square = len(size), 0.0
+    for j in range(i, end):
+        square += wide[i, j] * wide[i, j]
+    # Columns of T beyond i do not reach row i yet.
+    for j in range(i + 1):
+        square += T[i, j] * T[i, j]
+    # A zero row needs no reflection.
+    if not square > 0.0:
+        wide[i, i] = 0.0
+        return
+    pivot, length = wide[i, i], math.sqrt(square)
+    # The sign that does not cancel in pivot + signed; the column is flipped so that its diagonal is
+    # nonnegative.
+    signed = length if pivot >= 0.0 else -length
+    inverse, scale = 1.0 / length, 1.0 / (square + pivot * signed)
+    wide[i, i] = length
+    for r in range(i + 1, n):
+        inner = pivot * wide[r, i]
+        for j in range(i + 1, end):
+            inner += wide[i, j] * wide[r, j]
+        for j in range(i + 1):
+            inner += T[i, j] * T[r, j]
+        share = (inner + signed * wide[r, i]) * scale
+        # The part of row r along row i: the reflection turns row i into its length.
+        wide[r, i] = inner * inverse
+        for j in range(i + 1, end):
+            wide[r, j] -= share * wide[i, j]
+        for j in range(i + 1):
+            T[r, j] -= share * T[i, j]
 
 
 @kernel

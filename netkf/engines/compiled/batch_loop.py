@@ -1,16 +1,19 @@
 """Whole batches of runs through the event loop: draws of all runs in, samples of all runs out.
 
-One Simulation serves all runs of a batch. For each run a kernel copies its draws into the arrays of
-the Simulation, ``event_loop`` simulates it, and a kernel copies its samples out. Nothing in between
-is Python but three calls.
+One Simulation serves all runs of a batch. For each run its draws are copied into the arrays of the
+Simulation, ``event_loop`` simulates it, and its samples are copied out: one compiled call for all
+of them.
 """
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import numpy as np
 
 from netkf.engines.compiled.event_loop import DONE, WANT_CUTS, WANT_MESSAGES, event_loop
-from netkf.engines.compiled.state import Simulation, add_messages
+from netkf.engines.compiled.state import NODE, Simulation, add_messages
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Struct, struct_at
@@ -57,39 +60,98 @@ class BatchArrays(Struct):
     carriers: int
 
 
+ALONE = -1
+"""Instead of the number of a run: the Simulation is no run of a batch."""
+
+
 def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
     """Simulate all runs of a batch up to the horizon, or until an estimate is no longer finite."""
-    ziggurat = normal_ziggurat()
-    for run in range(len(batch.lengths)):
-        begin_run(state, batch.memory, run, ziggurat)
-        # Each call of the loop simulates until it wants something that only Python can make.
-        wanted = -1
-        while wanted != DONE:
-            wanted = int(event_loop(state, None, None))
-            # Samples first: after one that is not finite, whatever the loop wants is of no use any
-            # more.
-            if not keep_samples(state, batch.memory, run):
-                break
-            if wanted == WANT_CUTS:
-                draw_cuts(state, batch.memory, run, ziggurat)
-            elif wanted == WANT_MESSAGES:
-                # Ticks, path and noise are there up to the horizon; only cuts and messages have no
-                # known number.
-                add_messages(state, state.most_messages)
+    run, begun = 0, False
+    while run < len(batch.lengths):
+        run = int(simulate_runs(state, batch.memory, run, begun, normal_ziggurat()))
+        # The run goes on where it stopped for a larger pool. Ticks, path and noise are there up to
+        # the horizon; only cuts and messages have no known number.
+        if run < len(batch.lengths):
+            add_messages(state, state.most_messages)
+            begun = True
+
+
+def run_alone(state: Simulation) -> int:
+    """``event_loop`` for one run, by the kernel that batches use: it is compiled only once."""
+    return int(simulate_runs(state, _no_batch().memory, ALONE, True, normal_ziggurat()))
+
+
+@cache
+def _no_batch() -> BatchArrays:
+    """A batch without runs."""
+    sizes = {
+        **{"nodes": (0,), "xhat": (0, 0), "root": (0, 0, 0), "x_start": (0, 0, 0)},
+        **{"x_stop": (0, 0, 0), "moments": (0,) * 4, "cubic": (0,) * 4, "noise": (0,) * 5},
+        **{"cuts": (0, 4), "t": (0,), "entity": (0,), "at": (0,), "delay": (0,), "first": (0,)},
+        **{"first_delay": (0,), "shown_xhat": (0,) * 4, "shown_P": (0,) * 5, "lengths": (0,)},
+        **{"counts": (0, 0), "diverged": (0,)},
+    }
+    kinds: dict[str, np.dtype] = {"nodes": NODE, "cuts": np.dtype(np.uint64)}
+    integers = ("entity", "at", "first", "first_delay", "lengths", "counts", "diverged")
+    kinds.update(dict.fromkeys(integers, np.dtype(np.int64)))
+    arrays: dict[str, Any] = {
+        name: np.zeros(size, dtype=kinds.get(name, np.dtype(np.float64)))
+        for name, size in sizes.items()
+    }
+    return BatchArrays(**arrays, carriers=1)
 
 
 @kernel
-def begin_run(
-    state: Simulation, batch_memory: IntArray, run: int, ziggurat: NormalZiggurat
-) -> None:
-    """Put the Simulation to time 0 of a run and copy its draws there."""
-    # numba identifies an array much faster than a struct, and this is called once a run.
-    begin(state, struct_at(batch_memory, BatchArrays), run, ziggurat)
+def simulate_runs(
+    state: Simulation, batch_memory: IntArray, run: int, begun: bool, ziggurat: NormalZiggurat
+) -> int:
+    """Simulate the runs of a batch from ``run`` on, which has ``begun`` before or not; returns the
+    run that needs a larger pool of messages first, or the number of runs. For ALONE:
+    ``event_loop``.
+    """
+    # numba identifies an array much faster than a struct.
+    if run == ALONE:
+        return event_loop(state, None, None)
+    return simulate_from(state, struct_at(batch_memory, BatchArrays), run, begun, ziggurat)
+
+
+@kernel
+def simulate_from(
+    state: Simulation, batch: BatchArrays, run: int, begun: bool, ziggurat: NormalZiggurat
+) -> int:
+    """``simulate_runs`` for kernels."""
+    while run < len(batch.lengths):
+        if not begun:
+            begin(state, batch, run, ziggurat)
+        begun = False
+        if not simulate_run(state, batch, run, ziggurat):
+            return run
+        run += 1
+    return run
+
+
+@kernel
+def simulate_run(
+    state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggurat
+) -> bool:
+    """Simulate one run to its end; False where it needs a larger pool of messages first."""
+    wanted = -1
+    while wanted != DONE:
+        wanted = event_loop(state, None, None)
+        # Samples first: after one that is not finite, whatever the loop wants is of no use any
+        # more.
+        if not keep(state, batch, run):
+            return True
+        if wanted == WANT_CUTS:
+            refill_cuts(state, batch, run, ziggurat)
+        elif wanted == WANT_MESSAGES:
+            return False
+    return True
 
 
 @kernel
 def begin(state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggurat) -> None:
-    """``begin_run`` for kernels."""
+    """Put the Simulation to time 0 of a run and copy its draws there."""
     reset_filters(state, batch)
     reset_messages(state)
     # Positions in the arrays of draws: the run begins at the first frame, piece, tick and sample.
@@ -177,17 +239,8 @@ def copy_noise(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 
 @kernel
-def draw_cuts(
-    state: Simulation, batch_memory: IntArray, run: int, ziggurat: NormalZiggurat
-) -> None:
-    """Draw new normals for cuts where they are used up."""
-    batch = struct_at(batch_memory, BatchArrays)
-    refill_cuts(state, batch, run, ziggurat)
-
-
-@kernel
 def refill_cuts(state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggurat) -> None:
-    """``draw_cuts`` for kernels."""
+    """Draw new normals for cuts where they are used up."""
     # Streams are numbered run by run, sensor by sensor.
     sensing, stream = state.sensing, run * len(state.sensing.rows)
     for s in range(len(sensing.rows)):
@@ -202,16 +255,10 @@ def refill_cuts(state: Simulation, batch: BatchArrays, run: int, ziggurat: Norma
 
 
 @kernel
-def keep_samples(state: Simulation, batch_memory: IntArray, run: int) -> bool:
+def keep(state: Simulation, batch: BatchArrays, run: int) -> bool:
     """Copy the samples that were taken into the batch, up to the first that is not finite; False
     where there is such a one. What happened after it did not happen.
     """
-    return keep(state, struct_at(batch_memory, BatchArrays), run)
-
-
-@kernel
-def keep(state: Simulation, batch: BatchArrays, run: int) -> bool:
-    """``keep_samples`` for kernels."""
     # Samples are kept from the time after those that an earlier call has copied.
     taken, first = state.samples, state.probe_at - state.samples
     state.samples = 0

@@ -11,8 +11,8 @@ import numpy as np
 from netkf.algorithms.registry import built_in_filters
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
+from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.engines.compiled.batches import flow_batches
-from netkf.engines.compiled.event_loop import event_loop
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
@@ -70,7 +70,7 @@ class CompiledEngine(Engine):
         if scenario.slotted:
             compiling.announce(type(scenario.hosted).slot_kernel)
         else:
-            compiling.announce(event_loop)
+            compiling.announce(simulate_runs)
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

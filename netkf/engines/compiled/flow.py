@@ -14,6 +14,7 @@ import numpy as np
 from netkf.algorithms.models import FlowModel
 from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
+from netkf.engines.compiled.batch_loop import run_alone
 from netkf.engines.compiled.draws import Noise, Paths, no_path, sizes
 from netkf.engines.compiled.event_loop import (
     DONE,
@@ -243,9 +244,10 @@ class Workspace:
             "keep_own": getattr(algorithm, "on_loss", "") == "keep-own",
             "most_messages": most,
             "free_count": len(self._pool[0]),
-            # Each message of a tick leaves a "send" and its outcome, and the tick or transmission
-            # two rows more; an instant of samples leaves one row per sensing node.
-            "most_rows": 2 + 2 * most + int(np.diff(instants.first).max(initial=0)),
+            # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
+            # tick or transmission two rows more; an instant of samples leaves one row per sensing
+            # node.
+            "most_rows": 2 + 3 * most + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
             "age_limit": getattr(algorithm, "max_age", math.inf),
             "mail_time": 0.0,
@@ -275,7 +277,7 @@ class FlowRun:
             # Any value but DONE.
             wanted = WANT_ROWS
             while wanted != DONE:
-                wanted = int(event_loop(self._state, self._totals, self._history))
+                wanted = self._advance()
                 # Samples first: the run ends at one that is not finite, and with the rows before
                 # it.
                 if not self._hand_samples_on():
@@ -289,6 +291,11 @@ class FlowRun:
                 finally:
                     self._recorder.flush()
         return "complete"
+
+    def _advance(self) -> int:
+        if self._totals is None and self._history is None:
+            return run_alone(self._state)
+        return int(event_loop(self._state, self._totals, self._history))
 
     def _give(self, wanted: int) -> None:
         state = self._state

@@ -114,10 +114,8 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
     node, path, piece = state.nodes[h], state.path, state.piece
     scratch, sensing = state.scratch, state.sensing
     k, xhat, root, table = node.model, state.xhat, state.root, state.table
-    shape, begin = state.gains.shape, state.gains.first[k]
-    terms, width, last = shape[k, 1], shape[k, 2], path.last[piece]
-    gains = state.gains.series[begin : begin + terms * width].reshape(terms, width)
-    readings, values = scratch.moments[: shape[k, 0]], scratch.values[: width - 1]
+    gains, reach, last = state.gains.series[k], state.gains.reach[k], path.last[piece]
+    readings = scratch.moments[: state.gains.moments[k]]
     # The state of a node is whole after each stretch, so that a stop for normals may come in
     # between.
     while node.now < time:
@@ -154,7 +152,9 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
             last - now,
             scratch.early,
         )
-        gain_root(state.size, readings, gains, root, xhat, h, end - now, values)
+        gain_root(
+            state.size, readings, gains, reach, root, xhat, h, end - now, scratch.values
+        )
         node.now = end
     # The next gap sets its own bound.
     node.least = 0.0

@@ -265,6 +265,7 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
 def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
     """The triangular root of ``S V D^-1 V' S'``: D is the diagonal of ``values``, at least 1."""
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
+    wide, noise = state.flow_scratch.wide, state.flow_scratch.T
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -276,7 +277,8 @@ def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArr
     for i in range(n):
         for j in range(i + 1):
             root[h, i, j] = 1.0 if i == j else 0.0
-    transform(state.size, root, h, F, 0, state.flow_scratch.wide, state.flow_scratch.T, False)
+            noise[i, j] = 0.0
+    transform(state.size, root, h, F, 0, wide, noise)
 
 
 @kernel

@@ -60,13 +60,13 @@ CLOCKS = ("links", "directions", "nodes", "readings")
 
 
 class Gains(Struct):
-    """The gain tables of M models, flat: of model m from ``first[m]`` on; ``shape`` (M, 3) = rows
-    2 p of moments, terms and width.
+    """The gain tables of M models, padded to one size: ``series`` (M, terms, width), its ``reach``
+    (M, terms) and the rows 2 p of ``moments`` (M,).
     """
 
     series: FloatArray
-    first: IntArray
-    shape: IntArray
+    reach: FloatArray
+    moments: IntArray
 
 
 class Scratch(Struct):
@@ -284,15 +284,18 @@ def filters_at_start(scenario: Scenario) -> Filters:
 def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     n = len(models[0].A)
     # A model without sensors has no gains; its place keeps the numbering.
-    nothing = GainTable(n, 0, np.zeros((0, 0)))
+    nothing = GainTable(n, 0, np.zeros((0, 1)))
     gains = [model.gains if len(model.H) else nothing for model in models]
-    # Tables differ in size, so they are stored flat.
-    sizes = [gain.series.size for gain in gains]
+    terms, width = np.max([gain.series.shape for gain in gains], axis=0)
+    # The padding is never read: the last reach of a table is infinite.
+    series, reach = np.zeros((len(gains), terms, width - 1)), np.zeros((len(gains), terms))
+    for k, gain in enumerate(gains):
+        count, entries = len(gain.series), gain.series.shape[1] - 1
+        series[k, :count, :entries], reach[k, :count] = gain.series[:, :-1], gain.series[:, -1]
+    moments = np.array([gain.moments for gain in gains], dtype=np.int64)
     # The last model of the stack has no sensors: it predicts messages under way.
     return stack_tables([*(model.flow for model in models), models[0].blind_flow]), Gains(
-        series=np.concatenate([gain.series.ravel() for gain in gains]),
-        first=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
-        shape=np.array([(gain.moments, *gain.series.shape) for gain in gains], dtype=np.int64),
+        series=series, reach=reach, moments=moments
     )
 
 
@@ -319,8 +322,7 @@ def scratch_arrays(
     table: FlowTable, gains: Gains, instants: Instants
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
     """Scratch arrays for all that is computed."""
-    # ``most``, ``width``: the largest of all models.
-    n, (most, _, width) = table.levels.shape[3], gains.shape.max(axis=0)
+    n, most, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
     # Rows of the reading of each sample, then the largest sum over one instant.
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
     totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
