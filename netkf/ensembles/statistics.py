@@ -163,9 +163,8 @@ def run_values(batch: RunBatch, scenario: Scenario) -> RunValues:
 
 def _mean_of_nodes(averages: FloatArray) -> FloatArray:
     """(R, 1, 3) means over the nodes of (R, N, 3), node after node in every run."""
-    total = np.zeros((len(averages), 1, averages.shape[2]))
-    for k in range(averages.shape[1]):
-        total[:, 0] += averages[:, k]
+    # accumulate() adds in this order, and sum() does not.
+    total = np.add.accumulate(averages, axis=1)[:, -1:]
     return np.asarray(total / averages.shape[1])
 
 

@@ -58,7 +58,7 @@ def fill_series(
     (terms,) says up to which abs(gap) the terms so far are enough.
     """
     terms, distance = len(reach), abs(gap)
-    # Numbers of terms that are known when this is compiled: the sum of an entry stays in a register.
+    # Numbers of terms that are known when this is compiled: sums of entries stay in registers.
     if terms > 8 and distance <= reach[8]:
         horner(ORDER_8, out, width, series, gap)
     elif terms > 12 and distance <= reach[12]:

@@ -19,14 +19,14 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.series import fill_polynomial
+from netkf.linalg.local import local_vector
+from netkf.linalg.series import fill_series
+from netkf.linalg.structs import Size
 from netkf.plants.laws import GridLaws, grid_time
 from netkf.plants.transitions import Transitions
 from netkf.rng.normals import Normals
 
 BLOCK = 64  # steps drawn at once, or a multiple of it
-_THREE, _THREE_WEIGHTS = np.polynomial.legendre.leggauss(3)
-_THREE_MOMENTS = np.stack([_THREE_WEIGHTS, _THREE_WEIGHTS * _THREE])
 
 
 class Step(NamedTuple):
@@ -397,42 +397,22 @@ def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
     return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=2)
 
 
-@kernel
-def _fill_legendre(out: FloatArray, since: float, gap: float, length: float) -> None:
-    """Write (2, 4) the two moments over ``gap`` seconds from ``since`` on of the Legendre
-    polynomials of a step of ``length`` seconds, by Gauss's rule with three nodes, which is exact.
-    """
-    for m in range(2):
-        for c in range(4):
-            out[m, c] = 0.0
-    # Three nodes are exact up to degree 5: a cubic times P_1 has degree 4.
-    for k in range(3):
-        # Node k of the gap, as a point z in [-1, 1] of the whole step.
-        z = 2.0 * (since + 0.5 * gap * (1.0 + _THREE[k])) / length - 1.0
-        square = z * z
-        for m in range(2):
-            weight = 0.5 * gap * _THREE_MOMENTS[m, k]
-            out[m, 0] += weight
-            out[m, 1] += weight * z
-            out[m, 2] += weight * (1.5 * square - 0.5)
-            out[m, 3] += weight * (2.5 * square - 1.5) * z
-
-
 def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     """(2, n) moments of x over ``[start, end]`` inside a step."""
     n = len(step.x_start)
     # The moments of a whole piece were drawn from their exact law: no cubic is needed.
     if start == step.start and end == step.end:
         return step.moments
-    out, work = np.empty((2, n)), (np.empty(2 * n * n), np.empty(n), np.empty((2, 4)))
+    out, work = np.empty((2, n)), (np.empty(2 * n * n), np.empty(n))
     since, gap, length = start - step.start, end - start, step.end - step.start
     path = step.x_start[None], step.cubic[None]
-    fill_seen(out, laws.to_end, laws.to_moments, since, gap, length, *path, 0, *work)
+    fill_seen(np.zeros(n), out, laws.to_end, laws.to_moments, since, gap, length, *path, 0, *work)
     return out
 
 
-@kernel
+@kernel(fused=True)
 def fill_seen(
+    size: Size,
     out: FloatArray,
     to_end: FloatArray,
     to_moments: FloatArray,
@@ -443,32 +423,36 @@ def fill_seen(
     cubic: FloatArray,
     k: int,
     responses: FloatArray,
-    x: FloatArray,
-    from_noise: FloatArray,
+    scratch: FloatArray,
 ) -> None:
-    """``seen`` in loops, ``gap`` seconds from ``since`` on in piece ``k`` of ``length`` seconds,
-    into ``out`` (2, n); ``responses`` (2 n n,), ``x`` (n,) and ``from_noise`` (2, 4) are room to
-    work in.
+    """Write the moments (2, n) of x over ``gap`` seconds from ``since`` on in piece ``k`` of
+    ``length`` seconds into ``out``; ``responses`` (>= 2 n n,) and ``scratch`` (n,) are scratch.
     """
-    n = len(x)
+    n, x = len(size), local_vector(size, scratch)
     for i in range(n):
         x[i] = x_start[k, i]
     # x(since) by the response alone; the cubic below contains all that noise adds since the piece
     # began.
     if since > 0.0:
-        fill_polynomial(responses[: n * n], to_end, since)
+        fill_series(responses, n * n, to_end, to_end[:, to_end.shape[1] - 1], since)
         for i in range(n):
             x[i] = 0.0
             for j in range(n):
                 x[i] += responses[i * n + j] * x_start[k, j]
-    fill_polynomial(responses, to_moments, gap)
-    _fill_legendre(from_noise, since, gap, length)
-    for m in range(2):
-        for i in range(n):
-            total = 0.0
-            # Response to x over the gap, and the moments of the cubic.
-            for j in range(n):
-                total += responses[(m * n + i) * n + j] * x[j]
-            for c in range(4):
-                total += from_noise[m, c] * cubic[k, c, i]
-            out[m, i] = total
+    # P_2 and P_3 of the piece over the gap, at z = middle + share v with v in [-1, 1].
+    share, middle = gap / length, 2.0 * (since + 0.5 * gap) / length - 1.0
+    square, part = middle * middle, share * share
+    second = 1.5 * square + 0.5 * part - 0.5
+    third = middle * (2.5 * (square + part) - 1.5)
+    tilted = share * (2.5 * square + 0.5 * part - 0.5)
+    fill_series(responses, 2 * n * n, to_moments, to_moments[:, to_moments.shape[1] - 1], gap)
+    # Response to x over the gap, and the moments of the cubic.
+    for i in range(n):
+        plain = cubic[k, 0, i] + middle * cubic[k, 1, i]
+        plain += second * cubic[k, 2, i] + third * cubic[k, 3, i]
+        slope = share / 3.0 * cubic[k, 1, i]
+        slope += share * middle * cubic[k, 2, i] + tilted * cubic[k, 3, i]
+        out[0, i], out[1, i] = gap * plain, gap * slope
+        for j in range(n):
+            out[0, i] += responses[i * n + j] * x[j]
+            out[1, i] += responses[(n + i) * n + j] * x[j]

@@ -28,6 +28,7 @@ from netkf.core.fields import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Size
 from netkf.plants.linear import Readings, SlotReadings
 from netkf.plants.paths import BLOCK, DiffusionPath
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
@@ -177,12 +178,13 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
     """(2, p) moments of dy from those of x (2, n) and of unit white noise (2, p)."""
     out = np.empty(2 * len(H))
-    fill_reading(out, 0, len(H), seen, H[None], noise, root[None], 0)
+    fill_reading(H[0], out, 0, len(H), seen, H[None], noise, root[None], 0)
     return out.reshape(2, len(H))
 
 
-@kernel
+@kernel(fused=True)
 def fill_reading(
+    size: Size,
     out: FloatArray,
     row: int,
     rows: int,
@@ -192,17 +194,18 @@ def fill_reading(
     root: FloatArray,
     s: int,
 ) -> None:
-    """``reading`` in loops, of sensor ``s`` with ``rows`` rows of H (S, p, n) and root (S, p, p):
-    the first moments from ``out[row]`` on and the second ones half of ``out`` later.
+    """Write the moments of dy of sensor ``s``, ``rows`` of each, from those of x, ``seen`` (2, n),
+    and of unit white noise (2, p): the first ones from ``out[row]`` on and the second ones half of
+    ``out`` later. H is (S, p, n), root (S, p, p) and lower triangular.
     """
     half = len(out) // 2
     # Both moments are linear: dy = H x dt + dv, moment by moment.
     for m in range(2):
         for i in range(rows):
             total = 0.0
-            for j in range(seen.shape[1]):
+            for j in range(len(size)):
                 total += H[s, i, j] * seen[m, j]
-            for j in range(rows):
+            for j in range(i + 1):
                 total += root[s, i, j] * noise[m, j]
             out[m * half + row + i] = total
 

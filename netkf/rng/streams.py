@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -59,7 +59,7 @@ class Streams:
         takes some 30 microseconds for one. Entities have as many numbers each.
         """
         made: dict[tuple[str, tuple[int, ...]], _Words] = {}
-        if entities and _small(entities):
+        if entities and _small_ids(tuple(entities)) is not None:
             for purpose in purposes:
                 words = self.seed_words(purpose, entities)
                 made |= {(purpose, e): _Words(w) for e, w in zip(entities, words, strict=True)}
@@ -95,12 +95,13 @@ class ReplicaStreams:
         if not entities:
             return np.empty((0, 4), dtype=np.uint64)
         last = self.replica + self.count - 1
-        if last >= WORD or not _small(entities):
+        ids = _small_ids(tuple(entities))
+        if last >= WORD or ids is None:
             some = [s._sequence(purpose, *entity) for s in self.per_replica for entity in entities]
             return np.array([sequence.generate_state(4, np.uint64) for sequence in some])
         keys = np.empty((self.count, len(entities), 2 + len(entities[0])), dtype=np.uint32)
         keys[:, :, 0] = np.arange(self.replica, last + 1, dtype=np.uint32)[:, None]
-        keys[:, :, 1], keys[:, :, 2:] = _code(purpose), np.array(entities, dtype=np.uint32)
+        keys[:, :, 1], keys[:, :, 2:] = _code(purpose), ids
         words = np.empty((self.count * len(entities), 4), dtype=np.uint64)
         pool = np.empty(POOL, dtype=np.uint32)
         fill_seed_words(_entropy(self.seed), keys.reshape(len(words), -1), pool, words)
@@ -125,9 +126,12 @@ class _Words(ISeedSequence):
         return self._words
 
 
-def _small(entities: Sequence[tuple[int, ...]]) -> bool:
-    """Return True if every id fits into one word of 32 bits."""
-    return max(max(entity, default=0) for entity in entities) < WORD
+@lru_cache(maxsize=32)
+def _small_ids(entities: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
+    """Return the ids of entities as words of 32 bits (K, ids); None if one of them needs more."""
+    if max(max(entity, default=0) for entity in entities) >= WORD:
+        return None
+    return np.array(entities, dtype=np.uint32)
 
 
 WORD, MASK = 1 << 32, (1 << 32) - 1

@@ -131,9 +131,7 @@ def simulate_from(
 
 
 @kernel
-def simulate_run(
-    state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggurat
-) -> bool:
+def simulate_run(state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggurat) -> bool:
     """Simulate one run to its end; False where it needs a larger pool of messages first."""
     wanted = -1
     while wanted != DONE:

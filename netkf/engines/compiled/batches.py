@@ -17,6 +17,7 @@ from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace
+from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.poisson import all_ticks, window_of
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
@@ -110,6 +111,7 @@ def drawn_together(scenario: Scenario) -> bool:
     return uses_grid(scenario) and not scenario.sampled_sensors
 
 
+@once_per_scenario
 def batch_size(scenario: Scenario) -> int:
     """Number of runs that are drawn and kept together, at least 1."""
     if not drawn_together(scenario):

@@ -73,23 +73,16 @@ def event_loop(state: Simulation, totals: Totals | None, history: History | None
         # The piece of the path that the event lies in; events come in the order of time.
         while state.path.stop[state.piece] < now:
             state.piece += 1
-        # Participants are predicted first. A node that is there already is skipped, so that this
-        # may be repeated after a stop.
-        silent = event == ON_TICK and totals is None and history is None and is_lost(state)
-        for k in range(count_participants(state, event)):
-            h = participant(state, event, k)
-            # Nobody hears a message that is lost, so that its sender needs no prediction; increment
-            # sensors are read at every tick.
-            if silent and state.nodes[h].sensors == state.nodes[h].sensor:
-                continue
-            if not predict(state, h, now):
-                return WANT_CUTS
+        # Participants are predicted first, which may be repeated after a stop.
+        lost = event == ON_TICK and totals is None and history is None and is_lost(state)
+        if not predict_participants(state, event, lost, now):
+            return WANT_CUTS
         if event == ON_TICK:
             on_tick(state, totals, now)
             # The next events, unless there are others at this instant.
-            if totals is None and history is None and ends_instant(state, now):
-                if not absorb_mail(state, now):
-                    return WANT_CUTS
+            alone = totals is None and history is None and ends_instant(state, now)
+            if alone and not absorb_mail(state, totals, history, now):
+                return WANT_CUTS
         elif event == ON_ABSORB:
             on_absorb(state, totals, history, now)
         elif event == ON_SENSE:
@@ -161,6 +154,22 @@ def next_event(state: Simulation) -> tuple[int, float]:
 def next_of(times: FloatArray, k: int) -> float:
     """``times[k]``, or never."""
     return float(times[k]) if k < len(times) else NEVER
+
+
+@kernel
+def predict_participants(state: Simulation, event: int, lost: bool, now: float) -> bool:
+    """Predict the nodes that take part in an event; ``lost``: all messages of the tick are. False
+    where one of them needs more normals for cuts first.
+    """
+    for k in range(count_participants(state, event)):
+        h = participant(state, event, k)
+        # The sender of a message that is lost needs no prediction, unless it reads increments.
+        if lost and state.nodes[h].sensors == state.nodes[h].sensor:
+            continue
+        # A node that is there already is skipped.
+        if not predict(state, h, now):
+            return False
+    return True
 
 
 @kernel
@@ -354,10 +363,10 @@ def is_lost(state: Simulation) -> bool:
     """Return True if all messages of the next tick are lost."""
     ticks = state.ticks
     entity, first = state.entities[ticks.entity[state.tick_at]], ticks.at[state.tick_at]
+    heard = False
     for m in range(entity.after - entity.first):
-        if ticks.delay[first + m] >= 0.0:
-            return False
-    return True
+        heard = heard or ticks.delay[first + m] >= 0.0
+    return not heard
 
 
 @kernel
@@ -368,7 +377,9 @@ def ends_instant(state: Simulation, now: float) -> bool:
 
 
 @kernel
-def absorb_mail(state: Simulation, now: float) -> bool:
+def absorb_mail(
+    state: Simulation, totals: Totals | None, history: History | None, now: float
+) -> bool:
     """Let all receivers absorb their mail; False where one of them needs more normals for cuts
     first.
     """
@@ -376,7 +387,7 @@ def absorb_mail(state: Simulation, now: float) -> bool:
     while state.receivers > 0:
         if not predict(state, state.waiting[state.absorbing], now):
             return False
-        on_absorb(state, None, None, now)
+        on_absorb(state, totals, history, now)
     return True
 
 

@@ -10,12 +10,14 @@ from netkf.engines.compiled.state import Sensing, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import copy_matrix
+from netkf.linalg.structs import Size
 from netkf.plants.paths import fill_seen
 from netkf.plants.sensors import divide, fill_reading
 
 
 @kernel
 def read_increments(
+    size: Size,
     out: FloatArray,
     sensing: Sensing,
     first: int,
@@ -43,7 +45,7 @@ def read_increments(
             noise = early
             divide(early, rest[s], sensing.normals[s, used[s]], u, length)
             used[s] += 1
-        fill_reading(out, row, rows[s], x, H, noise, root, s)
+        fill_reading(size, out, row, rows[s], x, H, noise, root, s)
         row += rows[s]
         s += 1
 
@@ -57,8 +59,8 @@ def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float)
     if now == start and end == stop:
         copy_matrix(scratch.state_moments, path.moments[piece])
         return
-    n = scratch.state_moments.shape[1]
     fill_seen(
+        state.size,
         scratch.state_moments,
         path.to_end,
         path.to_moments,
@@ -68,9 +70,8 @@ def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float)
         path.x_start,
         path.cubic,
         piece,
-        scratch.values[: 2 * n * n],
+        scratch.values,
         scratch.x,
-        scratch.from_noise,
     )
 
 
@@ -143,6 +144,7 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
         share = (end - now) / (last - now) if end < last else -1.0
         step = path.step[piece]
         read_increments(
+            state.size,
             readings,
             sensing,
             node.sensor,
@@ -152,9 +154,7 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
             last - now,
             scratch.early,
         )
-        gain_root(
-            state.size, readings, gains, reach, root, xhat, h, end - now, scratch.values
-        )
+        gain_root(state.size, readings, gains, reach, root, xhat, h, end - now, scratch.values)
         node.now = end
     # The next gap sets its own bound.
     node.least = 0.0

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.schedule import (
     LOST,
     Schedule,
@@ -192,21 +193,29 @@ def is_poisson(scenario: Scenario) -> bool:
     return talks and type(network.activation) is Poisson and plain(network.channel)
 
 
+@once_per_scenario
+def _rates_and_chances(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
+    """Ticks per second of each entity (E,), and the delivery probability of each way (W,)."""
+    clock, senders = scenario.network.activation, senders_of(scenario)
+    assert isinstance(clock, LinkClock)
+    rates = np.array([clock.mean_rate(entity) for entity in senders.entities])
+    return rates, delivery_chances(scenario, senders.ways)
+
+
 class PoissonSchedules:
     """The ticks of some runs of such a scenario, a window at a time."""
 
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders | None = None
     ) -> None:
-        clock, runs = scenario.network.activation, len(streams.per_replica)
+        runs = len(streams.per_replica)
         senders = senders_of(scenario) if senders is None else senders
-        assert isinstance(clock, LinkClock)
         ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs
         # No states where nothing is random: draw_ticks() then draws no number.
         luck: np.ndarray = np.empty((0, 4), dtype=np.uint64)
         if not scenario.network.channel.loss.deterministic:
             luck = StreamBatch(streams, "loss", senders.sources).states
-        rates = np.array([clock.mean_rate(entity) for entity in senders.entities])
+        rates, chances = _rates_and_chances(scenario)
         self._drawing = Drawing(
             coming=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),
             rate=np.tile(rates, runs),
@@ -216,7 +225,7 @@ class PoissonSchedules:
             first=senders.first,
             hearing=senders.hearing,
             source=senders.source,
-            chance=delivery_chances(scenario, senders.ways),
+            chance=chances,
         )
         # The first tick of each entity, unit exponentials over its rate.
         self._drawing.coming[:] /= self._drawing.rate

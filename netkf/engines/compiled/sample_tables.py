@@ -77,7 +77,8 @@ class SampleTables:
 def _instants(
     scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
-    index, pooled, n = scenario.topology.index, scenario.hosted.pooled, scenario.plant.n
+    index = scenario.topology.index if placed else {}
+    pooled, n = scenario.hosted.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)
     host = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
     parts = [(scenario.sensors[p.entry], scenario.noise(p.entry, True)) for _, p in placed]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.clock import Entity
+from netkf.engines.compiled.kept import once_per_scenario
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
@@ -33,6 +34,7 @@ class Senders(NamedTuple):
         return len(self.sources) < len(self.ways)
 
 
+@once_per_scenario
 def senders_of(scenario: Scenario) -> Senders:
     """Return who transmits over which directed links; nobody if the filter does not talk."""
     topology, clock = scenario.topology, scenario.network.activation

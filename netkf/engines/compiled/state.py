@@ -72,7 +72,7 @@ class Gains(Struct):
 class Scratch(Struct):
     """Scratch arrays: moments (2 p,) and noise ``early`` (2, p) for the most increments p of any
     node, moments of x (``state_moments``) and their ``total`` (2, n), ``values`` of the longest
-    series, ``x`` (n,), ``from_noise`` (2, 4); a sample of at most q rows: ``y`` (q,), ``H`` (q, n),
+    series, ``x`` (n,); a sample of at most q rows: ``y`` (q,), ``H`` (q, n),
     ``root_R`` (q, q).
     """
 
@@ -82,7 +82,6 @@ class Scratch(Struct):
     total: FloatArray
     values: FloatArray
     x: FloatArray
-    from_noise: FloatArray
     y: FloatArray
     H: FloatArray
     root_R: FloatArray
@@ -336,7 +335,6 @@ def scratch_arrays(
         # fill_seen() needs two responses (n, n).
         values=np.zeros(max(width, 2 * n * n)),
         x=np.zeros(n),
-        from_noise=np.zeros((2, 4)),
         y=np.zeros(q),
         H=np.zeros((q, n)),
         root_R=np.zeros((q, q)),
