@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from netkf.core.errors import TheoryError
+
 HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not promised"
 VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
 MAX_RUNS = 1e9
@@ -99,9 +101,18 @@ def judge(
             why = "; ".join(f"{row.assumption} [{row.source}]: {row.evidence}" for row in rows)
             found.append(_reject(promise, why))
         else:
-            finding = promise.test(samples, level / max(statistical, 1))
-            found.append(_weigh(promise, finding, runs))
+            found.append(
+                _weigh(promise, _test(promise, samples, level / max(statistical, 1)), runs)
+            )
     return found
+
+
+def _test(promise: Promise, samples: Any, level: float) -> Finding:
+    """Return the finding of a test; it is unknown if theory cannot compute what to compare with."""
+    try:
+        return promise.test(samples, level)
+    except TheoryError as error:
+        return find_unknown(f"not computed: {error}")
 
 
 def _is_needed(promise: Promise, row: Assumption) -> bool:

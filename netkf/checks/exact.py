@@ -14,7 +14,7 @@ from netkf.algorithms.registry import built_in_class, overridden
 from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
 from netkf.checks.laws import NEES_TOLERANCE, compare_chi_square, find_largest
 from netkf.checks.points import sampled_indices
-from netkf.checks.rounding import compare_identities, largest_so_far
+from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples
 from netkf.checks.statistics import deviation_interval, quadratic_interval
 from netkf.core.errors import TheoryError
@@ -135,7 +135,7 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
     below = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
     message = f"least eigenvalue of P - Sigma relative to its trace in {below.size:,} covariances"
-    terms = largest_so_far(samples.runs.replayed[:MAX_REPLAYED], samples.first_covariances)
+    terms = samples.largest_terms(samples.runs.replayed[:MAX_REPLAYED])
     return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
 
 

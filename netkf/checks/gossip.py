@@ -34,7 +34,7 @@ from netkf.checks.mode_sequences import (
 )
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
-from netkf.checks.rounding import compare_identities, largest_so_far
+from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_replay
 from netkf.checks.statistics import (
     Interval,
@@ -201,7 +201,7 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
         f"largest trace of the bounds that they give: {largest}"
     )
     # The root of the bound is computed from one of size UNKNOWN, and has the roundings of that.
-    terms = np.maximum(UNKNOWN * np.sqrt(size), largest_so_far(P, samples.first_covariances))
+    terms = np.maximum(UNKNOWN * np.sqrt(size), samples.largest_terms(P))
     return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
 
 

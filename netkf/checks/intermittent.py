@@ -37,7 +37,7 @@ from netkf.checks.mode_sequences import (
 )
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
-from netkf.checks.rounding import compare_identities, largest_so_far
+from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_replay
 from netkf.checks.statistics import (
     deviation_interval,
@@ -240,7 +240,7 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
         gap = np.linalg.eigvalsh(np.nan_to_num(samples.runs.P - least, nan=-np.inf, posinf=-1e300))
     below = np.maximum(-gap[..., 0], 0.0)
     message = f"{size.size:,} covariances against the path without losses"
-    terms = largest_so_far(samples.runs.P, samples.first_covariances)
+    terms = samples.largest_terms(samples.runs.P)
     return compare_identities(below, np.nan_to_num(size), terms, BOUND_TOLERANCE, message)
 
 

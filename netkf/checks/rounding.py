@@ -37,11 +37,15 @@ def compare_identities(
     return find_identity(float(off[worst]) / unit, float(limit[worst]) / unit, message)
 
 
-def largest_so_far(P: FloatArray, start: FloatArray) -> FloatArray:
-    """Return the largest trace (R, K, N) that covariances P (R, K, N, n, n) have had at any node up
-    to each of the K times, ``start`` (N, n, n) included: messages carry one node's to another.
+def largest_terms(P: FloatArray, start: FloatArray, information: float = 0.0) -> FloatArray:
+    """Return the size (R, K, N) of the largest terms from which covariances P (R, K, N, n, n) were
+    computed.
+
+    They are the largest trace so far at any node, ``start`` (N, n, n) included, since messages
+    carry one node's covariance to another; and P^2 times ``information``, the norm of what all
+    readings of one instant say: P = (P_before^-1 + information)^-1 has the roundings of the sum.
     """
     traces = np.nan_to_num(np.trace(P, axis1=-2, axis2=-1), nan=0.0, posinf=0.0)
     first = float(np.trace(start, axis1=-2, axis2=-1).max())
     until = np.maximum.accumulate(traces.max(axis=2, initial=first), axis=1)
-    return np.asarray(np.broadcast_to(until[..., None], traces.shape))
+    return np.asarray(np.maximum(until[..., None], information * traces**2))

@@ -12,7 +12,7 @@ import numpy as np
 from netkf.checks.evidence import Finding, find_nothing, find_unknown
 from netkf.checks.laws import NEES_TOLERANCE, Pair, compare_chi_square, compare_growth
 from netkf.checks.points import check_slots, check_times, sampled_nodes
-from netkf.checks.rounding import compare_identities, largest_so_far
+from netkf.checks.rounding import compare_identities, largest_terms
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
@@ -75,6 +75,13 @@ class RunSamples:
         """P(0) (N', n, n) of all N' nodes of the network."""
         return np.array([self.scenario.start(node)[1] for node in self.scenario.nodes])
 
+    def largest_terms(self, P: FloatArray) -> FloatArray:
+        """Return the sizes (R, K, N) of the terms of covariances P (R, K, N, n, n), whose roundings
+        these have.
+        """
+        information = float(np.linalg.norm(self.scenario.node_infos[0].information, 2))
+        return largest_terms(P, self.first_covariances, information)
+
     @property
     def time_labels(self) -> list[str]:
         """Labels of the K times."""
@@ -111,7 +118,7 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
         f"{gap.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
-    terms = largest_so_far(expected, samples.first_covariances)
+    terms = samples.largest_terms(expected)
     return compare_identities(gap, size, terms, REPLAY_TOLERANCE, message)
 
 
