@@ -82,6 +82,7 @@ class ClockTrial(Trial):
             self._pass(shift=k == SHIFTED)
             if self.part.talks:
                 self._exchange(k, quiet=k % 2 == 0)
+            self.end()
 
     def _composes(self, node: int) -> None:
         watched, state = self.watched, self.states[node]

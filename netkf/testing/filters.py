@@ -11,6 +11,7 @@ from netkf.algorithms.filter import CLOCKS, Filter, commutes
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.slot import SlotFilter
 from netkf.linalg.arrays import FloatArray
+from netkf.testing.parents import check_parent
 from netkf.testing.shifts import all_trials, check_shift
 from netkf.testing.watching import Watched, demand, made
 
@@ -22,7 +23,7 @@ FLAGS = (
 )
 
 
-def check_filter(filter: Any, /, **settings: Any) -> None:
+def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings: Any) -> None:
     """Check a filter, or a class with its ``settings``, against its contract on small random
     systems of one to three states, in slots and under each clock that the class says it knows.
 
@@ -34,6 +35,15 @@ def check_filter(filter: Any, /, **settings: Any) -> None:
     absorbed. What ``conserved`` names is conserved by an exchange without losses. A class that
     defines ``shift`` does the same with shifted data, shifted. FlowFilter and SlotFilter classes
     are checked through their adapters.
+
+    A class that derives from a built-in filter and overrides anything (methods, class variables,
+    weights, the first slot, private helpers) runs beside that filter, with the same settings, on
+    the same readings and messages, in slots and under the clocks that both know. Estimates and
+    covariances that differ by more than 1e-6 of their size are told, with the attributes that are
+    its own: as AssertionError where the class only adjusts its parent, and as UserWarning where it
+    defines one of ``init``, ``predict``, ``update``, ``emit``, ``absorb``, ``estimate`` itself,
+    which may be by design. ``same_as_parent=False`` says that it is by design, and nothing is
+    compared; ``same_as_parent=True`` makes every difference an AssertionError.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
@@ -52,6 +62,8 @@ def check_filter(filter: Any, /, **settings: Any) -> None:
     if commutes(hosted):
         check_shift(watched, plain)
     watched.finish()
+    if isinstance(part, Filter):
+        check_parent(watched, same_as_parent)
 
 
 def former_names(hosted: Filter) -> dict[str, str]:

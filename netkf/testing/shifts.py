@@ -48,7 +48,7 @@ def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
     # The shift itself shows each node once more.
     moved = [shown for shown in shifted.shown if shown.after != "shift"]
     for one, other in zip(plain.shown, moved, strict=True):
-        for name, apart, size in _differences(one, other):
+        for name, apart, size in differences(one, other):
             demand(
                 apart <= ROUNDING * size,
                 f"{watched.name}.shift",
@@ -59,7 +59,8 @@ def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
             )
 
 
-def _differences(one: CheckedEstimate, other: CheckedEstimate) -> list[tuple[str, float, float]]:
+def differences(one: CheckedEstimate, other: CheckedEstimate) -> list[tuple[str, float, float]]:
+    """Return for xhat and P by how much two estimates differ, and the size of their entries."""
     found = [("xhat", _apart(one.xhat, other.xhat), 1.0 + one.size + other.size)]
     if one.P is not None and other.P is not None:
         found.append(("P", _apart(one.P, other.P), 1.0 + float(np.abs(one.P).max())))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from netkf.algorithms.filter import Exchange, Message
 from netkf.algorithms.models import SlotModel
 from netkf.testing.trials import Trial
@@ -11,8 +13,17 @@ SHIFTED = 3
 PERIOD = 1.0
 
 
+def slots_of(part: Any) -> int:
+    """Return the number of slots of a trial: some with exchanges."""
+    return min(int(part.first_slot), MOST_WAIT) + SLOTS
+
+
 class SlotTrial(Trial):
-    """The schedule for a few slots; everything is lost in the last one."""
+    """The schedule for a few slots (``slots`` of them if it is not 0); everything is lost in the
+    last one.
+    """
+
+    slots = 0
 
     def model(self, sees: bool) -> SlotModel:
         """Slots of one second."""
@@ -20,13 +31,14 @@ class SlotTrial(Trial):
 
     def run(self) -> None:
         """Slot after slot, from just before nodes exchange."""
-        part, slots = self.part, min(self.part.first_slot, MOST_WAIT) + SLOTS
+        part, slots = self.part, self.slots or slots_of(self.part)
         for slot in range(slots):
             if part.predicts and slot == slots - SHIFTED:
                 self.shift()
             self._slot(slot, lost=slot == slots - 1)
             if not part.predicts and slot == slots - SHIFTED:
                 self.shift()
+            self.end()
 
     def _slot(self, slot: int, lost: bool) -> None:
         part, phase = self.part, 0

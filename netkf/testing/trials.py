@@ -41,6 +41,9 @@ class Trial(ABC):
         self.watched, self.part, self.system = watched, watched.part, system
         self.random = Streams(0).generator("testing")
         self.shown: list[CheckedEstimate] = []
+        self.ends: list[dict[int, CheckedEstimate]] = []
+        """The estimate of each node at the end of each slot, or of each round under clocks."""
+        self._last: dict[int, CheckedEstimate] = {}
         self._shift = shift
         self.offset = np.zeros(len(system.M))
         """The present shift of the truth (n,)."""
@@ -71,7 +74,12 @@ class Trial(ABC):
         """Check what the node shows and keep it."""
         xhat, P = check_estimate(self.watched, state, len(self.system.M), after)
         size = float(np.abs(xhat).max())
-        self.shown.append(CheckedEstimate(node, after, xhat - self.offset, P, size))
+        self._last[node] = CheckedEstimate(node, after, xhat - self.offset, P, size)
+        self.shown.append(self._last[node])
+
+    def end(self) -> None:
+        """Keep the present estimates as those at the end of a slot or round."""
+        self.ends.append(dict(self._last))
 
     def step(self, node: int, method: str, *arguments: Any, shown: bool = True) -> None:
         """Call a method that returns the node's next state."""

@@ -188,3 +188,129 @@ class Wakes(LinkClock):
 class Late(LinkClock):
     def ticks(self, link, origin, index, now, random, count):
         return np.array([1.0, math.inf])
+
+
+NUMBERS = {}
+
+
+@says(CHANNELS, "OneWorse.delivery_probability: must be the same for links with eq", delivery=0.8)
+class OneWorse(Bernoulli):
+    def delivery_probability(self, link, message, bad, table_probability):
+        return 0.75 if link == (2, 3) else self.delivery
+
+
+@says(CHANNELS, "BackWorse.mean_delivery: must be the delivered fraction", delivery=0.8)
+class BackWorse(Bernoulli):
+    """One direction loses more than it says."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return 0.77 if link == (3, 1) else self.delivery
+
+    def mean_delivery(self, link, table_probability):
+        return self.delivery
+
+
+@says(CHANNELS, "Slightly.mean_delivery: must be the delivered fraction", delivery=0.8)
+class Slightly(Bernoulli):
+    """All links lose one percent more than they say."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return self.delivery - 0.01
+
+    def mean_delivery(self, link, table_probability):
+        return self.delivery
+
+
+@says(CHANNELS, "AllAtOnce.independent: must be False where outcomes of different", delivery=0.8)
+class AllAtOnce(Bernoulli):
+    """All links lose the same messages, by their numbers."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return 0.0 if (message * 2654435761) % 5 == 0 else 1.0
+
+    def mean_delivery(self, link, table_probability):
+        return 0.8
+
+
+@says(
+    CHANNELS,
+    "Coupled.delivery_probability: must give the same for the same arguments",
+    delivery=0.8,
+)
+class Coupled(Bernoulli):
+    def delivery_probability(self, link, message, bad, table_probability):
+        last, NUMBERS["last"] = NUMBERS.get("last"), (link, message)
+        return self.delivery if last in (None, (link, message)) else 0.9 * self.delivery
+
+
+@says(CHANNELS, "Ignores.mean_delivery: must be the delivered fraction")
+class Ignores(Loss):
+    """The entry of the table counts for the mean only."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return 0.8
+
+    def mean_delivery(self, link, table_probability):
+        return table_probability
+
+
+@says(CHANNELS, "Ordered.draw: ")
+class Ordered(Delay):
+    def draw(self, random):
+        NUMBERS[id(random)] = 0.5 * NUMBERS.get(id(random), 0.5) + 0.5 * random.random()
+        return NUMBERS[id(random)]
+
+
+@says(CHANNELS, "OneSlow.message_delay: must be from 0 to `longest` (1) seconds")
+class OneSlow(Delay):
+    @property
+    def longest(self):
+        return 1.0
+
+    def draw(self, random):
+        return random.random()
+
+    def message_delay(self, link, message, drawn):
+        return 2.0 if link == (3, 2) else drawn
+
+
+@says(CLOCKS, "OneSlower.mean_rate: must be the mean ticks per second", rate=2.0)
+class OneSlower(Poisson):
+    def ticks(self, link, origin, index, now, random, count):
+        slow = 1.1 if link == (2, 3) else 1.0
+        return np.add.accumulate([now, *(slow * random.standard_exponential(count) / self.rate)])[
+            1:
+        ]
+
+
+@says(CLOCKS, "Unstated.mean_rate: must be the mean ticks per second")
+class Unstated(LinkClock):
+    def ticks(self, link, origin, index, now, random, count):
+        slow = 1.1 if link == (2, 3) else 1.0
+        return np.add.accumulate([now, *(slow * random.standard_exponential(count))])[1:]
+
+
+@says(CLOCKS, "Waits.ticks: ticks of a link must not depend on those of others", rate=2.0)
+class Waits(Poisson):
+    """Links wait for each other."""
+
+    def ticks(self, link, origin, index, now, random, count):
+        start = NUMBERS.get("tick", (link, 0.0))
+        times = np.add.accumulate([now, *(random.standard_exponential(count) / self.rate)])[1:]
+        NUMBERS["tick"] = (link, times[-1])
+        return times if start[0] == link or count > 1 else times + 0.01
+
+
+@says(CLOCKS, "OneSeed.ticks: must draw from the generator given", rate=2.0)
+class OneSeed(Poisson):
+    def ticks(self, link, origin, index, now, random, count):
+        fixed = np.random.default_rng(4).standard_exponential(2000)[index : index + count]
+        return np.add.accumulate([now, *(fixed / self.rate)])[1:]
+
+
+@says(CLOCKS, "Even.memoryless: must be False where ticks are no Poisson process", rate=2.0)
+class Even(Poisson):
+    """Gaps of a gamma law of shape 1.1."""
+
+    def ticks(self, link, origin, index, now, random, count):
+        return np.add.accumulate([now, *(random.standard_gamma(1.1, count) / 2.2)])[1:]

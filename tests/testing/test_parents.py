@@ -1,0 +1,170 @@
+"""check_filter runs a class beside the built-in filter that it derives from."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from netkf import parts
+from netkf.testing import check_filter
+from netkf.testing.parents import check_parent, overridden_attributes
+from netkf.testing.watching import Watched
+
+ADJUSTED, DEFINED, SAME = {}, {}, {}
+
+
+def keep(table, words="", **settings):
+    def add(cls):
+        made = dataclass(frozen=True, eq=False)(cls)
+        table[made.__name__] = (made, settings, words)
+        return made
+
+    return add
+
+
+@keep(ADJUSTED, "Heavier.weight: must have the numbers of Hybrid", epsilon=0.3)
+class Heavier(parts.Hybrid):
+    def weight(self, degree, peer_degree):
+        return 1.02 * super().weight(degree, peer_degree)
+
+
+@keep(ADJUSTED, "Averse._pairs: must have the numbers of Hybrid", epsilon=0.3)
+class Averse(parts.Hybrid):
+    """A private helper that makes messages count less."""
+
+    def _pairs(self, state, messages):
+        return super()._pairs(state, [m._replace(weight=0.9 * m.weight) for m in messages])
+
+
+@keep(ADJUSTED, "LateStart.first_slot: must have the numbers of Gossip")
+class LateStart(parts.Gossip):
+    first_slot = 3
+
+
+@keep(ADJUSTED, "Everyone.pairwise: must have the numbers of Gossip")
+class Everyone(parts.Gossip):
+    pairwise = False
+
+
+@keep(ADJUSTED, "Unfair.share: must have the numbers of DiffusionFilter")
+class Unfair(parts.DiffusionFilter):
+    def share(self, own, arrived):
+        own, given = super().share(own, arrived)
+        return own + 0.1 * sum(given), [0.9 * weight for weight in given]
+
+
+@keep(ADJUSTED, "Forgetful._learned: must have the numbers of PushSum", gamma=3, delta=4.0)
+class Forgetful(parts.PushSum):
+    def _learned(self, state, before, whole):
+        new = super()._learned(state, before, whole)
+        return new._replace(mass=before) if hasattr(new, "mass") else new
+
+
+@keep(ADJUSTED, "Deaf.accepts: must have the numbers of CovarianceIntersection", epsilon=0.25)
+class Deaf(parts.CovarianceIntersection):
+    def accepts(self, payload, age):
+        return age == 0.0
+
+
+@keep(DEFINED, "its own: absorb", epsilon=0.3)
+class Half(parts.Hybrid):
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages[:1], exchange)
+
+    def shift(self, state, offset):
+        return super().shift(state, offset)
+
+
+@keep(DEFINED, "its own: init", epsilon=0.3)
+class Sure(parts.Hybrid):
+    def init(self, model, mean, cov, node):
+        return super().init(model, mean, 0.9 * cov, node)
+
+    def shift(self, state, offset):
+        return super().shift(state, offset)
+
+
+@keep(SAME, epsilon=0.3)
+class Renamed(parts.Hybrid):
+    """Nothing but a name."""
+
+
+@keep(SAME, epsilon=0.3)
+class OneClock(parts.Hybrid):
+    clocks = ("nodes",)
+
+    def scenario_notes(self, scenario):
+        return ("by nodes",)
+
+
+@keep(SAME, epsilon=0.3)
+class Rewritten(parts.Hybrid):
+    """The same update in the form of covariances."""
+
+    def update(self, state, reading):
+        if isinstance(reading, parts.Increments) or not len(reading.y):
+            return super().update(state, reading)
+        P = state.root @ state.root.T
+        S = reading.H @ P @ reading.H.T + reading.R
+        K = np.linalg.solve(S, reading.H @ P).T
+        P = P - K @ S @ K.T
+        xhat = state.xhat + K @ (reading.y - reading.H @ state.xhat)
+        return state._replace(xhat=xhat, root=np.linalg.cholesky(0.5 * (P + P.T)))
+
+    def shift(self, state, offset):
+        return super().shift(state, offset)
+
+
+@keep(SAME)
+class OtherWeights(parts.Gossip):
+    """Weights mean nothing to gossip."""
+
+    def weight(self, degree, peer_degree):
+        return 0.01
+
+
+def compare(cls, settings, same_as_parent=None):
+    return check_parent(Watched(cls(**settings)), same_as_parent)
+
+
+@pytest.mark.parametrize("name", ADJUSTED)
+def test_an_adjustment_that_changes_numbers_is_named(name):
+    cls, settings, words = ADJUSTED[name]
+    with pytest.raises(AssertionError) as caught:
+        compare(cls, settings)
+    text = str(caught.value)
+    assert text.startswith(words)
+    assert "same_as_parent=False" in text
+    assert "\n" not in text
+    assert compare(cls, settings, same_as_parent=False) is None
+
+
+@pytest.mark.parametrize("name", DEFINED)
+def test_a_step_that_differs_is_told_and_accused_where_it_should_be_the_same(name):
+    cls, settings, words = DEFINED[name]
+    with pytest.warns(UserWarning, match=words):
+        compare(cls, settings)
+    with pytest.raises(AssertionError, match="must have the numbers of Hybrid"):
+        compare(cls, settings, same_as_parent=True)
+    assert compare(cls, settings, same_as_parent=False) is None
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_equal_numbers_pass_silently(name):
+    cls, settings, _ = SAME[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert compare(cls, settings, same_as_parent=True) is None
+
+
+def test_check_filter_compares_with_the_parent():
+    with pytest.raises(AssertionError, match=r"LateStart.first_slot: must have the numbers of Gos"):
+        check_filter(LateStart)
+    assert check_filter(LateStart, same_as_parent=False) is None
+
+
+def test_attributes_of_its_own_are_listed_without_fields_and_new_names():
+    assert overridden_attributes(OneClock, parts.Hybrid) == ["clocks", "scenario_notes"]
+    assert overridden_attributes(Averse, parts.Hybrid) == ["_pairs"]
+    assert overridden_attributes(Renamed, parts.Hybrid) == []
