@@ -20,6 +20,7 @@ from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.samples import PoissonSamples
 
 NO_INFORMATION = 1e-15  # eigenvalues of G, its diagonal made 1, that are rounding
+MAX_PRODUCTS = 1 << 20  # entries of gains times unit matrices at once
 ELIMINATION_WORK = 3e9  # multiplications up to which elimination is taken
 
 
@@ -168,10 +169,14 @@ class PackedRiccati:
         P minimises the right-hand side over gains, so that their change has no first-order effect.
         """
         # (A - P G) X + X (A - P G)' without the arrivals, as a matrix on rows
-        K = P @ self.equations.G
-        change = -(K[:, None] @ self._basis)
-        blocks = self.pack(change + np.swapaxes(change, -1, -2)) + self._own
-        blocks = blocks - self.leaving[:, None, None] * np.eye(self.m)
+        blocks = np.tile(self._own, (len(P), 1, 1))
+        # In parts: the products of all nodes take 278 MB at 1000 nodes and n = 16.
+        parts = -(-len(self._sensed) * self._basis.size // MAX_PRODUCTS)
+        for nodes in np.array_split(self._sensed, max(1, parts)):
+            K = P[nodes] @ self.equations.G[nodes]
+            change = -(K[:, None] @ self._basis)
+            blocks[nodes] += self.pack(change + np.swapaxes(change, -1, -2))
+        blocks -= self.leaving[:, None, None] * np.eye(self.m)
         heard = [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
         for group in self.equations.samples:
             _, closed = group.update_gains(P)
