@@ -15,9 +15,9 @@ from netkf.algorithms.kernels.slots import (
     SlotRoom,
     SlotSamples,
     predict,
+    read_all,
     rebase,
     show,
-    use_reading,
 )
 from netkf.algorithms.registry import built_in
 from netkf.linalg.compiling import kernel
@@ -33,16 +33,13 @@ def local_slots(
     room: SlotRoom,
 ) -> None:
     """Carry filters that never talk through the slots of a plan: predict, then update."""
-    H = len(nodes.rows)
-    for s in range(plan.up.shape[1]):
-        if plan.sensed[s]:
-            predict(nodes, room)
-        for r in range(plan.up.shape[0]):
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                for h in range(H):
-                    use_reading(nodes, r * H + h, readings, r, s, h, room.update)
-            show(nodes, plan, samples, r, s)
-            rebase(nodes, readings, r, s)
+                predict(nodes, room, b)
+                read_all(nodes, readings, room, b, s)
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
 
 
 @built_in("local")

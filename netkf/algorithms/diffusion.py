@@ -10,13 +10,13 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo
-from netkf.algorithms.kernels.root_update import (
-    begin_intersection,
-    end_intersection,
-    intersect_roots,
-    invert_root,
-    merge_information,
+from netkf.algorithms.kernels.intersection import (
+    finish_lanes,
+    invert_lanes,
+    merge_lanes,
+    whiten,
 )
+from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
@@ -25,9 +25,9 @@ from netkf.algorithms.kernels.slots import (
     SlotRoom,
     SlotSamples,
     predict,
+    read_all,
     rebase,
     show,
-    use_reading,
 )
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
@@ -35,6 +35,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, either, field, nested, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, spread, store
 
 METROPOLIS = "metropolis"
 
@@ -57,26 +58,35 @@ class DiffusionState(NamedTuple):
 
 class DiffusionWeights(NamedTuple):
     """What filters give themselves when all messages arrive, ``own`` (H,), and whether they keep
-    the weight of messages that do not; ``inverse`` (H, n, n) is scratch.
+    the weight of messages that do not.
     """
 
     own: FloatArray
     keep_own: bool
-    inverse: FloatArray
 
 
 @kernel(inlined=True)
-def effective_weights(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
+def effective_weights(lanes: Lanes, own: float, heard: Any, keep_own: bool) -> tuple[Any, Any]:
     """Return the own weight and the divisor of the others, so that all of them sum to 1.
 
     ``own`` and ``heard`` are the nominal own weight and the sum of those of the messages that
     arrived, see ``DiffusionFilter.on_loss``.
     """
-    total = own + heard
+    total, rest = own + heard, 1.0 - heard
+    rest = select(rest > 0.0, rest, 0.0)
     # "keep-own", or no weight at all: the own weight is what the others leave.
-    if keep_own or total == 0.0:
-        return max(0.0, 1.0 - heard), 1.0
-    return own / total, total
+    nothing = total == 0.0
+    divisor = select(nothing, spread(lanes, 1.0), total)
+    if keep_own:
+        return rest, spread(lanes, 1.0)
+    return select(nothing, rest, own / divisor), divisor
+
+
+@kernel
+def weights_of_one(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
+    """``effective_weights`` of one filter with one lane."""
+    found: tuple[float, float] = effective_weights(ONE, own, heard, keep_own)
+    return found
 
 
 @kernel
@@ -90,85 +100,58 @@ def diffusion_slots(
     weights: DiffusionWeights,
 ) -> None:
     """Carry diffusion filters through the slots of a plan, D (6)-(9)."""
-    H = len(nodes.rows)
-    for s in range(plan.up.shape[1]):
-        for r in range(plan.up.shape[0]):
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, r, s)
-            rebase(nodes, readings, r, s)
-            for h in range(H if plan.sensed[s] else 0):
-                use_reading(nodes, r * H + h, readings, r, s, h, room.update)
-        # All filters of all runs have used their readings by now: predict them together.
-        if plan.sensed[s]:
-            predict(nodes, room)
-        for r in range(plan.up.shape[0]):
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
+            if plan.sensed[s]:
+                read_all(nodes, readings, room, b, s)
+                predict(nodes, room, b)
             if plan.exchanged[s]:
-                # Copies and inverse roots of all before any is combined: everyone combines what was
-                # sent.
-                for h in range(H):
-                    copy_estimate(nodes, r * H + h, room, h)
-                    # Once for each sender, however many hear it.
-                    invert_root(weights.inverse[h], nodes.root, r * H + h, 1.0)
-                for h in range(H):
-                    combine(nodes, plan, links, room, weights, r, s, h)
+                # Everyone combines what was sent: estimates and inverse roots, once for each sender
+                # however many hear it.
+                for h in range(len(nodes.rows)):
+                    for i in range(nodes.xhat.shape[2]):
+                        store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
+                    invert_lanes(room.lanes, room.root, nodes.root, b, h)
+                for h in range(len(nodes.rows)):
+                    combine(nodes, plan, links, room, weights, b, s, h)
 
 
-@kernel(inlined=True)
-def copy_estimate(nodes: SlotNodes, place: int, room: SlotRoom, h: int) -> None:
-    """Keep the estimate of a place as what filter ``h`` sends."""
-    for i in range(nodes.xhat.shape[1]):
-        room.xhat[h, i] = nodes.xhat[place, i]
-
-
-@kernel(inlined=True)
+@kernel
 def combine(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,
     room: SlotRoom,
     weights: DiffusionWeights,
-    r: int,
+    b: int,
     s: int,
     h: int,
 ) -> None:
-    """Intersect what filter ``h`` has with what it hears, D (8) and (9)."""
-    heard = 0.0
+    """Intersect what filter ``h`` of a block has with what it hears, D (8) and (9)."""
+    lanes, heard = room.lanes, spread(room.lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        if plan.up[r, s, 0, links.way[m]] == 1:
-            heard += links.weight[m]
-    own, divisor = effective_weights(weights.own[h], heard, weights.keep_own)
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        heard += select(arrived, links.weight[m], 0.0)
+    own, divisor = effective_weights(lanes, weights.own[h], heard, weights.keep_own)
     # Weight 1: nothing heard counts, and the estimate stays to the last bit.
-    if own == 1.0:
+    if not any_lane(own != 1.0):
         return
-    begin_intersection(room.update)
     # The own term needs no merging: it is the first.
-    whiten(room.update.total, own, weights.inverse, h, h, room)
-    # A weight of 0 adds no information.
+    whiten(lanes, room.total, own, room.root, room.xhat, h, h)
     for m in range(links.first[h], links.first[h + 1]):
-        if plan.up[r, s, 0, links.way[m]] == 1 and links.weight[m] > 0.0:
-            weight = links.weight[m] / divisor
-            whiten(room.update.whitened, weight, weights.inverse, links.sender[m], h, room)
-            merge_information(room.update.total, room.update.whitened)
-    place = r * len(nodes.rows) + h
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        # A weight of 0 adds no information.
+        if links.weight[m] > 0.0 and any_lane(arrived):
+            weight = select(arrived, links.weight[m] / divisor, 0.0)
+            whiten(lanes, room.whitened, weight, room.root, room.xhat, links.sender[m], h)
+            merge_lanes(lanes, room.total, room.whitened)
     # P = (sum w P^-1)^-1 and the mean, D (8) and (9).
-    end_intersection(nodes.root, nodes.xhat, place, room.xhat, h, room.update)
-
-
-@kernel(inlined=True)
-def whiten(
-    out: FloatArray, weight: float, inverse: FloatArray, sender: int, h: int, room: SlotRoom
-) -> None:
-    """Write the root of ``weight`` times the information that ``sender`` sends into ``out``
-    (n, n + 1); means, in its last column, count from what filter ``h`` had.
-    """
-    n, size = inverse.shape[1], math.sqrt(weight)
-    for i in range(n):
-        mean = 0.0
-        # sqrt(w) S^-1, a root of w P^-1.
-        for j in range(i + 1):
-            out[i, j] = size * inverse[sender, i, j]
-            mean += out[i, j] * (room.xhat[sender, j] - room.xhat[h, j])
-        out[i, n] = mean
+    finish_lanes(
+        lanes, nodes.root, nodes.xhat, b, h, room.xhat, room.total, room.whitened, own == 1.0
+    )
 
 
 @built_in("diffusion")
@@ -208,8 +191,7 @@ class DiffusionFilter(Filter):
     ) -> tuple[DiffusionWeights]:
         """The weights of the nodes."""
         own = np.array([info.own_weight for info in infos], dtype=np.float64)
-        n = len(states[0].xhat)
-        return (DiffusionWeights(own, self.on_loss == "keep-own", np.zeros((len(own), n, n))),)
+        return (DiffusionWeights(own, self.on_loss == "keep-own"),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -268,5 +250,5 @@ class DiffusionFilter(Filter):
         ones.
         """
         # fsum: the sum must not depend on the order of messages.
-        kept, divisor = effective_weights(own, math.fsum(arrived), self.on_loss == "keep-own")
+        kept, divisor = weights_of_one(own, math.fsum(arrived), self.on_loss == "keep-own")
         return kept, [weight / divisor for weight in arrived]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.kernels.slots import (
@@ -15,12 +15,13 @@ from netkf.algorithms.kernels.slots import (
     SlotRoom,
     SlotSamples,
     predict,
+    read_all,
     rebase,
     show,
-    use_reading,
 )
 from netkf.algorithms.registry import built_in
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import any_lane, load, load_flags, select, store
 
 
 @kernel
@@ -33,44 +34,48 @@ def gossip_slots(
     room: SlotRoom,
 ) -> None:
     """Carry gossip filters through the slots of a plan, G (10)."""
-    H = len(nodes.rows)
-    for s in range(plan.up.shape[1]):
-        for r in range(plan.up.shape[0]):
-            show(nodes, plan, samples, r, s)
-            rebase(nodes, readings, r, s)
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            # Samples show predictions: before the reading of the slot.
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
             if plan.exchanged[s]:
-                swap_pairs(nodes, plan, links, room, r, s)
+                swap_pairs(nodes, plan, links, room, b, s)
             if plan.sensed[s]:
-                for h in range(H):
-                    use_reading(nodes, r * H + h, readings, r, s, h, room.update)
-        if plan.sensed[s]:
-            predict(nodes, room)
+                read_all(nodes, readings, room, b, s)
+                predict(nodes, room, b)
+
+
+@kernel
+def swap_pairs(
+    nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, room: SlotRoom, b: int, s: int
+) -> None:
+    """Put what each node hears in place of its own pair, of several the last sender's."""
+    lanes, n = room.lanes, nodes.xhat.shape[2]
+    # All payloads are from before the exchange.
+    for h in range(len(nodes.rows)):
+        for i in range(n):
+            store(lanes, room.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
+            for j in range(i + 1):
+                store(lanes, room.root, h, i, j, load(lanes, nodes.root, b, h, i, j))
+    for h in range(len(nodes.rows)):
+        for m in range(links.first[h], links.first[h + 1]):
+            heard = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+            # Most links are idle in a matching of a single run.
+            if any_lane(heard):
+                take_pair(nodes, room, b, h, links.sender[m], heard)
 
 
 @kernel(inlined=True)
-def swap_pairs(
-    nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, room: SlotRoom, r: int, s: int
-) -> None:
-    """Put what each node hears in place of its own pair, of several the last sender's."""
-    H, n = len(nodes.rows), nodes.xhat.shape[1]
-    for write in (False, True):  # all payloads are from before the exchange
-        for h in range(H):
-            source = -1
-            for m in range(links.first[h], links.first[h + 1]):
-                if plan.up[r, s, 0, links.way[m]] == 1:
-                    source = links.sender[m]
-            if source < 0:
-                continue
-            for i in range(n):
-                if write:
-                    nodes.xhat[r * H + h, i] = room.xhat[h, i]
-                else:
-                    room.xhat[h, i] = nodes.xhat[r * H + source, i]
-                for j in range(i + 1):
-                    if write:
-                        nodes.root[r * H + h, i, j] = room.root[h, i, j]
-                    else:
-                        room.root[h, i, j] = nodes.root[r * H + source, i, j]
+def take_pair(nodes: SlotNodes, room: SlotRoom, b: int, h: int, sender: int, heard: Any) -> None:
+    """Copy what ``sender`` sent to filter ``h`` in the lanes that ``heard`` it."""
+    lanes = room.lanes
+    for i in range(nodes.xhat.shape[2]):
+        own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, room.xhat, sender, i)
+        store(lanes, nodes.xhat, b, h, i, select(heard, sent, own))
+        for j in range(i + 1):
+            own, sent = load(lanes, nodes.root, b, h, i, j), load(lanes, room.root, sender, i, j)
+            store(lanes, nodes.root, b, h, i, j, select(heard, sent, own))
 
 
 @built_in("gossip")

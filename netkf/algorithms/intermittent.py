@@ -25,6 +25,7 @@ from netkf.algorithms.registry import built_in
 from netkf.core.fields import choice, field, positive
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import any_lane, load_flags
 
 SLACK = 1.0 + 1e-6
 """Ages are rounded."""
@@ -76,22 +77,36 @@ def intermittent_slots(
     room: SlotRoom,
 ) -> None:
     """Carry intermittent filters through the slots of a plan, R (15)-(18)."""
-    H = len(nodes.rows)
-    for s in range(plan.up.shape[1]):
-        for r in range(plan.up.shape[0]):
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, r, s)
-            rebase(nodes, readings, r, s)
-            for h in range(H if plan.sensed[s] else 0):
-                use_reading(nodes, r * H + h, readings, r, s, h, room.update)
-                # Readings of others are used one after the other: with independent noise that
-                # equals one update.
-                for m in range(links.first[h], links.first[h + 1]):
-                    if plan.up[r, s, 0, links.way[m]] == 1:
-                        use_reading(nodes, r * H + h, readings, r, s, links.sender[m], room.update)
-        if plan.sensed[s]:
-            # R (15): all filters of all runs at once.
-            predict(nodes, room)
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
+            if plan.sensed[s]:
+                for h in range(len(nodes.rows)):
+                    use_readings(nodes, readings, plan, links, room, b, s, h)
+                predict(nodes, room, b)
+
+
+@kernel
+def use_readings(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    room: SlotRoom,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Update filter ``h`` of a block with its own reading and those that arrive."""
+    use_reading(nodes, readings, room, b, s, h, h, True)
+    # Readings of others are used one after the other: with independent noise that equals one
+    # update.
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(room.lanes, plan.up, b, s, 0, links.way[m])
+        if any_lane(arrived):
+            use_reading(nodes, readings, room, b, s, h, links.sender[m], arrived)
 
 
 @built_in("intermittent")

@@ -20,12 +20,13 @@ from netkf.algorithms import running_sums
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.mass import (
     add_gain,
+    average,
     correct_root,
     keep_share,
     learn_network,
     split_mass,
 )
-from netkf.algorithms.kernels.root_update import lower_root, update_scratch
+from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
@@ -37,9 +38,10 @@ from netkf.algorithms.kernels.slots import (
     predict_mean,
     rebase,
     show,
+    slot_room,
     whitened,
 )
-from netkf.algorithms.kernels.stopping import PAPER, RULES, has_stopped
+from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, has_stopped
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
@@ -47,6 +49,19 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, choice, field, integer, number, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    LANES,
+    ONE,
+    aligned,
+    any_lane,
+    blocks_of,
+    in_lanes,
+    load,
+    load_flags,
+    select,
+    spread,
+    store,
+)
 
 MASS, AVERAGE = 0, 1
 """The two exchanges of a slot."""
@@ -88,11 +103,12 @@ class PushSumState(NamedTuple):
 
 
 class PushSumArrays(NamedTuple):
-    """Mass (R H, m) and nominal ``degree`` (H,) of the nodes; what they take the network to be,
-    ``information`` (R H, n, n) and ``number`` (R H,); the information of a node ``alone``
+    """Mass (B, H, m, L) and nominal ``degree`` (H,) of the nodes; what they take the network to be,
+    ``information`` (B, H, n, n, L) and ``number`` (B, H, L); the information of a node ``alone``
     (H, n, n); the settings, and the root of P_inf, ``limit`` (n, n), with asymptotic gains.
 
-    Scratch: ``share`` (H, m), ``before`` (m,), ``found`` (1, n, n), ``found_number`` (1,).
+    Scratch: ``share`` (H, m, L), ``before`` (m, L), ``found`` (n, n, L), ``found_number`` (1, L),
+    ``silent`` (L,); of one lane ``stop``.
     """
 
     mass: FloatArray
@@ -110,6 +126,22 @@ class PushSumArrays(NamedTuple):
     before: FloatArray
     found: FloatArray
     found_number: FloatArray
+    silent: np.ndarray
+    stop: StopRoom
+
+
+class StopRoom(NamedTuple):
+    """What ``has_stopped`` compares, of one lane: ``mass`` (1, m) and mass ``before`` (m,),
+    information ``found`` and ``former`` (1, n, n), numbers (1,) of both, scratch (n, n).
+    """
+
+    mass: FloatArray
+    before: FloatArray
+    found: FloatArray
+    number: FloatArray
+    former: FloatArray
+    former_number: FloatArray
+    work: FloatArray
 
 
 @kernel
@@ -123,30 +155,38 @@ def push_sum_slots(
     arrays: PushSumArrays,
 ) -> None:
     """Carry push-sum filters through the slots of a plan, P Fig. 1."""
-    H = len(nodes.rows)
-    for s in range(plan.up.shape[1]):
-        # Step 3: with asymptotic gains the covariance is the limit, and only the mean is predicted.
-        if plan.sensed[s] and not arrays.asymptotic:
-            predict(nodes, room)
-        for r in range(plan.up.shape[0]):
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            # Step 3: with asymptotic gains the covariance is the limit, and only the mean is
+            # predicted.
+            if plan.sensed[s] and not arrays.asymptotic:
+                predict(nodes, room, b)
             # Step 2 before the correction, so that the gain uses what the mass of this slot says.
             if plan.exchanged[s] and not arrays.asymptotic:
-                exchange_mass(arrays, plan, links, samples, room, r, s)
+                exchange_mass(arrays, plan, links, samples, room, b, s)
             if plan.sensed[s]:
-                for h in range(H):
-                    correct(nodes, readings, room, arrays, r, s, h)
+                for h in range(len(nodes.rows)):
+                    correct(nodes, readings, room, arrays, b, s, h)
             if plan.exchanged[s]:
-                for step in range(arrays.gamma):
+                for step in range(1, 1 + arrays.gamma):
                     # Row 0 of ``up`` is the exchange of mass; averaging has the rows after it.
-                    up = plan.up[r, s, 1 + step]
-                    average(nodes.xhat, r * H, links, up, room.xhat, arrays.delta)
+                    average(
+                        room.lanes, nodes.xhat, b, links, plan.up, s, step, room.xhat,
+                        1.0 / arrays.delta,
+                    )  # fmt: skip
             if plan.sample[s] >= 0:
-                # Conserved over the network: the weight sums to 1, and n~ to N.
-                for h in range(H):
-                    samples.conserved[r, h, 0] = arrays.mass[r * H + h, 0]
-                    samples.conserved[r, h, 1] = arrays.mass[r * H + h, 1]
-            show(nodes, plan, samples, r, s)
-            rebase(nodes, readings, r, s)
+                keep_sums(arrays, samples, room, b)
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
+
+
+@kernel
+def keep_sums(arrays: PushSumArrays, samples: SlotSamples, room: SlotRoom, b: int) -> None:
+    """Write what the nodes hold of the sums over the network: the weight, to 1, and n~, to N."""
+    for h in range(len(arrays.degree)):
+        for k in range(2):
+            value = load(room.lanes, arrays.mass, b, h, k)
+            store(room.lanes, samples.conserved, b, h, k, value)
 
 
 @kernel
@@ -156,78 +196,111 @@ def exchange_mass(
     links: SlotLinks,
     samples: SlotSamples,
     room: SlotRoom,
-    r: int,
+    b: int,
     s: int,
 ) -> None:
     """One exchange of mass, P steps 2.1 to 2.3."""
-    H = len(arrays.degree)
+    H, slot = len(arrays.degree), plan.first + s
     # All shares before any mass changes: everyone sends what it had at the start of the exchange.
     for h in range(H):
-        split_mass(arrays.mass, r * H + h, arrays.degree[h], arrays.share, h)
+        split_mass(room.lanes, arrays.mass, b, h, arrays.degree[h], arrays.share)
     if arrays.rule == PAPER:  # nodes that have stopped send no mass
         # The same as a link that is down, so that receivers keep the mass conserved.
         for m in range(len(links.sender)):
-            if samples.stopped[r, links.sender[m]] < plan.first + s:
-                plan.up[r, s, 0, links.way[m]] = 0
+            for q in range(len(room.lanes)):
+                if samples.stopped[b, links.sender[m], q] < slot:
+                    plan.up[b, s, 0, links.way[m], q] = 0
     for h in range(H):
-        has_stopped = samples.stopped[r, h] < plan.first + s
-        if has_stopped and arrays.rule == PAPER:
-            # By the paper's rule a stopped node leaves the exchange altogether; its mass stays with
-            # it.
-            continue
-        received = mix_mass(arrays, plan, links, r, s, h)
-        # The safe rule goes on mixing, since other nodes still need its mass, but learns no more.
-        if has_stopped:
-            continue
-        if learn(arrays, r * H + h, h, received == arrays.degree[h], room.moved):
-            samples.stopped[r, h] = plan.first + s
+        for q in range(len(room.lanes)):
+            arrays.silent[q] = samples.stopped[b, h, q] < slot
+        received = mix_mass(arrays, plan, links, room, b, s, h)
+        learn(arrays, samples, room, b, h, received, slot)
 
 
-@kernel
+@kernel(inlined=True)
 def mix_mass(
-    arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, r: int, s: int, h: int
-) -> int:
+    arrays: PushSumArrays,
+    plan: SlotPlan,
+    links: SlotLinks,
+    room: SlotRoom,
+    b: int,
+    s: int,
+    h: int,
+) -> Any:
     """Take the mass that node ``h`` keeps and receives, P (3)-(5); return how many shares came."""
-    received, k, mass, share = 0, r * len(arrays.degree) + h, arrays.mass, arrays.share
+    lanes, mass, received = room.lanes, arrays.mass, spread(room.lanes, 0.0)
     # The mass before is kept for the stop rule.
-    for i in range(mass.shape[1]):
-        arrays.before[i], mass[k, i] = mass[k, i], 0.0
+    for i in range(mass.shape[2]):
+        store(lanes, arrays.before, i, load(lanes, mass, b, h, i))
+        store(lanes, mass, b, h, i, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        if plan.up[r, s, 0, links.way[m]] == 1:
-            received += 1
-            for i in range(mass.shape[1]):
-                mass[k, i] += share[links.sender[m], i]
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        received += select(arrived, 1.0, 0.0)
+        for i in range(mass.shape[2]):
+            share = select(arrived, load(lanes, arrays.share, links.sender[m], i), 0.0)
+            store(lanes, mass, b, h, i, load(lanes, mass, b, h, i) + share)
+    # By the paper's rule a stopped node leaves the exchange altogether; its mass stays with it. The
+    # safe rule goes on mixing, since other nodes still need its mass.
+    gone = load_flags(lanes, arrays.silent)
+    if arrays.rule == PAPER and any_lane(gone):
+        for i in range(mass.shape[2]):
+            now, before = load(lanes, mass, b, h, i), load(lanes, arrays.before, i)
+            store(lanes, mass, b, h, i, select(gone, before, now))
     # Its own share, once for itself and once for each share that did not come.
-    keep_share(mass, k, share, h, arrays.degree[h] + 1 - received)
+    times = (arrays.degree[h] + 1.0) - received
+    if arrays.rule != PAPER:
+        keep_share(lanes, mass, b, h, arrays.share, times, False)
+    else:
+        keep_share(lanes, mass, b, h, arrays.share, times, gone)
     return received
 
 
-@kernel
-def learn(arrays: PushSumArrays, k: int, h: int, whole: bool, work: FloatArray) -> bool:
-    """P (6) for the mass of place ``k``, a node ``h`` all of whose links were up if ``whole``;
-    return True if the node stops.
-    """
-    learn_network(arrays.mass, k, arrays.alone, h, arrays.found, arrays.found_number)
+@kernel(inlined=True)
+def learn(
+    arrays: PushSumArrays,
+    samples: SlotSamples,
+    room: SlotRoom,
+    b: int,
+    h: int,
+    received: Any,
+    slot: int,
+) -> None:
+    """P (6) for the mass of node ``h``, which ``received`` so many shares; note where it stops."""
+    lanes, found = room.lanes, arrays.found
+    learn_network(lanes, arrays.mass, b, h, arrays.alone, found, arrays.found_number)
     # The stop rule compares with the former G and N, so they are replaced only afterwards.
-    stops = has_stopped(
-        arrays.rule,
-        arrays.tolerance,
-        arrays.mass,
-        k,
-        arrays.before,
-        whole,
-        arrays.found,
-        arrays.found_number,
-        arrays.information,
-        arrays.number,
-        work,
-    )
-    n = arrays.found.shape[1]
+    if arrays.rule != NEVER:
+        store(lanes, room.row, 0, received)
+        for q in range(len(lanes)):
+            whole = room.row[0, q] == arrays.degree[h]
+            if arrays.silent[q] == 0 and stops(arrays, b, h, q, whole):
+                samples.stopped[b, h, q] = slot
+    # A node that stopped before learns no more.
+    frozen = load_flags(lanes, arrays.silent)
+    n = found.shape[0]
     for i in range(n):
         for j in range(n):
-            arrays.information[k, i, j] = arrays.found[0, i, j]
-    arrays.number[k] = arrays.found_number[0]
-    return stops
+            before, now = load(lanes, arrays.information, b, h, i, j), load(lanes, found, i, j)
+            store(lanes, arrays.information, b, h, i, j, select(frozen, before, now))
+    before, now = load(lanes, arrays.number, b, h), load(lanes, arrays.found_number, 0)
+    store(lanes, arrays.number, b, h, select(frozen, before, now))
+
+
+@kernel
+def stops(arrays: PushSumArrays, b: int, h: int, q: int, whole: bool) -> bool:
+    """Return True if node ``h`` of the run of lane ``q`` stops in this slot."""
+    one, n = arrays.stop, arrays.found.shape[0]
+    for i in range(arrays.mass.shape[2]):
+        one.mass[0, i], one.before[i] = arrays.mass[b, h, i, q], arrays.before[i, q]
+    for i in range(n):
+        for j in range(n):
+            one.found[0, i, j] = arrays.found[i, j, q]
+            one.former[0, i, j] = arrays.information[b, h, i, j, q]
+    one.number[0], one.former_number[0] = arrays.found_number[0, q], arrays.number[b, h, q]
+    return has_stopped(
+        arrays.rule, arrays.tolerance, one.mass, 0, one.before, whole, one.found, one.number,
+        one.former, one.former_number, one.work,
+    )  # fmt: skip
 
 
 @kernel(inlined=True)
@@ -236,49 +309,64 @@ def correct(
     readings: SlotReadings,
     room: SlotRoom,
     arrays: PushSumArrays,
-    r: int,
+    b: int,
     s: int,
     h: int,
 ) -> None:
     """Step 4 after the prediction, P (7) and (8); with asymptotic gains step 3 too."""
-    k, n = r * len(nodes.rows) + h, nodes.xhat.shape[1]
+    n, lanes = nodes.xhat.shape[2], room.lanes
     if arrays.asymptotic:
         # Asymptotic gains: xhat <- F xhat, and P_inf for the root.
-        predict_mean(nodes, k, room)
+        predict_mean(nodes, room, b, h)
         for i in range(n):
             for j in range(i + 1):
-                nodes.root[k, i, j] = arrays.limit[i, j]
+                store(lanes, nodes.root, b, h, i, j, arrays.limit[i, j])
     else:
         # P (7), from the prediction's root and what the node knows of the network.
-        correct_root(nodes.root, k, arrays.information, k, room.moved, room.update)
+        correct_root(nodes.root, b, h, arrays.information, room.moved, room)
     if nodes.rows[h] > 0:
-        H = readings.H[r % readings.H.shape[0], s % readings.H.shape[1], h]
         # P (8): N^(i) times the gain of the node's own reading.
-        y, number = readings.y[r, s, h], arrays.number[k]
-        add_gain(nodes.xhat, nodes.root, k, number, y, H, nodes.rows[h], room.vectors)
+        number = load(lanes, arrays.number, b, h)
+        add_gain(
+            lanes, nodes.xhat, nodes.root, b, h, number, readings.y, s, readings.H, nodes.rows[h],
+            room.row, room.gains,
+        )  # fmt: skip
 
 
-@kernel(inlined=True)
-def average(
-    z: FloatArray, first: int, links: SlotLinks, up: np.ndarray, moves: FloatArray, delta: float
+@kernel
+def add_gain_to_one(
+    x: FloatArray, root: FloatArray, number: float, y: FloatArray, H: FloatArray, room: FloatArray
 ) -> None:
-    """One averaging step of all nodes, P (9): to the places of z (K, n) from ``first`` on add
-    1 / delta of the differences to the estimates that arrive; ``moves`` (H, n) is scratch.
-    """
-    H, n = len(links.first) - 1, z.shape[1]
-    # All differences before any estimate moves: the step is simultaneous.
-    for h in range(H):
-        for i in range(n):
-            moves[h, i] = 0.0
-        for m in range(links.first[h], links.first[h + 1]):
-            if up[links.way[m]] == 1:
-                sender = first + links.sender[m]
-                for i in range(n):
-                    moves[h, i] += z[sender, i] - z[first + h, i]
-    for h in range(H):
-        # P (9): z <- z + (1 / delta) sum of the differences.
-        for i in range(n):
-            z[first + h, i] += moves[h, i] / delta
+    """``add_gain`` of one filter with one lane: x (1, 1, n, 1), y (1, 1, 1, p, 1)."""
+    add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], room[0], room[1])
+
+
+@kernel
+def split_one(mass: FloatArray, degree: int, share: FloatArray) -> None:
+    """``split_mass`` of one node with one lane, mass (1, 1, m, 1)."""
+    split_mass(ONE, mass, 0, 0, degree, share)
+
+
+@kernel
+def keep_one(mass: FloatArray, share: FloatArray, times: int) -> None:
+    """``keep_share`` of one node with one lane, mass (1, 1, m, 1)."""
+    keep_share(ONE, mass, 0, 0, share, times, False)
+
+
+@kernel
+def learn_one(
+    mass: FloatArray, alone: FloatArray, information: FloatArray, number: FloatArray
+) -> None:
+    """``learn_network`` of one node with one lane, mass (1, 1, m, 1)."""
+    learn_network(ONE, mass, 0, 0, alone, information, number)
+
+
+@kernel
+def correct_one(
+    root: FloatArray, information: FloatArray, rest: FloatArray, room: SlotRoom
+) -> None:
+    """``correct_root`` of one filter with one lane, root (1, 1, n, n, 1)."""
+    correct_root(root, 0, 0, information, rest, room)
 
 
 @built_in("push-sum")
@@ -334,16 +422,18 @@ class PushSum(Filter):
         """Return the arrays of all nodes of all runs at the start."""
         known = [state.network for state in states]
         alone = np.stack([state.model.information for state in states])
-        H, n = alone.shape[:2]
+        (H, n), blocks = alone.shape[:2], blocks_of(runs)
         # Unused without asymptotic gains, but kernels need an array of the right shape.
         limit = np.zeros((n, n)) if known[0].root is None else known[0].root
         mass = np.stack([state.mass for state in states])
+        m = mass.shape[1]
+        shapes = (1, m), (m,), (1, n, n), (1,), (1, n, n), (1,), (n, n)
         return (
             PushSumArrays(
-                mass=np.tile(mass, (runs, 1)),
+                mass=in_lanes(mass, blocks),
                 degree=np.array([state.degree for state in states], dtype=np.int64),
-                information=np.tile(np.stack([k.information for k in known]), (runs, 1, 1)),
-                number=np.tile(np.array([k.number for k in known], dtype=np.float64), runs),
+                information=in_lanes(np.stack([k.information for k in known]), blocks),
+                number=in_lanes(np.array([k.number for k in known], dtype=np.float64), blocks),
                 alone=alone,
                 rule=RULES.index(self.stop),
                 tolerance=self.tolerance,
@@ -352,10 +442,12 @@ class PushSum(Filter):
                 gamma=self.steps(AVERAGE),
                 asymptotic=self.asymptotic,
                 limit=np.ascontiguousarray(limit),
-                share=np.empty((H, mass.shape[1])),
-                before=np.empty(mass.shape[1]),
-                found=np.empty((1, n, n)),
-                found_number=np.empty(1),
+                share=aligned((H, m, LANES)),
+                before=aligned((m, LANES)),
+                found=aligned((n, n, LANES)),
+                found_number=aligned((1, LANES)),
+                silent=np.zeros(LANES, dtype=np.uint8),
+                stop=StopRoom(*(np.zeros(shape) for shape in shapes)),
             ),
         )
 
@@ -545,58 +637,66 @@ def corrected(
     """P (8): the prediction (n,) and ``number`` times the gain of the reading, which may have no
     rows.
     """
-    x = predicted[None].copy()
+    n, x = len(predicted), np.array(predicted, dtype=np.float64)
     if len(y):
         # The kernel takes readings whose noise has variance 1.
         y, H = whitened(y, H, R)
-        add_gain(x, root[None], 0, number, y, H, len(y), np.empty((2, x.shape[1])))
-    return np.asarray(x[0])
+        add_gain_to_one(
+            x.reshape(1, 1, n, 1),
+            np.ascontiguousarray(root).reshape(1, 1, n, n, 1),
+            number,
+            y.reshape(1, 1, 1, -1, 1),
+            H.reshape(1, 1, 1, -1, n, 1),
+            np.empty((2, n, 1)),
+        )
+    return x
 
 
 def share(mass: FloatArray, degree: int) -> FloatArray:
     """Return what a node of ``degree`` neighbours sends to each: its mass / (degree + 1)."""
-    part = np.empty((1, mass.size))
-    split_mass(mass.reshape(1, -1), 0, degree, part, 0)
-    return part.reshape(mass.shape)
+    part = np.empty(mass.shape)
+    split_one(mass.reshape(1, 1, -1, 1), degree, part.reshape(1, -1, 1))
+    return part
 
 
 def mixed(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
     """P (3)-(5) as they conserve mass: the shares ``received`` and the node's own, which it keeps
     once for itself and once for each link of its ``degree`` that failed.
     """
-    total = np.array(sum(received, np.zeros(mass.shape))).reshape(1, -1)
+    total = np.array(sum(received, np.zeros(mass.shape)))
     # The same kernels as in slots, on arrays of one place: both engines round alike.
-    own = share(mass, degree).reshape(1, -1)
-    keep_share(total, 0, own, 0, degree + 1 - len(received))
-    return total.reshape(mass.shape)
+    own = share(mass, degree).reshape(1, -1, 1)
+    keep_one(total.reshape(1, 1, -1, 1), own, degree + 1 - len(received))
+    return total
 
 
 def network(mass: FloatArray, model: SlotModel) -> Network:
     """P (6): C~ / w and n~ / w, or what the node knows of itself while its weight is exactly 0."""
     alone = model.information
-    information, number = np.empty((1, *alone.shape)), np.empty(1)
-    learn_network(mass[None], 0, alone[None], 0, information, number)
-    return Network(information[0], float(number[0]))
+    information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
+    learn_one(mass.reshape(1, 1, -1, 1), alone[None], information, number)
+    return Network(information[:, :, 0], float(number[0, 0]))
 
 
 def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
     """Root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root of P,
     possibly singular, and the information G (n, n).
     """
-    result, n = root[None].copy(), len(root)
-    room = update_scratch(n, 1)
-    correct_root(result, 0, information[None], 0, np.empty((n, n)), room)
-    return np.asarray(result[0])
+    n = len(root)
+    result, known = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
+    correct_one(result, known, np.empty((n, n, 1)), slot_room(1, n, ONE))
+    return np.asarray(result.reshape(n, n))
 
 
 def averaged(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
     """P (9): z plus 1 / delta of the differences to the estimates that arrived."""
     # One receiver and its senders, as a star whose links are all up.
-    x, count = np.stack([z, *received]), len(received)
+    x, count = np.stack([z, *received])[None, :, :, None], len(received)
     places = np.arange(count)
     links = SlotLinks(np.array([0, count]), places + 1, places, np.zeros(count))
-    average(x, 0, links, np.ones(count, dtype=np.uint8), np.empty((1, len(z))), delta)
-    return np.asarray(x[0])
+    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
+    average(ONE, x, 0, links, up, 0, 0, np.empty((1, len(z), 1)), 1.0 / delta)
+    return np.asarray(x[0, 0, :, 0])
 
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:

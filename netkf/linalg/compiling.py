@@ -143,7 +143,11 @@ def _overload_kernels() -> None:
     """Let compiled code call all kernels known so far."""
     from numba import extending
 
-    from netkf.linalg import local_types, struct_types  # noqa: F401 - register what kernels use
+    from netkf.linalg import (  # noqa: F401 - register what kernels use
+        lane_types,
+        local_types,
+        struct_types,
+    )
 
     for call, loops in _kernels.items():
         # An overload may be registered once only.

@@ -1,4 +1,8 @@
-"""The state and the readings of a plant in slots as kernels, slot after slot from given normals."""
+"""The state and the readings of a plant in slots as kernels, slot after slot from given normals.
+
+Runs are side by side in B blocks of L lanes (``netkf.linalg.lanes``); each draws from streams of
+its own, so that it is the same alone and in a batch.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +12,14 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import Lanes, load, spread, store
 from netkf.rng.numbers import NormalZiggurat, next_normal
 
 
 class Path(NamedTuple):
-    """``x[k+1] = F x[k] + root z[k]`` in R runs: F (n, n), root (n, q), the state x (R, n) of the
-    next slot and the absolute position of its ``origin`` (R, n), which moves to the state every
-    ``frame`` slots (0: never).
+    """``x[k+1] = F x[k] + root z[k]`` in R runs: F (n, n), root (n, q), the state x (B, n, L) of
+    the next slot and the absolute position of its ``origin`` (B, n, L), which moves to the state
+    every ``frame`` slots (0: never).
     """
 
     F: FloatArray
@@ -24,67 +29,102 @@ class Path(NamedTuple):
     origin: FloatArray
 
 
+@kernel(inlined=True)
+def draw_normals(
+    lanes: Lanes,
+    states: np.ndarray,
+    first: int,
+    every: int,
+    runs: int,
+    ziggurat: NormalZiggurat,
+    normals: FloatArray,
+    count: int,
+) -> None:
+    """Fill ``normals`` (>= count, L) with the next numbers of the streams ``first``,
+    ``first + every``, ... of so many ``runs``; idle lanes keep what they have.
+    """
+    # Lane by lane: one number does not wait for another there.
+    for j in range(count):
+        for q in range(min(runs, len(lanes))):
+            normals[j, q] = next_normal(states, first + q * every, ziggurat)
+
+
 @kernel
 def draw_starts(
-    states: np.ndarray, ziggurat: NormalZiggurat, mean: FloatArray, root: FloatArray, x: FloatArray
+    lanes: Lanes,
+    states: np.ndarray,
+    ziggurat: NormalZiggurat,
+    mean: FloatArray,
+    root: FloatArray,
+    room: FloatArray,
+    x: FloatArray,
 ) -> None:
-    """Fill x (R, n) with ``mean + root z`` for the first normals z (n,) of each stream."""
-    for r in range(len(x)):
+    """Fill x (B, n, L) with ``mean + root z`` for the first normals z (q,) of each of the streams
+    ``states`` (R, >= 4); ``room`` (q, L) is scratch.
+    """
+    for b in range(len(x)):
+        first, count = b * len(lanes), root.shape[1]
+        draw_normals(lanes, states, first, 1, len(states) - first, ziggurat, room, count)
         for i in range(len(mean)):
-            x[r, i] = mean[i]
-        # Column by column: each normal is used when it is drawn, and none is stored.
-        for j in range(root.shape[1]):
-            z = next_normal(states, r, ziggurat)
-            for i in range(len(mean)):
-                x[r, i] += root[i, j] * z
+            total = spread(lanes, mean[i])
+            for j in range(count):
+                total += root[i, j] * load(lanes, room, j)
+            store(lanes, x, b, i, total)
 
 
 @kernel
 def move_path(
+    lanes: Lanes,
     path: Path,
-    r: int,
+    b: int,
+    s: int,
     slot: int,
     normals: FloatArray,
     local: FloatArray,
     absolute: FloatArray,
     moved: FloatArray,
 ) -> None:
-    """Write the state of ``slot`` into ``local`` and ``absolute`` (n,), in the coordinates of the
-    frame that ends there and in those of the plant, and move run ``r`` on with ``normals`` (q,);
-    ``moved`` (n,) is scratch.
+    """Write the states of block ``b`` in ``slot`` into ``local[b, s]`` and ``absolute[b, s]``
+    (n, L), in the coordinates of the frame that ends there and in those of the plant, and move on
+    with ``normals`` (q, L); ``moved`` (n, L) is scratch.
     """
     n = len(path.F)
     # The state of this slot is written before the origin moves: it ends the frame.
     for i in range(n):
-        local[i], absolute[i] = path.x[r, i], path.x[r, i] + path.origin[r, i]
+        x = load(lanes, path.x, b, i)
+        store(lanes, local, b, s, i, x)
+        if path.frame > 0:
+            store(lanes, absolute, b, s, i, x + load(lanes, path.origin, b, i))
     # Slot 0 begins the first frame: its origin is already where it should be.
     if path.frame > 0 and slot > 0 and slot % path.frame == 0:
         for i in range(n):
-            path.origin[r, i] += path.x[r, i]
-            path.x[r, i] = 0.0
+            origin = load(lanes, path.origin, b, i) + load(lanes, path.x, b, i)
+            store(lanes, path.origin, b, i, origin)
+            store(lanes, path.x, b, i, 0.0)
     # x <- F x + root z, in local coordinates.
     for i in range(n):
-        total = 0.0
+        total = spread(lanes, 0.0)
         for j in range(n):
-            total += path.F[i, j] * path.x[r, j]
+            total += path.F[i, j] * load(lanes, path.x, b, j)
         for j in range(path.root.shape[1]):
-            total += path.root[i, j] * normals[j]
-        moved[i] = total
+            total += path.root[i, j] * load(lanes, normals, j)
+        store(lanes, moved, i, total)
     for i in range(n):
-        path.x[r, i] = moved[i]
+        store(lanes, path.x, b, i, load(lanes, moved, i))
     # The origin moves with the plant, without noise.
     if path.frame > 0:
         for i in range(n):
-            total = 0.0
+            total = spread(lanes, 0.0)
             for j in range(n):
-                total += path.F[i, j] * path.origin[r, j]
-            moved[i] = total
+                total += path.F[i, j] * load(lanes, path.origin, b, j)
+            store(lanes, moved, i, total)
         for i in range(n):
-            path.origin[r, i] = moved[i]
+            store(lanes, path.origin, b, i, load(lanes, moved, i))
 
 
 @kernel
 def draw_paths(
+    lanes: Lanes,
     path: Path,
     states: np.ndarray,
     ziggurat: NormalZiggurat,
@@ -93,15 +133,16 @@ def draw_paths(
     local: FloatArray,
     absolute: FloatArray,
 ) -> None:
-    """Fill ``local`` and ``absolute`` (R, S, n) from ``slot`` on with the next numbers of the
-    streams ``states`` (R, >= 4); ``room`` (2, max(n, q)) is scratch.
+    """Fill ``local`` and, with frames, ``absolute`` (B, S, n, L) from ``slot`` on with the next
+    numbers of the streams ``states`` (R, >= 4); ``room`` (2, max(n, q), L) is scratch.
     """
-    # Run by run, each from its own stream: a run is the same alone and in a batch.
-    for r in range(local.shape[0]):
+    for b in range(local.shape[0]):
+        first = b * len(lanes)
         for s in range(local.shape[1]):
-            for j in range(path.root.shape[1]):
-                room[0, j] = next_normal(states, r, ziggurat)
-            move_path(path, r, slot + s, room[0], local[r, s], absolute[r, s], room[1])
+            draw_normals(
+                lanes, states, first, 1, len(states) - first, ziggurat, room[0], path.root.shape[1]
+            )
+            move_path(lanes, path, b, s, slot + s, room[0], local, absolute, room[1])
 
 
 class SlotSensors(NamedTuple):
@@ -123,6 +164,7 @@ class SlotSensors(NamedTuple):
 
 @kernel
 def draw_readings(
+    lanes: Lanes,
     sensors: SlotSensors,
     states: np.ndarray,
     ziggurat: NormalZiggurat,
@@ -132,33 +174,50 @@ def draw_readings(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Fill the readings y (R, S, hosts, p), and H (R, S, hosts, p, n) where it is random, from the
-    states x (R, S, n) and ``regressors`` (D, R, S, k), with the next numbers of the streams
-    ``states`` (R M, >= 4); ``room`` (p,) is scratch.
+    """Fill the readings y (B, S, hosts, p, L), and H (B, S, hosts, p, n, L) where it is random,
+    from the states x (B, S, n, L) and ``regressors`` (D, B, S, k, L), with the next numbers of the
+    streams ``states`` (R M, >= 4); ``room`` (p, L) is scratch.
     """
-    n, count = x.shape[2], len(sensors.host)
-    for r in range(x.shape[0]):
+    count = len(sensors.host)
+    for b in range(x.shape[0] if count > 0 else 0):
+        runs, first = len(states) // count - b * len(lanes), b * len(lanes) * count
         for s in range(x.shape[1]):
             for m in range(count):
-                host, p, d = sensors.host[m], sensors.rows[m], sensors.driven[m]
                 # All normals of a sensor's reading before its rows, in the order that a single run
                 # takes them.
-                for i in range(p):
-                    room[i] = next_normal(states, r * count + m, ziggurat)
-                for i in range(p):
-                    row = sensors.row[m] + i
-                    total = 0.0
-                    for j in range(p):
-                        total += sensors.noise[m, i, j] * room[j]
-                    for j in range(n):
-                        weight = sensors.H[m, i, j]
-                        if d >= 0:  # sensors.H holds the whitening factor of the one row then
-                            weight = 0.0
-                            # The random row is C s, whitened.
-                            for k in range(sensors.C.shape[2]):
-                                weight += sensors.C[d, j, k] * regressors[d, r, s, k]
-                            weight *= sensors.H[m, i, 0]
-                            H[r, s, host, row, j] = weight
-                        # Whitened reading: y = H x + noise with the weights of this row.
-                        total += weight * x[r, s, j]
-                    y[r, s, host, row] = total
+                draw_normals(lanes, states, first + m, count, runs, ziggurat, room, sensors.rows[m])
+                for i in range(sensors.rows[m]):
+                    read_row(lanes, sensors, b, s, m, i, x, regressors, room, y, H)
+
+
+@kernel(inlined=True)
+def read_row(
+    lanes: Lanes,
+    sensors: SlotSensors,
+    b: int,
+    s: int,
+    m: int,
+    i: int,
+    x: FloatArray,
+    regressors: FloatArray,
+    normals: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+) -> None:
+    """Write row ``i`` of the reading of sensor ``m``, and of its H if that is random."""
+    host, row, d = sensors.host[m], sensors.row[m] + i, sensors.driven[m]
+    total = spread(lanes, 0.0)
+    for j in range(sensors.rows[m]):
+        total += sensors.noise[m, i, j] * load(lanes, normals, j)
+    # Whitened reading: y = H x + noise with the weights of this row.
+    for j in range(x.shape[2]):
+        weight = spread(lanes, sensors.H[m, i, j])
+        if d >= 0:  # sensors.H holds the whitening factor of the one row then
+            weight = spread(lanes, 0.0)
+            # The random row is C s, whitened.
+            for k in range(sensors.C.shape[2]):
+                weight += sensors.C[d, j, k] * load(lanes, regressors, d, b, s, k)
+            weight *= sensors.H[m, i, 0]
+            store(lanes, H, b, s, host, row, j, weight)
+        total += weight * load(lanes, x, b, s, j)
+    store(lanes, y, b, s, host, row, total)

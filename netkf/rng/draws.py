@@ -19,6 +19,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, Lanes, aligned, blocks_of
 from netkf.rng.streams import ReplicaStreams, Streams
 
 _U = np.uint64
@@ -55,24 +56,57 @@ def high_word(a: Any, b: Any) -> Any:
 
 
 @kernel
-def next_word(states: np.ndarray, k: int) -> Any:
-    """The next word of stream ``k`` of states (K, 4): state and increment, high words first."""
-    high, low = states[k, 0], states[k, 1]
+def scrambled(high: Any, low: Any) -> Any:
+    """The word that a state of two words gives."""
     made = high ^ (high >> S32)
     made *= CHEAP
     made ^= made >> S48
-    made *= low | ONE
-    step = low * CHEAP + states[k, 3]
-    carry = ONE if step < states[k, 3] else ZERO
-    states[k, 0] = high * CHEAP + high_word(low, CHEAP) + states[k, 2] + carry
-    states[k, 1] = step
-    return made
+    return made * (low | ONE)
+
+
+@kernel
+def following(high: Any, low: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
+    """The next state, of the state and the increment of a stream."""
+    step = low * CHEAP + more_low
+    carry = ONE if step < more_low else ZERO
+    return high * CHEAP + high_word(low, CHEAP) + more_high + carry, step
+
+
+@kernel
+def next_word(states: np.ndarray, k: int) -> Any:
+    """The next word of stream ``k`` of states (K, 4): state and increment, high words first."""
+    high, low = states[k, 0], states[k, 1]
+    states[k, 0], states[k, 1] = following(high, low, states[k, 2], states[k, 3])
+    return scrambled(high, low)
 
 
 @kernel
 def next_unit(states: np.ndarray, k: int) -> float:
     """The next number of stream ``k``, uniform on [0, 1)."""
     return float(next_word(states, k) >> S11) * TO_UNIT
+
+
+@kernel
+def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArray) -> None:
+    """Write the next uniform number of stream ``k`` of each run of block ``b`` into ``units[b, k]``
+    (L,), from states (B, K, 4, L).
+    """
+    # One instruction for several lanes: all do the same to words of their own.
+    for q in range(len(lanes)):
+        high, low = states[b, k, 0, q], states[b, k, 1, q]
+        units[b, k, q] = float(scrambled(high, low) >> S11) * TO_UNIT
+        following_high, following_low = following(high, low, states[b, k, 2, q], states[b, k, 3, q])
+        states[b, k, 0, q], states[b, k, 1, q] = following_high, following_low
+
+
+@kernel
+def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
+    """The next uniform number of stream ``k`` of the run of lane ``q`` of block ``b``."""
+    high, low = states[b, k, 0, q], states[b, k, 1, q]
+    states[b, k, 0, q], states[b, k, 1, q] = following(
+        high, low, states[b, k, 2, q], states[b, k, 3, q]
+    )
+    return float(scrambled(high, low) >> S11) * TO_UNIT
 
 
 @kernel
@@ -144,6 +178,15 @@ class StreamBatch:
         words = streams.seed_words(purpose, entities)
         self.states = np.empty(words.shape, dtype=np.uint64)
         seed_states(words, self.states)
+
+    def in_lanes(self, runs: int) -> np.ndarray:
+        """The states (B, K, 4, L) of the K streams of each of so many runs, by blocks of lanes."""
+        count = len(self.states) // runs
+        by_lane = np.zeros((blocks_of(runs) * LANES, count, 4), dtype=np.uint64)
+        by_lane[:runs] = self.states.reshape(runs, count, 4)
+        made: np.ndarray = aligned((blocks_of(runs), count, 4, LANES), np.uint64)
+        made[:] = np.moveaxis(by_lane.reshape(-1, LANES, count, 4), 1, -1)
+        return made
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """``Generator.random(count)`` of each of the entities in these places, one after the

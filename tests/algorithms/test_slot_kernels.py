@@ -5,6 +5,7 @@ import pytest
 
 from netkf.algorithms.kernels import slots
 from netkf.algorithms.push_sum import corrected
+from netkf.linalg.lanes import LANES, aligned
 
 CASES = [(seed, n) for seed in range(3) for n in (1, 2, 4, 7)]
 
@@ -18,28 +19,55 @@ def _covariance(random, n):
     return B @ B.T
 
 
+def lanes_last(values):
+    """The runs of one block (L, ...) as (1, ..., L)."""
+    made = aligned((1, *values.shape[1:], LANES))
+    made[0] = np.moveaxis(values, 0, -1)
+    return made
+
+
 def filters(random, n, p):
-    """Two filters of one run, and their whitened readings in one slot."""
+    """Two filters in each run of a block, and their whitened readings in one slot."""
     Q, F = triangular(random, n)[0], random.standard_normal((n, n))
-    nodes = slots.SlotNodes(
-        random.standard_normal((2, n)), triangular(random, n, 2), F, Q, np.array([p, 0])
-    )
-    y, H = random.standard_normal((1, 1, 2, p)), random.standard_normal((1, 1, 2, p, n))
-    local, rebased = random.standard_normal((1, 1, n)), np.array([True])
-    return nodes, slots.SlotReadings(y, H, local, rebased)
+    x = random.standard_normal((LANES, 2, n))
+    roots = triangular(random, n, 2 * LANES).reshape(LANES, 2, n, n)
+    nodes = slots.SlotNodes(lanes_last(x), lanes_last(roots), F, Q, np.array([p, 0]))
+    y = lanes_last(random.standard_normal((LANES, 1, 2, p)))
+    H = lanes_last(random.standard_normal((LANES, 1, 2, p, n)))
+    local = lanes_last(random.standard_normal((LANES, 1, n)))
+    return nodes, slots.SlotReadings(y, H, local, np.array([True]))
+
+
+def estimates(nodes, h, q):
+    """xhat (n,) and P (n, n) of filter ``h`` in lane ``q``."""
+    root = np.tril(nodes.root[0, h, :, :, q])
+    return nodes.xhat[0, h, :, q].copy(), root @ root.T
 
 
 @pytest.mark.parametrize(("seed", "n"), CASES)
 def test_prediction(seed, n):
     random = np.random.default_rng(seed)
     nodes, _ = filters(random, n, 1)
-    x, P = nodes.xhat[1].copy(), nodes.root[1] @ nodes.root[1].T
-    slots.predict(nodes, slots.slot_room(2, n))
-    root = np.tril(nodes.root[1])
-    expected = nodes.F @ P @ nodes.F.T + nodes.root_Q @ nodes.root_Q.T
-    np.testing.assert_allclose(root @ root.T, expected, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(nodes.xhat[1], nodes.F @ x, rtol=1e-10, atol=1e-12)
-    assert (np.diag(root) > 0.0).all()
+    before = [estimates(nodes, 1, q) for q in range(LANES)]
+    slots.predict(nodes, slots.slot_room(2, n), 0)
+    for q, (x, P) in enumerate(before):
+        found, cov = estimates(nodes, 1, q)
+        expected = nodes.F @ P @ nodes.F.T + nodes.root_Q @ nodes.root_Q.T
+        np.testing.assert_allclose(cov, expected, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(found, nodes.F @ x, rtol=1e-10, atol=1e-12)
+        assert (np.diag(nodes.root[0, 1, :, :, q]) > 0.0).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 7])
+def test_a_lane_is_the_same_in_any_company(n):
+    """One lane alone has the bits of the eight."""
+    random = np.random.default_rng(n)
+    nodes, _ = filters(random, n, 1)
+    roots = nodes.root[0, 0].copy()
+    slots.predict(nodes, slots.slot_room(2, n), 0)
+    for q in range(LANES):
+        alone = slots.predicted_root(roots[:, :, q], nodes.F, nodes.root_Q)
+        np.testing.assert_array_equal(np.tril(alone), np.tril(nodes.root[0, 0, :, :, q]))
 
 
 def test_prediction_of_what_is_known_and_moves_by_itself():
@@ -54,13 +82,14 @@ def test_prediction_of_what_is_known_and_moves_by_itself():
 def test_update_with_a_whitened_reading(seed, n, p):
     random = np.random.default_rng(seed)
     nodes, readings = filters(random, n, p)
-    x, P = nodes.xhat[0].copy(), nodes.root[0] @ nodes.root[0].T
-    y, H = readings.y[0, 0, 0], readings.H[0, 0, 0]
-    slots.use_reading(nodes, 0, readings, 0, 0, 0, slots.slot_room(2, n).update)
-    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(p))
-    root = np.tril(nodes.root[0])
-    np.testing.assert_allclose(root @ root.T, P - gain @ H @ P, rtol=1e-10, atol=1e-11)
-    np.testing.assert_allclose(nodes.xhat[0], x + gain @ (y - H @ x), rtol=1e-10, atol=1e-11)
+    before = [estimates(nodes, 0, q) for q in range(LANES)]
+    slots.read_all(nodes, readings, slots.slot_room(2, n), 0, 0)
+    for q, (x, P) in enumerate(before):
+        y, H = readings.y[0, 0, 0, :, q], readings.H[0, 0, 0, :, :, q]
+        gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(p))
+        found, cov = estimates(nodes, 0, q)
+        np.testing.assert_allclose(cov, P - gain @ H @ P, rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(found, x + gain @ (y - H @ x), rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize(("seed", "n"), CASES)
@@ -88,19 +117,22 @@ def test_the_gain_of_push_sum(seed, n):
 def test_samples_show_the_covariance_and_frames_move_estimates(seed, n):
     random = np.random.default_rng(seed)
     nodes, readings = filters(random, n, 1)
+    runs = LANES - 1  # the last lane is idle
     samples = slots.SlotSamples(
-        np.empty((1, 1, 2, n)),
-        np.empty((1, 1, 2, n, n)),
-        np.zeros((1, 2), int),
-        np.zeros((1, 2, 2)),
+        np.empty((runs, 1, 2, n)),
+        np.empty((runs, 1, 2, n, n)),
+        np.zeros((1, 2, LANES), int),
+        np.zeros((1, 2, 2, LANES)),
     )
-    flags = np.array([True])
-    plan = slots.SlotPlan(0, flags, flags, np.array([0]), np.zeros((1, 1, 1, 0), dtype=np.uint8))
-    slots.show(nodes, plan, samples, 0, 0)
-    np.testing.assert_allclose(
-        samples.P[0, 0], nodes.root @ nodes.root.swapaxes(1, 2), rtol=1e-10, atol=1e-12
-    )
+    flags, up = np.array([True]), np.zeros((1, 1, 1, 0, LANES), dtype=np.uint8)
+    plan, room = slots.SlotPlan(0, flags, flags, np.array([0]), up), slots.slot_room(2, n)
+    slots.show(nodes, plan, samples, room, 0, 0)
     before = nodes.xhat.copy()
-    slots.rebase(nodes, readings, 0, 0)
-    np.testing.assert_array_equal(samples.xhat[0, 0], before)
-    np.testing.assert_array_equal(nodes.xhat, before - readings.local[0, 0])
+    slots.rebase(nodes, readings, room, 0, 0)
+    for q in range(runs):
+        for h in range(2):
+            cov = estimates(nodes, h, q)[1]
+            np.testing.assert_allclose(samples.P[q, 0, h], cov, rtol=1e-10, atol=1e-12)
+            np.testing.assert_array_equal(samples.xhat[q, 0, h], before[0, h, :, q])
+    moved = before - readings.local[0, 0]
+    np.testing.assert_array_equal(nodes.xhat, moved)

@@ -2,106 +2,136 @@
 
 A mass is (2 + n n,): the weight w, the number of nodes n~ and the information C~ of P (3)-(5). The
 order of every sum is fixed, since the rounding of the mass decides in which slot a node stops.
+
+Node ``h`` of block ``b`` has place ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``): masses
+(B, H, m, L), roots (B, H, n, n, L).
 """
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
-from netkf.algorithms.kernels.root_update import UpdateScratch, rotate_out
+from netkf.algorithms.kernels.slots import SlotLinks, SlotRoom, rotate_lanes
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import Lanes, any_lane, load, load_flags, root_of, select, spread, store
 
 
-@kernel
-def split_mass(mass: FloatArray, k: int, degree: int, share: FloatArray, h: int) -> None:
-    """Write into ``share[h]`` what the node of place ``k`` and ``degree`` sends to each of its
-    neighbours: its mass over degree + 1.
+@kernel(inlined=True)
+def split_mass(
+    lanes: Lanes, mass: FloatArray, b: int, h: int, degree: int, share: FloatArray
+) -> None:
+    """Write into ``share[h]`` what a node of that ``degree`` sends to each of its neighbours: its
+    mass over degree + 1.
     """
     # P (3)-(5) with equal weights 1 / (degree + 1); the quotient is formed once, so all neighbours
     # are sent the same bits.
-    for i in range(mass.shape[1]):
-        share[h, i] = mass[k, i] / (degree + 1)
+    for i in range(mass.shape[2]):
+        store(lanes, share, h, i, load(lanes, mass, b, h, i) / (degree + 1))
 
 
-@kernel
-def keep_share(mass: FloatArray, k: int, share: FloatArray, h: int, times: int) -> None:
-    """Add to the mass of place ``k``, which is what it received, its own share: once for itself and
-    once for each link of the node that failed, ``times`` in all; P (3)-(5) as they conserve sums.
+@kernel(inlined=True)
+def keep_share(
+    lanes: Lanes, mass: FloatArray, b: int, h: int, share: FloatArray, times: Any, kept: Any
+) -> None:
+    """Add to the mass of a node, which is what it received, its own share: once for itself and once
+    for each link of the node that failed, ``times`` in all; P (3)-(5) as they conserve sums. The
+    mass stays as it is in the lanes that are ``kept``.
     """
     # A share that could not be sent stays here: the network's sums of w, n~ and C~ stay conserved.
-    for i in range(mass.shape[1]):
-        mass[k, i] = times * share[h, i] + mass[k, i]
+    for i in range(mass.shape[2]):
+        received = load(lanes, mass, b, h, i)
+        mixed = times * load(lanes, share, h, i) + received
+        store(lanes, mass, b, h, i, select(kept, received, mixed))
 
 
-@kernel
+@kernel(inlined=True)
 def learn_network(
-    mass: FloatArray, k: int, alone: FloatArray, h: int, information: FloatArray, number: FloatArray
+    lanes: Lanes,
+    mass: FloatArray,
+    b: int,
+    h: int,
+    alone: FloatArray,
+    information: FloatArray,
+    number: FloatArray,
 ) -> None:
-    """P (6): write C~ / w and n~ / w of place ``k`` into ``information`` (1, n, n) and ``number``
-    (1,), or what the node knows of itself, ``alone[h]``, while its weight is exactly 0.
+    """P (6): write C~ / w and n~ / w of a node into ``information`` (n, n, L) and ``number``
+    (1, L), or what the node knows of itself, ``alone[h]``, while its weight is exactly 0.
     """
     # P (6): G = C~ / w and N = n~ / w.
-    n, weight = information.shape[1], mass[k, 0]
+    n, weight = information.shape[0], load(lanes, mass, b, h, 0)
+    nothing = weight == 0.0
     for i in range(n):
         # Only one triangle is computed; mirroring it makes G symmetric bit for bit.
         for j in range(i + 1):
-            value = alone[h, i, j]
-            if weight != 0.0:
-                # The mean of both triangles, because C~ is symmetric only up to the rounding of its
-                # sums.
-                upper, lower = mass[k, 2 + i * n + j] / weight, mass[k, 2 + j * n + i] / weight
-                value = 0.5 * (upper + lower)
-            information[0, i, j] = information[0, j, i] = value
-    number[0] = 1.0 if weight == 0.0 else mass[k, 1] / weight
+            # The mean of both triangles, because C~ is symmetric only up to the rounding of its
+            # sums.
+            upper = load(lanes, mass, b, h, 2 + i * n + j) / weight
+            lower = load(lanes, mass, b, h, 2 + j * n + i) / weight
+            value = select(nothing, alone[h, i, j], 0.5 * (upper + lower))
+            store(lanes, information, i, j, value)
+            store(lanes, information, j, i, value)
+    store(lanes, number, 0, select(nothing, 1.0, load(lanes, mass, b, h, 1) / weight))
 
 
 @kernel(inlined=True)
 def correct_root(
-    root: FloatArray,
-    k: int,
-    information: FloatArray,
-    m: int,
-    rest: FloatArray,
-    room: UpdateScratch,
+    root: FloatArray, b: int, h: int, information: FloatArray, rest: FloatArray, room: SlotRoom
 ) -> None:
-    """Make place ``k`` the root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the information G
-    of place ``m`` (n, n); ``rest`` (n, n) is scratch.
+    """Make the root of a filter that of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the
+    information G of its place in ``information`` (B, H, n, n, L); ``rest`` (n, n, L) is scratch.
     """
     # G = sum v v' by Cholesky with the largest pivot first, and each v' is a row that is observed
     # with noise of variance 1: nothing is inverted, and P may be singular.
-    n, largest = root.shape[1], 0.0
+    lanes, n, v = room.lanes, root.shape[2], room.moved_mean
+    largest = spread(lanes, 0.0)
     # The whole diagonal gives the scale of G, against which a later pivot counts as rounding.
     for i in range(n):
-        largest = max(largest, information[m, i, i])
+        diagonal = load(lanes, information, b, h, i, i)
+        largest = select(diagonal > largest, diagonal, largest)
         for j in range(n):
-            rest[i, j] = information[m, i, j]
+            store(lanes, rest, i, j, load(lanes, information, b, h, i, j))
     for _ in range(n):
-        # Largest remaining diagonal entry: diagonal pivoting reveals the rank of G.
-        best = 0
-        for i in range(1, n):
-            if rest[i, i] > rest[best, best]:
-                best = i
-        pivot = rest[best, best]
-        # The rest is rounding of G: G has no further rank to use. ``not >`` also ends on nan.
-        if not pivot > ROUNDING * n * largest:
+        pivot = largest_row(lanes, rest, v)
+        # The rest is rounding of G: G has no further rank to use. ``>`` also ends on nan.
+        useful = pivot > ROUNDING * n * largest
+        if not any_lane(useful):
             return
-        size = math.sqrt(pivot)
-        # v' S, with v' = rest[best] / sqrt(pivot) the next row of the Cholesky factor.
+        # v', with v' = rest[best] / sqrt(pivot) the next row of the Cholesky factor, or zeros.
+        scale = select(useful, root_of(pivot), 1.0)
+        for i in range(n):
+            store(lanes, v, i, select(useful, load(lanes, v, i) / scale, 0.0))
         for j in range(n):
-            total = 0.0
+            total = spread(lanes, 0.0)
             for i in range(j, n):
-                total += rest[best, i] / size * root[k, i, j]
-            room.HS[0, j] = total
+                total += load(lanes, v, i) * load(lanes, root, b, h, i, j)
+            store(lanes, room.row, j, total)
         # P <- P - P v v' P / (1 + v' P v) on the root. The state is not corrected here: P (8) does
         # that.
-        rotate_out(room.size, root, k, room.HS, 0, room.gains, 1.0)
-        # Deflate, rest -= v v'. The gain of the rotation is spent, so its row holds v.
-        for i in range(n):
-            room.gains[0, i] = rest[best, i] / size
+        rotate_lanes(lanes, root, b, h, room.row, room.gains)
+        # Deflate, rest -= v v'.
         for i in range(n):
             for j in range(n):
-                rest[i, j] -= room.gains[0, i] * room.gains[0, j]
+                entry = load(lanes, rest, i, j) - load(lanes, v, i) * load(lanes, v, j)
+                store(lanes, rest, i, j, entry)
+
+
+@kernel(inlined=True)
+def largest_row(lanes: Lanes, rest: FloatArray, v: FloatArray) -> Any:
+    """Write the row of ``rest`` (n, n, L) with the largest diagonal entry into ``v`` (n, L), lane
+    by lane; return that entry.
+    """
+    # Diagonal pivoting reveals the rank of G.
+    n, pivot = len(rest), load(lanes, rest, 0, 0)
+    for j in range(n):
+        store(lanes, v, j, load(lanes, rest, 0, j))
+    for i in range(1, n):
+        diagonal = load(lanes, rest, i, i)
+        larger = diagonal > pivot
+        pivot = select(larger, diagonal, pivot)
+        for j in range(n):
+            store(lanes, v, j, select(larger, load(lanes, rest, i, j), load(lanes, v, j)))
+    return pivot
 
 
 ROUNDING = 2.0**-52
@@ -109,36 +139,73 @@ ROUNDING = 2.0**-52
 
 @kernel(inlined=True)
 def add_gain(
+    lanes: Lanes,
     x: FloatArray,
     root: FloatArray,
-    k: int,
-    number: float,
+    b: int,
+    h: int,
+    number: Any,
     y: FloatArray,
+    s: int,
     H: FloatArray,
     rows: int,
-    room: FloatArray,
+    seen: FloatArray,
+    turned: FloatArray,
 ) -> None:
-    """P (8): add ``number`` times ``S S' H' (y - H x)`` to place ``k`` of x (K, n), for a whitened
-    reading of so many ``rows``; ``room`` (2, n) is scratch.
+    """P (8): add ``number`` times ``S S' H' (y - H x)`` to the estimate of a filter, for its
+    whitened reading ``y[b, s, h]`` of so many ``rows`` and ``H[0, 0, h]``; ``seen`` and ``turned``
+    (n, L) are scratch.
     """
-    n = x.shape[1]
+    n = x.shape[2]
     # H' (y - H x); the noise is white with variance 1, so no R^-1 appears.
     for i in range(n):
-        room[0, i] = 0.0
+        store(lanes, seen, i, 0.0)
     for row in range(rows):
-        innovation = y[row]
+        innovation = load(lanes, y, b, s, h, row)
         for i in range(n):
-            innovation -= H[row, i] * x[k, i]
+            innovation -= load(lanes, H, 0, 0, h, row, i) * load(lanes, x, b, h, i)
         for i in range(n):
-            room[0, i] += H[row, i] * innovation
+            weight = load(lanes, H, 0, 0, h, row, i)
+            store(lanes, seen, i, load(lanes, seen, i) + weight * innovation)
     # S' times that, then S times it: P itself is never formed.
     for j in range(n):
-        total = 0.0
+        total = spread(lanes, 0.0)
         for i in range(j, n):
-            total += root[k, i, j] * room[0, i]
-        room[1, j] = total
+            total += load(lanes, root, b, h, i, j) * load(lanes, seen, i)
+        store(lanes, turned, j, total)
     for i in range(n):
-        total = 0.0
+        total = spread(lanes, 0.0)
         for j in range(i + 1):
-            total += root[k, i, j] * room[1, j]
-        x[k, i] += number * total
+            total += load(lanes, root, b, h, i, j) * load(lanes, turned, j)
+        store(lanes, x, b, h, i, load(lanes, x, b, h, i) + number * total)
+
+
+@kernel
+def average(
+    lanes: Lanes,
+    z: FloatArray,
+    b: int,
+    links: SlotLinks,
+    up: Any,
+    s: int,
+    step: int,
+    moved: FloatArray,
+    factor: float,
+) -> None:
+    """One averaging step of all nodes of a block, P (9): add ``factor`` = 1 / delta times the
+    differences to the estimates that arrive to z (B, H, n, L); ``moved`` (H, n, L) is scratch.
+    """
+    H, n = len(links.first) - 1, z.shape[2]
+    # All differences before any estimate moves: the step is simultaneous.
+    for h in range(H):
+        for i in range(n):
+            own, total = load(lanes, z, b, h, i), spread(lanes, 0.0)
+            for m in range(links.first[h], links.first[h + 1]):
+                arrived = load_flags(lanes, up, b, s, step, links.way[m])
+                difference = load(lanes, z, b, links.sender[m], i) - own
+                total += select(arrived, difference, 0.0)
+            # P (9): z <- z + (1 / delta) sum of the differences.
+            store(lanes, moved, h, i, own + factor * total)
+    for h in range(H):
+        for i in range(n):
+            store(lanes, z, b, h, i, load(lanes, moved, h, i))

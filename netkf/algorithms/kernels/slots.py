@@ -3,7 +3,12 @@
 A filter's kernel (``Filter.slot_kernel``) carries H filters through S slots of R runs in one call.
 It is given :class:`SlotNodes` (the state), :class:`SlotReadings` and :class:`SlotPlan` (what was
 drawn for these slots), :class:`SlotLinks` (who hears whom), :class:`SlotSamples` (what it fills in)
-and :class:`SlotRoom` (scratch), and works in place: filter ``h`` of run ``r`` is place ``r H + h``.
+and :class:`SlotRoom` (scratch), and works in place.
+
+Runs are side by side in blocks of L lanes (``netkf.linalg.lanes``): what belongs to filter ``h`` of
+run ``b L + q`` is ``[b, ..., h, ..., q]``, and kernels compute all lanes of a filter at once. Where
+R is no multiple of L, the last lanes of the last block are idle: they hold harmless numbers and are
+not sampled.
 
 Readings are whitened: with ``R = L L'`` as the filters believe it, ``L^-1 y`` and ``L^-1 H`` stand
 for y and H, so that the noise of each row has variance 1 and rows are used one after the other.
@@ -11,24 +16,32 @@ for y and H, so that the noise of each row has variance 1 and rows are used one 
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.root_update import (
-    TINY,
-    UpdateScratch,
-    rotate_out,
-    update_scratch,
-)
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    MANY,
+    ONE,
+    Lanes,
+    aligned,
+    load,
+    magnitude,
+    root_of,
+    select,
+    spread,
+    store,
+    with_sign,
+)
+
+TINY = 1e-200
 
 
 class SlotNodes(NamedTuple):
-    """xhat (R H, n) and lower triangular root (R H, n, n); F and root of Q (n, n, lower triangular)
-    that all filters believe; how many rows each filter reads, ``rows`` (H,).
+    """xhat (B, H, n, L) and lower triangular root (B, H, n, n, L) in B blocks; F and root of Q
+    (n, n, lower triangular) that all filters believe; how many rows each reads, ``rows`` (H,).
     """
 
     xhat: FloatArray
@@ -39,9 +52,9 @@ class SlotNodes(NamedTuple):
 
 
 class SlotReadings(NamedTuple):
-    """Whitened readings y (R, S, H, p) and H (R, S, H, p, n), or (1, 1, H, p, n) if it is fixed;
-    the truth ``local`` (R, S, n) in the coordinates of the estimates, whose origin moves there in
-    slots that are ``rebased`` (S,).
+    """Whitened readings y (B, S, H, p, L) and H (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is
+    fixed; the truth ``local`` (B, S, n, L) in the coordinates of the estimates, whose origin moves
+    there in slots that are ``rebased`` (S,).
     """
 
     y: FloatArray
@@ -52,8 +65,8 @@ class SlotReadings(NamedTuple):
 
 class SlotPlan(NamedTuple):
     """Number of the ``first`` of S slots; whether nodes read and predict (``sensed``), whether they
-    exchange, which sample a slot is or -1 (S, each); ``up`` (R, S, E, W): whether a message arrives
-    on a direction in each of the E steps of the exchanges of a slot.
+    exchange, which sample a slot is or -1 (S, each); ``up`` (B, S, E, W, L): whether a message
+    arrives on a direction in each of the E steps of the exchanges of a slot.
     """
 
     first: int
@@ -76,7 +89,8 @@ class SlotLinks(NamedTuple):
 
 class SlotSamples(NamedTuple):
     """xhat (R, T, H, n) and P (R, T, H, n, n); the slot in which each filter stopped learning for
-    good, ``stopped`` (R, H), and what it holds of conserved sums at the last sample, (R, H, K).
+    good, ``stopped`` (B, H, L), and what it holds of K conserved sums at the last sample,
+    ``conserved`` (B, H, K, L).
     """
 
     xhat: FloatArray
@@ -85,42 +99,29 @@ class SlotSamples(NamedTuple):
     conserved: FloatArray
 
 
-LANES = 8
-"""Covariances that are predicted side by side."""
-
-
-class Lanes(NamedTuple):
-    """Scratch of a prediction: ``root``, ``moved`` and ``noise`` (n, n, LANES), others (LANES,)."""
-
-    root: FloatArray
-    moved: FloatArray
-    noise: FloatArray
-    total: FloatArray
-    sign: FloatArray
-    pivot: FloatArray
-    scale: FloatArray
-
-
 class SlotRoom(NamedTuple):
-    """Scratch: of a sample and of combinations, ``vectors`` (2, n), ``moved`` (n, n), of a
-    prediction, and copies of the estimates (H, n) and roots (H, n, n) that are sent.
+    """The ``lanes`` and scratch: ``row``, ``gains`` and ``moved_mean`` (n, L) of a reading and a
+    mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened`` and ``total``
+    (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n, n, L).
     """
 
-    update: UpdateScratch
-    vectors: FloatArray
-    moved: FloatArray
     lanes: Lanes
+    row: FloatArray
+    gains: FloatArray
+    moved_mean: FloatArray
+    moved: FloatArray
+    noise: FloatArray
+    whitened: FloatArray
+    total: FloatArray
     xhat: FloatArray
     root: FloatArray
 
 
-def slot_room(H: int, n: int) -> SlotRoom:
+def slot_room(H: int, n: int, lanes: Lanes = MANY) -> SlotRoom:
     """Scratch for H filters of n states."""
-    wide = [np.zeros((n, n, LANES)) for _ in range(3)]
-    lanes = Lanes(*wide, *np.zeros((4, LANES)))
-    vectors, moved = np.zeros((2, n)), np.zeros((n, n))
-    sent = np.zeros((H, n)), np.zeros((H, n, n))
-    return SlotRoom(update_scratch(n, 1), vectors, moved, lanes, *sent)
+    L = len(lanes)
+    shapes: list[tuple[int, ...]] = [*[(n, L)] * 3, *[(n, n, L)] * 2, *[(n, n + 1, L)] * 2]
+    return SlotRoom(lanes, *(aligned(shape) for shape in [*shapes, (H, n, L), (H, n, n, L)]))
 
 
 def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -130,174 +131,223 @@ def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, F
     return np.ascontiguousarray(made[:, 0]), np.ascontiguousarray(made[:, 1:])
 
 
-@kernel(inlined=True)
-def show(nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, r: int, s: int) -> None:
-    """Fill in the sample of slot ``s``, where it is one."""
-    k, H, n = plan.sample[s], len(nodes.rows), nodes.xhat.shape[1]
+@kernel
+def show(
+    nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, room: SlotRoom, b: int, s: int
+) -> None:
+    """Fill in the samples of a block in slot ``s``, where it is one."""
+    k, lanes = plan.sample[s], room.lanes
     if k < 0:
         return
-    for h in range(H):
-        place = r * H + h
+    n, first = nodes.xhat.shape[2], b * len(lanes)
+    for h in range(len(nodes.rows)):
+        # P = S S', lower triangle and its mirror image, because samples hold covariances.
         for i in range(n):
-            samples.xhat[r, k, h, i] = nodes.xhat[place, i]
-            # P = S S', lower triangle and its mirror image, because samples hold covariances.
             for j in range(i + 1):
-                total = 0.0
+                total = spread(lanes, 0.0)
                 for m in range(j + 1):
-                    total += nodes.root[place, i, m] * nodes.root[place, j, m]
-                samples.P[r, k, h, i, j] = samples.P[r, k, h, j, i] = total
+                    total += load(lanes, nodes.root, b, h, i, m) * load(
+                        lanes, nodes.root, b, h, j, m
+                    )
+                store(lanes, room.moved, i, j, total)
+                store(lanes, room.moved, j, i, total)
+        # From lanes to runs; idle lanes have none.
+        for q in range(min(len(lanes), len(samples.xhat) - first)):
+            for i in range(n):
+                samples.xhat[first + q, k, h, i] = nodes.xhat[b, h, i, q]
+                for j in range(n):
+                    samples.P[first + q, k, h, i, j] = room.moved[i, j, q]
 
 
-@kernel(inlined=True)
-def rebase(nodes: SlotNodes, readings: SlotReadings, r: int, s: int) -> None:
+@kernel
+def rebase(nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, b: int, s: int) -> None:
     """Count estimates from the state of slot ``s``, where a frame of coordinates begins."""
     # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
-        H = len(nodes.rows)
-        for h in range(H):
-            for i in range(nodes.xhat.shape[1]):
-                nodes.xhat[r * H + h, i] -= readings.local[r, s, i]
+        for h in range(len(nodes.rows)):
+            for i in range(nodes.xhat.shape[2]):
+                x = load(room.lanes, nodes.xhat, b, h, i)
+                origin = load(room.lanes, readings.local, b, s, i)
+                store(room.lanes, nodes.xhat, b, h, i, x - origin)
+
+
+@kernel
+def read_all(nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, b: int, s: int) -> None:
+    """Update all filters of a block with their own readings of slot ``s``."""
+    for h in range(len(nodes.rows)):
+        use_reading(nodes, readings, room, b, s, h, h, True)
 
 
 @kernel(inlined=True)
 def use_reading(
     nodes: SlotNodes,
-    place: int,
     readings: SlotReadings,
-    r: int,
+    room: SlotRoom,
+    b: int,
     s: int,
     h: int,
-    room: UpdateScratch,
+    sender: int,
+    arrived: Any,
 ) -> None:
-    """Update a place with the reading of filter ``h`` in slot ``s`` of run ``r``."""
-    n = nodes.xhat.shape[1]
-    # H that is fixed has one run and one slot, and r % 1 = 0 finds it.
-    rH, sH = r % readings.H.shape[0], s % readings.H.shape[1]
-    for row in range(nodes.rows[h]):
+    """Update filter ``h`` of a block with the reading of filter ``sender`` in slot ``s``, in the
+    lanes where it has ``arrived``.
+    """
+    lanes, row, gains, n = room.lanes, room.row, room.gains, nodes.xhat.shape[2]
+    # H that is fixed has one block and one slot.
+    c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
+    for k in range(nodes.rows[sender]):
         # Scalar update with unit noise: h S and the innovation y - h x with all earlier rows used.
-        innovation = readings.y[r, s, h, row]
+        innovation = load(lanes, readings.y, b, s, sender, k)
         for j in range(n):
-            total = 0.0
+            total = spread(lanes, 0.0)
             for i in range(j, n):
-                total += readings.H[rH, sH, h, row, i] * nodes.root[place, i, j]
-            room.HS[0, j] = total
-            innovation -= readings.H[rH, sH, h, row, j] * nodes.xhat[place, j]
+                weight = load(lanes, readings.H, c, t, sender, k, i)
+                total += weight * load(lanes, nodes.root, b, h, i, j)
+            # A row of zeros changes nothing.
+            store(lanes, row, j, select(arrived, total, 0.0))
+            weight = load(lanes, readings.H, c, t, sender, k, j)
+            innovation -= weight * load(lanes, nodes.xhat, b, h, j)
         # ``size`` is the standard deviation of the innovation, so the gain is gains / size.
-        size = rotate_out(room.size, nodes.root, place, room.HS, 0, room.gains, 1.0)
+        step = innovation / rotate_lanes(lanes, nodes.root, b, h, row, gains)
         for i in range(n):
-            nodes.xhat[place, i] += room.gains[0, i] * (innovation / size)
+            x = load(lanes, nodes.xhat, b, h, i)
+            store(lanes, nodes.xhat, b, h, i, x + load(lanes, gains, i) * step)
 
 
 @kernel(inlined=True)
-def predict_mean(nodes: SlotNodes, place: int, room: SlotRoom) -> None:
-    """Move the estimate of a place to the next slot, ``F xhat``."""
-    n = nodes.xhat.shape[1]
+def rotate_lanes(
+    lanes: Lanes, root: FloatArray, b: int, h: int, row: FloatArray, gains: FloatArray
+) -> Any:
+    """Use the scalar observation with ``h S = row`` (n, L) and unit noise; the gain is ``gains``
+    (n, L) over the value that is returned, the standard deviation of the innovation.
+
+    These are the rotations of ``root_update.rotate_out``; an entry of 0 turns nothing.
+    """
+    n = root.shape[2]
     for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += nodes.F[i, j] * nodes.xhat[place, j]
-        room.vectors[0, i] = total
-    # F xhat needs all of the old xhat, hence the copy.
-    for i in range(n):
-        nodes.xhat[place, i] = room.vectors[0, i]
+        store(lanes, gains, i, 0.0)
+    # [1, h S; 0, S] times rotations that empty h S from its end, so that S stays triangular.
+    pivot = square = spread(lanes, 1.0)
+    for j in range(n - 1, -1, -1):
+        entry = load(lanes, row, j)
+        square += entry * entry
+        whole = root_of(square)
+        inverse = 1.0 / whole
+        # Exactly 1 for an entry of 0, so that not even rounding touches the root.
+        idle = entry == 0.0
+        c, s = select(idle, 1.0, pivot * inverse), entry * inverse
+        pivot = select(idle, pivot, whole)
+        # Rotate column j of [h S; S] into the column of the gain.
+        for i in range(j, n):
+            old, gain = load(lanes, root, b, h, i, j), load(lanes, gains, i)
+            store(lanes, root, b, h, i, j, c * old - s * gain)
+            store(lanes, gains, i, s * old + c * gain)
+    return pivot
 
 
 @kernel
-def predict(nodes: SlotNodes, room: SlotRoom) -> None:
-    """Move all places to the next slot: ``F xhat`` and ``F P F' + Q``."""
-    for place in range(len(nodes.xhat)):
-        predict_mean(nodes, place, room)
-    # Filters of all runs share F and Q, so their covariances are predicted LANES at a time.
-    for first in range(0, len(nodes.root), LANES):
-        predict_roots(nodes.root, first, nodes.F, nodes.root_Q, room.lanes)
+def predict(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
+    """Move all filters of a block to the next slot: ``F xhat`` and ``F P F' + Q``."""
+    for h in range(len(nodes.rows)):
+        predict_mean(nodes, room, b, h)
+        predict_root(room.lanes, nodes.root, b, h, nodes.F, nodes.root_Q, room.moved, room.noise)
 
 
 @kernel(inlined=True)
-def predict_roots(  # noqa: PLR0912 - loops side by side
-    root: FloatArray, first: int, F: FloatArray, root_Q: FloatArray, lanes: Lanes
-) -> None:
-    """Make LANES places of root (K, n, n) from ``first`` on the lower triangular roots of
-    ``F S S' F' + Q``; S and ``root_Q`` (n, n) are lower triangular.
-
-    All are worked on side by side, which the processor does with one instruction for several.
-    """
-    n, count = root.shape[1], min(LANES, len(root) - first)
-    S, moved, noise, total = lanes.root, lanes.moved, lanes.noise, lanes.total
+def predict_mean(nodes: SlotNodes, room: SlotRoom, b: int, h: int) -> None:
+    """Move the estimate of a filter to the next slot, ``F xhat``."""
+    lanes, n = room.lanes, nodes.xhat.shape[2]
     for i in range(n):
-        # Lanes are the last axis: contiguous, so that one load fills a vector register.
-        for j in range(i + 1):
-            for q in range(count):
-                S[i, j, q] = root[first + q, i, j]
-    for i in range(n):
-        # All LANES are computed even if fewer are used: a constant length compiles to vector code,
-        # and the surplus is not stored.
+        total = spread(lanes, 0.0)
         for j in range(n):
-            for q in range(LANES):
-                moved[i, j, q] = 0.0
-            # F S; S is lower triangular, so the sum begins at m = j.
+            total += nodes.F[i, j] * load(lanes, nodes.xhat, b, h, j)
+        store(lanes, room.moved_mean, i, total)
+    # F xhat needs all of the old xhat, hence the copy.
+    for i in range(n):
+        store(lanes, nodes.xhat, b, h, i, load(lanes, room.moved_mean, i))
+
+
+@kernel(inlined=True)
+def predict_root(
+    lanes: Lanes,
+    root: FloatArray,
+    b: int,
+    h: int,
+    F: FloatArray,
+    root_Q: FloatArray,
+    moved: FloatArray,
+    noise: FloatArray,
+) -> None:
+    """Make the lower triangular root S of filter ``h`` of a block that of ``F S S' F' + Q``;
+    ``root_Q`` (n, n) is lower triangular; ``moved`` and ``noise`` (n, n, L) are scratch.
+    """
+    n = len(F)
+    for i in range(n):
+        # F S; S is lower triangular, so the sum begins at m = j.
+        for j in range(n):
+            total = spread(lanes, 0.0)
             for m in range(j, n):
-                for q in range(LANES):
-                    moved[i, j, q] += F[i, m] * S[m, j, q]
+                total += F[i, m] * load(lanes, root, b, h, m, j)
+            store(lanes, moved, i, j, total)
         # A fresh root of Q per lane: the reflections use it up.
         for j in range(i + 1):
-            for q in range(LANES):
-                noise[i, j, q] = root_Q[i, j]
-    # Reflect row by row, as root_flow.transform() does, which leaves a lower triangular root.
+            store(lanes, noise, i, j, root_Q[i, j])
+    # Reflect [F S, root_Q] from the right, row by row, which leaves a lower triangular root.
     for i in range(n):
-        reflect_row(i, n, lanes)
-        for r in range(i + 1, n):
-            for q in range(LANES):
-                total[q] = lanes.pivot[q] * moved[r, i, q]
-            for j in range(i + 1, n):
-                for q in range(LANES):
-                    total[q] += moved[i, j, q] * moved[r, j, q]
-            for j in range(i + 1):
-                for q in range(LANES):
-                    total[q] += noise[i, j, q] * noise[r, j, q]
-            # Columns are flipped so that the diagonal stays nonnegative.
-            for q in range(LANES):
-                total[q] *= lanes.scale[q]
-                S[r, i, q] = lanes.sign[q] * (total[q] * lanes.pivot[q] - moved[r, i, q])
-            for j in range(i + 1, n):
-                for q in range(LANES):
-                    moved[r, j, q] -= total[q] * moved[i, j, q]
-            for j in range(i + 1):
-                for q in range(LANES):
-                    noise[r, j, q] -= total[q] * noise[i, j, q]
-    for i in range(n):
-        for j in range(i + 1):
-            for q in range(count):
-                root[first + q, i, j] = S[i, j, q]
+        reflect_row(lanes, root, b, h, i, moved, noise)
 
 
 @kernel(inlined=True)
-def reflect_row(i: int, n: int, lanes: Lanes) -> None:
-    """Find the reflection from the right that empties row ``i`` of [F S, root_Q] beyond its
-    diagonal: the row with ``pivot`` on the diagonal, times ``scale``.
+def reflect_row(
+    lanes: Lanes, root: FloatArray, b: int, h: int, i: int, moved: FloatArray, noise: FloatArray
+) -> None:
+    """Write column ``i`` of the triangular root of ``[moved, noise]``: the reflection that empties
+    row ``i`` beyond its diagonal, applied to the rows below.
     """
-    # The columns of root_Q right of i are still zero here. Signs are those that cancel nothing.
-    moved, noise, total = lanes.moved, lanes.noise, lanes.total
-    for q in range(LANES):
-        total[q] = 0.0
+    # The columns of root_Q right of i are still zero here.
+    n, pivot, beyond = len(moved), load(lanes, moved, i, i), spread(lanes, 0.0)
     for j in range(i + 1, n):
-        for q in range(LANES):
-            total[q] += moved[i, j, q] * moved[i, j, q]
+        entry = load(lanes, moved, i, j)
+        beyond += entry * entry
     for j in range(i + 1):
-        for q in range(LANES):
-            total[q] += noise[i, j, q] * noise[i, j, q]
-    for q in range(LANES):
-        pivot = moved[i, i, q]
-        length = math.sqrt(pivot * pivot + total[q])
-        # pivot and its length with one sign: nothing cancels.
-        lanes.sign[q] = math.copysign(1.0, pivot)
-        lanes.pivot[q] = pivot + lanes.sign[q] * length
-        # TINY keeps a row of zeros from dividing by zero: its reflection then only flips a column.
-        lanes.scale[q] = 1.0 / (length * (length + abs(pivot)) + TINY)
-        lanes.root[i, i, q] = length
+        entry = load(lanes, noise, i, j)
+        beyond += entry * entry
+    length = root_of(pivot * pivot + beyond)
+    # pivot and its length with one sign: nothing cancels.
+    sign = with_sign(spread(lanes, 1.0), pivot)
+    head = pivot + sign * length
+    # TINY keeps a row of zeros from dividing by zero: its reflection then only flips a column.
+    scale = 1.0 / (length * (length + magnitude(pivot)) + TINY)
+    # Columns are flipped so that the diagonal stays nonnegative.
+    store(lanes, root, b, h, i, i, length)
+    for r in range(i + 1, n):
+        first = load(lanes, moved, r, i)
+        total = head * first
+        for j in range(i + 1, n):
+            total += load(lanes, moved, i, j) * load(lanes, moved, r, j)
+        for j in range(i + 1):
+            total += load(lanes, noise, i, j) * load(lanes, noise, r, j)
+        total *= scale
+        store(lanes, root, b, h, r, i, sign * (total * head - first))
+        for j in range(i + 1, n):
+            entry = load(lanes, moved, r, j) - total * load(lanes, moved, i, j)
+            store(lanes, moved, r, j, entry)
+        for j in range(i + 1):
+            entry = load(lanes, noise, r, j) - total * load(lanes, noise, i, j)
+            store(lanes, noise, r, j, entry)
+
+
+@kernel
+def predict_one(
+    root: FloatArray, F: FloatArray, root_Q: FloatArray, moved: FloatArray, noise: FloatArray
+) -> None:
+    """``predict_root`` of one filter with one lane, root (1, 1, n, n, 1)."""
+    predict_root(ONE, root, 0, 0, F, root_Q, moved, noise)
 
 
 def predicted_root(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
     """The lower triangular root (n, n) of ``F S S' F' + Q``, of lower triangular roots."""
-    nodes = SlotNodes(np.zeros((1, len(F))), root[None].copy(), F, root_Q, np.zeros(1, np.int64))
-    predict(nodes, slot_room(1, len(F)))
-    return np.asarray(nodes.root[0])
+    n = len(F)
+    moved = np.array(root).reshape(1, 1, n, n, 1)
+    predict_one(moved, F, root_Q, np.empty((n, n, 1)), np.empty((n, n, 1)))
+    return np.asarray(moved.reshape(n, n))

@@ -1,20 +1,29 @@
 """Messages in slots, compiled: which nodes exchange, what arrives, and the events of all that.
 
 Every link draws from streams of its own, so that messages of many slots and runs are drawn before
-any estimate is computed. ``up`` (R, S, E, W) holds 1 where a message arrives on a direction in one
-of the E steps of a slot's exchanges.
+any estimate is computed. ``up`` (B, S, E, W, L) holds 1 where a message arrives on a direction in
+one of the E steps of a slot's exchanges, in B blocks of L runs side by side (``linalg.lanes``).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    Lanes,
+    load,
+    load_flags,
+    select,
+    spread,
+    store,
+    store_flags,
+)
 from netkf.network.matchings import PROTOCOLS
-from netkf.rng.draws import next_unit
+from netkf.rng.draws import next_unit, next_unit_of_lane, next_units
 from netkf.rng.numbers import next_integer, shuffle
 from netkf.trace.schema import CODES
 
@@ -47,10 +56,11 @@ class Channels(NamedTuple):
     places of nodes; direction 2 l goes from the first to the second).
 
     ``delivery`` (2, W): chance of a direction in the good and the bad state of its link. Streams
-    ``states`` and ``state_draws`` (R K, 4) of K links or directions, empty where nothing is drawn;
-    the last uniform number ``drawn`` (R K,) and state ``bad`` (R K,; -1 at first) of each; chances
-    ``to_bad``, ``to_good``. ``talks`` (E, W): whether the sender has something to send in a step.
-    A link has so many ``ways`` (directions) and ``streams`` of its own.
+    ``states`` and ``state_draws`` (B, K, 4, L) of K links or directions, empty where nothing is
+    drawn; the last uniform numbers ``drawn`` and ``state_drawn`` and state ``bad`` (B, K, L; -1 at
+    first) of each; chances ``to_bad``, ``to_good``. ``talks`` (E, W): whether the sender has
+    something to send in a step. A link has so many ``ways`` (directions) and ``streams`` of its
+    own.
     """
 
     ends: np.ndarray
@@ -58,6 +68,7 @@ class Channels(NamedTuple):
     states: np.ndarray
     state_draws: np.ndarray
     drawn: FloatArray
+    state_drawn: FloatArray
     bad: np.ndarray
     to_bad: float
     to_good: float
@@ -129,26 +140,53 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
 
 
 @kernel
-def draw_link(c: Channels, r: int, link: int, fresh: bool, up: np.ndarray, e: int) -> None:
-    """Decide about the messages of one activation of a link in step ``e``, into ``up`` (W,); links
-    that are not ``fresh`` keep their last numbers.
+def draw_link(
+    lanes: Lanes, c: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int
+) -> None:
+    """Decide about the messages of one activation of a link in all runs of a block, in step ``e``
+    of slot ``s`` of ``up``; links that are not ``fresh`` keep their last numbers.
     """
     for d in range(c.ways):
-        # The stream of this direction: with one stream per link (symmetric), both directions use
-        # it.
-        k = (r * len(c.ends) + link) * c.streams + d
-        if d >= c.streams:
-            k -= 1
+        # With one stream per link (symmetric) both directions use it.
+        k = link * c.streams + min(d, c.streams - 1)
         # Held links keep their number; -1 marks one that has none yet.
-        elif len(c.states) > 0 and (fresh or c.drawn[k] < 0.0):
-            c.drawn[k] = next_unit(c.states, k)
+        if d < c.streams and len(c.states) > 0 and (fresh or c.drawn[b, k, 0] < 0.0):
+            next_units(lanes, c.states, b, k, c.drawn)
             # A chain of states takes one step for each activation.
             if len(c.state_draws) > 0:
-                c.bad[k] = next_state(c.bad[k], next_unit(c.state_draws, k), c.to_bad, c.to_good)
+                next_units(lanes, c.state_draws, b, k, c.state_drawn)
+                for q in range(len(lanes)):
+                    c.bad[b, k, q] = next_state(
+                        c.bad[b, k, q], c.state_drawn[b, k, q], c.to_bad, c.to_good
+                    )
         w = link * c.ways + d
-        # ``bad`` is -1 for channels without a state, whose first row applies.
-        arrives = c.drawn[k] < c.delivery[max(c.bad[k], 0), w] and c.talks[e, w] == 1
-        up[w] = 1 if arrives else 0
+        if c.talks[e, w] == 1:
+            number = load(lanes, c.drawn, b, k)
+            if len(c.state_draws) == 0:
+                store_flags(lanes, up, b, s, e, w, number < c.delivery[0, w])
+                continue
+            for q in range(len(lanes)):
+                chance = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
+                up[b, s, e, w, q] = c.drawn[b, k, q] < chance
+
+
+@kernel
+def draw_link_of_lane(
+    c: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
+) -> None:
+    """``draw_link`` for the run of lane ``q`` alone, which uses this link."""
+    for d in range(c.ways):
+        k = link * c.streams + min(d, c.streams - 1)
+        if d < c.streams and len(c.states) > 0 and (fresh or c.drawn[b, k, q] < 0.0):
+            c.drawn[b, k, q] = next_unit_of_lane(c.states, b, k, q)
+            if len(c.state_draws) > 0:
+                u = next_unit_of_lane(c.state_draws, b, k, q)
+                c.bad[b, k, q] = next_state(c.bad[b, k, q], u, c.to_bad, c.to_good)
+        w = link * c.ways + d
+        if c.talks[e, w] == 1:
+            # A channel without a state has -1 there.
+            chance = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
+            up[b, s, e, w, q] = c.drawn[b, k, q] < chance
 
 
 @kernel
@@ -165,6 +203,7 @@ def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
 
 @kernel
 def draw_messages(
+    lanes: Lanes,
     c: Channels,
     m: Matchings,
     exchanged: np.ndarray,
@@ -173,27 +212,42 @@ def draw_messages(
     active: np.ndarray,
     count: np.ndarray,
 ) -> None:
-    """Fill ``up`` (R, S, E, W) in the slots that are ``exchanged`` (S,); links draw anew in steps
-    that are ``fresh`` (E,). Of matchings, ``active`` (R, S, E, A) are the links in their order and
-    ``count`` (R, S, E) is their number.
+    """Fill ``up`` (B, S, E, W, L), zeros before, in the slots that are ``exchanged`` (S,); links
+    draw anew in steps that are ``fresh`` (E,). Of matchings, ``active`` (R, S, E, A) are the links
+    in their order and ``count`` (R, S, E) is their number.
     """
-    for r in range(up.shape[0]):
+    for b in range(up.shape[0]):
         for s in range(up.shape[1]):
-            if not exchanged[s]:
-                continue
-            for e in range(up.shape[2]):
-                if m.protocol < 0:
-                    # Broadcast: every link is used in every step.
-                    for link in range(len(c.ends)):
-                        draw_link(c, r, link, fresh[e], up[r, s, e], e)
+            for e in range(up.shape[2] if exchanged[s] else 0):
+                if m.protocol >= 0:
+                    draw_pairs(lanes, c, m, fresh[e], up, active, count, b, s, e)
                     continue
-                # A matching uses few links: the others must be 0.
-                for w in range(up.shape[3]):
-                    up[r, s, e, w] = 0
-                found = draw_matching(m, c.ends, r, active[r, s, e])
-                count[r, s, e] = found
-                for k in range(found):
-                    draw_link(c, r, active[r, s, e, k], fresh[e], up[r, s, e], e)
+                # Broadcast: every link is used in every step.
+                for link in range(len(c.ends)):
+                    draw_link(lanes, c, b, link, fresh[e], up, s, e)
+
+
+@kernel
+def draw_pairs(
+    lanes: Lanes,
+    c: Channels,
+    m: Matchings,
+    fresh: bool,
+    up: np.ndarray,
+    active: np.ndarray,
+    count: np.ndarray,
+    b: int,
+    s: int,
+    e: int,
+) -> None:
+    """Draw the matchings of a step in all runs of a block, and their messages."""
+    first = b * len(lanes)
+    for q in range(min(len(lanes), len(count) - first)):
+        r = first + q
+        found = draw_matching(m, c.ends, r, active[r, s, e])
+        count[r, s, e] = found
+        for k in range(found):
+            draw_link_of_lane(c, b, active[r, s, e, k], fresh, up, s, e, q)
 
 
 class Stages(NamedTuple):
@@ -224,8 +278,8 @@ class SlotTimes(NamedTuple):
 
 class Hearing(NamedTuple):
     """Ids of all nodes (N,) and of those with sensors; the directions by receiver, as
-    algorithms.kernels.slots.SlotLinks has them; the number of messages sent so far (R, W); the slot
-    in which each node stopped (R, N), and whether it sends no more then.
+    algorithms.kernels.slots.SlotLinks has them; the number of messages sent so far (W,) by a
+    recorded run; the slot in which each node stopped (B, N, L), and whether it sends no more then.
     """
 
     nodes: np.ndarray
@@ -239,8 +293,8 @@ class Hearing(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Columns of the events of one run, of no length where they are only counted; how many there
-    are at each sample (T,), and of each kind in each run (R, KINDS).
+    """Columns of the events of one run; how many there are at each sample (T,), and of each kind,
+    (1, KINDS).
     """
 
     t: FloatArray
@@ -255,8 +309,8 @@ class Rows(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Messages of a block: ``up`` (R, S, E, W), links ``active`` in matchings (R, S, E, A), their
-    number ``pairs`` (R, S, E).
+    """Messages of S slots: ``up`` (B, S, E, W, L), links ``active`` in matchings (R, S, E, A), and
+    their number ``pairs`` (R, S, E).
     """
 
     up: np.ndarray
@@ -265,11 +319,10 @@ class Drawn(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """The circumstances of events: the ``run``, the ``slot`` by number and by place ``s`` in the
-    block, ``step`` and ``phase`` of the exchange (-1 where nodes read), the time ``t`` in seconds.
+    """The circumstances of events: the ``slot`` by number and by place ``s`` in the block, ``step``
+    and ``phase`` of the exchange (-1 where nodes read), the time ``t`` in seconds.
     """
 
-    run: int
     slot: int
     s: int
     step: int
@@ -282,11 +335,9 @@ def note(
     rows: Rows, m: Moment, kind: int, node: int, peer: int, message: int, age: float, at: int
 ) -> int:
     """Count one event and write it into row ``at``; return the next row."""
-    # Counting is cheap and always done; rows are written as long as there is room.
-    rows.counts[m.run, kind] += 1
-    if at < len(rows.t):
-        rows.t[at], rows.kind[at], rows.node[at], rows.peer[at] = m.t, kind, node, peer
-        rows.message[at], rows.phase[at], rows.age[at] = message, m.phase, age
+    rows.counts[0, kind] += 1
+    rows.t[at], rows.kind[at], rows.node[at], rows.peer[at] = m.t, kind, node, peer
+    rows.message[at], rows.phase[at], rows.age[at] = message, m.phase, age
     return at + 1
 
 
@@ -294,20 +345,17 @@ def note(
 def make_rows(
     stages: Stages, times: SlotTimes, c: Channels, h: Hearing, d: Drawn, pairwise: bool, rows: Rows
 ) -> int:
-    """Write the events of these slots in their order; return the number of rows of the last run."""
+    """Write the events of a run that is alone, in their order; return how many there are."""
     at = 0
-    for r in range(d.up.shape[0]):
-        # Rows are those of the last run: only a single run asks for them.
-        at = 0
-        for s in range(len(times.start)):
-            # Filters that predict are sampled before anything happens in the slot.
-            if times.predicts:
-                mark_sample(times, s, rows, at)
-            # At the horizon nothing is recorded but the sample.
-            if times.noted[s]:
-                at = _slot_rows(stages, times, c, h, d, pairwise, rows, r, s, at)
-            if not times.predicts:
-                mark_sample(times, s, rows, at)
+    for s in range(len(times.start)):
+        # Filters that predict are sampled before anything happens in the slot.
+        if times.predicts:
+            mark_sample(times, s, rows, at)
+        # At the horizon nothing is recorded but the sample.
+        if times.noted[s]:
+            at = _slot_rows(stages, times, c, h, d, pairwise, rows, s, at)
+        if not times.predicts:
+            mark_sample(times, s, rows, at)
     return at
 
 
@@ -315,7 +363,7 @@ def make_rows(
 def mark_sample(times: SlotTimes, s: int, rows: Rows, at: int) -> None:
     """Keep how many rows come before the sample of a slot, if it has one."""
     k = times.sample[s]
-    if k >= 0 and k < len(rows.at_sample):
+    if k >= 0:
         rows.at_sample[k] = at
 
 
@@ -328,14 +376,13 @@ def _slot_rows(
     d: Drawn,
     pairwise: bool,
     rows: Rows,
-    r: int,
     s: int,
     at: int,
 ) -> int:
-    """Write the events of one slot of run ``r``; return the row."""
+    """Write the events of one slot; return the row."""
     now = times.start[s]
     for k in range(len(stages.step)):
-        m = Moment(r, times.first + s, s, stages.step[k], stages.phase[k], now)
+        m = Moment(times.first + s, s, stages.step[k], stages.phase[k], now)
         if m.step < 0:
             if times.sensed[s]:
                 for node in h.sensing:
@@ -344,7 +391,7 @@ def _slot_rows(
             at = _sent(c, h, d, rows, m, pairwise, stages.stopping, at)
             # Absorptions happen at the end of the step, when its inboxes close.
             now = times.start[s] + stages.end[k]
-            closing = Moment(r, m.slot, s, m.step, m.phase, now)
+            closing = Moment(m.slot, s, m.step, m.phase, now)
             at = _closed(h, d, rows, closing, pairwise, stages.stopping, at)
     return at
 
@@ -363,9 +410,9 @@ def _sent(
     """Write what is sent in a step, after the tick of each pair or one round; return the row."""
     if not pairwise:
         at = note(rows, m, ROUND, -1, -1, -1, NAN, at)
-    links = d.pairs[m.run, m.s, m.step] if pairwise else len(c.ends)
+    links = d.pairs[0, m.s, m.step] if pairwise else len(c.ends)
     for a in range(links):
-        link = d.active[m.run, m.s, m.step, a] if pairwise else a
+        link = d.active[0, m.s, m.step, a] if pairwise else a
         if pairwise:
             i, j = h.nodes[c.ends[link, 0]], h.nodes[c.ends[link, 1]]
             at = note(rows, m, TICK, i, j, -1, NAN, at)
@@ -381,14 +428,14 @@ def _link_rows(
     for end in range(c.ways):
         w, i = link * c.ways + end, c.ends[link, end]
         # By the paper's rule a node that stopped in an earlier slot sends no more mass.
-        gone = h.silences and m.step == stopping and h.stopped[m.run, i] < m.slot
+        gone = h.silences and m.step == stopping and h.stopped[0, i, 0] < m.slot
         if c.talks[m.step, w] == 0 or gone:
             continue
         # Messages of a direction are numbered from 0, lost ones included.
-        number, sender, receiver = h.sent[m.run, w], h.nodes[i], h.nodes[c.ends[link, 1 - end]]
-        h.sent[m.run, w] = number + 1
+        number, sender, receiver = h.sent[w], h.nodes[i], h.nodes[c.ends[link, 1 - end]]
+        h.sent[w] = number + 1
         at = note(rows, m, SEND, sender, receiver, number, NAN, at)
-        if d.up[m.run, m.s, m.step, w] == 1:
+        if d.up[0, m.s, m.step, w, 0] == 1:
             at = note(rows, m, DELIVER, receiver, sender, number, 0.0, at)
         else:
             at = note(rows, m, LOST, sender, receiver, number, NAN, at)
@@ -403,15 +450,132 @@ def _closed(
     for i in range(len(h.nodes)):
         heard = False
         for k in range(h.first[i], h.first[i + 1]):
-            if d.up[m.run, m.s, m.step, h.way[k]] == 1:
+            if d.up[0, m.s, m.step, h.way[k], 0] == 1:
                 heard = True
                 if pairwise:
                     # The message of this step is the last one that was numbered.
-                    peer, number = h.nodes[h.sender[k]], h.sent[m.run, h.way[k]] - 1
+                    peer, number = h.nodes[h.sender[k]], h.sent[h.way[k]] - 1
                     at = note(rows, m, SWAP, h.nodes[i], peer, number, 0.0, at)
         if heard and not pairwise:
             at = note(rows, m, ABSORB, h.nodes[i], -1, -1, 0.0, at)
         # A node that stops in this slot does so after it absorbed.
-        if m.step == stopping and h.stopped[m.run, i] == m.slot:
+        if m.step == stopping and h.stopped[0, i, 0] == m.slot:
             at = note(rows, m, STOP, h.nodes[i], -1, -1, NAN, at)
     return at
+
+
+@kernel
+def count_events(
+    lanes: Lanes,
+    stages: Stages,
+    times: SlotTimes,
+    c: Channels,
+    h: Hearing,
+    d: Drawn,
+    pairwise: bool,
+    scratch: FloatArray,
+    counts: np.ndarray,
+) -> None:
+    """Add the events of R runs by kind to ``counts`` (R, KINDS), as ``make_rows`` would write them;
+    ``scratch`` (KINDS, L).
+    """
+    for b in range(d.up.shape[0]):
+        for kind in range(len(scratch)):
+            store(lanes, scratch, kind, 0.0)
+        for s in range(len(times.start)):
+            for k in range(len(stages.step) if times.noted[s] else 0):
+                e = stages.step[k]
+                if e < 0 and times.sensed[s]:
+                    add_count(lanes, scratch, SENSE, 1.0 * len(h.sensing))
+                elif e >= 0 and times.exchanged[s]:
+                    m = Moment(times.first + s, s, e, stages.phase[k], 0.0)
+                    count_step(lanes, c, h, d, m, pairwise, stages.stopping, scratch, counts, b)
+        first = b * len(lanes)
+        for q in range(min(len(lanes), len(counts) - first)):
+            for kind in range(len(scratch)):
+                counts[first + q, kind] += int(scratch[kind, q])
+
+
+@kernel(inlined=True)
+def add_count(lanes: Lanes, scratch: FloatArray, kind: int, number: Any) -> None:
+    """Count so many events of a kind in each lane."""
+    store(lanes, scratch, kind, load(lanes, scratch, kind) + number)
+
+
+@kernel
+def count_step(
+    lanes: Lanes,
+    c: Channels,
+    h: Hearing,
+    d: Drawn,
+    m: Moment,
+    pairwise: bool,
+    stopping: int,
+    scratch: FloatArray,
+    counts: np.ndarray,
+    b: int,
+) -> None:
+    """Count the events of one step of an exchange in the runs of a block."""
+    stops = m.step == stopping
+    if pairwise:
+        count_pairs(lanes, c, d, m, counts, b)
+    else:
+        add_count(lanes, scratch, ROUND, 1.0)
+        sent = 0
+        for w in range(d.up.shape[3]):
+            sent += c.talks[m.step, w]
+        add_count(lanes, scratch, SEND, 1.0 * sent)
+        add_count(lanes, scratch, LOST, 1.0 * sent)
+        if h.silences and stops:
+            count_silent(lanes, c, h, m, counts, b)
+    # Each message that arrives is one that was not lost.
+    absorbed = came = spread(lanes, 0.0)
+    for i in range(len(h.nodes)):
+        heard = spread(lanes, 0.0)
+        for k in range(h.first[i], h.first[i + 1]):
+            up = load_flags(lanes, d.up, b, m.s, m.step, h.way[k])
+            heard += select(up, 1.0, 0.0)
+        came += heard
+        absorbed += select(heard > 0.0, 1.0, 0.0)
+    add_count(lanes, scratch, DELIVER, came)
+    add_count(lanes, scratch, LOST, -came)
+    add_count(lanes, scratch, SWAP if pairwise else ABSORB, came if pairwise else absorbed)
+    if stops:
+        count_stops(lanes, h, m, counts, b)
+
+
+@kernel
+def count_pairs(lanes: Lanes, c: Channels, d: Drawn, m: Moment, counts: np.ndarray, b: int) -> None:
+    """Count the pairs of a step in the runs of a block, and what they send."""
+    first = b * len(lanes)
+    for r in range(first, min(first + len(lanes), len(counts))):
+        pairs, sent = d.pairs[r, m.s, m.step], 0
+        for a in range(pairs):
+            for way in range(c.ways):
+                sent += c.talks[m.step, d.active[r, m.s, m.step, a] * c.ways + way]
+        counts[r, TICK] += pairs
+        counts[r, SEND] += sent
+        counts[r, LOST] += sent
+
+
+@kernel
+def count_silent(
+    lanes: Lanes, c: Channels, h: Hearing, m: Moment, counts: np.ndarray, b: int
+) -> None:
+    """Take off the messages of nodes that stopped in an earlier slot and send no more."""
+    first = b * len(lanes)
+    for r in range(first, min(first + len(lanes), len(counts))):
+        for w in range(len(c.ends) * c.ways):
+            sender = c.ends[w // c.ways, w % c.ways]
+            if c.talks[m.step, w] == 1 and h.stopped[b, sender, r - first] < m.slot:
+                counts[r, SEND] -= 1
+                counts[r, LOST] -= 1
+
+
+@kernel
+def count_stops(lanes: Lanes, h: Hearing, m: Moment, counts: np.ndarray, b: int) -> None:
+    """Count the nodes that stop in a slot."""
+    first = b * len(lanes)
+    for r in range(first, min(first + len(lanes), len(counts))):
+        for i in range(len(h.nodes)):
+            counts[r, STOP] += h.stopped[b, i, r - first] == m.slot

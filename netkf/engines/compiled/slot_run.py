@@ -1,7 +1,8 @@
 """Runs in slots: messages, truth and readings of many slots are drawn, then the filters follow.
 
-A call of a kernel takes S slots of R runs at a time. Where channels or clocks are a user's own, or
-messages take time, the messages of one run are made in Python (engines.compiled.slot_events).
+A call of a kernel takes S slots of R runs at a time, which are side by side in B blocks of L lanes
+(linalg.lanes). Where channels or clocks are a user's own, or messages take time, the messages of
+one run are made in Python (engines.compiled.slot_events).
 """
 
 from __future__ import annotations
@@ -29,11 +30,14 @@ from netkf.engines.compiled.slot_messages import (
     Matchings,
     Rows,
     SlotTimes,
+    count_events,
     draw_messages,
     make_rows,
 )
 from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes
+from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
 from netkf.rng.draws import StreamBatch
 from netkf.rng.numbers import normal_ziggurat
@@ -47,7 +51,7 @@ NEVER = np.iinfo(np.int64).max
 
 
 class SlotBlock(NamedTuple):
-    """Results of S slots of R runs: states absolute and local (R, S, n), the slots that are
+    """Results of S slots of R runs: states absolute and local (R, T, n) in the slots that are
     ``sampled`` (T,), and what the filters had then.
     """
 
@@ -69,10 +73,10 @@ class SlotRuns:
         self.runs = 1 if isinstance(streams, Streams) else streams.count
         self._slot = 0
         setup, runs = self.setup, self.runs
-        # Filters of run r are places r H to (r + 1) H - 1 of all arrays.
+        self._blocks = blocks = blocks_of(runs)
         self._nodes = SlotNodes(
-            np.tile(setup.xhat, (runs, 1)),
-            np.tile(setup.root, (runs, 1, 1)),
+            in_lanes(setup.xhat, blocks),
+            in_lanes(setup.root, blocks),
             setup.F,
             setup.root_Q,
             setup.rows,
@@ -80,9 +84,9 @@ class SlotRuns:
         self._room = slot_room(setup.hosts, setup.n)
         self._extra = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
         # No slot reaches it: a node that never stops.
-        self._stopped = np.full((runs, setup.hosts), NEVER)
-        self._conserved = np.zeros((runs, setup.hosts, 2))
-        self._sent = np.zeros((runs, len(setup.directions)), dtype=np.int64)
+        self._stopped = np.full((blocks, setup.hosts, LANES), NEVER)
+        self._conserved = aligned((blocks, setup.hosts, 2, LANES))
+        self._sent = np.zeros(len(setup.directions), dtype=np.int64)
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
         self._begin_readings()
@@ -100,11 +104,10 @@ class SlotRuns:
             self._truth = self._scenario.slot_truth(self._streams.per_replica[0])
             return
         self._plant_states = StreamBatch(self._streams, "plant", [()]).states
-        x = np.empty((self.runs, setup.n))
-        root = square_root(plant.start_cov)
-        draw_starts(self._plant_states, normal_ziggurat(), plant.start_mean, root, x)
+        x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
         # A root of the covariance, which may be singular.
-        origin = np.zeros(x.shape)
+        root, room = square_root(plant.start_cov), np.zeros((setup.n, LANES))
+        draw_starts(MANY, self._plant_states, normal_ziggurat(), plant.start_mean, root, room, x)
         self._path = Path(plant.F, square_root(plant.Q), setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
@@ -114,7 +117,7 @@ class SlotRuns:
         self._noise = StreamBatch(streams, "noise", entities).states
         self._regressors: list[tuple[Path, np.ndarray]] = []
         for s, (A, drive, start) in zip(setup.driven, setup.regressors, strict=True):
-            x = np.tile(start, (self.runs, 1))
+            x = in_lanes(start, self._blocks)
             # No frame: regressors do not grow as an unstable plant does.
             path = Path(A, drive, 0, x, np.zeros(x.shape))
             states = StreamBatch(streams, "regressor", [(s.node, s.place.ordinal)]).states
@@ -127,23 +130,22 @@ class SlotRuns:
     def _begin_messages(self) -> None:
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
         # Empty arrays tell the kernels to draw nothing.
-        nothing = np.zeros((0, 4), dtype=np.uint64)
+        nothing = np.zeros((0, 0, 4, LANES), dtype=np.uint64)
         drawn = setup.is_drawn and links > 0
         loss = drawn and not setup.loss.deterministic
-        count = self.runs * len(setup.entities)
+        shape = self._blocks, len(setup.entities), LANES
         chain: Any = setup.loss if setup.is_chain else None
         to_bad, to_good = chain._steps if chain is not None else (0.0, 1.0)
         entities = setup.entities
         self._channels = Channels(
             setup.ends,
             setup.delivery,
-            StreamBatch(streams, "loss", entities).states if loss else nothing,
-            StreamBatch(streams, "weather", entities).states
-            if loss and setup.is_chain
-            else nothing,
+            self._in_lanes("loss", entities) if loss else nothing,
+            self._in_lanes("weather", entities) if loss and setup.is_chain else nothing,
             # -1 marks numbers that are not drawn yet and states without a past.
-            np.full(count, -1.0),
-            np.full(count, -1, dtype=np.int64),
+            np.full(shape, -1.0),
+            np.full(shape, -1.0),
+            np.full(shape, -1, dtype=np.int64),
             to_bad,
             to_good,
             setup.talks,
@@ -158,6 +160,10 @@ class SlotRuns:
             states[:, :4] = StreamBatch(streams, "matching", [()]).states
         order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
         self._matchings = Matchings(protocol, chance, states, first, members, order, busy)
+
+    def _in_lanes(self, purpose: str, entities: list[Link]) -> np.ndarray:
+        """States (B, K, 4, L) of the streams of K entities of each run."""
+        return StreamBatch(self._streams, purpose, entities).in_lanes(self.runs)
 
     @property
     def over(self) -> bool:
@@ -174,9 +180,9 @@ class SlotRuns:
             drawn = self._draw_messages(times)
         else:
             # Python makes the messages: as many slots as gave about so many rows.
-            count, up = self._events.following(rows, self._stopped[0])
+            count, up = self._events.following(rows, self._stopped[0, :, 0])
             times = self._times(count, True)
-            drawn = Drawn(up, *(np.zeros((0,) * d, dtype=np.int64) for d in (4, 3)))
+            drawn = Drawn(_in_first_lane(up), *(np.zeros((0,) * d, dtype=np.int64) for d in (4, 3)))
         local, absolute, rebased = self._states(count)
         readings = self._readings(times, local, rebased)
         T = int((times.sample >= 0).sum())
@@ -192,6 +198,7 @@ class SlotRuns:
         kernel(self._nodes, readings, plan, setup.links, samples, self._room, *self._extra)
         self._slot += count
         sampled = np.flatnonzero(times.sample >= 0)
+        absolute, local = (by_run(x[:, sampled], self.runs) for x in (absolute, local))
         return SlotBlock(absolute, local, sampled, samples, times, drawn)
 
     def _times(self, count: int, wanted: bool) -> SlotTimes:
@@ -215,105 +222,126 @@ class SlotRuns:
 
     def _draw_messages(self, times: SlotTimes) -> Drawn:
         setup = self.setup
-        lead = self.runs, len(times.start), len(setup.fresh)
-        pairs = setup.most_pairs
+        steps, pairs = (len(times.start), len(setup.fresh)), setup.most_pairs
         drawn = Drawn(
-            np.zeros((*lead, len(setup.directions)), dtype=np.uint8),
-            np.zeros((*lead, pairs), dtype=np.int64),
-            np.zeros(lead, dtype=np.int64),
+            np.zeros((self._blocks, *steps, len(setup.directions), LANES), dtype=np.uint8),
+            np.zeros((self.runs, *steps, pairs), dtype=np.int64),
+            np.zeros((self.runs, *steps), dtype=np.int64),
         )
         if len(setup.directions):
-            draw_messages(self._channels, self._matchings, times.exchanged, setup.fresh, *drawn)
+            draw_messages(
+                MANY, self._channels, self._matchings, times.exchanged, setup.fresh, *drawn
+            )
         return drawn
 
     def _states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Local and absolute states (R, S, n), and where the origin moves (S,)."""
+        """Local and absolute states (B, S, n, L), and where the origin moves (S,)."""
         setup = self.setup
         slots = range(self._slot, self._slot + count)
         rebased = np.zeros(count, dtype=bool)
         if self._path is None:
             x = np.stack([self._truth.state(slot) for slot in slots])
-            # One truth for all runs, as a contiguous array that the kernels take.
-            x = np.ascontiguousarray(np.broadcast_to(x, (self.runs, *x.shape)))
+            # One truth for all runs.
+            x = in_lanes(x, self._blocks)
             return x, x, rebased
         # At the end of a frame the origin moves to the state.
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
-        shape = self.runs, count, setup.n
-        local, absolute = np.empty(shape), np.empty(shape)
-        room = np.empty((2, max(setup.n, self._path.root.shape[1])))
-        draw_paths(
-            self._path, self._plant_states, normal_ziggurat(), self._slot, room, local, absolute
-        )
+        shape = self._blocks, count, setup.n, LANES
+        local: FloatArray = aligned(shape)
         # Without frames both are the same array.
-        return local, (absolute if setup.frame else local), rebased
+        absolute: FloatArray = aligned(shape) if setup.frame else local
+        self._draw_path(self._path, self._plant_states, local, absolute)
+        return local, absolute, rebased
+
+    def _draw_path(
+        self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
+    ) -> None:
+        room = aligned((2, max(path.root.shape), LANES))
+        draw_paths(MANY, path, states, normal_ziggurat(), self._slot, room, local, absolute)
 
     def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> SlotReadings:
         setup, count = self.setup, local.shape[1]
-        shape = self.runs, count, setup.hosts, setup.p
-        y = np.zeros(shape)
-        H = np.zeros((*shape, setup.n)) if setup.varies else setup.H
+        shape = self._blocks, count, setup.hosts, setup.p
+        y: FloatArray = aligned((*shape, LANES))
+        H: FloatArray = setup.H
         if setup.varies:
+            H = aligned((*shape, setup.n, LANES))
             H[:] = setup.H
         x = local
         if rebased.any() and setup.algorithm.predicts:  # read in the frame that begins there
             x = local.copy()
             x[:, rebased] = 0.0
         k = setup.sensors.C.shape[2]
-        driven = np.empty((len(self._regressors), self.runs, count, k))
+        driven: FloatArray = aligned((len(self._regressors), self._blocks, count, k, LANES))
         for path, (steps, states) in zip(driven, self._regressors, strict=True):
-            room = np.empty((2, max(steps.root.shape)))
-            draw_paths(steps, states, normal_ziggurat(), self._slot, room, path, path)
-        noise, room = self._noise, np.empty(setup.p)
-        draw_readings(setup.sensors, noise, normal_ziggurat(), x, driven, room, y, H)
+            self._draw_path(steps, states, path, path)
+        noise, room = self._noise, np.zeros((setup.p, LANES))
+        draw_readings(MANY, setup.sensors, noise, normal_ziggurat(), x, driven, room, y, H)
         if not self._recorded or not times.sensed.any():
             return SlotReadings(y, H, local, rebased)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
         for s, path in self._recorded:
             some = slice(s.row, s.row + len(s.root))
-            values, matrices = path.several(slots, x[0, times.sensed])
-            # Whitened with the R that filters believe.
-            y[:, times.sensed, s.host, some] = np.linalg.solve(s.root, values.T).T
-            H[:, times.sensed, s.host, some] = np.linalg.solve(s.root, matrices)
+            values, matrices = path.several(slots, x[0, times.sensed, :, 0])
+            # Whitened with the R that filters believe; all runs read the same.
+            white = np.linalg.solve(s.root, values.T).T, np.linalg.solve(s.root, matrices)
+            y[:, times.sensed, s.host, some] = white[0][..., None]
+            H[:, times.sensed, s.host, some] = white[1][..., None]
         return SlotReadings(y, H, local, rebased)
 
-    def events(self, block: SlotBlock, wanted: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The EVENT rows of a block of one run and how many of them come before each sample; empty
-        where they are only counted.
-        """
+    def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
+        """The EVENT rows of a block of one run and how many of them come before each sample."""
         if self._events is not None:
-            return self._events.rows(self._stopped[0])
+            return self._events.rows(self._stopped[0, :, 0])
         setup = self.setup
-        # Space for the largest number of rows; 0 counts only.
-        size = setup.rows_of(len(block.times.start)) if wanted else 0
+        # Space for the largest number of rows.
+        size = setup.rows_of(len(block.times.start))
         places: Any = [np.empty(size, dtype=EVENT[name]) for name in ROW_COLUMNS]
-        at_sample = np.zeros(len(block.sampled) if wanted else 0, dtype=np.int64)
+        at_sample = np.zeros(len(block.sampled), dtype=np.int64)
         rows = Rows._make([*places, at_sample, self.counts])
-        heard = setup.links
-        hearing = Hearing(
-            setup.nodes, setup.sensing, heard.first, heard.sender, heard.way, self._sent,
-            self._stopped, setup.silences,
-        )  # fmt: skip
         count = make_rows(
-            setup.stages, block.times, self._channels, hearing, block.drawn,
+            setup.stages, block.times, self._channels, self._hearing(), block.drawn,
             setup.algorithm.pairwise, rows,
         )  # fmt: skip
         # Kernels fill plain columns, which become records here.
-        table = np.empty(min(count, size), dtype=EVENT)
+        table = np.empty(count, dtype=EVENT)
         for name, column in zip(ROW_COLUMNS, places, strict=True):
-            table[name] = column[: len(table)]
+            table[name] = column[:count]
         return table, at_sample
+
+    def count_events(self, block: SlotBlock) -> None:
+        """Add the events of a block to ``counts``."""
+        setup = self.setup
+        count_events(
+            MANY, setup.stages, block.times, self._channels, self._hearing(), block.drawn,
+            setup.algorithm.pairwise, aligned((len(KINDS), LANES)), self.counts,
+        )  # fmt: skip
+
+    def _hearing(self) -> Hearing:
+        setup, heard = self.setup, self.setup.links
+        return Hearing(
+            setup.nodes, setup.sensing, heard.first, heard.sender, heard.way, self._sent,
+            self._stopped, setup.silences,
+        )  # fmt: skip
 
     def conserved(self) -> dict[str, FloatArray]:
         """Sums over all nodes that exchanges conserve: (R, 2) at the start and the last sample."""
         given: list[Any] = [self.setup.algorithm.conserved(s) for s in self.setup.states]
-        found = {}
+        found, sums = {}, by_run(self._conserved, self.runs)
         for k, name in enumerate(given[0]):
             # fsum: the check is of the exchanges, and not of its own rounding.
             start = math.fsum(values[name] for values in given)
-            now = [math.fsum(column) for column in self._conserved[:, :, k].tolist()]
+            now = [math.fsum(column) for column in sums[:, :, k].tolist()]
             found[name] = np.array([[start, value] for value in now])
         return found
+
+
+def _in_first_lane(up: np.ndarray) -> np.ndarray:
+    """The messages (1, S, E, W, L) of one run, from (1, S, E, W)."""
+    wide = np.zeros((*up.shape, LANES), dtype=np.uint8)
+    wide[..., 0] = up
+    return wide
 
 
 ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
@@ -338,18 +366,18 @@ def _record_block(
     """Simulate and record some slots; return True if all estimates are sound."""
     # A block of about so many rows: memory does not grow with the run.
     block = runs.following(MOST_ROWS)
-    rows, before = runs.events(block, wanted=True)
+    rows, before = runs.events(block)
     if len(block.sampled):
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
-    x = block.absolute[0, block.sampled]
+    x = block.absolute[0]
     fine = recorded(
         scenario,
         recorder,
         progress,
         block.times.start[block.sampled],
         x,
-        block.local[0, block.sampled] if runs.setup.frame else x,
+        block.local[0] if runs.setup.frame else x,
         block.samples.xhat[0],
         block.samples.P[0],
         # The rows up to the first broken sample, if there is one.
@@ -383,8 +411,8 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
     while not runs.over:
         with np.errstate(over="ignore", invalid="ignore"):
             block = runs.following(0)
-        runs.events(block, wanted=False)
-        x, local = block.absolute[:, block.sampled], block.local[:, block.sampled]
+        runs.count_events(block)
+        x, local = block.absolute, block.local
         error = local[:, :, None] - block.samples.xhat
         xhat = block.samples.xhat
         # Estimates in absolute coordinates for the batch; errors stay local.

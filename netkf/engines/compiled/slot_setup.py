@@ -18,6 +18,7 @@ from netkf.engines.compiled.slot_messages import (
     Stages,
 )
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.network.channels import GilbertElliott, identical_per_link
 from netkf.network.graphs import Link
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
@@ -140,7 +141,7 @@ class SlotSetup:
         self.drawn = [s for s, k in zip(self.placed, kinds, strict=True) if k is not RecordedSensor]
         self.driven = [s for s, k in zip(self.placed, kinds, strict=True) if k is RegressorSensor]
         self.varies = bool(self.recorded or self.driven)
-        self.H = np.zeros((1, 1, self.hosts, self.p, self.n))
+        self.H: FloatArray = aligned((1, 1, self.hosts, self.p, self.n, LANES))
         self._set_drawn(scenario)
 
     def _set_drawn(self, scenario: Scenario) -> None:
@@ -159,7 +160,7 @@ class SlotSetup:
                 driven[m], H[m, 0, 0] = self.driven.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = np.linalg.solve(s.root, sensor.H)
-            self.H[0, 0, s.host, s.row : s.row + rows] = H[m, :rows]
+            self.H[0, 0, s.host, s.row : s.row + rows] = H[m, :rows, :, None]
         regressors: list[Any] = [scenario.sensors[s.place.entry] for s in self.driven]
         # Regressors of different sizes are padded with zeros, which stay zero.
         k = max((len(sensor.A) for sensor in regressors), default=1)
@@ -274,23 +275,24 @@ class SlotSetup:
         """Slots of so many runs that one call takes; with about so many ``rows`` of events, if that
         is not 0.
         """
-        slots = BLOCK_BYTES // (runs * self.bytes_of_slot())
+        slots = BLOCK_BYTES // (blocks_of(runs) * LANES * self.bytes_of_slot())
         if rows:
             slots = min(slots, rows // max(1, self.rows_of(1)))
         return max(1, int(slots))
 
     def batch_runs(self) -> int:
         """Runs that are simulated side by side."""
-        samples = 8 * len(self.samples) * self.hosts * (2 + self.n) * self.n
-        # All slots of so many runs fit one call.
-        runs = min(BLOCK_BYTES // self.bytes_of_slot() // max(1, self.slots), MOST_RUNS)
-        return max(1, int(min(runs, SAMPLE_BYTES // max(1, samples))))
+        samples = max(1, 8 * len(self.samples) * self.hosts * (2 + self.n) * self.n)
+        # Whole blocks of lanes, unless not even one fits the memory.
+        together = min(BATCH_BYTES // samples, BLOCK_BYTES // (8 * self.bytes_of_slot()))
+        whole = min(together, MOST_RUNS) // LANES * LANES
+        return int(min(max(whole, LANES), max(1, MOST_BATCH_BYTES // samples)))
 
 
-BLOCK_BYTES = 1 << 20
+BLOCK_BYTES = 1 << 21
 """Of what is drawn for one call of a filter's kernel: about what a core keeps close by."""
-SAMPLE_BYTES, MOST_RUNS = 1 << 23, 256
-"""Of the samples of a batch, and its largest number of runs."""
+BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 24, 1 << 29, 512
+"""Of the samples of a batch, those of a block of lanes, and the largest number of runs."""
 
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:

@@ -1,0 +1,132 @@
+"""Covariance intersection, D (8) and (9), of filters in slots: values of lanes, in place.
+
+Information is a root too, ``P^-1 = Z' Z``; the formulas are those of ``root_update``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from netkf.algorithms.kernels.root_update import NEGLIGIBLE, SINGULAR, TINY
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, store, with_sign
+
+
+@kernel(inlined=True)
+def invert_lanes(lanes: Lanes, out: FloatArray, root: FloatArray, b: int, h: int) -> None:
+    """Write the inverse of the root of filter ``h`` of a block into ``out[h]``, with pivots of at
+    least SINGULAR of their row; see ``root_update.invert_root``.
+    """
+    # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
+    n, least = root.shape[2], spread(lanes, TINY)
+    for i in range(n):
+        for j in range(i + 1):
+            entry = load(lanes, root, b, h, i, j)
+            least += NEGLIGIBLE * entry * entry
+    for i in range(n):
+        row = least
+        for j in range(i + 1):
+            entry = load(lanes, root, b, h, i, j)
+            row += entry * entry
+        diagonal, floor = load(lanes, root, b, h, i, i), SINGULAR * root_of(row)
+        size = magnitude(diagonal)
+        inverse = 1.0 / with_sign(select(size > floor, size, floor), diagonal)
+        # Forward substitution, row i of S^-1.
+        for j in range(i):
+            value = spread(lanes, 0.0)
+            for m in range(j, i):
+                value -= load(lanes, root, b, h, i, m) * load(lanes, out, h, m, j)
+            store(lanes, out, h, i, j, value * inverse)
+        store(lanes, out, h, i, i, inverse)
+
+
+@kernel(inlined=True)
+def whiten(
+    lanes: Lanes,
+    out: FloatArray,
+    weight: Any,
+    inverse: FloatArray,
+    xhat: FloatArray,
+    sender: int,
+    h: int,
+) -> None:
+    """Write the root of ``weight`` times the information that ``sender`` sends, ``inverse``
+    (H, n, n, L), into ``out`` (n, n + 1, L); means, in its last column, count from ``xhat[h]``.
+    """
+    n, size = inverse.shape[1], root_of(weight)
+    for i in range(n):
+        mean = spread(lanes, 0.0)
+        # sqrt(w) S^-1, a root of w P^-1.
+        for j in range(i + 1):
+            entry = size * load(lanes, inverse, sender, i, j)
+            store(lanes, out, i, j, entry)
+            mean += entry * (load(lanes, xhat, sender, j) - load(lanes, xhat, h, j))
+        store(lanes, out, i, n, mean)
+
+
+@kernel(inlined=True)
+def merge_lanes(lanes: Lanes, total: FloatArray, whitened: FloatArray) -> None:
+    """Make ``total`` (n, n + 1, L) the root of both informations, means in the last column;
+    ``whitened`` (n, n + 1, L) is used up.
+    """
+    # Both are lower triangular, and stay so when columns are emptied from the last one on.
+    n = len(total)
+    for j in range(n - 1, -1, -1):
+        pivot, below = load(lanes, total, j, j), spread(lanes, 0.0)
+        for r in range(j, n):
+            entry = load(lanes, whitened, r, j)
+            below += entry * entry
+        # Lanes in which there is nothing to empty stay as they are.
+        idle = below <= NEGLIGIBLE * pivot * pivot + TINY
+        length = root_of(pivot * pivot + below)
+        # pivot - length without cancellation: pivots of ``total`` are never negative.
+        first = select(idle, 0.0, -below / (pivot + length))
+        scale = select(idle, 0.0, 2.0 / (first * first + below))
+        store(lanes, total, j, j, select(idle, pivot, length))
+        # Reflect the columns left of j and, in the place of column j itself, that of the means.
+        for column in range(j + 1):
+            c = n if column == j else column
+            inner = first * load(lanes, total, j, c)
+            for r in range(j, n):
+                inner += load(lanes, whitened, r, j) * load(lanes, whitened, r, c)
+            inner *= scale
+            store(lanes, total, j, c, load(lanes, total, j, c) - inner * first)
+            for r in range(j, n):
+                entry = load(lanes, whitened, r, c) - inner * load(lanes, whitened, r, j)
+                store(lanes, whitened, r, c, entry)
+
+
+@kernel(inlined=True)
+def finish_lanes(
+    lanes: Lanes,
+    root: FloatArray,
+    xhat: FloatArray,
+    b: int,
+    h: int,
+    centre: FloatArray,
+    total: FloatArray,
+    whitened: FloatArray,
+    kept: Any,
+) -> None:
+    """Write the intersection ``total`` (n, n + 1, L) into filter ``h`` of a block, but in the lanes
+    that are ``kept`` as they are; means count from ``centre[h]``.
+    """
+    # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
+    n = len(total)
+    for i in range(n):
+        inverse = 1.0 / load(lanes, total, i, i)
+        for j in range(i):
+            value = spread(lanes, 0.0)
+            for r in range(j, i):
+                value -= load(lanes, total, i, r) * load(lanes, whitened, r, j)
+            store(lanes, whitened, i, j, value * inverse)
+        store(lanes, whitened, i, i, inverse)
+    # x = centre + Z^-1 (Z (x - centre)).
+    for i in range(n):
+        mean = load(lanes, centre, h, i)
+        for j in range(i + 1):
+            entry = load(lanes, whitened, i, j)
+            mean += entry * load(lanes, total, j, n)
+            store(lanes, root, b, h, i, j, select(kept, load(lanes, root, b, h, i, j), entry))
+        store(lanes, xhat, b, h, i, select(kept, load(lanes, xhat, b, h, i), mean))

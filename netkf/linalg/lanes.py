@@ -1,0 +1,109 @@
+"""Numbers of several runs side by side, which kernels handle as one value (SIMD).
+
+Arrays hold the runs of a block along their last axis, L of them. ``load(lanes, array, i, j)`` takes
+``array[i, j]`` (L,) as one value, with which kernels compute as with a number: ``+ - * /``,
+comparisons, and the functions below. ``lanes`` is a tuple of L zeros, whose length is known when
+the kernel is compiled; with one lane the value is a plain float, so that the same kernel serves a
+single run. Operations are those of floats, lane by lane: a run has the same bits in any company.
+
+A comparison gives flags: one truth value for each lane.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+
+LANES = 8
+"""Runs side by side: as many float64 as the widest registers of common processors hold."""
+
+ALIGNMENT = 64
+"""Bytes: a value that crosses no line of the cache is loaded twice as fast."""
+
+Lanes = tuple[int, ...]
+MANY: Lanes = (0,) * LANES
+ONE: Lanes = (0,)
+
+
+def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
+    """Zeros in memory that begins at a line of the cache, C-contiguous."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    memory = np.zeros(size + ALIGNMENT, dtype=np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    return memory[start : start + size].view(dtype).reshape(shape)
+
+
+def blocks_of(runs: int, lanes: int = LANES) -> int:
+    """Number of blocks of so many ``lanes`` that hold the runs; the last may have idle lanes."""
+    return -(-runs // lanes)
+
+
+def in_lanes(values: FloatArray, blocks: int, lanes: int = LANES) -> FloatArray:
+    """The same ``values`` (...) for each lane: (blocks, ..., lanes)."""
+    made: FloatArray = aligned((blocks, *values.shape, lanes))
+    made[:] = values[..., None]
+    return made
+
+
+def by_run(values: Any, runs: int) -> Any:
+    """(runs, ...) from lanes (B, ..., L)."""
+    blocks, *shape, lanes = values.shape
+    every = np.moveaxis(values, -1, 1).reshape(blocks * lanes, *shape)
+    return np.ascontiguousarray(every[:runs])
+
+
+def load(lanes: Lanes, array: FloatArray, *place: int) -> Any:
+    """Return ``array[place]`` (L,) as one value."""
+    raise _only_in_kernels()
+
+
+def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
+    """Write a value, the last argument, into ``array[place]`` (L,); a float into all lanes."""
+    raise _only_in_kernels()
+
+
+def spread(lanes: Lanes, number: float) -> Any:
+    """Return a number in all lanes as one value."""
+    raise _only_in_kernels()
+
+
+def load_flags(lanes: Lanes, array: np.ndarray, *place: int) -> Any:
+    """Return flags, set where ``array[place]`` (L,) of uint8 is not 0."""
+    raise _only_in_kernels()
+
+
+def store_flags(lanes: Lanes, array: np.ndarray, *place_and_flags: Any) -> None:
+    """Write flags, the last argument, into ``array[place]`` (L,) of uint8 as 1 and 0."""
+    raise _only_in_kernels()
+
+
+def select(flags: Any, chosen: Any, other: Any) -> Any:
+    """Return ``chosen`` in the lanes that are flagged, ``other`` in the rest."""
+    raise _only_in_kernels()
+
+
+def any_lane(flags: Any) -> bool:
+    """Return True if a lane is flagged."""
+    raise _only_in_kernels()
+
+
+def root_of(value: Any) -> Any:
+    """Return the square root."""
+    raise _only_in_kernels()
+
+
+def magnitude(value: Any) -> Any:
+    """Return the absolute value."""
+    raise _only_in_kernels()
+
+
+def with_sign(size: Any, sign: Any) -> Any:
+    """Return ``size`` with the sign of ``sign``."""
+    raise _only_in_kernels()
+
+
+def _only_in_kernels() -> TypeError:
+    return TypeError("values of lanes exist in kernels only")
