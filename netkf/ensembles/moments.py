@@ -36,37 +36,62 @@ def moments_of(values: FloatArray, size: FloatArray) -> Moments:
     """Moments of R observations (R, S, C), merged in the binary tree over them; ``size`` (R, S) is
     1 where an observation exists and 0 where it does not. Both arrays are overwritten.
     """
-    M2 = np.zeros_like(values)
-    merge_in_place(size, values, M2)
-    return Moments(size[0].copy(), values[0].copy(), M2[0].copy())
+    _, rows, columns = values.shape
+    mean, M2 = np.empty((rows, columns)), np.empty((rows, columns))
+    merge_leaves(size, values, np.empty((len(values), 1, columns)), mean, M2)
+    return Moments(size[0].copy(), mean, M2)
 
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
     """Moments of both samples together."""
     size, mean, M2 = (np.stack(pair) for pair in zip(a, b, strict=True))
-    merge_in_place(size, mean, M2)
+    merge_two(size, mean, M2)
     return Moments(size[0], mean[0], M2[0])
 
 
-@kernel
-def merge_in_place(size: FloatArray, mean: FloatArray, M2: FloatArray) -> None:
-    """Merge R moments, size (R, S), mean and M2 (R, S, C), in the binary tree over R; the result is
-    the first of each, the others are overwritten (Chan, Golub and LeVeque 1983, (2.1)).
+@kernel(inlined=True)
+def merge_pair(
+    size: FloatArray, mean: FloatArray, M2: FloatArray, a: int, b: int, s: int, t: int
+) -> None:
+    """Merge the moments of row ``s`` of ``b`` into those of ``a``, size (R, S), mean (R, S, C);
+    their M2 (R, S', C) is row ``t`` (Chan, Golub and LeVeque 1983, (2.1)).
     """
-    runs, rows, columns = mean.shape
-    stride = 1
-    while stride < runs:
-        for a in range(0, runs - stride, 2 * stride):
-            b = a + stride
-            for s in range(rows):
-                total = size[a, s] + size[b, s]
-                share = size[b, s] / max(total, 1.0)
-                weight = size[a, s] * share
-                for c in range(columns):
-                    # mean <- mean_a + (mean_b - mean_a) size_b / size,
-                    # M2 <- M2_a + M2_b + (mean_b - mean_a)^2 size_a size_b / size
-                    delta = mean[b, s, c] - mean[a, s, c]
-                    mean[a, s, c] += delta * share
-                    M2[a, s, c] += M2[b, s, c] + delta * delta * weight
-                size[a, s] = total
-        stride *= 2
+    total = size[a, s] + size[b, s]
+    share = size[b, s] / max(total, 1.0)
+    weight = size[a, s] * share
+    for c in range(mean.shape[2]):
+        # mean <- mean_a + (mean_b - mean_a) size_b / size,
+        # M2 <- M2_a + M2_b + (mean_b - mean_a)^2 size_a size_b / size
+        delta = mean[b, s, c] - mean[a, s, c]
+        mean[a, s, c] += delta * share
+        M2[a, t, c] += M2[b, t, c] + delta * delta * weight
+    size[a, s] = total
+
+
+@kernel
+def merge_two(size: FloatArray, mean: FloatArray, M2: FloatArray) -> None:
+    """Merge two moments into the first: size (2, S), mean and M2 (2, S, C)."""
+    for s in range(mean.shape[1]):
+        merge_pair(size, mean, M2, 0, 1, s, s)
+
+
+@kernel
+def merge_leaves(
+    size: FloatArray, values: FloatArray, work: FloatArray, mean: FloatArray, M2: FloatArray
+) -> None:
+    """Write mean and M2 (S, C) of R observations (R, S, C), merged in the binary tree over R; size
+    (R, S) and values are overwritten, ``work`` (R, 1, C) is scratch.
+    """
+    runs, rows, columns = values.shape
+    # Row by row, so that the values of a row are still close by when they are merged again.
+    for s in range(rows):
+        for r in range(runs):
+            for c in range(columns):
+                work[r, 0, c] = 0.0
+        stride = 1
+        while stride < runs:
+            for a in range(0, runs - stride, 2 * stride):
+                merge_pair(size, values, work, a, a + stride, s, 0)
+            stride *= 2
+        for c in range(columns):
+            mean[s, c], M2[s, c] = values[0, s, c], work[0, 0, c]

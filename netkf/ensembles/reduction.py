@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, MANY, Lanes, aligned, any_lane, load, select, spread, store
 from netkf.trace.batch import RunBatch
 from netkf.trace.nees import errors, fill_nees
 from netkf.trace.run import BLUR, ROUNDING
@@ -33,13 +34,16 @@ def reduce_batch(batch: RunBatch) -> Reduced:
     """Values of all runs of a batch; the last sample of a run that diverged is left out."""
     runs, count, filters, n = batch.error.shape
     kept = batch.lengths - batch.diverged
-    samples = np.zeros((runs, count, filters, n * (n + 1) + 1))
+    samples = np.empty((runs, count, filters, n * (n + 1) + 1))
     reduced = Reduced(
         samples, np.zeros((runs, count)), np.zeros((runs, filters, 3)), np.full(runs, np.inf)
     )
     nees, regular = np.empty((runs, count, filters)), np.ones(runs, dtype=np.bool_)
-    scratch = np.empty((n, n)), np.empty((n, 1))
-    fill_nees_of_runs(batch.error, batch.P, kept, nees, regular, *scratch)
+    room = NeesRoom(
+        aligned((n, LANES)), aligned((n, n, LANES)), aligned((LANES,)), np.empty((n, n)),
+        np.empty((n, 1)),
+    )  # fmt: skip
+    fill_nees_of_runs(MANY, batch.error, batch.P, kept, nees, regular, room)
     for r in np.flatnonzero(~regular):
         # Some P is exactly singular: those that are singular up to rounding are left out as well.
         nees[r, : kept[r]] = errors(batch.error[r, : kept[r]], batch.P[r, : kept[r]])[1]
@@ -48,23 +52,76 @@ def reduce_batch(batch: RunBatch) -> Reduced:
     return reduced
 
 
+class NeesRoom(NamedTuple):
+    """Scratch: the error (n, L), P and its factor (n, n, L) and NEES (L,) of L samples, of one
+    sample ``factor`` (n, n) and ``solved`` (n, 1).
+    """
+
+    error: FloatArray
+    P: FloatArray
+    nees: FloatArray
+    factor: FloatArray
+    solved: FloatArray
+
+
 @kernel
 def fill_nees_of_runs(
+    lanes: Lanes,
     error: FloatArray,
     P: FloatArray,
     kept: np.ndarray,
     nees: FloatArray,
     regular: np.ndarray,
-    factor: FloatArray,
-    solved: FloatArray,
+    room: NeesRoom,
 ) -> None:
     """Write NEES (R, T, F) of the ``kept`` samples (R,) of each run, and whether all its P are
     regular (R,); see ``fill_nees``.
     """
+    filters, n = error.shape[2:]
     for r in range(len(kept)):
-        for t in range(kept[r]):
-            if not fill_nees(error[r, t], P[r, t], nees[r, t], factor, solved):
-                regular[r] = False
+        # L samples at a time, over times and filters alike.
+        samples = kept[r] * filters
+        for first in range(0, samples, len(lanes)):
+            count = min(len(lanes), samples - first)
+            for q in range(count):
+                t, f = (first + q) // filters, (first + q) % filters
+                for i in range(n):
+                    room.error[i, q] = error[r, t, f, i]
+                    for j in range(i + 1):
+                        room.P[i, j, q] = P[r, t, f, i, j]
+            fine = nees_of_lanes(lanes, room)
+            for q in range(count):
+                t, f = (first + q) // filters, (first + q) % filters
+                nees[r, t, f] = room.nees[q]
+            # Singular or broken: sample by sample, with a choice of pivots.
+            if not fine:
+                for q in range(count):
+                    t, f = (first + q) // filters, (first + q) % filters
+                    some = slice(f, f + 1)
+                    if not fill_nees(
+                        error[r, t, some], P[r, t, some], nees[r, t, some], room.factor, room.solved
+                    ):
+                        regular[r] = False
+
+
+@kernel(inlined=True)
+def nees_of_lanes(lanes: Lanes, room: NeesRoom) -> bool:
+    """Write ``e' P^-1 e`` of L errors; return False if a P is not positive definite, or nan."""
+    # P = L D L', and e' P^-1 e = z' D^-1 z with L z = e; P becomes L, and the error z.
+    n, total, fine = len(room.error), spread(lanes, 0.0), True
+    for k in range(n):
+        pivot, z = load(lanes, room.P, k, k), load(lanes, room.error, k)
+        fine = fine and not any_lane(select(pivot > 0.0, 0.0, 1.0) > 0.0)
+        inverse = 1.0 / pivot
+        total += z * z * inverse
+        for i in range(k + 1, n):
+            factor = load(lanes, room.P, i, k) * inverse
+            for j in range(k + 1, i + 1):
+                entry = load(lanes, room.P, i, j) - factor * load(lanes, room.P, j, k)
+                store(lanes, room.P, i, j, entry)
+            store(lanes, room.error, i, load(lanes, room.error, i) - factor * z)
+    store(lanes, room.nees, total)
+    return fine
 
 
 @kernel
@@ -83,49 +140,65 @@ def fill_reduced(
     rounding_from: FloatArray,
 ) -> None:
     """Fill the arrays of Reduced from those of a RunBatch and its NEES (R, T, F)."""
+    n = P.shape[4]
     for r in range(len(lengths)):
         kept = lengths[r] - 1 if diverged[r] else lengths[r]
-        for t in range(kept):
-            size[r, t] = 1.0
-            fill_sample(P[r, t], error[r, t], nees[r, t], samples[r, t])
+        for t in range(samples.shape[1]):
+            if t < kept:
+                size[r, t] = 1.0
+                fill_sample(P, error, nees, r, t, samples)
+                continue
+            for f in range(samples.shape[2]):
+                for column in range(samples.shape[3]):
+                    samples[r, t, f, column] = 0.0
         for t in range(lengths[r]):
-            if is_blurred(x[r, t], P[r, t], error[r, t], exact):
+            if is_blurred(x, P, error, r, t, exact):
                 rounding_from[r] = times[t]
                 break
-        average_samples(
-            times, samples[r], P.shape[4], kept, diverged[r], rounding_from[r], averages[r]
-        )
+        average_samples(times, samples, r, n, kept, diverged[r], rounding_from[r], averages)
 
 
-@kernel
-def fill_sample(P: FloatArray, error: FloatArray, nees: FloatArray, out: FloatArray) -> None:
-    """Write the columns (F, 2 u + 1) of one sample: P (F, n, n), error (F, n), NEES (F,)."""
-    n = error.shape[1]
+@kernel(inlined=True)
+def fill_sample(
+    P: FloatArray, error: FloatArray, nees: FloatArray, r: int, t: int, out: FloatArray
+) -> None:
+    """Write the columns (F, 2 u + 1) of sample ``t`` of run ``r``."""
+    n = error.shape[3]
     half = n * (n + 1) // 2
-    for f in range(len(nees)):
+    for f in range(nees.shape[2]):
         column = 0
         for i in range(n):
+            e = error[r, t, f, i]
             for j in range(i, n):
-                out[f, column] = P[f, i, j]
-                out[f, half + column] = error[f, i] * error[f, j]
+                out[r, t, f, column] = P[r, t, f, i, j]
+                out[r, t, f, half + column] = e * error[r, t, f, j]
                 column += 1
-        out[f, 2 * half] = nees[f]
+        out[r, t, f, 2 * half] = nees[r, t, f]
 
 
-@kernel
-def is_blurred(x: FloatArray, P: FloatArray, error: FloatArray, exact: bool) -> bool:
-    """The rule of ``trace.run.rounding_from`` for one sample: x (n,), P (F, n, n), error (F, n)."""
-    filters, n = error.shape
+@kernel(inlined=True)
+def is_blurred(
+    x: FloatArray, P: FloatArray, error: FloatArray, r: int, t: int, exact: bool
+) -> bool:
+    """The rule of ``trace.run.rounding_from`` for sample ``t`` of run ``r``: x (n,), P (F, n, n),
+    error (F, n).
+    """
+    filters, n = error.shape[2:]
     largest, least, square = 0.0, np.inf, 0.0
     given, broken = False, False
     for f in range(filters):
         for i in range(n):
-            value = abs(error[f, i]) if exact else abs(x[i])
-            broken = broken or np.isnan(value) or np.isnan(P[f, i, i])
-            largest, least = max(largest, value), min(least, P[f, i, i])
-            square += error[f, i] * error[f, i]
-            for j in range(n):
-                given = given or not np.isnan(P[f, i, j])
+            value = abs(error[r, t, f, i]) if exact else abs(x[r, t, i])
+            broken = broken or np.isnan(value) or np.isnan(P[r, t, f, i, i])
+            largest, least = max(largest, value), min(least, P[r, t, f, i, i])
+            if not given:
+                square += error[r, t, f, i] * error[r, t, f, i]
+                for j in range(n):
+                    given = given or not np.isnan(P[r, t, f, i, j])
+    # Most samples are far from it, which squares tell without a root; nan goes on.
+    bound = ROUNDING * BLUR * largest
+    if given and bound * bound < 0.5 * least:
+        return False
     if not given:
         # The filter gives no covariance: the errors themselves show their size.
         broken, least = np.isnan(square) or np.isnan(largest), square / (filters * n)
@@ -137,14 +210,15 @@ def is_blurred(x: FloatArray, P: FloatArray, error: FloatArray, exact: bool) -> 
 def average_samples(
     times: FloatArray,
     samples: FloatArray,
+    r: int,
     n: int,
     kept: int,
     diverged: bool,
     rounding_from: float,
     out: FloatArray,
 ) -> None:
-    """Write the averages (F, 3) of one run over its first ``kept`` samples (T, F, 2 u + 1), by the
-    rule of ``runs.summary.averaged_samples``.
+    """Write the averages (F, 3) of run ``r`` over its first ``kept`` samples (T, F, 2 u + 1), by
+    the rule of ``runs.summary.averaged_samples``.
     """
     half = n * (n + 1) // 2
     first = 0
@@ -156,18 +230,18 @@ def average_samples(
         clear += 1
     # Covariances have all their digits, but those of a run that diverges outgrow all bounds.
     last = clear if diverged and clear > first else kept
-    for f in range(len(out)):
-        square, trace, nees = 0.0, 0.0, 0.0
-        for t in range(first, kept):
+    for t in range(first, kept):
+        for f in range(out.shape[1]):
             column = 0
             for i in range(n):
                 if t < last:
-                    trace += samples[t, f, column]
+                    out[r, f, 1] += samples[r, t, f, column]
                 if t < clear:
-                    square += samples[t, f, half + column]
+                    out[r, f, 0] += samples[r, t, f, half + column]
                 column += n - i
             if t < clear:
-                nees += samples[t, f, 2 * half]
-        out[f, 0] = square / (clear - first)
-        out[f, 1] = trace / (last - first)
-        out[f, 2] = nees / (clear - first)
+                out[r, f, 2] += samples[r, t, f, 2 * half]
+    for f in range(out.shape[1]):
+        out[r, f, 0] /= clear - first
+        out[r, f, 1] /= last - first
+        out[r, f, 2] /= clear - first

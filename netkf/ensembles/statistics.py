@@ -129,12 +129,14 @@ def _recorded_run(
 class RunValues(NamedTuple):
     """Values of R runs that statistics are over.
 
-    ``samples`` (R, T, N, 2 u + 1) with ``size`` (R, T) 1 or 0; ``averages`` (R, N + 1, 3);
-    ``messages`` (R, 5); ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
+    ``samples`` (R, T, F, 2 u + 1) of F filters with ``size`` (R, T) 1 or 0, each ``shown`` by so
+    many nodes (N where the filter is pooled, else 1); ``averages`` (R, N + 1, 3); ``messages``
+    (R, 5); ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
     """
 
     samples: FloatArray
     size: FloatArray
+    shown: int
     averages: FloatArray
     messages: FloatArray
     events: np.ndarray
@@ -146,12 +148,13 @@ class RunValues(NamedTuple):
 def run_values(batch: RunBatch, scenario: Scenario) -> RunValues:
     """Values of the runs of a batch, for every node where the filter is pooled."""
     reduced, nodes = reduce_batch(batch), len(scenario.nodes)
-    samples, averages = reduced.samples, reduced.averages
-    if samples.shape[2] < nodes:
-        samples, averages = np.repeat(samples, nodes, axis=2), np.repeat(averages, nodes, axis=1)
+    shown, averages = nodes // reduced.samples.shape[2], reduced.averages
+    if shown > 1:
+        averages = np.repeat(averages, nodes, axis=1)
     return RunValues(
-        samples,
+        reduced.samples,
         reduced.size,
+        shown,
         np.concatenate([averages, _mean_of_nodes(averages)], axis=1),
         count_messages(batch.counts, scenario.slotted),
         batch.counts.sum(axis=1),
@@ -179,8 +182,12 @@ def merge_runs(values: RunValues, runs: slice) -> RunStatistics:
         )
         for name, sums in values.sums.items()
     }
+    found = moments_of(samples.reshape(*samples.shape[:2], -1), values.size[runs])
+    if values.shown > 1:
+        # All nodes show the same filter.
+        found = Moments(found.size, *(np.tile(v, values.shown) for v in (found.mean, found.M2)))
     return RunStatistics(
-        moments_of(samples.reshape(*samples.shape[:2], -1), values.size[runs]),
+        found,
         moments_of(averages.reshape(count, 1, -1), one.copy()),
         moments_of(messages.reshape(count, 1, -1), one.copy()),
         np.array([values.events[runs].sum(), values.diverged[runs].sum()]),

@@ -11,6 +11,7 @@ A comparison gives flags: one truth value for each lane.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ ONE: Lanes = (0,)
 
 def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
     """Zeros in memory that begins at a line of the cache, C-contiguous."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.zeros(size + ALIGNMENT, dtype=np.uint8)
     start = -memory.ctypes.data % ALIGNMENT
     return memory[start : start + size].view(dtype).reshape(shape)

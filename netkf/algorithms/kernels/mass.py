@@ -153,19 +153,21 @@ def add_gain(
     turned: FloatArray,
 ) -> None:
     """P (8): add ``number`` times ``S S' H' (y - H x)`` to the estimate of a filter, for its
-    whitened reading ``y[b, s, h]`` of so many ``rows`` and ``H[0, 0, h]``; ``seen`` and ``turned``
-    (n, L) are scratch.
+    whitened reading ``y[b, s, h]`` of so many ``rows`` and its H; ``seen`` and ``turned`` (n, L)
+    are scratch.
     """
     n = x.shape[2]
+    # H that is fixed has one block and one slot.
+    d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
     # H' (y - H x); the noise is white with variance 1, so no R^-1 appears.
     for i in range(n):
         store(lanes, seen, i, 0.0)
     for row in range(rows):
         innovation = load(lanes, y, b, s, h, row)
         for i in range(n):
-            innovation -= load(lanes, H, 0, 0, h, row, i) * load(lanes, x, b, h, i)
+            innovation -= load(lanes, H, d, t, h, row, i) * load(lanes, x, b, h, i)
         for i in range(n):
-            weight = load(lanes, H, 0, 0, h, row, i)
+            weight = load(lanes, H, d, t, h, row, i)
             store(lanes, seen, i, load(lanes, seen, i) + weight * innovation)
     # S' times that, then S times it: P itself is never formed.
     for j in range(n):

@@ -66,13 +66,17 @@ class SlotBlock(NamedTuple):
 class SlotRuns:
     """R runs of one scenario, side by side."""
 
-    def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams) -> None:
+    def __init__(
+        self, scenario: Scenario, streams: Streams | ReplicaStreams, whole: bool = False
+    ) -> None:
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
         # One run, or the replicas of a batch.
         self.runs = 1 if isinstance(streams, Streams) else streams.count
         self._slot = 0
         setup, runs = self.setup, self.runs
+        # Samples of the whole runs if so many are wanted at once, else those of a block.
+        self.samples = self._empty_samples(len(setup.samples)) if whole else None
         self._blocks = blocks = blocks_of(runs)
         self._nodes = SlotNodes(
             in_lanes(setup.xhat, blocks),
@@ -185,21 +189,20 @@ class SlotRuns:
             drawn = Drawn(_in_first_lane(up), *(np.zeros((0,) * d, dtype=np.int64) for d in (4, 3)))
         local, absolute, rebased = self._states(count)
         readings = self._readings(times, local, rebased)
-        T = int((times.sample >= 0).sum())
-        n, hosts = setup.n, setup.hosts
-        samples = SlotSamples(
-            np.empty((self.runs, T, hosts, n)),
-            np.empty((self.runs, T, hosts, n, n)),
-            self._stopped,
-            self._conserved,
-        )
+        sampled = np.flatnonzero(times.sample >= 0)
+        kept = self.samples if self.samples is not None else self._empty_samples(len(sampled))
+        samples = SlotSamples(*kept, self._stopped, self._conserved)
         plan = SlotPlan(self._slot, times.sensed, times.exchanged, times.sample, drawn.up)
         kernel = type(setup.algorithm).slot_kernel
         kernel(self._nodes, readings, plan, setup.links, samples, self._room, *self._extra)
         self._slot += count
-        sampled = np.flatnonzero(times.sample >= 0)
         absolute, local = (by_run(x[:, sampled], self.runs) for x in (absolute, local))
         return SlotBlock(absolute, local, sampled, samples, times, drawn)
+
+    def _empty_samples(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Space for so many samples, xhat (R, T, H, n) and P (R, T, H, n, n)."""
+        shape = self.runs, count, self.setup.hosts, self.setup.n
+        return np.empty(shape), np.empty((*shape, self.setup.n))
 
     def _times(self, count: int, wanted: bool) -> SlotTimes:
         """Flags, samples and, if ``wanted``, start times of the next slots."""
@@ -212,8 +215,10 @@ class SlotRuns:
         sensed = acts & ((slots > 0) | algorithm.predicts)
         exchanged = acts & (slots >= algorithm.first_slot) & algorithm.talks
         sample = np.full(count, -1, dtype=np.int64)
-        here = setup.samples[np.isin(setup.samples, slots)] - self._slot
-        sample[here] = np.arange(len(here))
+        first, last = np.searchsorted(setup.samples, (self._slot, self._slot + count))
+        # Counted from the first sample of the run, or of these slots.
+        here = np.arange(first, last) - (first if self.samples is None else 0)
+        sample[setup.samples[first:last] - self._slot] = here
         start = np.zeros(count)
         # Times are computed only if rows are wanted: a batch has none.
         if wanted:
@@ -406,22 +411,23 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
     """Simulate consecutive replicas side by side; a run that diverges goes on to the end with what
     it has (``with_ends`` mends that).
     """
-    runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)))
-    parts: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
+    runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), whole=True)
+    assert runs.samples is not None
+    xhat, P = runs.samples
+    x = np.empty((len(replicas), *xhat.shape[1::2]))
+    local = np.empty(x.shape) if runs.setup.frame else x
+    first = 0
     while not runs.over:
         with np.errstate(over="ignore", invalid="ignore"):
             block = runs.following(0)
         runs.count_events(block)
-        x, local = block.absolute, block.local
-        error = local[:, :, None] - block.samples.xhat
-        xhat = block.samples.xhat
-        # Estimates in absolute coordinates for the batch; errors stay local.
-        if runs.setup.frame:
-            xhat = xhat + (x - local)[:, :, None]
-        parts.append((x, xhat, block.samples.P, error))
-    x, xhat, P, error = parts[0]
-    if len(parts) > 1:
-        x, xhat, P, error = (np.concatenate(c, axis=1) for c in zip(*parts, strict=True))
+        some = slice(first, first + len(block.sampled))
+        x[:, some], local[:, some] = block.absolute, block.local
+        first = some.stop
+    error = local[:, :, None] - xhat
+    # Estimates in absolute coordinates for the batch; errors stay local.
+    if runs.setup.frame:
+        xhat = xhat + (x - local)[:, :, None]
     return RunBatch(
         replicas=replicas,
         times=runs.setup.sample_times,
@@ -440,7 +446,10 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
 def with_ends(batch: RunBatch, alone: Callable[[range], Iterator[RunBatch]]) -> RunBatch:
     """The batch with every run that diverges as it is ``alone``, where it ends."""
     # A run that diverges goes on in a batch; its true end is that of the run alone.
-    fine = np.isfinite(batch.xhat).all(axis=(1, 2, 3)) & np.isfinite(batch.P).all(axis=(1, 2, 3, 4))
+    # A sum is finite if all its terms are; of huge ones it may overflow, which does no harm.
+    with np.errstate(over="ignore", invalid="ignore"):
+        sums = [v.reshape(len(batch), -1).sum(axis=1) for v in (batch.xhat, batch.P)]
+    fine = np.isfinite(sums).all(axis=0)
     for r in np.flatnonzero(~fine).tolist():
         (one,) = alone(batch.replicas[r : r + 1])
         for name in ("x", "xhat", "P", "error", "lengths", "counts", "status"):
