@@ -33,7 +33,7 @@ def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
     """Zeros in memory that begins at a line of the cache, C-contiguous."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.zeros(size + ALIGNMENT, dtype=np.uint8)
-    start = -memory.ctypes.data % ALIGNMENT
+    start = -memory.__array_interface__["data"][0] % ALIGNMENT
     return memory[start : start + size].view(dtype).reshape(shape)
 
 

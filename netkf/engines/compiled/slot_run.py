@@ -36,6 +36,7 @@ from netkf.engines.compiled.slot_messages import (
 )
 from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes
 from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
@@ -71,6 +72,7 @@ class SlotRuns:
     ) -> None:
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
+        self._first = Streams(streams.seed, streams.replica)
         # One run, or the replicas of a batch.
         self.runs = 1 if isinstance(streams, Streams) else streams.count
         self._slot = 0
@@ -94,9 +96,7 @@ class SlotRuns:
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
         self._begin_readings()
-        self._events = (
-            None if setup.is_drawn else SlotEvents(scenario, streams.per_replica[0], setup)
-        )
+        self._events = None if setup.is_drawn else SlotEvents(scenario, self._first, setup)
         self._begin_messages()
 
     def _begin_truth(self) -> None:
@@ -105,7 +105,7 @@ class SlotRuns:
         self._path: Path | None = None
         # A recorded truth is the same in all runs.
         if not plant.is_random:
-            self._truth = self._scenario.slot_truth(self._streams.per_replica[0])
+            self._truth = self._scenario.slot_truth(self._first)
             return
         self._plant_states = StreamBatch(self._streams, "plant", [()]).states
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
@@ -126,7 +126,7 @@ class SlotRuns:
             path = Path(A, drive, 0, x, np.zeros(x.shape))
             states = StreamBatch(streams, "regressor", [(s.node, s.place.ordinal)]).states
             self._regressors.append((path, states))
-        scenario, first = self._scenario, streams.per_replica[0]
+        scenario, first = self._scenario, self._first
         self._recorded: list[tuple[AssignedSensor, Any]] = [
             (s, scenario.slot_path(first, s.node, s.place)) for s in setup.recorded
         ]
@@ -397,6 +397,16 @@ MOST_ROWS = 1 << 15
 """Rows of events that are made at once."""
 
 
+@kernel
+def fill_errors(x: FloatArray, xhat: FloatArray, error: FloatArray) -> None:
+    """Write ``x - xhat`` (R, T, H, n) of states x (R, T, n)."""
+    for r in range(xhat.shape[0]):
+        for t in range(xhat.shape[1]):
+            for h in range(xhat.shape[2]):
+                for i in range(xhat.shape[3]):
+                    error[r, t, h, i] = x[r, t, i] - xhat[r, t, h, i]
+
+
 def slot_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
     """Yield the runs of consecutive replicas in order."""
     setup = slot_setup(scenario)
@@ -424,7 +434,8 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
         some = slice(first, first + len(block.sampled))
         x[:, some], local[:, some] = block.absolute, block.local
         first = some.stop
-    error = local[:, :, None] - xhat
+    error = np.empty(xhat.shape)
+    fill_errors(local, xhat, error)
     # Estimates in absolute coordinates for the batch; errors stay local.
     if runs.setup.frame:
         xhat = xhat + (x - local)[:, :, None]

@@ -1,0 +1,108 @@
+"""Values of lanes in kernels against numpy, for one lane and for several."""
+
+import numpy as np
+import pytest
+
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    LANES,
+    MANY,
+    ONE,
+    aligned,
+    any_lane,
+    by_run,
+    in_lanes,
+    load,
+    load_flags,
+    magnitude,
+    root_of,
+    select,
+    spread,
+    store,
+    store_flags,
+    with_sign,
+)
+
+SIZES = pytest.mark.parametrize("lanes", [ONE, MANY], ids=["one", "many"])
+
+
+@kernel
+def compute(lanes, a, b, out):
+    """Every operation once, a row of ``out`` each."""
+    x, y = load(lanes, a, 0), load(lanes, b, 0)
+    store(lanes, out, 0, x + y * 2.0 - 1)
+    store(lanes, out, 1, x / y - (-x))
+    store(lanes, out, 2, root_of(magnitude(x)))
+    store(lanes, out, 3, with_sign(y, x))
+    store(lanes, out, 4, select(x > y, x, 7.0))
+    store(lanes, out, 5, select((x < y) | (x == y), spread(lanes, 1.0), 0.0))
+    store(lanes, out, 6, select((x >= 0.0) & (y != 1.0), y, x))
+    total = spread(lanes, 1.0)
+    total += x
+    total *= y
+    total -= 3.0
+    total /= 2.0
+    store(lanes, out, 7, total)
+
+
+@SIZES
+def test_operations_are_those_of_numbers(lanes):
+    random = np.random.default_rng(1)
+    for _ in range(20):
+        a, b = random.normal(size=(2, 1, len(lanes)))
+        if random.random() < 0.3:
+            b[:] = a
+        out = aligned((8, len(lanes)))
+        compute(lanes, a, b, out)
+        x, y = a[0], b[0]
+        expected = [
+            x + y * 2.0 - 1,
+            x / y - (-x),
+            np.sqrt(np.abs(x)),
+            np.copysign(y, x),
+            np.where(x > y, x, 7.0),
+            np.where(x <= y, 1.0, 0.0),
+            np.where((x >= 0.0) & (y != 1.0), y, x),
+            ((1.0 + x) * y - 3.0) / 2.0,
+        ]
+        np.testing.assert_array_equal(out, expected)
+
+
+@kernel
+def exceed(lanes, a, bound, flags):
+    """Flag the entries above ``bound``; return True if there are any and they are read back."""
+    above = load(lanes, a, 0) > bound
+    store_flags(lanes, flags, 0, above)
+    return any_lane(above) and any_lane(load_flags(lanes, flags, 0))
+
+
+@SIZES
+def test_flags_are_kept_as_bytes(lanes):
+    values = np.arange(len(lanes), dtype=float)[None]
+    flags = np.full((1, len(lanes)), 9, dtype=np.uint8)
+    assert not exceed(lanes, values, float(len(lanes)), flags)
+    assert not flags.any()
+    assert exceed(lanes, values, len(lanes) - 1.5, flags)
+    np.testing.assert_array_equal(flags[0], values[0] > len(lanes) - 1.5)
+
+
+@SIZES
+def test_comparisons_with_nan_are_false(lanes):
+    flags = np.ones((1, len(lanes)), dtype=np.uint8)
+    assert not exceed(lanes, np.full((1, len(lanes)), np.nan), 0.0, flags)
+
+
+def test_values_exist_in_kernels_only():
+    with pytest.raises(TypeError, match="kernels only"):
+        load(ONE, np.zeros((1, 1)), 0)
+
+
+def test_runs_are_laid_out_by_blocks():
+    laid = in_lanes(np.arange(6.0).reshape(2, 3), 2)
+    assert laid.shape == (2, 2, 3, LANES)
+    assert laid.ctypes.data % 64 == 0
+    laid[1, 0, 0, 2] = 50.0
+    runs = by_run(laid, LANES + 3)
+    assert runs.shape == (LANES + 3, 2, 3)
+    assert runs[LANES + 2, 0, 0] == 50.0
+    assert (runs[:, 1, 2] == 5.0).all()
