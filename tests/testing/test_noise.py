@@ -1,0 +1,154 @@
+"""The tests of noise find what the docstrings of the checkers state, and accuse nobody."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.stats import binom, norm
+
+from netkf import parts
+from netkf.testing import noise
+from netkf.testing.channels import check_made_channel
+from netkf.testing.clocks import check_made_clock
+
+STATED = noise.Stated("Some.path", "the noise", "R")
+SEEDS = 10
+RUNS, LENGTH = 400, 250
+
+
+def white(seed, q=1):
+    return np.random.default_rng(seed).standard_normal((RUNS, LENGTH, q))
+
+
+def biased(e):
+    return e + 0.03
+
+
+def louder(e):
+    return math.sqrt(1.04) * e
+
+
+def coloured(e):
+    return e + 0.03 * np.roll(e, 2, axis=1)
+
+
+def late(e):
+    return np.concatenate([e[:, :200], math.sqrt(1.09) * e[:, 200:]], axis=1)
+
+
+def related(e):
+    return e @ np.array([[1.0, 0.03], [0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (biased, "must have the mean 0; got a mean of 0.0"),
+        (louder, "of the stated variance"),
+        (coloured, "must be uncorrelated with the noise 2 steps apart"),
+        (late, "in quarter 4 of a run"),
+        (related, "in components 0 and 1"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_stated_errors_are_found_with_probability_nine_tenths(change, words):
+    found = 0
+    for seed in range(SEEDS):
+        try:
+            noise.check_white(change(white(seed, 2 if change is related else 1)), STATED)
+        except AssertionError as error:
+            found += words in str(error)
+    assert found >= 7  # with 0.9 each, fewer would be found once in 78 times
+
+
+def test_white_noise_passes_at_every_seed():
+    for seed in range(SEEDS):
+        noise.check_white(white(seed, 2), STATED)
+
+
+def test_skewed_noise_is_accused_no_more_often_than_stated(monkeypatch):
+    """Squares of normals have one long tail, at the level of five percent for each family."""
+    monkeypatch.setattr(noise, "LEVEL", 0.05)
+    monkeypatch.setattr(noise, "FAMILIES", 1)
+    squares = [np.random.default_rng(seed).standard_normal(1000) ** 2 - 1.0 for seed in range(2000)]
+    alarms = sum(noise.largest_deviation(some[:, None]) is not None for some in squares)
+    assert alarms <= 130  # 100 are expected, with a standard deviation of 10
+
+
+def test_the_bound_of_frequencies_holds():
+    """Chernoff: the probability of a tail is at most exp(-N divergence)."""
+    for N, p in ((20_000, 0.8), (500, 0.01), (50, 0.5)):
+        for k in np.unique(np.linspace(0, N, 41).astype(int)):
+            bound = math.exp(-N * noise.divergence(np.array([k / N]), np.array([p]))[0])
+            tail = binom.cdf(k, N, p) if k <= N * p else binom.sf(k - 1, N, p)
+            assert tail <= bound * (1.0 + 1e-9)
+    assert noise.divergence(np.array([0.5]), np.array([0.0]))[0] == math.inf
+    assert noise.divergence(np.array([0.0, 1.0]), np.array([0.0, 1.0])).tolist() == [0.0, 0.0]
+
+
+def test_the_level_of_a_family_is_shared_among_its_tests():
+    for count in (1, 10, 1000):
+        assert 2.0 * norm.sf(noise.standard_errors(count)) * count == pytest.approx(5e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class OneLossier(parts.Bernoulli):
+    """One direction loses .022 more than stated."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return 0.778 if link == (3, 1) else 0.8
+
+    def mean_delivery(self, link, table_probability):
+        return 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Slower(parts.Poisson):
+    def ticks(self, entity, origin, index, now, random, count):
+        times = super().ticks(entity, origin, index, 0.0, random, count)
+        return now + (1.0 + self.slow(entity)) * times
+
+    def slow(self, entity):
+        return 0.028
+
+
+@dataclass(frozen=True, eq=False)
+class OneSlower(Slower):
+    def slow(self, entity):
+        return 0.076 if entity == (1, 3) else 0.0
+
+
+def found_by(checker, part):
+    found = 0
+    for seed in range(SEEDS):
+        try:
+            checker(part, None, 100 + seed)
+        except AssertionError as error:
+            found += "mean_" in str(error)
+    return found
+
+
+def test_one_lossier_direction_is_found():
+    assert found_by(check_made_channel, OneLossier(0.8)) >= 7
+
+
+@pytest.mark.parametrize("cls", [Slower, OneSlower])
+def test_slower_clocks_are_found(cls, monkeypatch):
+    # The form of ticks is looked at elsewhere: here it takes most of the time, and `now` is added
+    # in another order.
+    monkeypatch.setattr("netkf.testing.clocks._one_entity", lambda *_: None)
+    monkeypatch.setattr("netkf.testing.clocks._exponential", lambda *_: None)
+    assert found_by(check_made_clock, cls(rate=2.0)) >= 7
+
+
+def test_sound_channels_and_clocks_pass_at_other_seeds(monkeypatch):
+    monkeypatch.setattr(noise, "LEVEL", 1e-4)
+    monkeypatch.setattr("netkf.testing.clocks._one_entity", lambda *_: None)
+    for seed in range(3):
+        check_made_channel(parts.Bernoulli(0.7), None, seed)
+        check_made_channel(parts.GilbertElliott(mean_loss=0.1, mean_burst=20.0), None, seed)
+        check_made_channel(parts.LognormalDelay(0.3, 1.5), None, seed)
+        check_made_clock(parts.Poisson(rate=3.0), None, seed)
+        check_made_clock(parts.Renewal("gamma", rate=2.0, shape=0.2), None, seed)
+        check_made_clock(parts.Poisson(rate=3.0, at="nodes"), None, seed)
