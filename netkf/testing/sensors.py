@@ -16,6 +16,7 @@ from netkf.testing.noise import (
     check_uncorrelated,
     check_unrelated,
     check_white,
+    largest_deviation,
     whitening,
 )
 from netkf.testing.readings import (
@@ -33,6 +34,7 @@ READINGS, LENGTH, MAX_NODES = 100_000, 250, 8
 STEPS, RUNS = 500, 10
 REGRESSOR_RUNS, REGRESSOR_SLOTS = 2000, 12
 SHORT = 40
+TIMES_RUNS, SAMPLES = 400, 50.0
 ROUNDING = 1e-9
 
 
@@ -53,8 +55,8 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
     a varying H by 0.05 of a standard deviation or 7 %. Errors at one of N nodes, or in one quarter
     of a run, must be sqrt(N) times, or twice, as large. The law of a RegressorSensor's H: means
     off by 0.18 standard deviations, variances by 24 %. Times of samples increase, lie inside the
-    run and do not depend on its length. Recorded sensors are not drawn: pickle only. A sound class
-    fails once in a million checks.
+    run, do not depend on its length, and are as many as the clock states (off by 8 %). Recorded
+    sensors are not drawn: pickle only. A sound class fails once in a million checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
@@ -291,6 +293,7 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
     rate = sensor.sampling.mean_rate((nodes[0], 0)) if isinstance(sensor.sampling, Clock) else 1.0
     if rate > 0.0:
         horizon = 50.0 / rate
+    _check_sampling_rate(sensor, where, nodes, seed)
     for node in nodes:
         times = [
             _times(sensor, where, node, seed, end) for end in (horizon, 0.4 * horizon, horizon)
@@ -311,6 +314,27 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
         demand(
             np.array_equal(shorter, times[1]), where, rule, f"{len(times[1])} times before 0.4 T"
         )
+
+
+def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> None:
+    """Check the number of samples against the mean rate of the clock, where it is known."""
+    rate = sensor.sampling.mean_rate((nodes[0], 0))
+    if not rate > 0.0:
+        return
+    runs = 1 + TIMES_RUNS // len(nodes)
+    expected = SAMPLES
+    counts = np.array(
+        [
+            len(_times(sensor, where, node, seed + 1 + run, expected / rate))
+            for node in nodes
+            for run in range(runs)
+        ]
+    )
+    found = largest_deviation(counts[:, None] / expected - 1.0, fewest=TIMES_RUNS // 2)
+    # One tick more or less in a run is a matter of its phase.
+    if found is not None and abs(found.mean) > 1.0 / expected:
+        words = f"{1.0 + found.mean:.4g} (+- {found.error:.2g}) of the stated number of samples"
+        fail(where, "must be as many as the mean rate of `sampling` states", words)
 
 
 def _times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:

@@ -234,7 +234,14 @@ class LateTimes(LinearSensor):
         return super().sample_times(node, ordinal, generator, horizon) + 0.5
 
 
-@says(SENSORS, "Stretches.sample_times: must not depend on the length of the run", **SAMPLED)
+@says(SENSORS, "Rarely.sample_times: must be as many as the mean rate", **SAMPLED)
+class Rarely(LinearSensor):
+    def sample_times(self, node, ordinal, generator, horizon):
+        times = 1.1 * super().sample_times(node, ordinal, generator, horizon)
+        return times[times < horizon]
+
+
+@says(SENSORS, "Stretches.sample_times: must ", **SAMPLED)
 class Stretches(LinearSensor):
     def sample_times(self, node, ordinal, generator, horizon):
         return horizon * np.array([0.2, 0.5, 0.7])
