@@ -47,26 +47,26 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
 @kernel
 def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
     """Write the first len(out) entries of the sum at ``gap`` seconds into ``out``."""
-    fill_series(out, len(out), series, series[:, series.shape[1] - 1], gap)
+    fill_series(out, len(out), series, series, series.shape[1] - 1, gap)
 
 
 @kernel
 def fill_series(
-    out: FloatArray, width: int, series: FloatArray, reach: FloatArray, gap: float
+    out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
-    """Write the first ``width`` entries of ``sum_k gap^k series[k]`` into ``out``; ``reach``
-    (terms,) says up to which abs(gap) the terms so far are enough.
+    """Write the first ``width`` entries of ``sum_k gap^k series[k]`` into ``out``; this ``column``
+    of ``reach`` (terms, ...) says up to which abs(gap) the terms so far are enough.
     """
     terms, distance = len(reach), abs(gap)
     # Numbers of terms that are known when this is compiled: sums of entries stay in registers.
-    if terms > 8 and distance <= reach[8]:
+    if terms > 8 and distance <= reach[8, column]:
         horner(ORDER_8, out, width, series, gap)
-    elif terms > 12 and distance <= reach[12]:
+    elif terms > 12 and distance <= reach[12, column]:
         horner(ORDER_12, out, width, series, gap)
-    elif terms > 16 and distance <= reach[16]:
+    elif terms > 16 and distance <= reach[16, column]:
         horner(ORDER_16, out, width, series, gap)
     else:
-        add_terms(out, width, series, reach, gap)
+        add_terms(out, width, series, reach, column, gap)
 
 
 @kernel(inlined=True, fused=True)
@@ -84,13 +84,13 @@ def horner(
 
 @kernel
 def add_terms(
-    out: FloatArray, width: int, series: FloatArray, reach: FloatArray, gap: float
+    out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
     """``fill_series`` with as many terms as ``reach`` asks for."""
     for j in range(width):
         out[j] = series[0, j]
     k, even = 0, 1.0
-    while abs(gap) > reach[k]:  # two rows at a time: ``out`` is gone through half as often
+    while abs(gap) > reach[k, column]:  # two rows at a time: ``out`` is gone through half as often
         odd = even * gap
         even = odd * gap
         for j in range(width):

@@ -434,7 +434,7 @@ def fill_seen(
     # x(since) by the response alone; the cubic below contains all that noise adds since the piece
     # began.
     if since > 0.0:
-        fill_series(responses, n * n, to_end, to_end[:, to_end.shape[1] - 1], since)
+        fill_series(responses, n * n, to_end, to_end, to_end.shape[1] - 1, since)
         for i in range(n):
             x[i] = 0.0
             for j in range(n):
@@ -445,7 +445,8 @@ def fill_seen(
     second = 1.5 * square + 0.5 * part - 0.5
     third = middle * (2.5 * (square + part) - 1.5)
     tilted = share * (2.5 * square + 0.5 * part - 0.5)
-    fill_series(responses, 2 * n * n, to_moments, to_moments[:, to_moments.shape[1] - 1], gap)
+    last = to_moments.shape[1] - 1
+    fill_series(responses, 2 * n * n, to_moments, to_moments, last, gap)
     # Response to x over the gap, and the moments of the cubic.
     for i in range(n):
         plain = cubic[k, 0, i] + middle * cubic[k, 1, i]

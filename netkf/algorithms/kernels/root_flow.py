@@ -69,9 +69,9 @@ class FlowTable(Struct):
     sizes  : (M, 5) rows q of a block of Gamma, number of blocks (0: nothing is observed), whether
              there is noise, number of levels, and that of the first one longer than all cells
     size   : (M,) trace of G, 1/s
-    reach  : (M, terms) up to which gap the terms so far are enough, see linalg/series
-    series : (M, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g) and,
-             where something is observed, F
+    reach  : (M, cells, terms, 1) up to which gap the terms so far are enough, see linalg/series
+    series : (M, cells, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g)
+             and, where something is observed, F and G_g
     gamma  : (M, blocks, terms, 1 + q n) the reach of ``c_j / (g^j sqrt(2 j + 1))``, and its terms
     bound  : (M, blocks) bounds of ``|row block j of Gamma|^2 / g^(2 j + 1)``
     levels : (M, levels, 4, n, n) ``exp(A g)``, F, Gamma (upper) and T (lower triangular) for
@@ -181,7 +181,7 @@ def flow_table(
         unit=np.array([unit]),
         sizes=np.array([sizes], dtype=np.int64),
         size=np.array([float((seen * seen).sum())]),
-        reach=reach[None, :, : last + 1].copy(),
+        reach=reach[None, :, : last + 1, None].copy(),
         series=series[None, :, : last + 1].copy(),
         gamma=np.array(gamma).reshape(1, len(gamma), TERMS, len(seen) * n + 1),
         bound=bound[None],
@@ -597,7 +597,7 @@ def fill_cell(
     """Write the first ``width`` values of the series of a cell, ``since`` seconds from its middle,
     see linalg/series.
     """
-    fill_series(out, width, table.series[m, cell], table.reach[m, cell], since)
+    fill_series(out, width, table.series[m, cell], table.reach[m, cell], 0, since)
 
 
 @kernel(fused=True)
@@ -696,7 +696,7 @@ def take_root(size: Size, T: FloatArray, packed: FloatArray) -> None:
             T[i, j] *= inverse
 
 
-@kernel(inlined=True, fused=True)
+@kernel(fused=True)
 def transform(
     size: Size,
     root: FloatArray,
@@ -709,7 +709,7 @@ def transform(
     """Make place ``k`` the lower triangular root of ``F P F' + T T'``; F lies by rows from
     ``begin`` on, T (n, n) is lower triangular and used up; ``scratch`` is (n, n).
     """
-    n, wide = len(size), local_matrix(size, scratch)
+    n, wide, noise = len(size), local_matrix(size, scratch), local_matrix(size, T)
     # F S; S is lower triangular, so the sum begins at r = j.
     for i in range(n):
         for j in range(n):
@@ -717,8 +717,10 @@ def transform(
             for r in range(j, n):
                 total += F[begin + i * n + r] * root[k, r, j]
             wide[i, j] = total
+        for j in range(i + 1):
+            noise[i, j] = T[i, j]
     for i in range(n):
-        reflect_row(size, i, n, wide, T)
+        reflect_row(size, i, n, wide, noise)
     for i in range(n):
         for j in range(i + 1):
             root[k, i, j] = wide[i, j]
@@ -744,6 +746,7 @@ def gain_root(
     moments: FloatArray,
     series: FloatArray,
     reach: FloatArray,
+    column: int,
     root: FloatArray,
     x: FloatArray,
     k: int,
@@ -751,11 +754,11 @@ def gain_root(
     values: FloatArray,
 ) -> None:
     """Use the ``moments`` (2p,) of the readings of a gap, which become innovations, at its end:
-    ``x += (U + S S' W) innovations``. ``series`` and ``reach`` are those of a GainTable, ``values``
-    room for a row.
+    ``x += (U + S S' W) innovations``. ``series`` is that of a GainTable, its reach is in a
+    ``column`` of ``reach``, and ``values`` is room for a row.
     """
     n, q = len(size), len(moments)
-    fill_series(values, 3 * n * q, series, reach, gap)
+    fill_series(values, 3 * n * q, series, reach, column, gap)
     # Innovations: the moments minus C x.
     for m in range(q):
         for j in range(n):
@@ -827,6 +830,7 @@ def gain_update_root(
         return x
     n = len(x)
     means, values = x.reshape(1, n).copy(), np.zeros(table.series.shape[1] - 1)
-    series, reach = table.series, table.series[:, -1]
-    gain_root(x, moments.copy(), series, reach, root.reshape(1, n, n), means, 0, gap, values)
+    series, last = table.series, table.series.shape[1] - 1
+    roots, innovations = root.reshape(1, n, n), moments.copy()
+    gain_root(x, innovations, series, series, last, roots, means, 0, gap, values)
     return np.asarray(means[0])

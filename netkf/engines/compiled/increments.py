@@ -154,7 +154,7 @@ def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
             last - now,
             scratch.early,
         )
-        gain_root(state.size, readings, gains, reach, root, xhat, h, end - now, scratch.values)
+        gain_root(state.size, readings, gains, reach, 0, root, xhat, h, end - now, scratch.values)
         node.now = end
     # The next gap sets its own bound.
     node.least = 0.0

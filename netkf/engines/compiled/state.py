@@ -61,7 +61,7 @@ CLOCKS = ("links", "directions", "nodes", "readings")
 
 class Gains(Struct):
     """The gain tables of M models, padded to one size: ``series`` (M, terms, width), its ``reach``
-    (M, terms) and the rows 2 p of ``moments`` (M,).
+    (M, terms, 1) and the rows 2 p of ``moments`` (M,).
     """
 
     series: FloatArray
@@ -287,10 +287,10 @@ def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     gains = [model.gains if len(model.H) else nothing for model in models]
     terms, width = np.max([gain.series.shape for gain in gains], axis=0)
     # The padding is never read: the last reach of a table is infinite.
-    series, reach = np.zeros((len(gains), terms, width - 1)), np.zeros((len(gains), terms))
+    series, reach = np.zeros((len(gains), terms, width - 1)), np.zeros((len(gains), terms, 1))
     for k, gain in enumerate(gains):
         count, entries = len(gain.series), gain.series.shape[1] - 1
-        series[k, :count, :entries], reach[k, :count] = gain.series[:, :-1], gain.series[:, -1]
+        series[k, :count, :entries], reach[k, :count] = gain.series[:, :-1], gain.series[:, -1:]
     moments = np.array([gain.moments for gain in gains], dtype=np.int64)
     # The last model of the stack has no sensors: it predicts messages under way.
     return stack_tables([*(model.flow for model in models), models[0].blind_flow]), Gains(
