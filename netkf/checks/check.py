@@ -25,6 +25,8 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.exact import promised_filter, with_promised_filter
 from netkf.checks.paper import PaperChecks
+from netkf.checks.parts.rows import part_promises
+from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
 from netkf.checks.points import check_slots, check_times
 from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import ReplicaSummary, stack_summaries
@@ -99,11 +101,13 @@ class ReplicaResult(NamedTuple):
                  class, on the same readings and messages, nan if that was not run or rounding hides
                  it
     expected   : it diverged, and so does the built-in filter
+    parts      : what it shows of the parts of the scenario
     """
 
     summary: ReplicaSummary | None
     difference: float
     expected: bool = False
+    parts: PartSummary | None = None
 
     @property
     def diverged(self) -> bool:
@@ -123,7 +127,8 @@ def run_replica(
         difference, expected = _error_difference(run, twin), twin.status == "diverged"
     if diverged:
         return ReplicaResult(None, difference, expected)
-    return ReplicaResult(find_checks(scenario).summarise(scenario, run), difference)
+    summary, parts = find_checks(scenario).summarise(scenario, run), summarise_parts(scenario, run)
+    return ReplicaResult(summary, difference, parts=parts)
 
 
 def _error_difference(run: Run, twin: Run) -> float:
@@ -196,11 +201,20 @@ def judge_replicas(
             *checks.assumptions(scenario),
         ],
         len(found),
-        1.0 - confidence,
+        0.5 * (1.0 - confidence),
     )
+    rows += _judge_parts(scenario, found, seed, 0.5 * (1.0 - confidence))
     if promised is not scenario:
         rows = [*judge([SAME_AS_BASE], found, [], len(found), 1.0), *rows]
     return finish(tuple(rows))
+
+
+def _judge_parts(
+    scenario: Scenario, results: list[ReplicaResult], seed: int, level: float
+) -> list[Evidence]:
+    """Return the rows about the parts of the scenario."""
+    samples = stack_parts(scenario, seed, [one.parts for one in results if one.parts is not None])
+    return judge(part_promises(samples), samples, [], len(results), level)
 
 
 def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:

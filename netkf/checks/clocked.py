@@ -12,6 +12,7 @@ import numpy as np
 
 from netkf.checks.evidence import Assumption, Finding, Promise
 from netkf.checks.exact import (
+    check_bias,
     check_error_covariance,
     check_expected_nees,
     check_upper_bound,
@@ -63,13 +64,19 @@ PROMISES = (
     Promise(
         "errors have the covariance that the equations give them",
         "derived",
-        (START, REACH),
+        (REACH,),
         check_error_covariance,
+    ),
+    Promise(
+        "errors have no bias that the equations do not give them",
+        "derived",
+        (REACH,),
+        check_bias,
     ),
     Promise(
         "NEES has the mean that exact errors say",
         "derived",
-        (START, REACH),
+        (REACH,),
         check_expected_nees,
     ),
 )

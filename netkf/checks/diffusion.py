@@ -12,6 +12,7 @@ from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing, find_unknown
 from netkf.checks.exact import (
     MAX_REPLAYED,
+    check_bias,
     check_error_covariance,
     check_expected_nees,
     check_upper_bound,
@@ -132,8 +133,14 @@ PROMISES = (
     Promise(
         "errors have the covariance that the equations give them",
         "D (6)-(9), derived",
-        ("the filters start", REACH),
+        (REACH,),
         check_error_covariance,
+    ),
+    Promise(
+        "errors have no bias that the equations do not give them",
+        "D (6)-(9), derived",
+        (REACH,),
+        check_bias,
     ),
     Promise(
         "NEES has the mean that exact errors say, at most n",

@@ -25,6 +25,11 @@ class Evidence:
     verdict   : broken if the whole interval is below 0, holds if it stays above ``-tolerance``,
         undecided if it is too wide, not promised if an assumption fails
     needed    : estimated number of runs that would decide an undecided promise, or None
+    seen, expected : the value that was found where it was furthest off, and what it should be; nan
+        where the promise is no equation of two values
+    off       : distance of the two (relative for covariances and rates)
+    detectable : error that would have been found with probability 0.9
+    runs_needed : ``needed``
     """
 
     promise: str
@@ -37,6 +42,11 @@ class Evidence:
     verdict: str
     needed: int | None
     evidence: str
+    seen: float = math.nan
+    expected: float = math.nan
+    off: float = math.nan
+    detectable: float = math.nan
+    runs_needed: int | None = None
 
 
 class Finding(NamedTuple):
@@ -46,6 +56,8 @@ class Finding(NamedTuple):
     early   : the promise is about a limit and the horizon is too short to tell
     blurred : rounding of a large state has left no errors to judge by
     horizon : seconds after which the limit would be reached, nan if that is not known
+    seen, expected, off, detectable : see :class:`Evidence`; ``off`` is by default how far the
+        margin is below 0
     """
 
     margin: tuple[float, float, float]
@@ -54,6 +66,10 @@ class Finding(NamedTuple):
     early: bool = False
     blurred: bool = False
     horizon: float = math.nan
+    seen: float = math.nan
+    expected: float = math.nan
+    off: float = math.nan
+    detectable: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -147,6 +163,11 @@ def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict,
         needed,
         message,
+        finding.seen,
+        finding.expected,
+        max(0.0, -margin) if math.isnan(finding.off) and low < high else finding.off,
+        finding.detectable,
+        needed,
     )
 
 
@@ -171,7 +192,8 @@ def find_identity(deviation: float, allowed: float, message: str) -> Finding:
     """
     margin = allowed - deviation
     text = f"largest relative deviation {deviation:.1e}, rounding explains {allowed:.0e}; {message}"
-    return Finding((margin, margin, margin), 0.0, text)
+    found = Finding((margin, margin, margin), 0.0, text)
+    return found._replace(seen=deviation, expected=0.0, off=deviation, detectable=allowed)
 
 
 def find_nothing(tolerance: float) -> Finding:

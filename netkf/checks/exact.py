@@ -5,22 +5,37 @@ covariance of the errors must be, without the engine.
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from netkf.algorithms.registry import built_in_class, overridden
 from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
-from netkf.checks.laws import NEES_TOLERANCE, compare_chi_square, find_largest
+from netkf.checks.laws import (
+    EVERYTHING,
+    NEES_TOLERANCE,
+    compare_chi_square,
+    find_largest,
+    pool,
+)
 from netkf.checks.points import sampled_indices
 from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples
-from netkf.checks.statistics import deviation_interval, quadratic_interval
+from netkf.checks.statistics import (
+    POWER,
+    Interval,
+    deviation_interval,
+    quadratic_interval,
+    scale_interval,
+)
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.errors import diagonal_blocks, replayed_covariances
+from netkf.theory.common.errors import diagonal_blocks, error_law
+from netkf.theory.common.replay import ErrorLaw
 from netkf.trace.nees import errors
 from netkf.trace.run import BLUR, Run, blurred
 
@@ -32,7 +47,7 @@ LEAST_VARIANCE_INTEGRATED, LEAST_VARIANCE = 0.02, 1e-8
 """Relative variances below which a direction is left out. Readings that are integrated over steps
 may be off by 1e-3 of the largest variance; in slots nothing is.
 """
-BOUND_TOLERANCE = 1e-8
+BOUND_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
 
 
 def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
@@ -44,21 +59,71 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     e = np.where(blurred(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
     P, e, nees = run.P[:, sampled], e[:, sampled], nees[:, sampled]
-    replayed = Sigma = np.full(P.shape, np.nan)
-    whole = np.full((len(run.times), 2), np.nan)
     if run.replica < MAX_REPLAYED and few_errors(scenario).holds:
         try:
-            replayed, stacked = replayed_covariances(with_promised_filter(scenario), run)
+            law = error_law(with_promised_filter(scenario), run)
         except TheoryError:  # an assumption says so, and rows that need them are not promised
-            return ReplicaSummary(P, e, nees, replayed, Sigma, whole)
-        Sigma = diagonal_blocks(stacked, len(scenario.nodes))
-        lost = blurred(run, Sigma)[:, sampled]
-        e = np.where(lost[..., None], np.nan, e)
-        nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
-        least = LEAST_VARIANCE if scenario.slotted else LEAST_VARIANCE_INTEGRATED
-        whole = whiten_errors(run.error, stacked, least, (BLUR * run.rounding) ** 2)
-        replayed, Sigma = replayed[:, sampled], Sigma[:, sampled]
-    return ReplicaSummary(P, e, nees, replayed, Sigma, whole)
+            return _unreplayed(P, e, nees)
+        return _replayed_summary(scenario, run, law, e, nees)
+    return _unreplayed(P, e, nees)
+
+
+def _unreplayed(P: FloatArray, e: FloatArray, nees: FloatArray) -> ReplicaSummary:
+    """Return a summary without exact covariances."""
+    times, n = len(P), P.shape[-1]
+    unknown = np.full(P.shape, np.nan)
+    pair = np.full(2, np.nan)
+    bias = np.full((n, n + 1), np.nan)
+    mean = np.full(e.shape, np.nan)
+    return ReplicaSummary(P, e, nees, unknown, mean, unknown, np.tile(pair, (times, 1)), pair, bias)
+
+
+def _replayed_summary(
+    scenario: Scenario, run: Run, law: ErrorLaw, e: FloatArray, nees: FloatArray
+) -> ReplicaSummary:
+    """Return the summary of a run with the exact law of its errors."""
+    sampled, nodes, times = sampled_indices(scenario), len(scenario.nodes), len(run.times)
+    hosts, n = law.P.shape[1], scenario.plant.n
+    size = hosts * n
+    # Blocks on the diagonal: the covariance at each time.
+    stacked = np.einsum("kakb->kab", law.covariance.reshape(times, size, times, size))
+    mean = law.mean.reshape(times, hosts, n)
+    Sigma, replayed = diagonal_blocks(stacked, hosts), law.P
+    centred = run.error[:, :hosts] - mean
+    floor = (BLUR * run.rounding) ** 2
+    least = LEAST_VARIANCE if scenario.slotted else LEAST_VARIANCE_INTEGRATED
+    whole = whiten_errors(centred, stacked, least, floor)
+    joint, bias = _pool_times(centred, law.covariance, least, float(floor.max()))
+    if hosts < nodes:  # all share one pooled filter
+        mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
+    lost = blurred(run, Sigma)[:, sampled]
+    e = np.where(lost[..., None], np.nan, e)
+    nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
+    replayed, mean, Sigma = (part[:, sampled] for part in (replayed, mean, Sigma))
+    return ReplicaSummary(run.P[:, sampled], e, nees, replayed, mean, Sigma, whole, joint, bias)
+
+
+def _pool_times(
+    e: FloatArray, covariance: FloatArray, least: float, floor: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the squared errors of all times together with their degrees of freedom (2,), and what
+    they say about a bias that all of them have, (n, n + 1).
+
+    ``e`` is (K, M, n) less its mean, ``covariance`` (K M n, K M n); on directions that are left out
+    see :func:`whiten_errors`.
+    """
+    size, n = e[0].size, e.shape[-1]
+    # Errors of different times differ in size by far: each is compared with that of its own time.
+    scale = np.repeat(np.sqrt(np.diagonal(covariance).reshape(-1, size).max(axis=1)), size)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    used = (values > least * values[-1]) & (values > floor / scale.min() ** 2)
+    white = (vectors / np.sqrt(np.where(used, values, np.inf))).T / scale
+    z = white @ e.reshape(-1)
+    # A constant bias b adds white X b, with X the identities of all estimates below each other.
+    design = white.reshape(len(white), -1, n).sum(axis=1)
+    bias = np.concatenate([design.T @ design, (design.T @ z)[:, None]], axis=1)
+    return np.array([z @ z, used.sum()]), bias
 
 
 def few_errors(scenario: Scenario) -> Assumption:
@@ -144,31 +209,80 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     and for all nodes together.
     """
     runs = samples.runs
-    e, Sigma, whole = runs.e[:MAX_REPLAYED], runs.Sigma[:MAX_REPLAYED], runs.whole[:MAX_REPLAYED]
-    alone = np.einsum("rkna,rkna->rkn", e, _solve_errors(Sigma, e)).reshape(len(e), -1)
-    n = samples.scenario.plant.n
+    Sigma, whole, n = runs.Sigma[:MAX_REPLAYED], runs.whole[:MAX_REPLAYED], samples.scenario.plant.n
+    e = runs.e[:MAX_REPLAYED] - runs.mean[:MAX_REPLAYED]
     if np.isnan(e).all():
         return find_nothing(NEES_TOLERANCE)
+    alone = np.einsum("rkna,rkna->rkn", e, _solve_errors(Sigma, e)).reshape(len(e), -1)
     with np.errstate(invalid="ignore"):
         ratios = np.concatenate([alone / n, whole[..., 0] / whole[..., 1]], axis=1)
     freedom = [n * len(e)] * alone.shape[1] + whole[..., 1].sum(axis=0).tolist()
     labels = [*samples.point_labels, *(f"{time}, all nodes" for time in samples.time_labels)]
-    found = compare_chi_square(ratios, freedom, labels, level, "e' Sigma^-1 e")
+    # A part of the level for each point, as much for all of them together, which see far less.
+    found = compare_chi_square(ratios, freedom, labels, level / 2.0, "e' Sigma^-1 e")
+    pooled = _compare_pooled(runs.joint[:MAX_REPLAYED], level / 2.0)
+    found = pool(found, pooled, EVERYTHING)
     return found._replace(message=found.message + samples.blurred_note)
+
+
+def _compare_pooled(joint: FloatArray, level: float) -> Interval:
+    """Return an interval for the relative difference of all errors from their covariance."""
+    total, freedom = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
+    if not freedom > 0.0:
+        return Interval(math.nan, 0.0, math.inf)
+    return deviation_interval(1.0, scale_interval(total, freedom, level))
+
+
+def check_bias(samples: RunSamples, level: float) -> Finding:
+    """Test that errors less their exact mean have no bias that is the same at all nodes and times,
+    by generalised least squares.
+
+    The distance is that of the bias from 0 in standard deviations of an error that is typical, the
+    inverse of the information that one run has on it.
+    """
+    bias = samples.runs.bias[:MAX_REPLAYED]
+    bias = bias[np.isfinite(bias).all(axis=(1, 2))]
+    n = bias.shape[1]
+    if not len(bias) or not np.abs(bias).any():
+        return find_nothing(BIAS_TOLERANCE)
+    information, vector = bias[:, :, :n].sum(axis=0), bias[:, :, n].sum(axis=0)
+    values, vectors = np.linalg.eigh(information)
+    seen = values > 1e-10 * values[-1]
+    z = (vectors.T @ vector)[seen] / np.sqrt(values[seen])
+    # z is standard normal without a bias; its length is at most that of the noise and the bias.
+    length, freedom = float(np.linalg.norm(z)), int(seen.sum())
+    reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(freedom / 2.0, level)))
+    per_run = 1.0 / math.sqrt(len(bias))
+    apart = Interval(
+        length * per_run,
+        max(0.0, length - reach) * per_run,
+        (length + reach) * per_run,
+        (reach + float(scipy.special.ndtri(POWER))) * per_run,
+        length * per_run,
+        0.0,
+    )
+    message = "bias that all errors share, in standard deviations of what one run tells of it,"
+    return find_largest([(apart, "all nodes and times")], BIAS_TOLERANCE, message)
 
 
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     """Compare the mean NEES with its expected value given the events of each run.
 
     NEES is then a quadratic form of Gaussian errors, whose weights are the eigenvalues of
-    P^-1 Sigma, and so is its sum over runs: nothing is estimated.
+    P^-1 Sigma, and so is its sum over runs: nothing is estimated. Errors that have a mean count
+    less that mean.
     """
     runs, n = samples.runs, samples.scenario.plant.n
     P, Sigma = runs.replayed[:MAX_REPLAYED], runs.Sigma[:MAX_REPLAYED]
-    weights = np.linalg.eigvals(np.linalg.pinv(P) @ Sigma).real
+    inverse, m = np.linalg.pinv(P), runs.mean[:MAX_REPLAYED]
+    weights = np.linalg.eigvals(inverse @ Sigma).real
     weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)
     mean = weights.sum(axis=(0, 2))
-    nees = runs.nees[:MAX_REPLAYED].reshape(len(P), -1)
+    nees = runs.nees[:MAX_REPLAYED]
+    if np.nan_to_num(m).any():
+        e = runs.e[:MAX_REPLAYED] - m
+        nees = np.einsum("rkna,rknab,rknb->rkn", e, inverse, e)
+    nees = nees.reshape(len(P), -1)
     known = np.flatnonzero(np.isfinite(nees).all(axis=0) & (mean > 0.0))
     if np.isnan(runs.e[:MAX_REPLAYED]).all():
         return find_nothing(NEES_TOLERANCE)
@@ -176,15 +290,45 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
         return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)
     found = []
     for k in known.tolist():
-        total, share = float(nees[:, k].sum()), level / len(known)
+        total, share = float(nees[:, k].sum()), 0.5 * level / len(known)
         ratio = quadratic_interval(total, weights[:, k].ravel(), share)
         found.append((deviation_interval(1.0, ratio), f"at {samples.point_labels[k]}"))
     message = (
         f"mean NEES {nees[:, known].mean():.4g}, exact errors say "
         f"{mean[known].mean() / len(P):.4g}, n is {n}; largest relative difference"
     )
-    finding = find_largest(found, NEES_TOLERANCE, message)
+    each, squares = weights[:, known].sum(axis=2), (weights[:, known] ** 2).sum(axis=2)
+    together = pooled_nees(nees[:, known], each, squares, 0.5 * level)
+    finding = pool(find_largest(found, NEES_TOLERANCE, message), together, EVERYTHING)
     return finding._replace(message=finding.message + samples.blurred_note)
+
+
+def check_nees(samples: RunSamples, level: float) -> Finding:
+    """Test NEES / n for mean 1: given the exchanges, errors are Gaussian with covariance P."""
+    n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
+    if np.isnan(samples.runs.e).all():
+        return find_nothing(NEES_TOLERANCE)
+    freedom = [n * len(nees)] * nees.shape[1]
+    found = compare_chi_square(nees / n, freedom, samples.point_labels, level / 2.0, "NEES")
+    known = nees[:, np.isfinite(nees).all(axis=0)]
+    if known.size:
+        exactly = np.full(known.shape, float(n))
+        found = pool(found, pooled_nees(known, exactly, exactly, level / 2.0), EVERYTHING)
+    return found._replace(message=found.message + samples.blurred_note)
+
+
+def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: float) -> Interval:
+    """Return an interval for the relative difference of all NEES (R, K) together from their exact
+    means (R, K); ``square`` (R, K) is half of their variances.
+
+    The runs are independent. However the points of one run are related, the standard deviation of
+    their sum is at most the sum of theirs.
+    """
+    spread = np.sqrt(2.0 * square).sum(axis=1)
+    expected = float(mean.sum())
+    freedom = 2.0 * expected**2 / float((spread**2).sum())
+    ratio = scale_interval(freedom * float(nees.sum()) / expected, freedom, level)
+    return deviation_interval(1.0, ratio)
 
 
 def _solve_errors(Sigma: FloatArray, e: FloatArray) -> FloatArray:

@@ -11,7 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.checks.evidence import Assumption, Finding, Promise
-from netkf.checks.exact import check_error_covariance, few_errors, summarise_exactly
+from netkf.checks.exact import (
+    check_bias,
+    check_error_covariance,
+    check_nees,
+    few_errors,
+    summarise_exactly,
+)
 from netkf.checks.laws import (
     LAW_TOLERANCE,
     Pair,
@@ -35,7 +41,7 @@ from netkf.checks.mode_sequences import (
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_replay
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
 from netkf.checks.statistics import (
     Interval,
     band_width,
@@ -409,8 +415,14 @@ PROMISES = (
     Promise(
         "errors have the covariance that swaps and readings give them",
         "G (8), (10), derived",
-        ("the filters start", "exact errors are within reach"),
+        ("exact errors are within reach",),
         check_error_covariance,
+    ),
+    Promise(
+        "errors have no bias that the equations do not give them",
+        "G (8), (10), derived",
+        ("exact errors are within reach",),
+        check_bias,
     ),
     Promise(
         "errors are as large as P says: the mean NEES is n",

@@ -13,7 +13,13 @@ import numpy as np
 
 from netkf.algorithms.kernels.chains import trace_path
 from netkf.checks.evidence import Assumption, Finding, Promise
-from netkf.checks.exact import check_error_covariance, few_errors, summarise_exactly
+from netkf.checks.exact import (
+    check_bias,
+    check_error_covariance,
+    check_nees,
+    few_errors,
+    summarise_exactly,
+)
 from netkf.checks.laws import (
     LAW_TOLERANCE,
     Pair,
@@ -38,7 +44,7 @@ from netkf.checks.mode_sequences import (
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
 from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_nees, check_replay
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
 from netkf.checks.statistics import (
     deviation_interval,
     distance_to_law,
@@ -518,8 +524,14 @@ PROMISES = (
     Promise(
         "errors have the covariance that the readings give them",
         "R (15)-(18), derived",
-        ("the filters start", "exact errors are within reach"),
+        ("exact errors are within reach",),
         check_error_covariance,
+    ),
+    Promise(
+        "errors have no bias that the equations do not give them",
+        "R (15)-(18), derived",
+        ("exact errors are within reach",),
+        check_bias,
     ),
     Promise("errors are as large as P says: the mean NEES is n", "R (14)", KNOWN, check_nees),
 )

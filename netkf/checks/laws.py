@@ -47,8 +47,37 @@ def find_largest(
     """
     chosen, label = max(distances, key=lambda item: (item[0].low, item[0].value))
     widest = max(interval.high for interval, _ in distances)
+    detectable = max(interval.detectable for interval, _ in distances)
     text = f"{message} in {len(distances)} comparisons, {label}"
-    return Finding((-chosen.value, -widest, -chosen.low), tolerance, text)
+    margin = -chosen.value, -widest, -chosen.low
+    found = Finding(margin, tolerance, text, detectable=detectable)
+    return found._replace(seen=chosen.seen, expected=chosen.expected)
+
+
+EVERYTHING = "all times, nodes and runs together"
+POOLED_TOLERANCE = 0.1
+"""Tolerated relative difference where everything is pooled."""
+
+
+def pool(single: Finding, pooled: Interval, what: str) -> Finding:
+    """Return the finding of a row from its single comparisons and one of all of them together.
+
+    Both have their share of the level. A single comparison that is off is the finding; otherwise
+    the pooled one is, because it says far more precisely how much could be wrong.
+    """
+    off = single.margin[2] < 0.0 and not pooled.low > 0.0
+    if off or not pooled.value >= 0.0:
+        return single
+    margin = -pooled.value, -pooled.high, -pooled.low
+    text = f"{what}; {single.message}: {max(0.0, -single.margin[0]):.3g}"
+    return single._replace(
+        margin=margin,
+        tolerance=POOLED_TOLERANCE,
+        message=text,
+        seen=pooled.seen,
+        expected=pooled.expected,
+        detectable=pooled.detectable,
+    )
 
 
 def compare_laws(pairs: Sequence[Pair], level: float, horizon: float = math.nan) -> Finding:
@@ -66,7 +95,7 @@ def compare_laws(pairs: Sequence[Pair], level: float, horizon: float = math.nan)
                 known = pair.expected[:, k, k]
                 low = law_distance(one, known, share / 2.0).low
                 apart = law_distance(one, other, share / 2.0)
-                apart = Interval(apart.value, low, max(apart.high, low))
+                apart = apart._replace(low=low, high=max(apart.high, low))
                 early |= law_distance(known, other, 0.5).value > LAW_TOLERANCE
             found.append((apart, f"at {pair.label}, entry {k}"))
     finding = find_largest(found, LAW_TOLERANCE, "largest distance of distribution functions")
@@ -113,7 +142,7 @@ def compare_growth(
         for k, (run, law) in enumerate(zip(seen, known, strict=True)):
             low = max(0.0, run.low - law.high) if law is not None else 0.0
             early |= (law.value if law is not None else run.low) > LAW_TOLERANCE
-            found.append((Interval(run.value, low, run.high), f"at {pair.label}, entry {k}"))
+            found.append((run._replace(low=low), f"at {pair.label}, entry {k}"))
     message = f"largest excess of P(P > {GROWTH:g} J) at the end over P(P > J) at half of the time"
     finding = find_largest(found, LAW_TOLERANCE, message)
     differs = any(apart.low > 0.0 for apart, _ in found)

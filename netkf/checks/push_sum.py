@@ -14,6 +14,7 @@ import scipy.special
 from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing, find_unknown
 from netkf.checks.exact import (
     LEAST_VARIANCE,
+    check_bias,
     check_error_covariance,
     few_errors,
     summarise_exactly,
@@ -261,13 +262,14 @@ PROMISES = (
     Promise(
         "errors have the covariance that the steps give them",
         "P (7)-(9), derived",
-        (
-            "mass is exchanged in every slot",
-            "the filters know",
-            "the filters start",
-            "exact errors are within reach",
-        ),
+        ("mass is exchanged in every slot", "the filters know", "exact errors are within reach"),
         check_error_covariance,
+    ),
+    Promise(
+        "errors have no bias that the equations do not give them",
+        "P (7)-(9), derived",
+        ("mass is exchanged in every slot", "the filters know", "exact errors are within reach"),
+        check_bias,
     ),
     Promise(
         "every node comes to the covariance P_inf",

@@ -30,14 +30,17 @@ def verdict_text(verdict: Verdict, claim: str = "") -> str:
 
 
 def _describe(row: Evidence) -> str:
-    """Return the evidence of a row with its margin, or the assumptions that fail."""
+    """Return the evidence of a row, how far off it is and what would have been seen, or the
+    assumptions that fail.
+    """
     message = row.evidence
     if row.verdict == NOT_PROMISED:
         message = row.assumptions
     elif row.low < row.high:
-        ends = [f"{value + 0.0:.3g}" for value in (row.margin, row.low, row.high)]  # no -0
-        message += "; margin {} in [{}, {}]".format(*ends)
-        message += f", {row.tolerance:g} below 0 is tolerated" if row.tolerance else ""
+        message += f"; off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}"
+        if row.detectable > 0.0:
+            message += f"; an error of {row.detectable:.2g} would have been seen"
+        message += f"; {row.tolerance:g} is tolerated" if row.tolerance else ""
     if row.needed is not None:
         message += f"; needs about {row.needed:,} runs"
     return message

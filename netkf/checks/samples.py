@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from netkf.checks.evidence import Finding, find_nothing, find_unknown
-from netkf.checks.laws import NEES_TOLERANCE, Pair, compare_chi_square, compare_growth
+from netkf.checks.evidence import Finding, find_unknown
+from netkf.checks.laws import Pair, compare_growth
 from netkf.checks.points import check_slots, check_times, sampled_nodes
 from netkf.checks.rounding import compare_identities, largest_terms
 from netkf.linalg.arrays import FloatArray
@@ -26,9 +26,12 @@ class ReplicaSummary:
     P, e       : (K, N, n, n), (K, N, n) covariances and errors, nan if rounding blurs them
     nees       : (K, N) e' P^-1 e
     replayed   : (K, N, n, n) P by the equations of the filter, from the events of the run
-    Sigma      : (K, N, n, n) covariance of the errors given the events
+    mean, Sigma : (K, N, n), (K, N, n, n) mean and covariance of the errors given the events
     whole      : (K, 2) squared errors of all nodes together, whitened by their covariance given the
                  events, and their degrees of freedom
+    joint      : (2,) the same of all times together
+    bias       : (n, n + 1) information on a constant bias of all errors, and that information times
+                 its estimate
 
     Papers add fields of their own. Summaries of R runs are stacked: every field gets a first axis
     of length R.
@@ -38,8 +41,11 @@ class ReplicaSummary:
     e: FloatArray
     nees: FloatArray
     replayed: FloatArray
+    mean: FloatArray
     Sigma: FloatArray
     whole: FloatArray
+    joint: FloatArray
+    bias: FloatArray
 
 
 Summary = TypeVar("Summary", bound=ReplicaSummary)
@@ -142,13 +148,3 @@ def check_growth(samples: RunSamples, level: float) -> Finding:
         pairs.append(Pair(f"node {node}", P[:, -2, i], P[:, -1, i]))
         expected.append((known[:, -2, i], known[:, -1, i]) if len(known) else None)
     return compare_growth(pairs, expected, level)
-
-
-def check_nees(samples: RunSamples, level: float) -> Finding:
-    """Test NEES / n for mean 1: given the exchanges, errors are Gaussian with covariance P."""
-    n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
-    if np.isnan(samples.runs.e).all():
-        return find_nothing(NEES_TOLERANCE)
-    freedom = [n * len(nees)] * nees.shape[1]
-    found = compare_chi_square(nees / n, freedom, samples.point_labels, level, "NEES")
-    return found._replace(message=found.message + samples.blurred_note)

@@ -21,17 +21,40 @@ MIN_EXPECTED = 5.0
 """Expected count of a cell below which Pearson's statistic is not chi-square."""
 
 
+POWER = 0.9
+"""Probability with which an error of the size that a row calls detectable is found."""
+
+
 class Interval(NamedTuple):
-    """An estimate and an interval that misses the truth with at most the stated probability."""
+    """An estimate and an interval that misses the truth with at most the stated probability.
+
+    ``detectable``: the distance of the truth from its expected value at which the interval leaves
+    the expected value out with probability POWER. An interval for a distance knows the two values
+    that are apart, ``seen`` and ``expected``.
+    """
 
     value: float
     low: float
     high: float
+    detectable: float = math.nan
+    seen: float = math.nan
+    expected: float = math.nan
+
+
+def detectable_shift(deviation: float, level: float) -> float:
+    """Return the shift that a two-sided test at ``level`` finds with probability POWER, where the
+    estimate is about normal with this standard deviation.
+    """
+    return deviation * float(_normal_quantile(1.0 - level / 2.0) + _normal_quantile(POWER))
+
+
+def _normal_quantile(probability: float) -> float:
+    return float(scipy.special.ndtri(probability))
 
 
 def probability_interval(successes: int, trials: int, level: float) -> Interval:
     """Return the interval of Clopper and Pearson, exact for independent trials."""
-    low = high = math.nan
+    low = high = detectable = math.nan
     if trials:
         missed = trials - successes
         low = (
@@ -40,14 +63,19 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
         high = (
             float(scipy.special.betaincinv(successes + 1, missed, 1 - level / 2)) if missed else 1.0
         )
-    return Interval(successes / max(trials, 1), low, high)
+        # At least one half of a trial on either side: a fraction of 0 or 1 has a spread too.
+        p = (successes + 0.5) / (trials + 1.0)
+        detectable = detectable_shift(math.sqrt(p * (1.0 - p) / trials), level)
+    return Interval(successes / max(trials, 1), low, high, detectable)
 
 
 def deviation_interval(expected: float, found: Interval) -> Interval:
     """Return an interval for the distance of a quantity from its expected value."""
     inside = found.low <= expected <= found.high
     ends = abs(found.low - expected), abs(found.high - expected)
-    return Interval(abs(found.value - expected), 0.0 if inside else min(ends), max(ends))
+    low = 0.0 if inside else min(ends)
+    apart = abs(found.value - expected)
+    return Interval(apart, low, max(ends), found.detectable, found.value, expected)
 
 
 def band_width(samples: int, level: float) -> float:
@@ -86,7 +114,10 @@ def _ecdf_gaps(one: FloatArray, other: FloatArray) -> FloatArray:
 def _band_interval(gaps: FloatArray, a: int, b: int, level: float) -> Interval:
     value = max(0.0, float(gaps.max()))
     width = band_width(a, level / 2.0) + band_width(b, level / 2.0)
-    return Interval(value, max(0.0, value - width), min(1.0, value + width))
+    # At one point the difference of the two has at most this deviation.
+    spread = 0.5 * math.sqrt(1.0 / a + 1.0 / b)
+    detectable = min(1.0, width + _normal_quantile(POWER) * spread)
+    return Interval(value, max(0.0, value - width), min(1.0, value + width), detectable)
 
 
 def distance_to_law(
@@ -104,7 +135,9 @@ def distance_to_law(
     below = np.maximum(cdf(points - slack) - before, 0.0)
     value = float(max(above.max(), below.max()))
     width = band_width(len(values), level)
-    return Interval(value, max(0.0, value - width), min(1.0, value + width))
+    spread = 0.5 / math.sqrt(len(values))
+    detectable = min(1.0, width + _normal_quantile(POWER) * spread)
+    return Interval(value, max(0.0, value - width), min(1.0, value + width), detectable)
 
 
 def scale_interval(total: float, freedom: float, level: float) -> Interval:
@@ -113,7 +146,11 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
     """
     upper = 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, 1.0 - level / 2.0))
     lower = 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, level / 2.0))
-    return Interval(total / freedom, total / upper, total / lower)
+    # c times a chi-square variable leaves the interval with probability POWER.
+    up = upper / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, 1.0 - POWER)))
+    down = lower / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, POWER)))
+    detectable = max(up - 1.0, 1.0 - down)
+    return Interval(total / freedom, total / upper, total / lower, detectable)
 
 
 def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:
@@ -131,7 +168,14 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
     if np.ptp(weights) <= 1e-9 * weights.max():
         return scale_interval(total / float(weights[0]), float(len(weights)), level)
     upper, lower = (_quadratic_quantile(weights, level / 2.0, up) for up in (True, False))
-    return Interval(total / mean, total / upper, total / lower)
+    # Quantiles in the middle are near those of a scaled chi-square variable.
+    freedom = mean**2 / float((weights**2).sum())
+    up, down = (
+        2.0 * mean / freedom * float(scipy.special.gammaincinv(freedom / 2.0, chance))
+        for chance in (1.0 - POWER, POWER)
+    )
+    detectable = max(upper / up - 1.0, 1.0 - lower / down)
+    return Interval(total / mean, total / upper, total / lower, detectable)
 
 
 def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
@@ -193,7 +237,9 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
     flat = samples.reshape(count, -1)
     covariance = np.atleast_2d(np.cov(flat, rowvar=False))
     widest = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
-    return Interval(float(values[-1]), low, float(values[-1]) + reach * widest)
+    spread = float(along[-1]) / math.sqrt(count)
+    detectable = reach * float(along.max()) + _normal_quantile(POWER) * spread
+    return Interval(float(values[-1]), low, float(values[-1]) + reach * widest, detectable)
 
 
 def pearson_test(counts: np.ndarray, probabilities: FloatArray) -> tuple[float, int]:

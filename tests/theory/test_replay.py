@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
-from netkf.theory.common.errors import replayed_covariances
+from netkf.theory.common.errors import error_law, replayed_covariances
 from tests.engines.linearity import OneDraw, run
 
 POISSON = {"kind": "poisson", "rate": 2.0}
@@ -61,6 +62,8 @@ CASES = [
     ("local", None),
     ("central", None),
 ]
+LONG = {"kind": "periodic", "period": 100.0}
+STARTS = [[0.7, -0.4], [1.5, 0.2], [-2.0, 3.0], [0.0, 0.1]]
 SAMPLES_ONLY = {"intermittent", "dropping", "window", "push-sum"}
 
 
@@ -144,3 +147,41 @@ def test_filters_with_another_plant_and_other_noises(tmp_path):
     expected, run = engine_covariance(scenario)
     close(theory.error_covariance(scenario, run), expected, 1e-9)
     close(replayed_covariances(scenario, run)[0], run.P, 1e-9)
+
+
+@pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
+def test_the_mean_of_errors_is_what_other_starts_add(name, at, tmp_path):
+    # Same truth, readings and messages: estimates differ by the mean of their errors only.
+    scenario = scenario_of(name, at, LATE, SAMPLED, tmp_path)
+    moved = scenario.replace({"filter.mean": STARTS[0] if name == "central" else STARTS})
+    run, other = (netkf.simulate(one, engine="simpy") for one in (scenario, moved))
+    law = error_law(moved, other)
+    shape = len(run.times), law.P.shape[1], 2
+    mean = law.mean.reshape(shape)
+    hosts = shape[1]
+    close(mean, (other.error - run.error)[:, :hosts], 1e-9)
+    assert np.abs(mean).max() > 0.1
+    close(law.covariance, error_law(scenario, run).covariance, 1e-9)
+
+
+@pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
+def test_the_joint_law_has_the_covariance_of_each_time(name, at, tmp_path):
+    scenario = scenario_of(name, at, LATE, SAMPLED, tmp_path)
+    run = netkf.simulate(scenario, engine="simpy")
+    law = error_law(scenario, run)
+    hosts, times = law.P.shape[1], len(run.times)
+    joint = law.covariance.reshape(times, 2 * hosts, times, 2 * hosts)
+    stacked = theory.error_covariance(scenario, run, stacked=True)[:, : 2 * hosts, : 2 * hosts]
+    close(np.einsum("kakb->kab", joint), stacked, 1e-10)
+    assert not law.mean.any()
+
+
+def test_the_joint_law_of_a_filter_without_readings_is_the_plants(tmp_path):
+    # Errors are then the state itself: E[x(s) x(t)'] = C(s) exp(A (t - s))'.
+    sensors = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[1.0]], "sampling": LONG}]
+    scenario = scenario_of("local", None, {}, sensors, tmp_path, probe=[0.4, 1.5])
+    run = netkf.simulate(scenario, engine="simpy")
+    law = error_law(scenario, run)
+    C, A = theory.error_covariance(scenario, run)[:, 2], scenario.truth.A
+    joint = law.covariance.reshape(2, 4, 2, 2, 4, 2)[:, 2, :, :, 2]
+    close(joint[0, :, 1], C[0] @ scipy.linalg.expm(A * 1.1).T, 1e-10)

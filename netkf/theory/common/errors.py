@@ -13,7 +13,7 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.replay import replay_errors
+from netkf.theory.common.replay import ErrorLaw, replay_errors, replay_law
 from netkf.trace.run import Run
 
 
@@ -49,14 +49,29 @@ def replayed_covariances(scenario: Scenario, run: Run) -> tuple[FloatArray, Floa
     return P, joint
 
 
-def _replay_nodes(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the joint error covariance (T, N n, N n) and P (T, N, n, n) of all nodes."""
+def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
+    """Return the joint Gaussian law of all errors at all ``run.times``, given the run's events.
+
+    Unlike :func:`error_covariance` it relates different times, and includes the mean that errors
+    have where filters start elsewhere than the plant. Nodes that share one pooled filter count
+    once. Raises the errors of :func:`error_covariance`.
+    """
+    _require_same_run(scenario, run)
+    return replay_law(scenario, run)
+
+
+def _require_same_run(scenario: Scenario, run: Run) -> None:
     if not isinstance(run, Run):
         raise TheoryError(
             f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
         )
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
+
+
+def _replay_nodes(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
+    """Return the joint error covariance (T, N n, N n) and P (T, N, n, n) of all nodes."""
+    _require_same_run(scenario, run)
     joint, P = replay_errors(scenario, run)
     nodes, n = len(scenario.nodes), scenario.plant.n
     # A pooled filter is replayed once; all nodes share its estimate, and so its error.

@@ -7,6 +7,7 @@ One driver for clocks and one for slots, over the same operations on errors
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,15 +35,46 @@ def replay_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]
     P is (T, M, n, n); M = 1 if all nodes share one pooled filter. Raises TheoryError for a filter
     whose equations are not known here.
     """
-    require_known_filter(scenario)
-    errors = StackedErrors(scenario, len(nodes_by_host(scenario)))
-    replay = _replay_slots if scenario.slotted else _replay_instants
+    errors = _stacked_errors(scenario)
     # The generator stops at each sample, when the errors have their values of that time.
-    pairs = [(errors.covariance(), errors.covariances()) for _ in replay(scenario, run, errors)]
+    pairs = [(errors.covariance(), errors.covariances()) for _ in _replay(scenario, run, errors)]
     if not pairs:
         n = errors.n
         return np.empty((0, errors.hosts * n, errors.hosts * n)), np.empty((0, errors.hosts, n, n))
     return np.array([joint for joint, _ in pairs]), np.array([P for _, P in pairs])
+
+
+class ErrorLaw(NamedTuple):
+    """The Gaussian law of the errors of M hosts at T times given the events of a run.
+
+    ``mean`` (T M n,) and ``covariance`` (T M n, T M n) of all errors together, ``P`` (T, M, n, n).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    P: FloatArray
+
+
+def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
+    """Return the joint law of the errors at all ``run.times``, of which there must be some.
+
+    Raises TheoryError for a filter whose equations are not known here.
+    """
+    errors, P = _stacked_errors(scenario), []
+    for k, _ in enumerate(_replay(scenario, run, errors)):
+        errors.keep(k)
+        P.append(errors.covariances())
+    return ErrorLaw(*errors.law(len(P)), np.array(P))
+
+
+def _stacked_errors(scenario: Scenario) -> StackedErrors:
+    require_known_filter(scenario)
+    return StackedErrors(scenario, len(nodes_by_host(scenario)))
+
+
+def _replay(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
+    """Replay a run; yield at each of ``run.times``."""
+    return (_replay_slots if scenario.slotted else _replay_instants)(scenario, run, errors)
 
 
 def require_known_filter(scenario: Scenario) -> None:

@@ -27,7 +27,7 @@ from netkf.theory.numerics.prediction import (
 from netkf.theory.numerics.stack import GaussianStack
 from netkf.theory.numerics.updates import Observation, update_covariance_root
 
-STATE = "state"
+STATE, OFFSET = "state", "offset"
 Term = tuple[Hashable, FloatArray]
 """An estimate and the matrix (n, n) by which its error is multiplied."""
 
@@ -47,7 +47,7 @@ class StackedErrors:
         self.roots: dict[Hashable, FloatArray] = {}
         self.owner: dict[Hashable, int | None] = {}
         first = square_root(np.asarray(scenario.plant.start_cov))
-        # All estimates start at known means, so that their first errors have the same inputs.
+        # Estimates start at known means, so that the random part of their errors is the same.
         columns = self.stack.inputs(first.shape[1])
         self.follows = _errors_follow_state(scenario)
         if self.follows:
@@ -58,10 +58,53 @@ class StackedErrors:
             self.stack.add(host, columns, first)
             self.roots[host] = square_root(np.asarray(scenario.start(node)[1]))
             self.owner[host] = host
+        self._add_offsets(scenario)
+
+    def _add_offsets(self, scenario: Scenario) -> None:
+        """Let the errors begin at the distance of each filter's mean from the plant's.
+
+        The distances are factors of one more input, which is the number 1 and not drawn. A vector
+        that holds only that input finds its share in any error, after any rotation of the inputs.
+        """
+        start, n = scenario.plant.start_mean, self.n
+        offsets: dict[Hashable, FloatArray] = {
+            host: start - scenario.start(scenario.nodes[host])[0] for host in range(self.hosts)
+        }
+        if self.follows:
+            offsets[STATE] = start
+        if not any(offset.any() for offset in offsets.values()):
+            return
+        one = self.stack.inputs(1)
+        self.stack.put(OFFSET, np.zeros((n, 0)))
+        self.stack.add(OFFSET, one, np.eye(n, 1))
+        for name, offset in offsets.items():
+            self.stack.add(name, one, offset[:, None])
+
+    def keep(self, sample: int) -> None:
+        """Keep the errors of all hosts as they are now as number ``sample``, for ``law``."""
+        for host in range(self.hosts):
+            self.stack.put(("sample", sample, host), self.stack.form(host))
+
+    def law(self, samples: int) -> tuple[FloatArray, FloatArray]:
+        """Return the mean (K M n,) and the joint covariance of the errors of the hosts that were
+        kept in K samples.
+        """
+        names = [("sample", k, host) for k in range(samples) for host in range(self.hosts)]
+        return self._mean_and_covariance(names)
+
+    def _mean_and_covariance(self, names: Sequence[Hashable]) -> tuple[FloatArray, FloatArray]:
+        forms = self.stack.forms(names).reshape(len(names) * self.n, -1)
+        if OFFSET not in self.stack:
+            return np.zeros(len(forms)), np.asarray(forms @ forms.T)
+        one = self.stack.form(OFFSET)[0]
+        mean = np.asarray(forms @ one)
+        # What is left is random: the part along the input that is a number is taken out first.
+        rest = forms - np.outer(mean, one)
+        return mean, np.asarray(rest @ rest.T)
 
     def covariance(self) -> FloatArray:
         """Return the joint covariance (M n, M n) of the errors of the hosts."""
-        return self.stack.covariance(range(self.hosts))
+        return self._mean_and_covariance(range(self.hosts))[1]
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the hosts."""

@@ -1,0 +1,245 @@
+"""Noises of the plant and of the sensors, drawn again from the streams of a run, and whitened.
+
+The plant and the sensors draw from streams of their own, whatever the filters and the network do.
+What they give is compared here with the matrices in the scenario, with plain formulas.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from netkf.checks.parts.moments import Moments, moments, whitening
+from netkf.checks.parts.sources import stated_part
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.plants.linear import LinearPlant
+from netkf.plants.recorded import RecordedSensor
+from netkf.rng.streams import Streams
+from netkf.scenario.model import PlacedSensor, takes_samples
+from netkf.scenario.scenario import Scenario
+
+MAX_STEPS = 64
+"""Steps of a path, and readings of a sensor, that are looked at in one run."""
+MAX_ROWS = 24
+"""Rows of readings, of all sensors together, that are looked at."""
+VISIBLE = 1e-5
+"""Standard deviation of a noise over the size of the state below which rounding hides it."""
+
+
+class PathLaw(NamedTuple):
+    """Times (S + 1,) in seconds of the states that are compared, and the law of what each step
+    adds: ``x(t + gap) = Phi x(t) + w``, and the matrix (d, n) that whitens w.
+    """
+
+    times: FloatArray
+    Phi: FloatArray
+    white: FloatArray
+    deviation: float
+
+
+@lru_cache(maxsize=8)
+def path_law(scenario: Scenario) -> PathLaw | None:
+    """Return the law of the path by the matrices of the scenario; None without a drawn one."""
+    if not scenario.plant.is_random:
+        return None
+    if scenario.slotted:
+        plant: Any = stated_part(scenario.plant, "plant") or scenario.plant
+        slots = min(MAX_STEPS, int(scenario.horizon / plant.period))
+        times = plant.period * np.arange(slots + 1)
+        Phi, W = np.asarray(plant.F), np.asarray(plant.Q)
+    else:
+        stated: Any = stated_part(scenario.plant, "plant") or scenario.plant
+        times = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
+        Phi, W = _discretised(stated.A, stated.B, float(times[1]))
+    size = float(np.sqrt(np.diagonal(W).max()))
+    return PathLaw(times, Phi, whitening(W), size)
+
+
+def _discretised(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
+    """Return ``exp(A gap)`` and the covariance of the noise over a gap, by Van Loan's formula."""
+    n = len(A)
+    blocks = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]])
+    moved = scipy.linalg.expm(blocks * gap)
+    Phi = moved[n:, n:].T
+    W = Phi @ moved[:n, n:]
+    return Phi, 0.5 * (W + W.T)
+
+
+def plant_moments(scenario: Scenario, streams: Streams) -> Moments | None:
+    """Return the moments of what the steps of one path add; None without noise or path."""
+    law = path_law(scenario)
+    if law is None or not len(law.white):
+        return None
+    x = _states(scenario, streams, law)
+    w = x[1:] - x[:-1] @ law.Phi.T
+    # Differences of states that have grown far beyond the noise are rounding.
+    seen = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
+    kept = len(seen) if seen.all() else int(np.argmin(seen))
+    return moments(w[:kept] @ law.white.T)
+
+
+def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
+    """Return the states (S + 1, n) of one run."""
+    if scenario.slotted:
+        truth = scenario.slot_plant.truth(streams.generator("plant"))
+        return np.array([truth.absolute(slot) for slot in range(len(law.times))])
+    watched = _watched(scenario)
+    path = watched.continuous_truth(streams, frames=False)
+    return np.array([path.absolute(time) for time in law.times.tolist()])
+
+
+@lru_cache(maxsize=8)
+def _watched(scenario: Scenario) -> Scenario:
+    """Return the scenario with states at the times of its path law; cached for its tables."""
+    law = path_law(scenario)
+    assert law is not None
+    return dataclasses.replace(scenario, probe=law.times)
+
+
+def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
+    """Return x(0) (count, n) of replicas 0 to count - 1."""
+    drawn = []
+    for replica in range(count):
+        random = Streams(seed, replica).generator("plant")
+        plant: Any = scenario.plant
+        if isinstance(plant, LinearPlant):
+            drawn.append(plant.truth(random).absolute(0))
+        else:
+            drawn.append(scenario.truth.start(random))
+    return np.array(drawn)
+
+
+class SensorLaw(NamedTuple):
+    """One sensor on one node: H (p, n), the root (p, p) of R, and how it gives readings."""
+
+    label: str
+    node: int
+    place: PlacedSensor
+    H: FloatArray | None
+    root: FloatArray
+    sampled: bool
+
+
+@lru_cache(maxsize=8)
+def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
+    """Return the drawn sensors that are looked at; all of them unless they have many rows."""
+    found: list[SensorLaw] = []
+    rows = 0
+    for node, places in scenario.placed.items():
+        for place in places:
+            sensor = scenario.sensors[place.entry]
+            if not sensor.is_random or isinstance(sensor, RecordedSensor):
+                continue
+            stated: Any = stated_part(sensor, "sensor") or sensor
+            rows += len(stated.R)
+            if rows > MAX_ROWS:
+                return tuple(found)
+            # The row of a regressor is random, and travels with its reading.
+            H = None if stated.varying else np.asarray(stated.H)
+            label = f"sensor {place.ordinal} of node {node}" if len(places) > 1 else f"node {node}"
+            root = np.linalg.cholesky(stated.R)
+            sampled = not scenario.slotted and takes_samples(sensor)
+            found.append(SensorLaw(label, node, place, H, root, sampled))
+    return tuple(found)
+
+
+def reading_labels(scenario: Scenario) -> list[str]:
+    """Return the labels of the entries of the moments of readings."""
+    return [
+        f"reading {row} of {law.label}" if len(law.root) > 1 else f"the reading of {law.label}"
+        for law in sensor_laws(scenario)
+        for row in range(len(law.root))
+    ]
+
+
+def reading_moments(scenario: Scenario, streams: Streams) -> Moments | None:
+    """Return the moments of the noises of all readings; None if no sensor is drawn.
+
+    Sensors are shown states of a usual size that are drawn here, because a sensor has no say in
+    what it is shown. Noise number k of all sensors counts as one vector, in which those that have
+    given fewer readings are missing.
+    """
+    laws = sensor_laws(scenario)
+    if not laws:
+        return None
+    columns = [_noises(scenario, streams, law) for law in laws]
+    length = max(len(column) for column in columns)
+    whole = [
+        np.pad(column, ((0, length - len(column)), (0, 0)), constant_values=np.nan)
+        for column in columns
+    ]
+    return moments(np.concatenate(whole, axis=1))
+
+
+def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> FloatArray:
+    """Return the whitened noises (S, p) of a sensor's first readings in one run."""
+    random = streams.generator("check readings", law.node, law.place.ordinal)
+    if scenario.slotted:
+        count = min(MAX_STEPS, int(scenario.horizon / scenario.slot_plant.period))
+        path: Any = scenario.slot_path(streams, law.node, law.place)
+    elif law.sampled:
+        times = scenario.sample_times(streams)[law.node, law.place.ordinal]
+        count = min(MAX_STEPS, len(times))
+        path = scenario.sample_path(streams, law.node, law.place)
+    else:
+        return np.concatenate([*_increment_noises(scenario, streams, law, random)])
+    x = _shown_states(scenario, random, count)
+    if not count:
+        return np.empty((0, len(law.root)))
+    y, H = path.several(range(count), x)
+    expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
+    return np.asarray(np.linalg.solve(law.root, (y - expected).T).T)
+
+
+def _shown_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
+    """Return states (count, n) of the size of the first ones and of what some steps add."""
+    plant: Any = scenario.plant
+    root = square_root(plant.start_cov + 10.0 * np.asarray(plant.Q))
+    return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
+
+
+class _Grid(NamedTuple):
+    """The part of a path that a sensor of increments asks: the period and the present step."""
+
+    period: float
+    end: float
+
+    def step_end(self) -> float:
+        """Return the end of the present step in seconds."""
+        return self.end
+
+
+def _increment_noises(
+    scenario: Scenario, streams: Streams, law: SensorLaw, random: np.random.Generator
+) -> Iterator[FloatArray]:
+    """Yield whitened noises (2, p): of some steps whole, of others cut in two.
+
+    Each part of a step has two moments, with the variances R length and R length / 3.
+    """
+    sensor: Any = scenario.sensors[law.place.entry]
+    node, ordinal = law.node, law.place.ordinal
+    path = sensor.path(*(streams.generator(p, node, ordinal) for p in ("noise", "cut")))
+    period = scenario.truth.sensing_period
+    assert period is not None
+    assert law.H is not None
+    for k in range(min(MAX_STEPS // 4, int(scenario.horizon / period))):
+        start, end = k * period, (k + 1) * period
+        # Whole steps and cut ones take turns.
+        cuts = [end] if k % 2 else [start + 0.3 * period, end]
+        for stop in cuts:
+            seen = _shown_states(scenario, random, 2) * (stop - start)
+            dy = path.moments(_Grid(period, end), seen, start, stop)
+            scale = np.sqrt((stop - start) * np.array([[1.0], [1.0 / 3.0]]))
+            yield np.linalg.solve(law.root, ((dy - seen @ law.H.T) / scale).T).T
+            start = stop
+
+
+def whitened_starts(scenario: Scenario, x: FloatArray) -> FloatArray:
+    """Return x(0) (R, n) of many runs, whitened by the stated mean and covariance, (R, d)."""
+    plant: Any = scenario.plant
+    return np.asarray((x - plant.start_mean) @ whitening(plant.start_cov).T)

@@ -1,0 +1,114 @@
+"""Promises that a scenario makes about its own parts."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from netkf.checks.evidence import Finding, Promise
+from netkf.checks.parts.moments import (
+    Moments,
+    compare_correlations,
+    compare_means,
+    compare_variances,
+    moments,
+    total,
+)
+from netkf.checks.parts.network_rows import network_promises
+from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts
+from netkf.checks.parts.samples import PartSamples
+from netkf.scenario.scenario import Scenario
+
+STARTS = 10_000
+"""States x(0) that are drawn: each run has only one."""
+
+
+def _labels(what: str, count: int) -> list[str]:
+    return [f"{what} {k}" for k in range(count)]
+
+
+@lru_cache(maxsize=4)
+def _starts(scenario: Scenario, seed: int) -> Moments:
+    return moments(whitened_starts(scenario, start_states(scenario, seed, STARTS)))
+
+
+def _start_variance(samples: PartSamples, level: float) -> Finding:
+    found = _starts(samples.scenario, samples.seed)
+    labels = _labels("direction", len(found.first))
+    return compare_variances(found, labels, level, "directions of x(0)")
+
+
+def _start_mean(samples: PartSamples, level: float) -> Finding:
+    found = _starts(samples.scenario, samples.seed)
+    return compare_means(found, _labels("direction", len(found.first)), level)
+
+
+def _steps(samples: PartSamples) -> tuple[Moments, list[str]]:
+    found = total(samples.steps)
+    return found, _labels("direction", len(found.first))
+
+
+def _step_variance(samples: PartSamples, level: float) -> Finding:
+    found, labels = _steps(samples)
+    return compare_variances(found, labels, level, "directions of the noise")
+
+
+def _step_mean(samples: PartSamples, level: float) -> Finding:
+    return compare_means(*_steps(samples), level)
+
+
+def _step_correlation(samples: PartSamples, level: float) -> Finding:
+    return compare_correlations(*_steps(samples), level)
+
+
+def _reading_variance(samples: PartSamples, level: float) -> Finding:
+    labels = reading_labels(samples.scenario)
+    return compare_variances(total(samples.readings), labels, level, "readings")
+
+
+def _reading_mean(samples: PartSamples, level: float) -> Finding:
+    return compare_means(total(samples.readings), reading_labels(samples.scenario), level)
+
+
+def _reading_correlation(samples: PartSamples, level: float) -> Finding:
+    return compare_correlations(total(samples.readings), reading_labels(samples.scenario), level)
+
+
+START_ROWS = (
+    Promise("the state starts with its covariance", "the scenario", (), _start_variance),
+    Promise("the state starts with its mean", "the scenario", (), _start_mean),
+)
+PLANT_ROWS = (
+    Promise("the plant's noise has its covariance", "the scenario", (), _step_variance),
+    Promise("the plant follows its equation without a bias", "the scenario", (), _step_mean),
+    Promise("the plant's noise is white", "the scenario", (), _step_correlation),
+)
+SENSOR_ROWS = (
+    Promise("noises of the sensors have their covariance", "the scenario", (), _reading_variance),
+    Promise("readings have no bias", "the scenario", (), _reading_mean),
+    Promise(
+        "noises of the sensors are white and independent of each other",
+        "the scenario",
+        (),
+        _reading_correlation,
+    ),
+)
+
+
+def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
+    """Return the promises about the parts that these samples can be held to."""
+    scenario = samples.scenario
+    found: list[Promise] = []
+    if scenario.plant.is_random and np.any(scenario.plant.start_cov):
+        found += START_ROWS
+    if samples.steps is not None and path_law(scenario) is not None:
+        found += PLANT_ROWS
+    if samples.readings is not None:
+        found += SENSOR_ROWS
+    wanted = {"clock": samples.ticks, "messages": samples.fates, "links": samples.pairs}
+    for promise in network_promises(scenario):
+        key = next((k for k in wanted if promise.statement.startswith(k)), "clock")
+        if wanted[key] is not None:
+            found.append(promise)
+    return tuple(found)
