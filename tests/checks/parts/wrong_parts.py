@@ -79,7 +79,7 @@ class Coloured(LinearSensor):
 @dataclass(frozen=True, eq=False)
 class Slower(Poisson):
     def ticks(self, entity, origin, index, now, random, count):
-        return now + 1.05 * (super().ticks(entity, origin, index, now, random, count) - now)
+        return now + 1.1 * (super().ticks(entity, origin, index, now, random, count) - now)
 
 
 @dataclass(frozen=True, eq=False)
