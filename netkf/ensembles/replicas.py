@@ -13,6 +13,7 @@ from netkf.core.fields import integer
 from netkf.ensembles.blocks import BlockTask, Job, Task, each_replica
 from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.ensembles.pools import Pool, make_pool
+from netkf.linalg.lanes import LANES
 from netkf.scenario.scenario import Scenario
 
 Progress = Callable[[int, int], None]
@@ -134,6 +135,9 @@ def _blocks(pool: Pool, job: Job, known: Mapping[int, Callable[[], Any]]) -> Ite
     start = 0
     while start < job.stop:
         size = pool.next_size(job.stop - start, job.stop)
+        # Runs in slots are side by side in lanes: fewer of them take as long.
+        if pool.ahead == 1 and isinstance(job.scenario, Scenario) and job.scenario.slotted:
+            size = max(size, LANES)
         if start:
             size = min(size, start & -start)  # a block is a node of the tree
         yield job._replace(start=start, size=size)
