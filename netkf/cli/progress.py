@@ -8,6 +8,8 @@ from collections.abc import Callable
 from types import TracebackType
 
 CLEAR_LINE = "\r\033[K"
+REPORT_SECONDS = 20.0
+"""Seconds between two reports of a command that prints to a file or a pipe."""
 
 
 class ProgressLine:
@@ -18,6 +20,7 @@ class ProgressLine:
 
     def __init__(self) -> None:
         self._is_terminal, self._printed = sys.stderr.isatty(), False
+        self._reported = time.monotonic()
 
     def __enter__(self) -> ProgressLine:
         return self
@@ -36,6 +39,14 @@ class ProgressLine:
         if self._is_terminal:
             self._printed = True
             print(f"{CLEAR_LINE}{text}", end="", file=sys.stderr, flush=True)
+
+    def report(self, text: str) -> None:
+        """Replace the line by a text; without a terminal print it every REPORT_SECONDS seconds."""
+        self.show(text)
+        now = time.monotonic()
+        if not self._is_terminal and now - self._reported >= REPORT_SECONDS:
+            self._reported = now
+            print(f"netkf: {text}", file=sys.stderr, flush=True)
 
     def simulated_time(self, horizon: float) -> Callable[[float], None]:
         """Return a function of the simulated time (seconds) that shows the percentage done."""

@@ -32,7 +32,8 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--by",
         choices=["theory", "simulation"],
-        help="decide by theory or by simulation (default: theory if it has an answer)",
+        help="decide by theory or by simulation alone (default: the exact quantity or a bound, "
+        "and simulation where the bound does not reach the target)",
     )
     parser.add_argument(
         "--runs",
@@ -75,7 +76,7 @@ def _run(options: argparse.Namespace) -> int:
             workers=options.workers,
             scheduler=options.scheduler,
             engine=options.engine,
-            progress=line.show,
+            progress=line.report,
         )
     if options.json:
         probes = [probe._asdict() for probe in sorted(sizing.probes)]

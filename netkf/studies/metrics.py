@@ -18,10 +18,14 @@ from netkf.runs.simulate import simulate
 from netkf.scenario.model import Filtering
 from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, error_covariance, riccati_step
+from netkf.theory.hybrid.path_moments import expected_squares
+from netkf.trace.run import Run
 from netkf.trace.schema import KINDS
 
 MAX_ERRORS = 24
-"""Errors of all nodes together whose exact covariance is about as cheap as a few runs."""
+"""Errors of all nodes together whose exact covariance is about as cheap as a few runs, in slots."""
+MAX_COUPLED = 40
+"""The same in continuous time, where compiled code integrates them."""
 
 
 class RunMetrics(NamedTuple):
@@ -70,22 +74,34 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
     run = simulate(scenario, seed, replica, engine)
     if run.status != "complete":
         return block_metrics(scenario, seed, range(replica, replica + 1), engine)
-    square, trace = (
-        time_average(scenario, np.trace(matrices, axis1=2, axis2=3))[None]
-        for matrices in (error_covariance(scenario, run), run.P)
-    )
+    square = time_average(scenario, _expected_squares(scenario, run))[None]
+    trace = time_average(scenario, np.trace(run.P, axis1=2, axis2=3))[None]
     counts = np.array([[run.count(kind) for kind in KINDS]])
     messages = count_messages(counts, scenario.slotted)
     return RunMetrics(square, trace, messages, np.zeros((1, 1)), np.full((1, 1), np.inf))
 
 
+def _expected_squares(scenario: Scenario, run: Run) -> FloatArray:
+    """Return E|x - xhat_i|^2 (T, N) given the events of a run; raises TheoryError if not known."""
+    if not scenario.slotted:
+        return expected_squares(scenario, run)
+    return np.asarray(np.trace(error_covariance(scenario, run), axis1=2, axis2=3))
+
+
 def expected_errors_known(scenario: Scenario) -> bool:
-    """Return True if ``expected_metrics`` exists and takes about the time of a few runs."""
-    small = len(scenario.nodes) * scenario.plant.n <= MAX_ERRORS
-    if not (scenario.slotted and small and scenario.is_random):
+    """Return True if ``expected_metrics`` exists and takes about the time of a few runs.
+
+    In continuous time it does for the hybrid filter with increments and instant messages.
+    """
+    errors = len(scenario.nodes) * scenario.plant.n
+    if not scenario.is_random or errors > (MAX_ERRORS if scenario.slotted else MAX_COUPLED):
         return False
+    short = scenario
+    if not scenario.slotted and isinstance(scenario.probe, float):
+        # Whether it is known does not depend on the horizon.
+        short = scenario.replace({"horizon": scenario.probe})
     try:
-        error_covariance(scenario, simulate(scenario))
+        _expected_squares(short, simulate(short))
     except TheoryError:
         return False
     return True

@@ -22,17 +22,24 @@ from netkf.studies.metrics import (
 from netkf.studies.parameter_grid import is_integer_key
 from netkf.studies.pools import PoolOptions, shared_pool
 from netkf.studies.search import (
-    DIGITS,
     FIRST_BATCH,
+    FIRST_EXPECTED,
     MAX_PROBES,
     Search,
     SimulationPlan,
     Sizing,
     SizingProblem,
+    decide_by_both,
     decide_by_simulation,
     decide_by_theory,
 )
-from netkf.studies.targets import QUANTITIES, Target, parse_target, quantity_by_theory
+from netkf.studies.targets import (
+    QUANTITIES,
+    Target,
+    parse_target,
+    quantity_by_theory,
+    theory_is_exact,
+)
 
 LOAD = "load it first: netkf.size(netkf.load(path), ...)"
 
@@ -57,9 +64,10 @@ def size(
     as ``"worst_rms<=0.5"``; quantities are worst_rms, mean_rms, worst_trace, mean_trace and
     within_central, the largest RMS error over that of a filter with all readings.
 
-    ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: theory
-    if it has an answer. By simulation, runs are added at each value until an interval decides,
-    at most ``runs``; all values share the same random draws, and all decisions together are right
+    ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: the
+    exact value where it is known; else the bound where that reaches the target, and simulation
+    where it does not. By simulation, runs are added at each value until an interval decides, at
+    most ``runs``; all values share the same random draws, and all decisions together are right
     with probability ``confidence``. If the exact covariance of the errors given the events of a run
     is known and cheap (small networks in slots) it replaces the squared errors, which takes far
     fewer runs. The quantity is assumed to be monotone in the key; that is checked at the values
@@ -71,7 +79,7 @@ def size(
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)
     if by is not None:
-        choice(*DIGITS)("--by", by)
+        choice("theory", "simulation")("--by", by)
     wanted, sure = parse_target(target), number(above=0.0, below=1.0)("--confidence", confidence)
     integer(low=FIRST_BATCH)("--runs", runs)
     if wanted.of_errors and not scenario.plant.truth_known:
@@ -82,31 +90,37 @@ def size(
     used = choose_engine(engine, base.replace({key: low}))
     chosen = by or _choose_method(base, key, (low, high), wanted)
     problem = SizingProblem(base, key, whole, wanted, chosen)
-    if chosen == "theory":
+    if chosen != "simulation":
         quantity = quantity_by_theory(problem.at(low), wanted)[1]
+    if chosen == "theory":
         return Search(problem, partial(decide_by_theory, problem)).run(low, high, 1.0, quantity)
-    task, quantity = _choose_task(problem, low, used)
+    task, simulated, first = _choose_task(problem, low, used)
+    if chosen == "both":
+        quantity = f"{quantity}; where that is above the limit, simulated: {simulated}"
+    else:
+        quantity = simulated
     # Bonferroni over all values and all interim looks at each of them.
-    level = (1.0 - sure) / (MAX_PROBES["simulation"] * _count_looks(runs))
+    level = (1.0 - sure) / (MAX_PROBES["simulation"] * _count_looks(runs, first))
     with shared_pool(runs, PoolOptions(workers, executor, scheduler)) as pool:
-        plan = SimulationPlan(task, runs, level, pool, progress)
-        decide = partial(decide_by_simulation, problem, plan)
+        plan = SimulationPlan(task, runs, level, pool, progress, first)
+        method = decide_by_both if chosen == "both" else decide_by_simulation
+        decide = partial(method, problem, plan)
         return Search(problem, decide).run(low, high, sure, quantity)
 
 
-def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str]:
-    """Return the task that simulates, and a description of the quantity."""
+def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
+    """Return the task that simulates, what the quantity is, and the runs of a first look."""
     quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
     if problem.target.of_errors and expected_errors_known(problem.at(low)):
         one = partial(expected_metrics, engine=engine)
         exact = ", each with its exact expected squared error given its events"
-        return partial(each_replica, one, join_metrics), quantity + exact
-    return partial(block_metrics, engine=engine), quantity
+        return partial(each_replica, one, join_metrics), quantity + exact, FIRST_EXPECTED
+    return partial(block_metrics, engine=engine), quantity, FIRST_BATCH
 
 
-def _count_looks(runs: int) -> int:
-    """Return how often a value is looked at while its runs are doubled."""
-    return 1 + math.ceil(math.log2(max(1.0, runs / FIRST_BATCH)))
+def _count_looks(runs: int, first: int) -> int:
+    """Return how often a value is looked at while its runs are doubled from ``first`` on."""
+    return 1 + math.ceil(math.log2(max(1.0, runs / first)))
 
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
@@ -125,10 +139,11 @@ def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
 
 
 def _choose_method(scenario: Scenario, key: str, ends: tuple[float, float], target: Target) -> str:
-    """Return theory if it has an answer at both ends, else simulation."""
+    """Return theory if it is exact at both ends, both if it is a bound, else simulation."""
+    scenarios = [scenario.replace({key: end}) for end in ends]
     try:
-        for end in ends:
-            quantity_by_theory(scenario.replace({key: end}), target)
+        for one in scenarios:
+            quantity_by_theory(one, target)
     except TheoryError:
         return "simulation"
-    return "theory"
+    return "theory" if all(theory_is_exact(one, target) for one in scenarios) else "both"

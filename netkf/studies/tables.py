@@ -44,7 +44,7 @@ def _with_error(value: float | None, error: float | None) -> str:
 
 def sizing_text(found: Sizing) -> str:
     """Return the values that were tried, the answer, and how sure it is."""
-    header = [found.key, found.target.quantity, "at least", "at most", "runs", "target"]
+    header = [found.key, found.target.quantity, "at least", "at most", "runs", "target", "by"]
     rows = [
         [
             f"{p.value:g}",
@@ -53,14 +53,16 @@ def sizing_text(found: Sizing) -> str:
             format_number(p.high),
             str(p.runs),
             p.target,
+            p.by,
         ]
         for p in sorted(found.probes)
     ]
     if found.by == "theory":
-        header = [*header[:2], header[-1]]
+        header = [header[0], f"{found.target.quantity} ({found.probes[0].by})", header[-2]]
         rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(found.probes)]
     lines = [table(header, rows), ""]
     lines += [answer(found), f"{found.target.quantity}: {found.quantity}", f"sure: {found.sure}"]
+    lines += [found.advice] if found.advice else []
     return "\n".join(lines)
 
 
@@ -69,13 +71,19 @@ def answer(found: Sizing) -> str:
     values = [probe.value for probe in found.probes]
     span = f"{min(values):g} .. {max(values):g}"
     if found.value is None:
-        undecided = any(probe.target == "undecided" for probe in found.probes)
+        undecided = any(probe.target in ("undecided", "not shown") for probe in found.probes)
         words = "was shown to reach" if undecided else "reaches"
         return f"no value of {found.key} in {span} {words} {found.target}"
     which = "largest" if found.grows else "smallest"
     if found.misses is None:
         return f"{found.key} = {found.value:g}: all of {span} reaches {found.target}"
     miss = next(probe for probe in found.probes if probe.value == found.misses)
+    if miss.target == "not shown":
+        return (
+            f"{found.key} = {found.value:g} is the {which} for which the bound shows "
+            f"{found.target}; at {found.misses:g} the bound is above the limit, the quantity may "
+            "not be"
+        )
     words = "misses it" if miss.target == "missed" else "was not shown to"
     return (
         f"{found.key} = {found.value:g} is the {which} that reaches {found.target}; "

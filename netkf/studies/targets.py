@@ -85,6 +85,22 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
     return math.sqrt(value) if target.of_errors else value, message
 
 
+def theory_is_exact(scenario: Scenario, target: Target) -> bool:
+    """Return True if ``quantity_by_theory`` is the quantity itself, False if it is a bound."""
+    if scenario.filter.algorithm.talks:
+        return False
+    return not target.of_errors or _starts_with_the_truth(scenario)
+
+
+def _starts_with_the_truth(scenario: Scenario) -> bool:
+    """Return True if every filter starts with the mean and the covariance of x(0)."""
+    plant = scenario.plant
+    return all(
+        np.array_equal(P, plant.start_cov) and np.array_equal(x, plant.start_mean)
+        for x, P in map(scenario.start, scenario.nodes)
+    )
+
+
 def _explain_errors(scenario: Scenario) -> str:
     """Return how P bounds the errors; raises TheoryError if it does not."""
     if not scenario.filters_know_the_truth:
@@ -93,11 +109,7 @@ def _explain_errors(scenario: Scenario) -> str:
     start = rows[rows["assumption"].str.startswith("P_i(0) >= ")]
     if not start["holds"].all():
         raise TheoryError("P_i(0) is below the covariance of the first error: P need not bound it")
-    same = all(
-        np.array_equal(P, scenario.plant.start_cov) and np.array_equal(x, scenario.plant.start_mean)
-        for x, P in map(scenario.start, scenario.nodes)
-    )
-    exact = same and not scenario.filter.algorithm.talks
+    exact = _starts_with_the_truth(scenario) and not scenario.filter.algorithm.talks
     return "" if exact else "; P_i in turn bounds the covariance of the error, H (10)"
 
 

@@ -29,6 +29,7 @@ from netkf.studies.metrics import (
 from netkf.studies.parameter_grid import parse_grid, parse_interval
 from netkf.studies.size import size
 from netkf.studies.sweep import sweep, sweep_to_directory
+from netkf.studies.tables import answer
 from netkf.studies.targets import Target, parse_target, quantity_by_simulation
 from tests.conftest import SCENARIOS
 
@@ -258,7 +259,7 @@ def test_theory_finds_the_root_of_the_recursion(build, quantity):
 
 
 def test_a_bound_by_theory_is_kept_in_a_simulation_of_its_own(short):
-    found = size(short, RATE, 0.5, 50.0, "mean_trace<=3.0")
+    found = size(short, RATE, 0.5, 50.0, "mean_trace<=3.0", by="theory")
     assert found
     assert found.by == "theory"
     assert "H(12)" in found.quantity
@@ -271,6 +272,99 @@ def test_a_bound_by_theory_is_kept_in_a_simulation_of_its_own(short):
     ensemble = netkf.monte_carlo(short.replace({RATE: found.value}), runs=40, seed=77, workers=1)
     mean, error = ensemble.average[-1, 1], ensemble.se_average[-1, 1]
     assert mean - 4.0 * error <= 3.0
+
+
+def test_a_bound_is_called_a_bound(short):
+    """At the value below, the bound is above the limit: that is not said to miss it."""
+    found = size(short, RATE, 0.5, 50.0, "mean_trace<=3.0", by="theory")
+    assert {p.by for p in found.probes} == {"bound"}
+    assert {p.target for p in found.probes} == {"reached", "not shown"}
+    assert all(p.low == 0.0 for p in found.probes)
+    text = answer(found)
+    assert "for which the bound shows mean_trace <= 3" in text
+    assert "misses" not in text
+    assert "proves nothing" in found.sure
+
+
+def test_where_the_bound_says_no_it_is_simulated(short):
+    """The bound on worst_rms asks for far more than simulation says is needed."""
+    target = "worst_rms<=1.7"
+    bound = size(short, RATE, 0.5, 50.0, target, by="theory")
+    found = size(short, RATE, 0.5, 50.0, target, runs=256, workers=1)
+    assert found.by == "both"
+    assert found.value < bound.value
+    for probe in found.probes:
+        assert (probe.by == "bound") == (probe.runs == 0)
+        assert probe.by == "simulation" or probe.target == "reached"
+    # a simulation of its own agrees with both decisions
+    for value, word in ((found.value, "reached"), (min(p.value for p in found.probes), "missed")):
+        assert next(p for p in found.probes if p.value == value).target == word
+        own = netkf.monte_carlo(short.replace({RATE: value}), runs=300, seed=88, workers=1)
+        square, error = own.average[:-1, 0], own.se_average[:-1, 0]
+        worst = int(np.argmax(square))
+        assert (square[worst] - 4.0 * error[worst] <= 2.89) or word == "missed"
+        assert (square[worst] + 4.0 * error[worst] > 2.89) or word == "reached"
+
+
+def test_a_target_under_burst_losses_takes_a_handful_of_runs(ring):
+    """Twelve nodes of a grid: 1000 runs with squared errors left this undecided."""
+    made = ring.replace(
+        {
+            "network.graph": {"kind": "grid", "rows": 3, "columns": 4},
+            "sensors.0.nodes": [0, 11],
+            "network.channel.loss": {"kind": "gilbert-elliott", "to_bad": 0.1, "to_good": 0.3},
+            "filter.epsilon": 0.25,
+            "horizon": 5.0,
+        }
+    )
+    found = size(made, RATE, 1.0, 20.0, "worst_rms<=1.7", runs=64, workers=1)
+    assert found
+    assert found.by == "simulation"
+    assert sum(probe.runs for probe in found.probes if probe.target != "undecided") < 300
+    own = netkf.monte_carlo(made.replace({RATE: found.value}), runs=600, seed=4, workers=1)
+    square, error = own.average[:-1, 0], own.se_average[:-1, 0]
+    worst = int(np.argmax(square))
+    assert square[worst] - 4.0 * error[worst] <= 1.7**2
+
+
+def test_a_range_that_is_too_small_gets_another(short):
+    low = size(short, RATE, 20.0, 40.0, "mean_trace<=3.0", by="theory")
+    assert low.value == 20.0
+    assert low.advice == f"next range: --vary {RATE}=2:20"
+    none = size(short, RATE, 1.0, 2.0, "mean_trace<=3.0", by="theory")
+    assert none.value is None
+    span = none.advice.removeprefix(f"next range: --vary {RATE}=")
+    further = size(short, RATE, *map(float, span.split(":")), "mean_trace<=3.0", by="theory")
+    assert further
+    never = size(short, RATE, 1.0, 2.0, "mean_trace<=0.1", by="theory")
+    assert "hardly changes" in never.advice
+    loss = "network.channel.loss.delivery"
+    full = size(short, loss, 0.5, 1.0, "mean_trace<=2.45", by="theory")
+    assert not full
+    assert "cannot be" in full.advice or "hardly changes" in full.advice
+
+
+def test_a_value_too_close_to_the_limit_is_given_up(short):
+    """The limit is the estimate of 1000 runs, so that no number of runs decides there."""
+    ensemble = netkf.monte_carlo(short.replace({RATE: 5.0}), runs=1000, workers=1)
+    limit = float(ensemble.average[-1, 0]) ** 0.5
+    found = size(short, RATE, 1.0, 5.0, f"mean_rms<={limit!r}", by="simulation", workers=1)
+    close = next(p for p in found.probes if p.value == 5.0)
+    assert close.target == "undecided"
+    assert close.runs < 1000
+    assert "would tell" in found.advice or "too close" in found.advice
+    assert found.table["by"].eq("simulation").all()
+
+
+def test_a_long_search_reports_without_a_terminal(short, monkeypatch, capsys):
+    from netkf.cli import progress
+
+    monkeypatch.setattr(progress, "REPORT_SECONDS", 0.0)
+    arguments = ["size", RING, "--set", "horizon=2.0", "--vary", f"{RATE}=0.5:50", "--runs", "64"]
+    main([*arguments, "--target", "mean_trace<=2.5", "--by", "simulation"])
+    lines = capsys.readouterr().err.splitlines()
+    assert any("simulating" in line for line in lines)
+    assert any("after 32 of at most 64 runs" in line for line in lines)
 
 
 def test_simulation_brackets_what_a_long_simulation_says(build):
@@ -349,7 +443,7 @@ def test_a_quantity_that_is_not_monotone_is_told(monkeypatch, short):
 
     for module in ("size", "search"):
         monkeypatch.setattr(f"netkf.studies.{module}.quantity_by_theory", made_up)
-    found = size(short, RATE, 1.0, 4.0, "mean_trace<=2")
+    found = size(short, RATE, 1.0, 4.0, "mean_trace<=2", by="theory")
     assert "NOT monotone between 1 and 2" in found.sure
 
 

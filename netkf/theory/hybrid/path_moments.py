@@ -1,0 +1,82 @@
+"""Mean squared errors of the hybrid filters given the messages of a run, by quadrature.
+
+As ``netkf.theory.error_covariance``, to some six digits instead of rounding and a hundred times
+faster, for filters in continuous time whose messages take no time and whose sensors give
+increments. Averages over runs need no more.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.algorithms.kernels.error_moments import run_moments
+from netkf.algorithms.registry import overridden
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+STEP = 0.1  # of the integration, times the fastest rate
+MAX_ERRORS = 120  # of all nodes together
+
+
+def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
+    """Return E|x - xhat_i|^2 (T, N) at ``run.times``, given the messages of the run.
+
+    Raises TheoryError for filters, sensors and channels for which it is not known in this way.
+    """
+    _require_plain(scenario)
+    A, Q = scenario.belief
+    nodes = scenario.nodes
+    G, true_G = np.zeros((2, len(nodes), *A.shape))
+    for i, node in enumerate(nodes):
+        H, R = scenario.observation(node, believed=True)
+        gain = np.linalg.solve(R, H).T
+        G[i], true_G[i] = gain @ H, gain @ scenario.observation(node)[1] @ gain.T
+    P = np.array([scenario.start(node)[1] for node in nodes], dtype=np.float64)
+    # All estimates start at known means: their first errors are x(0) less a constant.
+    means = np.array([scenario.start(node)[0] for node in nodes]) - scenario.plant.start_mean
+    S = np.einsum("ia,jb->ijab", means, means) + np.asarray(scenario.plant.start_cov)
+    instants, ends, rows, columns, weights = _messages(scenario, run)
+    fastest = max(float(np.abs(p @ g).max()) for p in P for g in G) + float(np.abs(A).max())
+    plain = [np.ascontiguousarray(x, dtype=np.float64) for x in (A, Q, scenario.truth.Q)]
+    model = (*plain, G, true_G)
+    found = np.empty((len(run.times), len(nodes)))
+    step = STEP / max(fastest, 1e-9)
+    run_moments(P, S, model, instants, ends, rows, columns, weights, run.times, step, found)
+    if not np.isfinite(found).all():
+        raise TheoryError("the mean squares grow too fast for their quadrature")
+    return found
+
+
+def _require_plain(scenario: Scenario) -> None:
+    """Raise TheoryError unless the filters follow H with increments and instant messages."""
+    if scenario.slotted or scenario.sampled_sensors or not scenario.is_random:
+        raise TheoryError("mean squares by quadrature are for random increments")
+    if scenario.hosted.combination != "convex" or overridden(scenario.filter.algorithm):
+        raise TheoryError("mean squares by quadrature are for the hybrid filter")
+    if scenario.network.channel.delay.fixed != 0.0:
+        raise TheoryError("mean squares by quadrature are for messages that take no time")
+    if not np.array_equal(scenario.belief[0], scenario.truth.A):
+        raise TheoryError("the filters' A differs from the plant's: the error follows the state")
+    if len(scenario.nodes) * scenario.plant.n > MAX_ERRORS:
+        raise TheoryError(f"mean squares by quadrature are for at most {MAX_ERRORS} errors")
+
+
+def _messages(
+    scenario: Scenario, run: Run
+) -> tuple[FloatArray, np.ndarray, np.ndarray, np.ndarray, FloatArray]:
+    """Return the instants of arrivals, where each begins, and receivers, senders and weights."""
+    rows = run.log[run.log["kind"] == CODES["deliver"]]
+    index = scenario.topology.index
+    place = np.zeros(max(index) + 1, dtype=np.int64)
+    place[list(index)] = list(index.values())
+    pairs, which = np.unique(
+        np.stack([rows["node"], rows["peer"]], axis=1), axis=0, return_inverse=True
+    )
+    table = np.array([scenario.weight(int(i), int(j)) for i, j in pairs], dtype=np.float64)
+    instants, starts = np.unique(rows["t"], return_index=True)
+    ends = np.append(starts, len(rows)).astype(np.int64)
+    weights = table[which.reshape(-1)] if len(pairs) else np.zeros(0)
+    return instants, ends, place[rows["node"]], place[rows["peer"]], weights
