@@ -20,6 +20,7 @@ from netkf.theory import (
     central_covariance,
     covariance_bound,
     limit_covariance,
+    link_rate_for,
     steady_covariance,
     steady_covariance_bound,
     true_limit_covariance,
@@ -27,6 +28,8 @@ from netkf.theory import (
 from netkf.theory.common.papers import paper_function
 from netkf.theory.hybrid.steady import steady_by_node
 
+CLOSE_TO_S = 0.1  # of the Frobenius norm of S
+MAX_RATED = 60  # nodes for which rates are looked for in seconds
 MARKS = {True: "holds", False: "FAILS", None: "unknown"}
 LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
     "limit_covariance": limit_covariance,
@@ -61,10 +64,26 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
     ends = np.array([scenario.horizon])
     found["bound_at_horizon"] = _value(lambda: covariance_bound(scenario, ends)[0])
     found["steady_bound"] = _steady(scenario)
+    found["link_rate"] = _link_rate(scenario)
     for name, function in LIMITS.items():
         found[name] = _value(lambda function=function: function(scenario))  # type: ignore[misc]
     whole: dict[str, Any] = finite(found)
     return whole
+
+
+def _link_rate(scenario: Scenario) -> dict[str, Any]:
+    """Return the link rates from which on the steady bound is within a share of the size of S."""
+    try:
+        if len(scenario.nodes) > MAX_RATED:
+            raise TheoryError(
+                f"not looked for beyond {MAX_RATED} nodes; netkf.theory.link_rate_for looks for "
+                "them however long it takes"
+            )
+        delta = CLOSE_TO_S * float(np.linalg.norm(limit_covariance(scenario)))
+        factor, rate = link_rate_for(scenario, delta)
+    except TheoryError as error:
+        return {"value": None, "factor": None, "delta": None, "reason": str(error)}
+    return {"value": rate, "factor": factor, "delta": delta, "reason": None}
 
 
 def _slot_central(scenario: Scenario) -> FloatArray:
@@ -143,8 +162,18 @@ def _limit_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
     lines = ["", "traces to compare"]
     for name, label in labels.items():
         lines.append(f"  {label}: {found[name]['reason'] or format_number(found[name]['trace'])}")
+    if found["link_rate"]["reason"] is None:
+        lines.append(_rate_line(found["link_rate"]))
     note = mismatch_note(scenario)
     return [*lines, f"note: {note}"] if note else lines
+
+
+def _rate_line(found: dict[str, Any]) -> str:
+    """Return the line on the rates of H Theorem 3."""
+    rates = f"{format_number(found['factor'])} times the rates given"
+    if found["value"] is not None:
+        rates = f"links from {format_number(found['value'])} per second on"
+    return f"  {rates} keep the steady bound within {CLOSE_TO_S:.0%} of S, H Theorem 3"
 
 
 def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:

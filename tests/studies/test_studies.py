@@ -317,14 +317,14 @@ def test_a_target_under_burst_losses_takes_a_handful_of_runs(ring):
             "horizon": 5.0,
         }
     )
-    found = size(made, RATE, 1.0, 20.0, "worst_rms<=1.7", runs=64, workers=1)
+    found = size(made, RATE, 1.0, 20.0, "worst_rms<=2.0", runs=64, workers=1)
     assert found
     assert found.by == "simulation"
     assert sum(probe.runs for probe in found.probes if probe.target != "undecided") < 300
     own = netkf.monte_carlo(made.replace({RATE: found.value}), runs=600, seed=4, workers=1)
     square, error = own.average[:-1, 0], own.se_average[:-1, 0]
     worst = int(np.argmax(square))
-    assert square[worst] - 4.0 * error[worst] <= 1.7**2
+    assert square[worst] - 4.0 * error[worst] <= 2.0**2
 
 
 def test_a_range_that_is_too_small_gets_another(short):
@@ -345,13 +345,15 @@ def test_a_range_that_is_too_small_gets_another(short):
 
 
 def test_a_value_too_close_to_the_limit_is_given_up(short):
-    """The limit is the estimate of 1000 runs, so that no number of runs decides there."""
-    ensemble = netkf.monte_carlo(short.replace({RATE: 5.0}), runs=1000, workers=1)
-    limit = float(ensemble.average[-1, 0]) ** 0.5
-    found = size(short, RATE, 1.0, 5.0, f"mean_rms<={limit!r}", by="simulation", workers=1)
+    """The limit is the estimate of a quarter of the runs, so that no number of runs decides."""
+    made = short.replace({"horizon": 1.0})
+    ensemble = netkf.monte_carlo(made.replace({RATE: 5.0}), runs=100, workers=1)
+    limit = float(ensemble.average[-1, 1])
+    target = f"mean_trace<={limit!r}"
+    found = size(made, RATE, 1.0, 5.0, target, by="simulation", runs=400, workers=1)
     close = next(p for p in found.probes if p.value == 5.0)
     assert close.target == "undecided"
-    assert close.runs < 1000
+    assert close.runs < 400
     assert "would tell" in found.advice or "too close" in found.advice
     assert found.table["by"].eq("simulation").all()
 

@@ -10,6 +10,7 @@ import scipy.optimize
 import netkf
 from netkf import theory
 from netkf.core.errors import TheoryError
+from netkf.runs.promises import compute_promises, promises_text
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
 
@@ -152,3 +153,13 @@ def test_gains_that_do_not_stabilise(build):
     slow = netkf.load(SCENARIOS / "delayed_links.toml")
     with pytest.raises(TheoryError, match="no delay"):
         theory.constant_gain_bound(slow)
+
+
+def test_netkf_theory_prints_the_rate(ring):
+    """Within 10 % of the size of S."""
+    found = compute_promises(ring)
+    delta = 0.1 * np.linalg.norm(theory.limit_covariance(ring))
+    assert found["link_rate"]["value"] == pytest.approx(theory.link_rate_for(ring, delta).rate)
+    assert "keep the steady bound within 10% of S" in promises_text(ring, found)
+    alone = compute_promises(netkf.load(SCENARIOS / "delayed_links.toml"))["link_rate"]
+    assert alone["reason"] or alone["value"]

@@ -11,6 +11,7 @@ import scipy.stats
 from netkf import theory
 from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
+from netkf.runs.promises import compute_promises, promises_text
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import of_case, planar, scenario
 
@@ -179,3 +180,13 @@ def test_a_leader_in_the_middle_of_a_star_and_in_a_triangle():
     assert known[2] == pytest.approx(0.25 + 0.25 * 0.25 + 0.5 * 0.75)
     with pytest.raises(TheoryError, match="not a node"):
         theory.leader_agreement(triangle, 2, leader=9)
+
+
+def test_netkf_theory_prints_corollary_2_and_the_leader():
+    H, R = {0: [[1.0]], 1: [[1.0]]}, {0: [[0.01]], 1: [[0.01]]}
+    made = scenario([[0, 1]], [[0.5]], [[1.0]], H, R, 1, 2.8, 0.2)
+    found = compute_promises(made)
+    assert found["push_sum"]["corollary_2"]["value"]["needed"] == 18
+    # 1 - 0.8^t reaches 0.99 at t = 21
+    assert found["push_sum"]["leader_slots"]["value"] == 21
+    assert "Corollary 2: 11, where rho(A_R) is 1.38: too few" in promises_text(made, found)

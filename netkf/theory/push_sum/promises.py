@@ -10,8 +10,10 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.limits import central_covariance
+from netkf.theory.push_sum.broadcasts import leader_agreement
 from netkf.theory.push_sum.certified_gamma import (
     MAX_SEARCHED,
+    corollary_2,
     exact_minimum_gamma,
     minimum_gamma,
     searches_gamma,
@@ -22,6 +24,7 @@ from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
 from netkf.theory.push_sum.mean_square import push_sum_radius
 
 MAX_STEPS = 20  # gamma up to which the exact one is searched for
+MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election, and its probability to be over
 
 
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
@@ -52,6 +55,17 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         found = disconnection_probability(scenario)
         return [found.low, found.high]
 
+    def corollary() -> dict[str, float]:
+        found = corollary_2(scenario)
+        return found._asdict()
+
+    def leader() -> int:
+        known = leader_agreement(scenario, MAX_LEADER_SLOTS)
+        late = known < AGREEMENT
+        if late.all():
+            raise TheoryError(f"not within {MAX_LEADER_SLOTS} slots")
+        return int(late.sum())
+
     functions: dict[str, Callable[[], Any]] = {
         "limit_trace": limit,
         "central_trace": central,
@@ -61,6 +75,8 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         "exact_minimum_gamma": exact_gamma,
         "minimum_gamma_mean": lambda: minimum_gamma(scenario, "mean"),
         "minimum_gamma_mean_square": lambda: minimum_gamma(scenario, "mean-square"),
+        "corollary_2": corollary,
+        "leader_slots": leader,
         "disconnection_probability": cut,
     }
     return {name: _value(function) for name, function in functions.items()}
@@ -90,6 +106,10 @@ def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]
         low, high = ends
         return number(low) if low == high else f"{number(low)} .. {number(high)} (simulated)"
 
+    def corollary(found: dict[str, float]) -> str:
+        verdict = "too few" if found["gamma"] < found["needed"] else "enough"
+        return f"{found['gamma']}, where rho(A_R) is {number(found['radius'])}: {verdict}"
+
     return [
         f"trace of P_inf, what every node takes its covariance to be: {text('limit_trace')}",
         f"trace of the central filter's covariance: {text('central_trace')}",
@@ -98,6 +118,9 @@ def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]
         f"smallest gamma with a radius below 1: {text('exact_minimum_gamma', str)}",
         f"smallest gamma by P Theorem 5 (mean): {text('minimum_gamma_mean', str)}",
         f"smallest gamma by P Theorem 6 (mean square): {text('minimum_gamma_mean_square', str)}",
+        f"smallest gamma with P (44), Corollary 2: {text('corollary_2', corollary)}",
+        f"slots until all nodes know a leader with probability {AGREEMENT:g}, P Remark 3: "
+        f"{text('leader_slots', str)}",
         f"rho(L): {text('laplacian_radius')}",
         f"disconnection probability: {text('disconnection_probability', interval)}",
     ]
