@@ -90,15 +90,11 @@ def size(
     used = choose_engine(engine, base.replace({key: low}))
     chosen = by or _choose_method(base, key, (low, high), wanted)
     problem = SizingProblem(base, key, whole, wanted, chosen)
-    if chosen != "simulation":
-        quantity = quantity_by_theory(problem.at(low), wanted)[1]
     if chosen == "theory":
+        quantity = quantity_by_theory(problem.at(low), wanted)[1]
         return Search(problem, partial(decide_by_theory, problem)).run(low, high, 1.0, quantity)
     task, simulated, first = _choose_task(problem, low, used)
-    if chosen == "both":
-        quantity = f"{quantity}; where that is above the limit, simulated: {simulated}"
-    else:
-        quantity = simulated
+    quantity = _describe_quantity(problem, low, simulated)
     # Bonferroni over all values and all interim looks at each of them.
     level = (1.0 - sure) / (MAX_PROBES["simulation"] * _count_looks(runs, first))
     with shared_pool(runs, PoolOptions(workers, executor, scheduler)) as pool:
@@ -106,6 +102,14 @@ def size(
         method = decide_by_both if chosen == "both" else decide_by_simulation
         decide = partial(method, problem, plan)
         return Search(problem, decide).run(low, high, sure, quantity)
+
+
+def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> str:
+    """Return the description of what is simulated, after that of the bound that is tried first."""
+    if problem.by != "both":
+        return simulated
+    bound = quantity_by_theory(problem.at(low), problem.target)[1]
+    return f"{bound}; where that is above the limit, simulated: {simulated}"
 
 
 def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
