@@ -22,7 +22,7 @@ from netkf.checks.laws import (
     pool,
 )
 from netkf.checks.points import sampled_indices
-from netkf.checks.rounding import compare_identities
+from netkf.checks.rounding import EPS, OPERATIONS, compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples
 from netkf.checks.statistics import (
     POWER,
@@ -48,6 +48,8 @@ LEAST_VARIANCE_INTEGRATED, LEAST_VARIANCE = 0.02, 1e-8
 may be off by 1e-3 of the largest variance; in slots nothing is.
 """
 BOUND_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
+SINGULAR = 1e-12
+"""Relative size of an eigenvalue below which a covariance has no inverse to judge by."""
 
 
 def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
@@ -57,7 +59,7 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     sampled = sampled_indices(scenario)
     _, nees = errors(run.error, run.P)
     e = np.where(blurred(run, run.P)[..., None], np.nan, run.error)
-    nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
+    nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
     P, e, nees = run.P[:, sampled], e[:, sampled], nees[:, sampled]
     if run.replica < MAX_REPLAYED and few_errors(scenario).holds:
         try:
@@ -90,8 +92,8 @@ def _replayed_summary(
     mean = law.mean.reshape(times, hosts, n)
     Sigma, replayed = diagonal_blocks(stacked, hosts), law.P
     centred = run.error[:, :hosts] - mean
-    floor = (BLUR * run.rounding) ** 2
-    least = LEAST_VARIANCE if scenario.slotted else LEAST_VARIANCE_INTEGRATED
+    floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
+    least = _least_variance(scenario)
     whole = whiten_errors(centred, stacked, least, floor)
     joint, bias = _pool_times(centred, law.covariance, least, float(floor.max()))
     if hosts < nodes:  # all share one pooled filter
@@ -126,6 +128,27 @@ def _pool_times(
     return np.array([z @ z, used.sum()]), bias
 
 
+def _nearly_singular(P: FloatArray) -> np.ndarray:
+    """Return (K, N) bool: rounding decides about the inverses of covariances (K, N, n, n)."""
+    finite = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
+    values = np.linalg.eigvalsh(np.where(finite[..., None, None], P, 0.0))
+    return np.asarray(~(values[..., 0] > SINGULAR * values[..., -1]))
+
+
+def _variance_floor(scenario: Scenario) -> float:
+    """Return the variance below which errors are rounding: of the start and of what the readings
+    leave.
+    """
+    information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
+    left = 1.0 / information if information > 0.0 else 0.0
+    return (OPERATIONS * EPS) ** 2 * (left + float(np.trace(scenario.plant.start_cov)))
+
+
+def _least_variance(scenario: Scenario) -> float:
+    """Return the relative variance below which a direction is left out."""
+    return LEAST_VARIANCE if scenario.slotted else LEAST_VARIANCE_INTEGRATED
+
+
 def few_errors(scenario: Scenario) -> Assumption:
     """Return the assumption that the exact covariance of all errors together can be computed."""
     size = len(scenario.nodes) * scenario.plant.n
@@ -142,7 +165,8 @@ def whiten_errors(
     ``least`` times the largest one and above ``floor`` (K,), which rounding reaches. Those with
     small variances show how far the nodes disagree.
     """
-    values, vectors = np.linalg.eigh(stacked)
+    known = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
+    values, vectors = np.linalg.eigh(np.where(known[:, None, None], stacked, 0.0))
     used = (values > least * values[:, -1:]) & (values > np.reshape(floor, (-1, 1)))
     along = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1))
     square = np.where(used, along**2 / np.where(used, values, 1.0), 0.0).sum(axis=1)
@@ -208,18 +232,25 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     """Test that errors whitened by their exact covariance are chi-square at every node and time,
     and for all nodes together.
     """
-    runs = samples.runs
-    Sigma, whole, n = runs.Sigma[:MAX_REPLAYED], runs.whole[:MAX_REPLAYED], samples.scenario.plant.n
+    runs, scenario = samples.runs, samples.scenario
+    Sigma, whole, n = runs.Sigma[:MAX_REPLAYED], runs.whole[:MAX_REPLAYED], scenario.plant.n
     e = runs.e[:MAX_REPLAYED] - runs.mean[:MAX_REPLAYED]
     if np.isnan(e).all():
         return find_nothing(NEES_TOLERANCE)
-    alone = np.einsum("rkna,rkna->rkn", e, _solve_errors(Sigma, e)).reshape(len(e), -1)
-    with np.errstate(invalid="ignore"):
-        ratios = np.concatenate([alone / n, whole[..., 0] / whole[..., 1]], axis=1)
-    freedom = [n * len(e)] * alone.shape[1] + whole[..., 1].sum(axis=0).tolist()
+    # Each error is whitened by itself; directions without any variance are left out of the freedom.
+    alone = whiten_errors(
+        e.reshape(-1, 1, n),
+        Sigma.reshape(-1, n, n),
+        _least_variance(scenario),
+        _variance_floor(scenario),
+    ).reshape(len(e), -1, 2)
+    both = np.concatenate([alone, whole], axis=1)
+    freedom = np.nan_to_num(both[..., 1]).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = both[..., 0] * (len(e) / freedom)
     labels = [*samples.point_labels, *(f"{time}, all nodes" for time in samples.time_labels)]
     # A part of the level for each point, as much for all of them together, which see far less.
-    found = compare_chi_square(ratios, freedom, labels, level / 2.0, "e' Sigma^-1 e")
+    found = compare_chi_square(ratios, freedom.tolist(), labels, level / 2.0, "e' Sigma^-1 e")
     pooled = _compare_pooled(runs.joint[:MAX_REPLAYED], level / 2.0)
     found = pool(found, pooled, EVERYTHING)
     return found._replace(message=found.message + samples.blurred_note)
@@ -329,11 +360,3 @@ def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: f
     freedom = 2.0 * expected**2 / float((spread**2).sum())
     ratio = scale_interval(freedom * float(nees.sum()) / expected, freedom, level)
     return deviation_interval(1.0, ratio)
-
-
-def _solve_errors(Sigma: FloatArray, e: FloatArray) -> FloatArray:
-    """Return Sigma^-1 e (..., n), by the pseudoinverse if a covariance is singular."""
-    try:
-        return np.asarray(np.linalg.solve(Sigma, e[..., None])[..., 0])
-    except np.linalg.LinAlgError:
-        return np.asarray((np.linalg.pinv(Sigma, hermitian=True) @ e[..., None])[..., 0])

@@ -234,7 +234,7 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
         Pair(f"slot {slot}", samples.runs.P[runs, k, picks[k]], samples.reference.P[k])
         for k, slot in enumerate(check_slots(samples.scenario))
     ]
-    return compare_laws(pairs, level)
+    return compare_laws(pairs, level, samples.first_trace)
 
 
 def _each_sensor(samples: GossipSamples, level: float) -> Finding:
@@ -247,7 +247,7 @@ def _each_sensor(samples: GossipSamples, level: float) -> Finding:
         for k, slot in enumerate(check_slots(samples.scenario))
         for i, node in enumerate(samples.nodes)
     ]
-    return compare_laws(pairs, level)
+    return compare_laws(pairs, level, samples.first_trace)
 
 
 def _sensors_together(samples: GossipSamples, level: float) -> Finding:
@@ -291,7 +291,7 @@ def _tokens(samples: GossipSamples, level: float) -> Finding:
     for i, node in enumerate(samples.nodes):
         own = samples.runs.tokens[:, i]
         pairs.append(Pair(f"token {node}", own, everywhere, everywhere[origin == i]))
-    found = compare_laws(pairs, level)
+    found = compare_laws(pairs, level, samples.first_trace)
     return _with_horizon(samples, found, _token_memory) if found.early else found
 
 
@@ -304,7 +304,7 @@ def _initial_condition_forgotten(samples: GossipSamples, level: float) -> Findin
     for i, node in enumerate(samples.nodes):
         here = positions[:, -1] == i
         pairs.append(Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[here], P[-1, here]))
-    found = compare_laws(pairs, level)
+    found = compare_laws(pairs, level, samples.first_trace)
     return _with_horizon(samples, found, _start_memory) if found.early else found
 
 

@@ -299,7 +299,7 @@ def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
         for k, slot in enumerate(check_slots(samples.scenario))
         for i, node in enumerate(samples.nodes)
     ]
-    return compare_laws(pairs, level)
+    return compare_laws(pairs, level, samples.first_trace)
 
 
 def _bounded(samples: IntermittentSamples, level: float) -> Finding:
@@ -320,7 +320,7 @@ def _initial_condition_forgotten(samples: IntermittentSamples, level: float) -> 
         Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
         for i, node in enumerate(samples.nodes)
     ]
-    found = compare_laws(pairs, level)
+    found = compare_laws(pairs, level, samples.first_trace)
     return _with_horizon(samples, found, _memory_of) if found.early else found
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.checks.evidence import Assumption, Finding, find_unknown
+from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.statistics import (
     Interval,
     deviation_interval,
@@ -80,27 +80,35 @@ def pool(single: Finding, pooled: Interval, what: str) -> Finding:
     )
 
 
-def compare_laws(pairs: Sequence[Pair], level: float, horizon: float = math.nan) -> Finding:
+def _rounding_of(P: FloatArray, start: float) -> float:
+    """Return the size of rounding in entries of covariances P (S, n, n) that were computed from
+    others with traces up to ``start``.
+    """
+    return OPERATIONS * EPS * max(start, float(np.median(np.trace(P, axis1=-2, axis2=-1))))
+
+
+def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
     """Compare the laws of pairs of samples, entry by entry of the diagonal: ranks need no moments
-    of the covariances. ``horizon`` is that of a finding on a limit that is not reached.
+    of the covariances. ``start`` is the largest trace at time 0, of which roundings remain.
     """
     share, early = level / sum(pair.one.shape[-1] for pair in pairs), False
     found = []
     for pair in pairs:
         for k in range(pair.one.shape[-1]):
             one, other = pair.one[:, k, k], pair.other[:, k, k]
+            blur = _rounding_of(pair.one, start)
             if pair.expected is None:
-                apart = law_distance(one, other, share)
+                apart = law_distance(one, other, share, blur)
             else:
                 known = pair.expected[:, k, k]
-                low = law_distance(one, known, share / 2.0).low
-                apart = law_distance(one, other, share / 2.0)
+                low = law_distance(one, known, share / 2.0, blur).low
+                apart = law_distance(one, other, share / 2.0, blur)
                 apart = apart._replace(low=low, high=max(apart.high, low))
                 early |= law_distance(known, other, 0.5).value > LAW_TOLERANCE
             found.append((apart, f"at {pair.label}, entry {k}"))
     finding = find_largest(found, LAW_TOLERANCE, "largest distance of distribution functions")
     differs = any(apart.low > 0.0 for apart, _ in found)
-    return finding._replace(early=early and not differs, horizon=horizon)
+    return finding._replace(early=early and not differs)
 
 
 def diagonal_distances(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -125,14 +133,13 @@ def compare_growth(
     pairs: Sequence[Pair],
     expected: Sequence[tuple[FloatArray, FloatArray] | None],
     level: float,
-    horizon: float = math.nan,
 ) -> Finding:
     """Test that the later sample of each pair is stochastically at most GROWTH times the earlier
     one.
 
     ``expected``: samples of the laws that both must have, since laws may still grow in a short
     horizon: only what grows faster than these breaks the promise; None if they are not known, and
-    then nothing does. ``horizon`` is that of a finding on laws that still grow.
+    then nothing does.
     """
     share, early = 0.5 * level / sum(pair.one.shape[-1] for pair in pairs), False
     found = []
@@ -146,7 +153,7 @@ def compare_growth(
     message = f"largest excess of P(P > {GROWTH:g} J) at the end over P(P > J) at half of the time"
     finding = find_largest(found, LAW_TOLERANCE, message)
     differs = any(apart.low > 0.0 for apart, _ in found)
-    return finding._replace(early=early and not differs, horizon=horizon)
+    return finding._replace(early=early and not differs)
 
 
 def compare_chi_square(

@@ -81,6 +81,11 @@ class RunSamples:
         """P(0) (N', n, n) of all N' nodes of the network."""
         return np.array([self.scenario.start(node)[1] for node in self.scenario.nodes])
 
+    @property
+    def first_trace(self) -> float:
+        """The largest trace of P(0)."""
+        return float(np.trace(self.first_covariances, axis1=-2, axis2=-1).max())
+
     def largest_terms(self, P: FloatArray) -> FloatArray:
         """Return the sizes (R, K, N) of the terms of covariances P (R, K, N, n, n), whose roundings
         these have.

@@ -92,21 +92,32 @@ def round_digits(values: FloatArray) -> FloatArray:
         return np.asarray(np.where(np.isfinite(scale), np.round(values * scale) / scale, values))
 
 
-def law_distance(one: FloatArray, other: FloatArray, level: float) -> Interval:
+def law_distance(
+    one: FloatArray, other: FloatArray, level: float, rounding: float = 0.0
+) -> Interval:
     """Return an interval for the largest difference between the distribution functions behind two
     samples (S,) and (S',), which may depend on each other.
+
+    Values that differ by less than ``rounding``, or in the last of DIGITS digits, count as equal.
     """
-    return _band_interval(np.abs(_ecdf_gaps(one, other)), len(one), len(other), level)
+    gaps = np.abs(_ecdf_gaps(one, other, rounding))
+    return _band_interval(gaps, len(one), len(other), level)
 
 
-def law_excess(one: FloatArray, other: FloatArray, level: float) -> Interval:
-    """Return an interval for the largest ``P(other > x) - P(one > x)`` over all x."""
-    return _band_interval(_ecdf_gaps(one, other), len(one), len(other), level)
+def law_excess(one: FloatArray, other: FloatArray, level: float, rounding: float = 0.0) -> Interval:
+    """Return an interval for the largest ``P(other > x) - P(one > x)`` over all x; see
+    :func:`law_distance` for ``rounding``.
+    """
+    return _band_interval(_ecdf_gaps(one, other, rounding), len(one), len(other), level)
 
 
-def _ecdf_gaps(one: FloatArray, other: FloatArray) -> FloatArray:
-    a, b = np.sort(round_digits(one)), np.sort(round_digits(other))
-    points = np.concatenate([a, b])
+def _ecdf_gaps(one: FloatArray, other: FloatArray, rounding: float) -> FloatArray:
+    a, b = np.sort(one), np.sort(other)
+    points = np.sort(np.concatenate([a, b]))
+    # Neighbours that only rounding parts are one value: the gap is that above the last of them.
+    with np.errstate(invalid="ignore"):
+        apart = np.diff(points) > np.maximum(rounding, 10.0 ** (1 - DIGITS) * np.abs(points[1:]))
+    points = points[np.append(apart, True)]
     ranks = [np.searchsorted(sample, points, "right") / len(sample) for sample in (a, b)]
     return np.asarray(ranks[0] - ranks[1])
 
