@@ -271,7 +271,7 @@ def test_arrivals_of_the_wrong_probability_are_caught(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "source"), [("Forgetful", "R (15)-(18)"), ("Overconfident", "R (15)")]
+    ("kind", "source"), [("Forgetful", "R (15)-(18)"), ("Overconfident", "R (14)")]
 )
 def test_broken_intermittent_filters_are_caught(kind, source, tmp_path):
     scenario = scenario_of(INTERMITTENT, tmp_path, filter={"kind": f"tests.checks.broken:{kind}"})
