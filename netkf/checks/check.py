@@ -24,6 +24,13 @@ from netkf.checks.evidence import (
     judge,
 )
 from netkf.checks.exact import promised_filter, with_promised_filter
+from netkf.checks.looks import (
+    MOST_RUNS,
+    is_decided,
+    keep_decisions,
+    level_of_look,
+    next_runs,
+)
 from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
@@ -55,7 +62,9 @@ TWIN_TOLERANCE = 1e-6
 class Verdict:
     """Evidence for every promise; true if none is broken.
 
-    ``confidence``: all intervals of all rows hold together with at least this probability.
+    ``confidence``: all intervals of all rows, of earlier looks too, hold together with at least
+    this probability. ``results`` are what the runs gave, to which others can be added; ``looks``
+    is how often rows were judged, and ``spent`` what that took of the level.
     """
 
     scenario: str
@@ -63,15 +72,21 @@ class Verdict:
     seed: int
     confidence: float
     rows: tuple[Evidence, ...]
+    results: tuple[ReplicaResult, ...] = dataclasses.field(default=(), repr=False, compare=False)
+    looks: int = 1
+    spent: float = 0.0
+
+    @property
+    def is_decided(self) -> bool:
+        """True if more runs would decide no further row."""
+        return is_decided(self.rows)
 
     def __bool__(self) -> bool:
         return all(row.verdict != BROKEN for row in self.rows)
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row per promise: promise, source, assumptions, margin, low, high, tolerance, verdict,
-        needed, evidence.
-        """
+        """One row per promise, with the fields of Evidence as columns."""
         import pandas as pd
 
         names = [field.name for field in dataclasses.fields(Evidence)]
@@ -237,6 +252,10 @@ def check(
     executor: Executor | None = None,
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    until: str | None = None,
+    most: int = MOST_RUNS,
+    earlier: Verdict | None = None,
 ) -> Verdict:
     """Compare all that is promised of the scenario's filter with ``runs`` replicas.
 
@@ -245,6 +264,11 @@ def check(
     ``scheduler`` and ``progress`` are those of ``netkf.monte_carlo``; they do not change the
     verdict.
 
+    With ``until = "decided"`` runs are added until every row is decided, a promise is broken or
+    ``most`` runs are done. Runs can also be added to an ``earlier`` verdict on the same scenario
+    and seed. All intervals of all looks hold together, so that one may stop at any of them; the
+    confidence of a verdict with runs added says what the looks before have spent.
+
     Raises TheoryError if nothing is promised, ScenarioError for bad arguments.
     """
     if not isinstance(scenario, Scenario):
@@ -252,19 +276,62 @@ def check(
     count = integer(low=MIN_RUNS)("runs", runs)
     sure = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
+    if until not in (None, "decided"):
+        raise ScenarioError("until", "must be decided, or left out", until, 'write "decided"')
+    _require_earlier(scenario, earlier, root, count)
     _require_laws(scenario)
     chosen = with_check_times(scenario)
-    results = replicate(
-        partial(run_replica, engine=choose_engine("auto", chosen)),
-        chosen,
-        count,
-        root,
-        workers=workers,
-        executor=executor,
-        scheduler=scheduler,
-        progress=progress,
+    verdict, last = earlier, max(count, most if until else count)
+    while True:
+        found = list(verdict.results) if verdict is not None else []
+        found += replicate(
+            partial(run_replica, engine=choose_engine("auto", chosen)),
+            chosen,
+            count - len(found),
+            root,
+            first=len(found),
+            workers=workers,
+            executor=executor,
+            scheduler=scheduler,
+            progress=progress,
+        )
+        verdict = _look_again(chosen, verdict, found, root, sure, bool(until))
+        if not until or not verdict or verdict.is_decided or count >= last:
+            return verdict
+        count = next_runs(verdict.rows, count, last)
+
+
+def _look_again(
+    scenario: Scenario,
+    before: Verdict | None,
+    results: list[ReplicaResult],
+    seed: int,
+    confidence: float,
+    again: bool,
+) -> Verdict:
+    """Return the verdict on all results so far, with what looks before it have decided."""
+    look, level = (before.looks if before is not None else 0) + 1, 1.0 - confidence
+    # A single look may spend the whole level, unless others are planned.
+    share = level_of_look(level, look) if again or before is not None else level
+    spent = (before.spent if before is not None else 0.0) + share
+    verdict = judge_replicas(scenario, results, seed, 1.0 - share)
+    rows = keep_decisions(before.rows, verdict.rows) if before is not None else verdict.rows
+    sure = 1.0 - max(spent, level) if again else 1.0 - spent
+    return dataclasses.replace(
+        verdict, rows=rows, confidence=sure, results=tuple(results), looks=look, spent=spent
     )
-    return judge_replicas(chosen, results, root, sure)
+
+
+def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, runs: int) -> None:
+    """Raise ScenarioError unless runs can be added to an earlier verdict."""
+    if earlier is None:
+        return
+    if (earlier.scenario, earlier.seed) != (scenario.name, seed):
+        problem = f"is of scenario {earlier.scenario} and seed {earlier.seed}"
+        raise ScenarioError("earlier", problem, (scenario.name, seed), "check it anew")
+    if runs <= len(earlier.results):
+        problem = f"has {len(earlier.results):,} runs already"
+        raise ScenarioError("runs", f"must be more: the verdict {problem}", runs, "give more")
 
 
 def _require_laws(scenario: Scenario) -> None:

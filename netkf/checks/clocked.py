@@ -93,6 +93,8 @@ UPPER_BOUND = Promise(
 class ClockedChecks(PaperChecks):
     """Equations of slot filters under clocks."""
 
+    summary_type = ClockedSummary
+
     def summarise(self, scenario: Scenario, run: Run) -> ClockedSummary:
         """Return the summary of a run whose samples are at ``check_times``."""
         drift = [abs(total - start) / abs(start) for start, total in run.sums.values()]

@@ -180,6 +180,8 @@ PROMISES = (
 class DiffusionChecks(PaperChecks):
     """Promises of D, Algorithm 1, Lemma 4.1 and Theorem 4.2."""
 
+    summary_type = DiffusionSummary
+
     def summarise(self, scenario: Scenario, run: Run) -> DiffusionSummary:
         """Return the summary of a run whose samples are at ``check_times``."""
         sampled = sampled_indices(scenario)

@@ -436,6 +436,8 @@ PROMISES = (
 class GossipChecks(PaperChecks):
     """Promises of G, Propositions 6, 7, Theorems 8, 10."""
 
+    summary_type = GossipSummary
+
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> GossipSummary:

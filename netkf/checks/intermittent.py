@@ -558,6 +558,8 @@ DIVERGES = Promise(
 class IntermittentChecks(PaperChecks):
     """Promises of R, Theorems 9, 10, Propositions 8, 24, 25 and (29)."""
 
+    summary_type = IntermittentSummary
+
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> IntermittentSummary:

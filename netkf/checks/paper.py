@@ -16,9 +16,11 @@ class PaperChecks(ABC):
     """The promises of one paper and what their tests need of each run.
 
     ``slots_only``: the paper is about slots; under clocks only the equations are checked.
+    ``summary_type``: class of the summaries of runs.
     """
 
     slots_only: ClassVar[bool] = False
+    summary_type: ClassVar[type[ReplicaSummary]] = ReplicaSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
         """Return the summary of a run whose samples are at ``check_times``."""

@@ -310,6 +310,8 @@ CERTIFIED = Promise(
 class PushSumChecks(PaperChecks):
     """Promises of P, Lemmas 4, 10 and Theorems 1, 2, 4, 5, 6."""
 
+    summary_type = PushSumSummary
+
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> PushSumSummary:

@@ -48,5 +48,14 @@ def _describe(row: Evidence) -> str:
 
 def verdict_json(verdict: Verdict) -> dict[str, Any]:
     """Return the verdict as plain JSON values."""
-    document: dict[str, Any] = finite({**dataclasses.asdict(verdict), "holds": bool(verdict)})
-    return document
+    document = {
+        "scenario": verdict.scenario,
+        "runs": verdict.runs,
+        "seed": verdict.seed,
+        "confidence": verdict.confidence,
+        "rows": [dataclasses.asdict(row) for row in verdict.rows],
+        "holds": bool(verdict),
+        "decided": verdict.is_decided,
+    }
+    plain: dict[str, Any] = finite(document)
+    return plain

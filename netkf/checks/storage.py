@@ -1,0 +1,156 @@
+"""What a check leaves in a directory, so that runs can be added later.
+
+``results.npz`` holds the summaries of all replicas as plain arrays, which execute nothing when they
+are read; ``verdict.json`` the verdict and what it belongs to.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netkf.checks.check import ReplicaResult, Verdict, find_checks, with_check_times
+from netkf.checks.evidence import Evidence
+from netkf.checks.parts.samples import PartSummary
+from netkf.checks.report import verdict_json, verdict_text
+from netkf.core.errors import ScenarioError
+from netkf.runs.files import (
+    new_directory,
+    scenario_digest,
+    write_atomically,
+    write_json,
+    write_scenario,
+    write_text,
+)
+from netkf.runs.provenance import versions
+from netkf.scenario.scenario import Scenario
+
+RESULTS, VERDICT = "results.npz", "verdict.json"
+
+
+def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str = "") -> None:
+    """Write scenario.toml, verdict.json, verdict.csv, verdict.txt and results.npz."""
+    if not (directory / "scenario.toml").exists():
+        write_scenario(directory, scenario)
+    with write_atomically(directory / RESULTS) as part, part.open("wb") as file:
+        columns: dict[str, Any] = _columns(verdict.results)
+        np.savez_compressed(file, **columns)
+    with write_atomically(directory / "verdict.csv") as part:
+        verdict.table.to_csv(part, index=False)
+    write_text(directory / "verdict.txt", (text or verdict_text(verdict, scenario.claim)) + "\n")
+    document = verdict_json(verdict)
+    document |= {
+        "digest": scenario_digest(scenario),
+        "versions": versions(),
+        "looks": verdict.looks,
+        "spent": verdict.spent,
+    }
+    write_json(directory / VERDICT, document)
+
+
+def verdict_directory(out: Path, scenario: Scenario) -> Path:
+    """Create the directory of a new verdict; raises ScenarioError if it is not empty."""
+    return new_directory(out, scenario.name)
+
+
+def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
+    """Return the verdict in a directory, to which runs can be added.
+
+    Raises ScenarioError if there is none, or one of another scenario, seed or version.
+    """
+    remedy = "give a directory that netkf check --out has written"
+    try:
+        found = json.loads((directory / VERDICT).read_text(encoding="utf-8"))
+        same = {
+            "scenario": (found["digest"], scenario_digest(scenario)),
+            "seed": (found["seed"], seed),
+            "versions": (found["versions"], versions()),
+        }
+        looks, spent = int(found["looks"]), float(found["spent"])
+        rows = tuple(_row(row) for row in found["rows"])
+        results = _results(directory / RESULTS, scenario)
+        count, confidence = int(found["runs"]), float(found["confidence"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        problem = f"has no verdict that can be read ({type(error).__name__})"
+        raise ScenarioError("--resume", problem, str(directory), remedy) from None
+    for name, (kept, wanted) in same.items():
+        if kept != wanted:
+            problem = f"{directory} holds a verdict of another {name.removesuffix('s')}"
+            raise ScenarioError("--resume", problem, kept, "start a new directory")
+    if len(results) != count:
+        problem = f"{directory} holds {len(results)} results of {count} runs"
+        raise ScenarioError("--resume", problem, str(directory), "start a new directory")
+    return Verdict(scenario.name, count, seed, confidence, rows, tuple(results), looks, spent)
+
+
+def _row(found: dict[str, Any]) -> Evidence:
+    """Return a row; JSON has null for numbers that are not finite."""
+    numbers = ("margin", "low", "high", "tolerance", "seen", "expected", "off", "detectable")
+    missing = {name: np.nan for name in numbers if found[name] is None}
+    return Evidence(**{**found, **missing})
+
+
+def _columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
+    """Return all results as arrays with a first axis over the replicas."""
+    columns = {
+        "difference": np.array([one.difference for one in results]),
+        "expected": np.array([one.expected for one in results]),
+        "diverged": np.array([one.diverged for one in results]),
+    }
+    whole = [one for one in results if one.summary is not None]
+    if not whole:
+        return columns
+    for name in vars(whole[0].summary):
+        columns[f"summary.{name}"] = np.array([getattr(one.summary, name) for one in whole])
+    for part, first in zip(PartSummary._fields, whole[0].parts or (), strict=False):
+        for name in first._fields if first is not None else ():
+            values = [getattr(getattr(one.parts, part), name) for one in whole]
+            columns[f"{part}.{name}"] = np.array(values)
+    return columns
+
+
+def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
+    """Return the results that :func:`save_verdict` wrote, in order."""
+    with np.load(path, allow_pickle=False) as file:
+        columns = {name: file[name] for name in file.files}
+    chosen = with_check_times(scenario)
+    summary_type, part_types = find_checks(chosen).summary_type, _part_types()
+    results, place = [], 0
+    for k, diverged in enumerate(columns["diverged"].tolist()):
+        difference, expected = float(columns["difference"][k]), bool(columns["expected"][k])
+        if diverged:
+            results.append(ReplicaResult(None, difference, expected))
+            continue
+        at = {name: values[place] for name, values in columns.items() if "." in name}
+        summary = summary_type(**_fields(at, "summary"))
+        parts = {
+            part: cls(**_fields(at, part)) if _fields(at, part) else None
+            for part, cls in part_types.items()
+        }
+        results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts)))
+        place += 1
+    return results
+
+
+def _fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+    return {
+        name.split(".", 1)[1]: value
+        for name, value in values.items()
+        if name.split(".", 1)[0] == prefix
+    }
+
+
+def _part_types() -> dict[str, Any]:
+    from netkf.checks.parts import events, moments
+
+    return {
+        "ticks": events.TickCounts,
+        "fates": events.FateCounts,
+        "pairs": events.PairCounts,
+        "steps": moments.Moments,
+        "readings": moments.Moments,
+    }
