@@ -30,6 +30,7 @@ class Evidence:
     off       : distance of the two (relative for covariances and rates)
     detectable : error that would have been found with probability 0.9
     runs_needed : ``needed``
+    replica   : number of a run that shows a broken promise, None if it takes many runs
     """
 
     promise: str
@@ -47,6 +48,7 @@ class Evidence:
     off: float = math.nan
     detectable: float = math.nan
     runs_needed: int | None = None
+    replica: int | None = None
 
 
 class Finding(NamedTuple):
@@ -56,8 +58,8 @@ class Finding(NamedTuple):
     early   : the promise is about a limit and the horizon is too short to tell
     blurred : rounding of a large state has left no errors to judge by
     horizon : seconds after which the limit would be reached, nan if that is not known
-    seen, expected, off, detectable : see :class:`Evidence`; ``off`` is by default how far the
-        margin is below 0
+    seen, expected, off, detectable, replica : see :class:`Evidence`; ``off`` is by default how far
+        the margin is below 0
     """
 
     margin: tuple[float, float, float]
@@ -70,6 +72,7 @@ class Finding(NamedTuple):
     expected: float = math.nan
     off: float = math.nan
     detectable: float = math.nan
+    replica: int | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,7 @@ def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
         max(0.0, -margin) if math.isnan(finding.off) and low < high else finding.off,
         finding.detectable,
         needed,
+        finding.replica if verdict == BROKEN else None,
     )
 
 

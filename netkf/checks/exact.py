@@ -330,7 +330,9 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     )
     each, squares = weights[:, known].sum(axis=2), (weights[:, known] ** 2).sum(axis=2)
     together = pooled_nees(nees[:, known], each, squares, 0.5 * level)
-    finding = pool(find_largest(found, NEES_TOLERANCE, message), together, EVERYTHING)
+    finding = pool(
+        find_largest(found, NEES_TOLERANCE, message), together, EVERYTHING, NEES_TOLERANCE
+    )
     return finding._replace(message=finding.message + samples.blurred_note)
 
 
@@ -344,7 +346,12 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
     known = nees[:, np.isfinite(nees).all(axis=0)]
     if known.size:
         exactly = np.full(known.shape, float(n))
-        found = pool(found, pooled_nees(known, exactly, exactly, level / 2.0), EVERYTHING)
+        found = pool(
+            found,
+            pooled_nees(known, exactly, exactly, level / 2.0),
+            EVERYTHING,
+            NEES_TOLERANCE,
+        )
     return found._replace(message=found.message + samples.blurred_note)
 
 

@@ -59,7 +59,9 @@ POOLED_TOLERANCE = 0.1
 """Tolerated relative difference where everything is pooled."""
 
 
-def pool(single: Finding, pooled: Interval, what: str) -> Finding:
+def pool(
+    single: Finding, pooled: Interval, what: str, tolerance: float = POOLED_TOLERANCE
+) -> Finding:
     """Return the finding of a row from its single comparisons and one of all of them together.
 
     Both have their share of the level. A single comparison that is off is the finding; otherwise
@@ -72,7 +74,7 @@ def pool(single: Finding, pooled: Interval, what: str) -> Finding:
     text = f"{what}; {single.message}: {max(0.0, -single.margin[0]):.3g}"
     return single._replace(
         margin=margin,
-        tolerance=POOLED_TOLERANCE,
+        tolerance=tolerance,
         message=text,
         seen=pooled.seen,
         expected=pooled.expected,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 import textwrap
 from collections import Counter
 from typing import Any
@@ -14,19 +16,69 @@ from netkf.runs.files import finite
 INDENT = " " * 13
 WIDTH = 87
 
+PAPERS = {
+    "H": "Tanwani: error bounds for locally optimal distributed filters",
+    "R": "Kar, Sinopoli, Moura: Kalman filtering with intermittent observations",
+    "G": "Kar, Moura: gossip and distributed Kalman filtering",
+    "D": "Xie, Gan, Liu: distributed Kalman filtering for stochastic regression",
+    "P": "Battilotti, Cacace, d'Angelo: random sub-graphs with link failures",
+}
+"""The papers behind the letters in the sources of promises."""
 
-def verdict_text(verdict: Verdict, claim: str = "") -> str:
-    """Return the text of ``netkf check``: the rows, then how many there are of each verdict."""
+
+def verdict_text(verdict: Verdict, claim: str = "", command: str = "") -> str:
+    """Return the text of ``netkf check``: broken rows first and once more at the end, then how many
+    rows there are of each verdict. ``command`` replays a run: the number of the run follows it.
+    """
     lines = [f"{verdict.scenario}: {claim}" if claim else verdict.scenario, ""]
-    for row in verdict.rows:
+    broken = [row for row in verdict.rows if row.verdict == BROKEN]
+    for row in [*broken, *(row for row in verdict.rows if row.verdict != BROKEN)]:
         mark = row.verdict.upper() if row.verdict == BROKEN else row.verdict
         lines.append(f"{mark:<{len(INDENT)}}{row.promise}  [{row.source}]")
         message = _describe(row)
         lines += textwrap.wrap(message, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
+    lines += ["", *_legend(verdict), *_summary(verdict)]
+    return "\n".join([*lines, *_broken_again(broken, command)])
+
+
+def _legend(verdict: Verdict) -> list[str]:
+    """Return a line for each paper whose letter stands in a source."""
+    # A letter is a paper's at the beginning of a source or of one of its parts.
+    sources = "; ".join(row.source for row in verdict.rows)
+    return [
+        f"[{letter} ...]: {title}"
+        for letter, title in PAPERS.items()
+        if re.search(rf"(^|[;,] |from ){letter}[ (]", sources)
+    ]
+
+
+def _summary(verdict: Verdict) -> list[str]:
+    """Return the lines that count the verdicts."""
     counts = Counter(row.verdict for row in verdict.rows)
     shown = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
-    together = f"all intervals together hold with probability {verdict.confidence:.6g}"
-    return "\n".join([*lines, "", f"{shown}; {verdict.runs:,} runs, {together}"])
+    looks = f" at all of {verdict.looks} looks" if verdict.looks > 1 else ""
+    together = f"all intervals{looks} hold together with probability {verdict.confidence:.6g}"
+    lines = [f"{shown}; {verdict.runs:,} runs, {together}"]
+    needed = [row.needed for row in verdict.rows if row.needed is not None]
+    if needed:
+        lines.append(
+            f"about {max(needed):,} runs would decide what is undecided: --runs {max(needed)}, or "
+            "--until decided"
+        )
+    return lines
+
+
+def _broken_again(broken: list[Evidence], command: str) -> list[str]:
+    """Return the broken promises, each with the command that replays a run that shows it."""
+    lines = []
+    for row in broken:
+        values = ""
+        if math.isfinite(row.seen) and math.isfinite(row.expected):
+            values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"
+        lines.append(f"BROKEN: {row.promise}  [{row.source}]{values}")
+        if command and row.replica is not None:
+            lines.append(f"        replay it: {command} {row.replica}")
+    return ["", *lines] if lines else []
 
 
 def _describe(row: Evidence) -> str:
@@ -37,6 +89,8 @@ def _describe(row: Evidence) -> str:
     if row.verdict == NOT_PROMISED:
         message = row.assumptions
     elif row.low < row.high:
+        if math.isfinite(row.seen) and math.isfinite(row.expected):
+            message += f"; seen {row.seen:.4g}, expected {row.expected:.4g}"
         message += f"; off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}"
         if row.detectable > 0.0:
             message += f"; an error of {row.detectable:.2g} would have been seen"

@@ -12,6 +12,14 @@ OPERATIONS = 1e3
 """Roundings of one relative error EPS each that may add up in one computed entry."""
 
 
+def allowed_deviation(size: FloatArray, terms: ArrayLike, base: float) -> FloatArray:
+    """Return the deviations that rounding explains, in the shape of ``size``; on the arguments see
+    :func:`compare_identities`.
+    """
+    largest = np.maximum(np.broadcast_to(terms, np.shape(size)), size)
+    return np.asarray(np.maximum(base * np.asarray(size), OPERATIONS * EPS * largest))
+
+
 def compare_identities(
     gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float, message: str
 ) -> Finding:
@@ -28,7 +36,7 @@ def compare_identities(
     largest = np.maximum(np.broadcast_to(terms, np.shape(gap)).reshape(-1), scale)
     if not len(off):
         return find_identity(0.0, base, message)
-    limit = np.maximum(base * scale, OPERATIONS * EPS * largest)
+    limit = allowed_deviation(scale, largest, base)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(off > 0.0, off / limit, 0.0)
     worst = int(np.argmax(share))

@@ -12,7 +12,7 @@ import numpy as np
 from netkf.checks.evidence import Finding, find_unknown
 from netkf.checks.laws import Pair, compare_growth
 from netkf.checks.points import check_slots, check_times, sampled_nodes
-from netkf.checks.rounding import compare_identities, largest_terms
+from netkf.checks.rounding import allowed_deviation, compare_identities, largest_terms
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
@@ -130,7 +130,16 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
     terms = samples.largest_terms(expected)
-    return compare_identities(gap, size, terms, REPLAY_TOLERANCE, message)
+    finding = compare_identities(gap, size, terms, REPLAY_TOLERANCE, message)
+    wrong = ~(gap <= allowed_deviation(size, terms, REPLAY_TOLERANCE))
+    if not wrong.any():
+        return finding
+    # The earliest time of all runs, and there the first run and node.
+    time, run, node = np.argwhere(np.swapaxes(wrong, 0, 1))[0].tolist()
+    replica = int(np.flatnonzero(replayed)[run])
+    label = samples.point_labels[time * len(samples.nodes) + node]
+    text = f"{finding.message}; first seen to depart in run {replica} at {label}"
+    return finding._replace(message=text, replica=replica)
 
 
 def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:

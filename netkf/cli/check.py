@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from netkf.cli.options import (
     FAILED,
     Command,
     add_json,
+    add_no_plot,
     add_pool,
     add_seed,
     load_scenario,
@@ -15,12 +19,26 @@ from netkf.cli.options import (
     print_json,
     print_notes,
 )
+from netkf.cli.pictures import VERDICT, load_drawing, print_missing
 from netkf.cli.progress import ProgressLine
+from netkf.core.errors import ScenarioError
+
+if TYPE_CHECKING:
+    from netkf.checks.check import Verdict
+    from netkf.scenario.scenario import Scenario
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--runs", type=parse_count, default=500, help="number of runs (default: 500)"
+    )
+    parser.add_argument(
+        "--until",
+        choices=["decided"],
+        help="begin with --runs and add runs until every row is decided",
+    )
+    parser.add_argument(
+        "--most", type=parse_count, help="runs after which --until ends (default: 20000)"
     )
     add_seed(parser)
     parser.add_argument(
@@ -29,18 +47,24 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         default=0.99,
         help="probability with which all intervals hold together (default: 0.99)",
     )
+    parser.add_argument("--out", type=Path, help="directory for the verdict, its table and picture")
+    parser.add_argument(
+        "--resume", action="store_true", help="add runs to the verdict in --out, up to --runs"
+    )
     add_pool(parser)
     add_json(parser)
+    add_no_plot(parser)
 
 
 def _run(options: argparse.Namespace) -> int:
     """Return the exit status: 1 if a promise is broken."""
     from netkf.checks.check import check
+    from netkf.checks.looks import MOST_RUNS
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 
-    # Promises are checked at times of their own, so that the file's may not fit the horizon.
-    scenario = load_scenario(options, {"probe": [0.0]})
+    scenario = load_scenario(options)
+    earlier = _prepare(scenario, options)
     with ProgressLine() as line:
         verdict = check(
             scenario,
@@ -49,13 +73,60 @@ def _run(options: argparse.Namespace) -> int:
             workers=options.workers,
             scheduler=options.scheduler,
             progress=line.counter("runs"),
+            until=options.until,
+            most=options.most or MOST_RUNS,
+            earlier=earlier,
         )
+    text = verdict_text(verdict, scenario.claim, _replay_command(options))
     print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
+    if options.out is not None:
+        _save(scenario, verdict, text, options)
     if options.json:
         print_json(verdict_json(verdict))
     else:
-        print(verdict_text(verdict, scenario.claim))
+        print(text)
+        if options.out is not None:
+            print(f"written to {options.out}")
     return 0 if verdict else FAILED
+
+
+def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
+    """Make the directory of the verdict, or return the earlier verdict in it."""
+    if options.out is None:
+        if options.resume:
+            remedy = "add --out DIR with the directory of the verdict"
+            raise ScenarioError("--resume", "needs a verdict to add runs to", None, remedy)
+        return None
+    from netkf.checks.storage import load_verdict, verdict_directory
+
+    if options.resume:
+        return load_verdict(options.out, scenario, scenario.seed)
+    verdict_directory(options.out, scenario)
+    return None
+
+
+def _save(scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace) -> None:
+    """Write the files of a verdict, and its picture if matplotlib is there."""
+    from netkf.checks.storage import save_verdict
+
+    save_verdict(options.out, scenario, verdict, text)
+    if options.no_plot:
+        return
+    draw: Any = load_drawing(VERDICT)
+    if draw is None:
+        print_missing()
+    else:
+        draw(options.out / "verdict.png", verdict, scenario.claim)
+
+
+def _replay_command(options: argparse.Namespace) -> str:
+    """Return the command that runs a replica of this check, without the number of the replica."""
+    words = ["netkf", "run", str(options.scenario)]
+    for change in options.set:
+        words += ["--set", change]
+    if options.seed is not None:
+        words += ["--seed", str(options.seed)]
+    return shlex.join([*words, "--replica"])
 
 
 COMMAND = Command("check", "compare simulations with theory, one row per promise", _declare, _run)
