@@ -7,6 +7,7 @@ paper whose theory and checks speak about it (packages ``netkf.theory.<paper>`` 
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import pkgutil
 from collections.abc import Callable
@@ -22,6 +23,9 @@ _REGISTERED: dict[str, type[Filter]] = {}
 
 WEIGHING = ("share", "max_measurement_interval", "steps", "redraws_links")
 """Methods besides STEPS that theorems rely on; other weights of links are known to the theory."""
+
+LINK_WEIGHTS = ("weight", "pair_weights")
+"""What a class may define anew and stay what it is: theory asks the class for its weights."""
 
 TRAITS = ("schedule", "clocks", "predicts", "first_slot", "pairwise", "talks", "pooled",
           "newest_only")  # fmt: skip
@@ -51,6 +55,26 @@ def built_in_class(algorithm: object) -> type[Filter] | None:
     """The built-in class of a filter, or the one that a user's class is derived from."""
     known = set(built_in_filters().values())
     return next((cls for cls in type(algorithm).__mro__ if cls in known), None)
+
+
+def own_attributes(algorithm: object) -> list[str]:
+    """Return the attributes of the built-in class that a user's class defines anew, sorted.
+
+    Methods, class variables, weights and private helpers alike; fields and dunder names are left
+    out.
+    """
+    known = built_in_class(algorithm)
+    if known is None:
+        return []
+    order = type(algorithm).__mro__
+    names = {
+        name
+        for one in order[: order.index(known)]
+        for name in vars(one)
+        if hasattr(known, name) and not name.startswith("__")
+    }
+    fields = {field.name for field in dataclasses.fields(known)}
+    return sorted(names - fields - {"_abc_impl", "_is_protocol"})
 
 
 def overridden(algorithm: object, known: type | None = None) -> list[str]:

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.registry import LINK_WEIGHTS, own_attributes
 from netkf.checks.clocked import CHECKS as UNDER_CLOCKS
 from netkf.checks.evidence import (
     BROKEN,
+    NOT_PROMISED,
     Assumption,
     Evidence,
     Finding,
@@ -23,7 +25,7 @@ from netkf.checks.evidence import (
     find_nothing,
     judge,
 )
-from netkf.checks.exact import promised_filter, with_promised_filter
+from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
 from netkf.checks.looks import (
     MOST_RUNS,
     is_decided,
@@ -137,8 +139,8 @@ def run_replica(
     run, promised = simulate(scenario, seed, replica, engine), with_promised_filter(scenario)
     diverged, difference = run.status == "diverged", math.nan
     expected = promised is scenario
-    if promised is not scenario and (diverged or replica < TWIN_RUNS):
-        twin = simulate(promised, seed, replica, SimpyEngine())
+    if own_attributes(scenario.filter.algorithm) and (diverged or replica < TWIN_RUNS):
+        twin = simulate(with_base_filter(scenario), seed, replica, SimpyEngine())
         difference, expected = _error_difference(run, twin), twin.status == "diverged"
     if diverged:
         return ReplicaResult(None, difference, expected)
@@ -219,9 +221,23 @@ def judge_replicas(
         0.5 * (1.0 - confidence),
     )
     rows += _judge_parts(scenario, found, seed, 0.5 * (1.0 - confidence))
-    if promised is not scenario:
-        rows = [*judge([SAME_AS_BASE], found, [], len(found), 1.0), *rows]
-    return finish(tuple(rows))
+    return finish((*_judge_base(scenario, found), *rows))
+
+
+def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Evidence]:
+    """Return the row about a user's class beside the built-in one that it derives from.
+
+    A class whose only own attributes are weights of links differs by design, if it does.
+    """
+    own = own_attributes(scenario.filter.algorithm)
+    if not own:
+        return []
+    (row,) = judge([SAME_AS_BASE], results, [], len(results), 1.0)
+    listed = ", ".join(own)
+    if row.verdict == BROKEN and set(own) <= set(LINK_WEIGHTS):
+        why = f"it differs by design: {listed} is its own; {row.evidence}"
+        return [dataclasses.replace(row, verdict=NOT_PROMISED, assumptions=why)]
+    return [dataclasses.replace(row, evidence=f"{row.evidence}; its own: {listed}")]
 
 
 def _judge_parts(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from netkf.algorithms.registry import built_in_class, overridden
+from netkf.algorithms.registry import LINK_WEIGHTS, built_in_class, own_attributes
 from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
 from netkf.checks.laws import (
     EVERYTHING,
@@ -176,18 +176,22 @@ def whiten_errors(
 def with_promised_filter(scenario: Scenario) -> Scenario:
     """Return the scenario with the filter that its promises are about.
 
-    For a user's class that defines steps of its own this is the built-in class it derives from.
+    For a user's class that defines anything but weights anew this is the built-in class it derives
+    from.
     """
     own = promised_filter(scenario.filter.algorithm) is scenario.filter.algorithm
-    return scenario if own else _replace_filter(scenario)
+    return scenario if own else with_base_filter(scenario)
 
 
 @lru_cache(maxsize=8)
-def _replace_filter(scenario: Scenario) -> Scenario:
-    """Return the scenario with the built-in filter; cached, since its tables take time and every
-    replica asks for it.
+def with_base_filter(scenario: Scenario) -> Scenario:
+    """Return the scenario with the built-in filter that a user's class derives from, with the same
+    parameters; cached, since its tables take time and every replica asks for it.
     """
-    base = promised_filter(scenario.filter.algorithm)
+    algorithm = scenario.filter.algorithm
+    known: Any = built_in_class(algorithm)
+    parameters = [field.name for field in dataclasses.fields(known) if field.init]
+    base = known(**{name: getattr(algorithm, name) for name in parameters})
     filtering = dataclasses.replace(scenario.filter, algorithm=base)
     return dataclasses.replace(scenario, filter=filtering)
 
@@ -211,7 +215,7 @@ def promised_filter(algorithm: Any) -> Any:
             f"nothing is promised of {name}: it declares talks = False, and what is promised of "
             f"{known.__name__} is about exchanges; derive it from netkf.parts.Local"
         )
-    if not overridden(algorithm):
+    if set(own_attributes(algorithm)) <= set(LINK_WEIGHTS):
         return algorithm
     parameters = [field.name for field in dataclasses.fields(known) if field.init]
     return known(**{name: getattr(algorithm, name) for name in parameters})

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from netkf.algorithms.filter import STEPS
-from netkf.algorithms.registry import built_in_class
+from netkf.algorithms.registry import built_in_class, own_attributes
 from netkf.testing.clocked import ClockTrial
 from netkf.testing.shifts import differences
 from netkf.testing.slotted import SlotTrial, slots_of
@@ -37,7 +37,7 @@ def check_parent(watched: Watched, same_as_parent: bool | None) -> None:
     """
     part = watched.part
     known = built_in_class(part)
-    own = [] if known is None else overridden_attributes(type(part), known)
+    own = own_attributes(part)
     if same_as_parent is False or known is None or not own:
         return
     parameters = [field.name for field in dataclasses.fields(known) if field.init]
@@ -55,17 +55,6 @@ def check_parent(watched: Watched, same_as_parent: bool | None) -> None:
         warnings.warn(message, UserWarning, stacklevel=4)
         return
     demand(False, f"{watched.name}.{own[0]}", rule, text, remedy)
-
-
-def overridden_attributes(cls: type, known: type) -> list[str]:
-    """Return the attributes of ``known`` that classes derived from it define anew: methods, class
-    variables, weights and private helpers alike; fields and dunder names are left out.
-    """
-    order = cls.__mro__[: cls.__mro__.index(known)]
-    names = {name for one in order for name in vars(one) if hasattr(known, name)}
-    fields = {field.name for field in dataclasses.fields(known)}
-    internal = {"_abc_impl", "_is_protocol"}
-    return sorted(n for n in names - fields - internal if not n.startswith("__"))
 
 
 def largest_difference(own: Watched, parent: Watched) -> Difference | None:
