@@ -287,3 +287,26 @@ class SwapsTooMuch(Gossip):
             xhat, root = message.payload
             state = state._replace(xhat=xhat, root=1.4 * root)
         return state
+
+
+@dataclass(frozen=True, eq=False)
+class HeavierLinks(Hybrid):
+    """Gives its neighbours another weight, which is its own choice."""
+
+    def weight(self, degree, peer_degree):
+        return 0.5 * self.epsilon
+
+
+@dataclass(frozen=True, eq=False)
+class SameWeights(Hybrid):
+    """Writes down the weight that it has anyway."""
+
+    def weight(self, degree, peer_degree):
+        return self.epsilon
+
+
+@dataclass(frozen=True, eq=False)
+class LateSwaps(Gossip):
+    """Swaps from slot 3 on."""
+
+    first_slot = 3

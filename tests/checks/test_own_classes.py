@@ -1,0 +1,60 @@
+"""Classes that define something anew run beside the built-in one that they derive from."""
+
+import pytest
+
+from netkf.algorithms.gossip import Gossip
+from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.registry import own_attributes
+from netkf.checks.check import SAME_AS_BASE, check
+from netkf.checks.evidence import BROKEN, HOLDS, NOT_PROMISED
+from netkf.scenario.reading import from_table
+from tests.checks.broken import HeavierLinks, LateSwaps, SameWeights, SwapsOnlyX
+from tests.checks.test_check import GOSSIP, RING
+
+
+def beside(table, name, folder):
+    chosen = {**table["filter"], "kind": f"tests.checks.broken:{name}"}
+    verdict = check(from_table({**table, "filter": chosen}, folder), 10, workers=1)
+    rows = [row for row in verdict.rows if row.promise == SAME_AS_BASE.statement]
+    assert len(rows) == 1
+    return verdict, rows[0]
+
+
+@pytest.mark.parametrize(
+    ("part", "own"),
+    [
+        (Gossip(), []),
+        (Hybrid(epsilon=0.3), []),
+        (HeavierLinks(epsilon=0.3), ["weight"]),
+        (LateSwaps(), ["first_slot"]),
+        (SwapsOnlyX(), ["absorb"]),
+        (object(), []),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_own_attributes_are_those_that_a_class_defines_anew(part, own):
+    assert own_attributes(part) == own
+
+
+def test_own_weights_are_a_design_and_the_row_says_so(tmp_path):
+    verdict, row = beside(RING, "HeavierLinks", tmp_path)
+    assert row.verdict == NOT_PROMISED
+    assert "weight is its own" in row.assumptions
+    # Its promises are those of the filter with these weights.
+    assert bool(verdict)
+
+
+def test_weights_that_change_nothing_hold(tmp_path):
+    verdict, row = beside(RING, "SameWeights", tmp_path)
+    assert row.verdict == HOLDS
+    assert "its own: weight" in row.evidence
+    assert bool(verdict)
+    assert own_attributes(SameWeights(epsilon=0.3)) == ["weight"]
+
+
+@pytest.mark.parametrize(("name", "own"), [("LateSwaps", "first_slot"), ("SwapsOnlyX", "absorb")])
+def test_what_should_be_the_same_and_is_not_is_broken(name, own, tmp_path):
+    verdict, row = beside(GOSSIP, name, tmp_path)
+    assert row.verdict == BROKEN
+    assert own in row.evidence
+    assert not verdict
