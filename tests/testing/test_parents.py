@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from netkf import parts
+from netkf.algorithms.registry import own_attributes
 from netkf.testing import check_filter
-from netkf.testing.parents import check_parent, overridden_attributes
+from netkf.testing.parents import check_parent
 from netkf.testing.watching import Watched
 
 ADJUSTED, DEFINED, SAME = {}, {}, {}
@@ -165,6 +166,6 @@ def test_check_filter_compares_with_the_parent():
 
 
 def test_attributes_of_its_own_are_listed_without_fields_and_new_names():
-    assert overridden_attributes(OneClock, parts.Hybrid) == ["clocks", "scenario_notes"]
-    assert overridden_attributes(Averse, parts.Hybrid) == ["_pairs"]
-    assert overridden_attributes(Renamed, parts.Hybrid) == []
+    assert own_attributes(OneClock(epsilon=0.3)) == ["clocks", "scenario_notes"]
+    assert own_attributes(Averse(epsilon=0.3)) == ["_pairs"]
+    assert own_attributes(Renamed(epsilon=0.3)) == []
