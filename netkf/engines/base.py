@@ -72,6 +72,10 @@ class Engine(ABC):
     ) -> str:
         """Simulate up to the horizon and return the status, "complete" or "diverged"."""
 
+    def together(self, scenario: Scenario) -> int:
+        """The number of runs, a power of two, that are best handed out together at least."""
+        return 1
+
     def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
         """Yield the runs of consecutive ``replicas`` in order, as many at a time as suits the
         engine; each run is to the last bit what ``run`` gives for its replica.

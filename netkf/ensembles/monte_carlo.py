@@ -110,6 +110,7 @@ def monte_carlo(
         executor=executor,
         scheduler=scheduler,
         progress=progress,
+        together=chosen.together(scenario),
     )
     return ensemble_of(scenario, whole, seed, chosen.name)
 

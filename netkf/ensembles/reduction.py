@@ -38,23 +38,25 @@ def reduce_batch(batch: RunBatch) -> Reduced:
     reduced = Reduced(
         samples, np.zeros((runs, count)), np.zeros((runs, filters, 3)), np.full(runs, np.inf)
     )
-    nees, regular = np.empty((runs, count, filters)), np.ones(runs, dtype=np.bool_)
+    regular = np.ones(runs, dtype=np.bool_)
     room = NeesRoom(
         aligned((n, LANES)), aligned((n, n, LANES)), aligned((LANES,)), np.empty((n, n)),
-        np.empty((n, 1)),
+        np.empty((n, 1)), np.empty(1),
     )  # fmt: skip
-    fill_nees_of_runs(MANY, batch.error, batch.P, kept, nees, regular, room)
+    # Times and filters as one axis: samples of a run lie one after the other.
+    flat = [v.reshape(runs, count * filters, *v.shape[3:]) for v in (batch.error, batch.P, samples)]
+    fill_samples(MANY, flat[0], flat[1], kept * filters, flat[2], regular, room)
     for r in np.flatnonzero(~regular):
         # Some P is exactly singular: those that are singular up to rounding are left out as well.
-        nees[r, : kept[r]] = errors(batch.error[r, : kept[r]], batch.P[r, : kept[r]])[1]
-    given = batch.times, batch.x, batch.P, batch.error, nees, batch.lengths, batch.diverged
+        samples[r, : kept[r], :, -1] = errors(batch.error[r, : kept[r]], batch.P[r, : kept[r]])[1]
+    given = batch.times, batch.x, batch.P, batch.error, batch.lengths, batch.diverged
     fill_reduced(*given, batch.exact_errors, *reduced)
     return reduced
 
 
 class NeesRoom(NamedTuple):
     """Scratch: the error (n, L), P and its factor (n, n, L) and NEES (L,) of L samples, of one
-    sample ``factor`` (n, n) and ``solved`` (n, 1).
+    sample ``factor`` (n, n), ``solved`` (n, 1) and NEES ``alone`` (1,).
     """
 
     error: FloatArray
@@ -62,46 +64,59 @@ class NeesRoom(NamedTuple):
     nees: FloatArray
     factor: FloatArray
     solved: FloatArray
+    alone: FloatArray
 
 
 @kernel
-def fill_nees_of_runs(
+def fill_samples(
     lanes: Lanes,
     error: FloatArray,
     P: FloatArray,
     kept: np.ndarray,
-    nees: FloatArray,
+    samples: FloatArray,
     regular: np.ndarray,
     room: NeesRoom,
 ) -> None:
-    """Write NEES (R, T, F) of the ``kept`` samples (R,) of each run, and whether all its P are
-    regular (R,); see ``fill_nees``.
+    """Write the samples (R, K, 2 u + 1) of K errors (R, K, n) and P (R, K, n, n) of each run, zeros
+    behind those that are ``kept`` (R,), and whether all its P are regular (R,); see ``fill_nees``.
     """
-    filters, n = error.shape[2:]
+    last = samples.shape[2] - 1
     for r in range(len(kept)):
         # L samples at a time, over times and filters alike.
-        samples = kept[r] * filters
-        for first in range(0, samples, len(lanes)):
-            count = min(len(lanes), samples - first)
+        for first in range(0, kept[r], len(lanes)):
+            count = min(len(lanes), kept[r] - first)
             for q in range(count):
-                t, f = (first + q) // filters, (first + q) % filters
-                for i in range(n):
-                    room.error[i, q] = error[r, t, f, i]
-                    for j in range(i + 1):
-                        room.P[i, j, q] = P[r, t, f, i, j]
+                fill_sample(error, P, r, first + q, q, samples, room)
             fine = nees_of_lanes(lanes, room)
             for q in range(count):
-                t, f = (first + q) // filters, (first + q) % filters
-                nees[r, t, f] = room.nees[q]
+                samples[r, first + q, last] = room.nees[q]
             # Singular or broken: sample by sample, with a choice of pivots.
             if not fine:
-                for q in range(count):
-                    t, f = (first + q) // filters, (first + q) % filters
-                    some = slice(f, f + 1)
-                    if not fill_nees(
-                        error[r, t, some], P[r, t, some], nees[r, t, some], room.factor, room.solved
-                    ):
+                for k in range(first, first + count):
+                    one, matrix = error[r, k : k + 1], P[r, k : k + 1]
+                    if not fill_nees(one, matrix, room.alone, room.factor, room.solved):
                         regular[r] = False
+                    samples[r, k, last] = room.alone[0]
+        for k in range(kept[r], samples.shape[1]):
+            for column in range(last + 1):
+                samples[r, k, column] = 0.0
+
+
+@kernel(inlined=True)
+def fill_sample(
+    error: FloatArray, P: FloatArray, r: int, k: int, q: int, out: FloatArray, room: NeesRoom
+) -> None:
+    """Write the columns of sample ``k`` of run ``r`` but NEES, and put it into lane ``q``."""
+    n = error.shape[2]
+    half, column = n * (n + 1) // 2, 0
+    for i in range(n):
+        e = error[r, k, i]
+        room.error[i, q] = e
+        for j in range(i, n):
+            entry = P[r, k, i, j]
+            room.P[j, i, q] = out[r, k, column] = entry
+            out[r, k, half + column] = e * error[r, k, j]
+            column += 1
 
 
 @kernel(inlined=True)
@@ -130,7 +145,6 @@ def fill_reduced(
     x: FloatArray,
     P: FloatArray,
     error: FloatArray,
-    nees: FloatArray,
     lengths: np.ndarray,
     diverged: np.ndarray,
     exact: bool,
@@ -139,44 +153,40 @@ def fill_reduced(
     averages: FloatArray,
     rounding_from: FloatArray,
 ) -> None:
-    """Fill the arrays of Reduced from those of a RunBatch and its NEES (R, T, F)."""
+    """Fill the arrays of Reduced from those of a RunBatch and its samples."""
     n = P.shape[4]
     for r in range(len(lengths)):
         kept = lengths[r] - 1 if diverged[r] else lengths[r]
-        for t in range(samples.shape[1]):
-            if t < kept:
-                size[r, t] = 1.0
-                fill_sample(P, error, nees, r, t, samples)
-                continue
-            for f in range(samples.shape[2]):
-                for column in range(samples.shape[3]):
-                    samples[r, t, f, column] = 0.0
+        for t in range(kept):
+            size[r, t] = 1.0
         for t in range(lengths[r]):
-            if is_blurred(x, P, error, r, t, exact):
+            if not is_clear(x, P, error, r, t, exact) and is_blurred(x, P, error, r, t, exact):
                 rounding_from[r] = times[t]
                 break
         average_samples(times, samples, r, n, kept, diverged[r], rounding_from[r], averages)
 
 
 @kernel(inlined=True)
-def fill_sample(
-    P: FloatArray, error: FloatArray, nees: FloatArray, r: int, t: int, out: FloatArray
-) -> None:
-    """Write the columns (F, 2 u + 1) of sample ``t`` of run ``r``."""
-    n = error.shape[3]
-    half = n * (n + 1) // 2
-    for f in range(nees.shape[2]):
-        column = 0
+def is_clear(x: FloatArray, P: FloatArray, error: FloatArray, r: int, t: int, exact: bool) -> bool:
+    """Return True if sample ``t`` of run ``r`` is surely not blurred, which squares tell without a
+    root; arrays as in ``is_blurred``.
+    """
+    filters, n = error.shape[2:]
+    largest, least = 0.0, np.inf
+    # A nan is no number here: what is blurred is not decided by it either.
+    for f in range(filters):
         for i in range(n):
-            e = error[r, t, f, i]
-            for j in range(i, n):
-                out[r, t, f, column] = P[r, t, f, i, j]
-                out[r, t, f, half + column] = e * error[r, t, f, j]
-                column += 1
-        out[r, t, f, 2 * half] = nees[r, t, f]
+            variance = P[r, t, f, i, i]
+            least = variance if variance < least else least
+    for f in range(filters if exact else 1):
+        for i in range(n):
+            value = abs(error[r, t, f, i]) if exact else abs(x[r, t, i])
+            largest = value if value > largest else largest
+    bound = ROUNDING * BLUR * largest
+    return bool(least < np.inf and bound * bound < 0.5 * least)
 
 
-@kernel(inlined=True)
+@kernel
 def is_blurred(
     x: FloatArray, P: FloatArray, error: FloatArray, r: int, t: int, exact: bool
 ) -> bool:
@@ -195,10 +205,6 @@ def is_blurred(
                 square += error[r, t, f, i] * error[r, t, f, i]
                 for j in range(n):
                     given = given or not np.isnan(P[r, t, f, i, j])
-    # Most samples are far from it, which squares tell without a root; nan goes on.
-    bound = ROUNDING * BLUR * largest
-    if given and bound * bound < 0.5 * least:
-        return False
     if not given:
         # The filter gives no covariance: the errors themselves show their size.
         broken, least = np.isnan(square) or np.isnan(largest), square / (filters * n)
@@ -232,14 +238,15 @@ def average_samples(
     last = clear if diverged and clear > first else kept
     for t in range(first, kept):
         for f in range(out.shape[1]):
-            column = 0
+            column, square, trace = 0, 0.0, 0.0
             for i in range(n):
-                if t < last:
-                    out[r, f, 1] += samples[r, t, f, column]
-                if t < clear:
-                    out[r, f, 0] += samples[r, t, f, half + column]
+                trace += samples[r, t, f, column]
+                square += samples[r, t, f, half + column]
                 column += n - i
+            if t < last:
+                out[r, f, 1] += trace
             if t < clear:
+                out[r, f, 0] += square
                 out[r, f, 2] += samples[r, t, f, 2 * half]
     for f in range(out.shape[1]):
         out[r, f, 0] /= clear - first

@@ -45,6 +45,7 @@ def replicate_blocks(
     progress: Progress | None = None,
     first: int = 0,
     block: int | None = None,
+    together: int = LANES,
     known: Mapping[int, Callable[[], Any]] | None = None,
     received: Callable[[int, Any], Any] | None = None,
 ) -> Any:
@@ -62,10 +63,11 @@ def replicate_blocks(
     ``executor`` of concurrent.futures, or by the Dask ``scheduler`` at an address; a ``pool`` of
     make_pool stands for all of them, and is closed at the end. ``seed`` defaults to the scenario's.
 
-    ``block`` is the number of replicas handed out together, a power of two; by default the pool
-    chooses. With ``block``, blocks are numbered from 0; those that are ``known`` are not done again
-    but called for, and ``received(number, result)`` sees each of the others when it comes and
-    returns what to merge.
+    ``together`` replicas of a scenario in slots, a power of two, are one block at least where
+    blocks are done here. ``block`` is the number of replicas handed out together, a power of two;
+    by default the pool chooses. With ``block``, blocks are numbered from 0; those that are
+    ``known`` are not done again but called for, and ``received(number, result)`` sees each of the
+    others when it comes and returns what to merge.
 
     Raises ScenarioError for arguments that are wrong, EngineError where workers die again and again
     or a plugged-in class fails, and what ``task`` raises.
@@ -80,7 +82,7 @@ def replicate_blocks(
     try:
         job = Job(scenario, task, seed, first, 0, runs, block or 0)
         whole = _gathered(
-            pool, job, merge, known or {}, received or _as_it_came, progress or _quiet
+            pool, job, together, merge, known or {}, received or _as_it_came, progress or _quiet
         )
         ended = True
     finally:
@@ -104,6 +106,7 @@ def _quiet(done: int, wanted: int) -> None:
 def _gathered(
     pool: Pool,
     job: Job,
+    together: int,
     merge: Merge,
     known: Mapping[int, Callable[[], Any]],
     received: Callable[[int, Any], Any],
@@ -120,12 +123,14 @@ def _gathered(
 
     for number in sorted(known):
         take(job._replace(start=number * job.size), known[number]())
-    for block, result in _completed(pool, _blocks(pool, job, known)):
+    for block, result in _completed(pool, _blocks(pool, job, together, known)):
         take(block, received(block.start // block.size, result))
     return tree.result()
 
 
-def _blocks(pool: Pool, job: Job, known: Mapping[int, Callable[[], Any]]) -> Iterator[Job]:
+def _blocks(
+    pool: Pool, job: Job, together: int, known: Mapping[int, Callable[[], Any]]
+) -> Iterator[Job]:
     """Yield the blocks that are not known, in order; the pool chooses sizes as it is asked."""
     if job.size:
         for number in range(-(-job.stop // job.size)):
@@ -137,7 +142,7 @@ def _blocks(pool: Pool, job: Job, known: Mapping[int, Callable[[], Any]]) -> Ite
         size = pool.next_size(job.stop - start, job.stop)
         # Runs in slots are side by side in lanes: fewer of them take as long.
         if pool.ahead == 1 and isinstance(job.scenario, Scenario) and job.scenario.slotted:
-            size = max(size, LANES)
+            size = max(size, together)
         if start:
             size = min(size, start & -start)  # a block is a node of the tree
         yield job._replace(start=start, size=size)

@@ -293,9 +293,7 @@ class Hearing(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Columns of the events of one run; how many there are at each sample (T,), and of each kind,
-    (1, KINDS).
-    """
+    """Columns of the events of one run, and how many there are at each sample (T,)."""
 
     t: FloatArray
     kind: np.ndarray
@@ -305,7 +303,6 @@ class Rows(NamedTuple):
     phase: np.ndarray
     age: FloatArray
     at_sample: np.ndarray
-    counts: np.ndarray
 
 
 class Drawn(NamedTuple):
@@ -334,8 +331,7 @@ class Moment(NamedTuple):
 def note(
     rows: Rows, m: Moment, kind: int, node: int, peer: int, message: int, age: float, at: int
 ) -> int:
-    """Count one event and write it into row ``at``; return the next row."""
-    rows.counts[0, kind] += 1
+    """Write one event into row ``at``; return the next row."""
     rows.t[at], rows.kind[at], rows.node[at], rows.peer[at] = m.t, kind, node, peer
     rows.message[at], rows.phase[at], rows.age[at] = message, m.phase, age
     return at + 1

@@ -302,18 +302,16 @@ class SlotRuns:
         setup = self.setup
         # Space for the largest number of rows.
         size = setup.rows_of(len(block.times.start))
-        places: Any = [np.empty(size, dtype=EVENT[name]) for name in ROW_COLUMNS]
+        table = np.empty(size, dtype=EVENT)
+        # Kernels write the columns where the records have them.
+        places: Any = [table[name] for name in ROW_COLUMNS]
         at_sample = np.zeros(len(block.sampled), dtype=np.int64)
-        rows = Rows._make([*places, at_sample, self.counts])
+        rows = Rows._make([*places, at_sample])
         count = make_rows(
             setup.stages, block.times, self._channels, self._hearing(), block.drawn,
             setup.algorithm.pairwise, rows,
         )  # fmt: skip
-        # Kernels fill plain columns, which become records here.
-        table = np.empty(count, dtype=EVENT)
-        for name, column in zip(ROW_COLUMNS, places, strict=True):
-            table[name] = column[:count]
-        return table, at_sample
+        return table[:count], at_sample
 
     def count_events(self, block: SlotBlock) -> None:
         """Add the events of a block to ``counts``."""
