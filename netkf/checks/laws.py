@@ -19,7 +19,7 @@ from netkf.checks.statistics import (
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
-LAW_TOLERANCE, NEES_TOLERANCE = 0.2, 0.25
+LAW_TOLERANCE, NEES_TOLERANCE = 0.25, 0.3
 """Tolerated distance of distribution functions, and relative difference of the mean NEES from n."""
 GROWTH = 4.0
 """Factor by which a covariance may still be larger at the end than at half of the horizon."""

@@ -58,7 +58,7 @@ def _clock_labels(scenario: Scenario) -> list[str]:
 
 def _rates(samples: PartSamples, level: float) -> Finding:
     """Compare the ticks of all runs with the rates, all clocks together and one by one."""
-    scenario, counts = samples.scenario, samples.ticks.ticks
+    scenario, counts = samples.scenario, samples.ticks.ticks.sum(axis=1)
     expected = clock_rates(scenario) * scenario.horizon
     poisson, found = _is_poisson(scenario), counts.sum(axis=0).astype(float)
     intervals = []
@@ -123,15 +123,16 @@ def _gaps(samples: PartSamples, level: float) -> Finding:
 
 def _clocks_apart(samples: PartSamples, level: float) -> Finding:
     """Compare the spread of all ticks of a run with that of independent Poisson clocks."""
-    counts, scenario = samples.ticks.ticks, samples.scenario
-    mean = float((clock_rates(scenario) * scenario.horizon).sum())
+    scenario, ticks = samples.scenario, samples.ticks.ticks
+    counts = ticks.reshape(-1, ticks.shape[2])
+    mean = float((clock_rates(scenario) * scenario.horizon).sum()) / ticks.shape[1]
     values = counts.sum(axis=1) - mean
     # A squared Poisson count has a little more spread than a squared normal one.
     freedom = len(values) / (1.0 + 0.5 / mean)
     ratio = scale_interval(freedom * float((values**2).mean()) / mean, freedom, level / 2.0)
     apart = deviation_interval(1.0, ratio)
-    intervals = [(apart, "variance of all ticks of a run over that of independent clocks")]
-    pairs = _largest_correlation(counts, level / 2.0)
+    intervals = [(apart, "variance of all ticks at once over that of independent clocks")]
+    pairs = _largest_correlation(counts - counts.mean(axis=0), level / 2.0)
     if pairs is not None:
         value, clocks = pairs
         labels = _clock_labels(scenario)
@@ -141,23 +142,6 @@ def _clocks_apart(samples: PartSamples, level: float) -> Finding:
 
 MAX_CLOCKS = 60
 """Clocks of which all pairs are compared."""
-
-
-def _largest_correlation(
-    counts: np.ndarray, level: float
-) -> tuple[Interval, tuple[int, int]] | None:
-    """Return an interval for the largest correlation of two columns of counts (R, E)."""
-    some = counts[:, :MAX_CLOCKS].astype(float)
-    kept = np.flatnonzero((some.mean(axis=0) >= 5.0) & (some.var(axis=0) > 0.0))
-    if len(kept) < 2 or len(some) < 30:
-        return None
-    related = np.corrcoef(some[:, kept], rowvar=False)
-    upper = np.triu_indices(len(kept), 1)
-    worst = int(np.argmax(np.abs(related[upper])))
-    value = float(related[upper][worst])
-    found = correlation_interval(value, float(len(some)), level / len(upper[0]))
-    i, j = kept[upper[0][worst]], kept[upper[1][worst]]
-    return deviation_interval(0.0, found), (int(i), int(j))
 
 
 def _stated_loss(scenario: Scenario) -> Any:
@@ -181,7 +165,8 @@ def _direction_label(scenario: Scenario, k: int) -> str:
 def _losses(samples: PartSamples, level: float) -> Finding:
     """Compare lost shares with the stated ones, all directions together and one by one."""
     scenario, fates = samples.scenario, samples.fates
-    q, sent, lost = loss_probabilities(scenario), fates.sent, fates.lost
+    q = loss_probabilities(scenario)
+    sent, lost = fates.sent.sum(axis=1), fates.lost.sum(axis=1)
     used = np.flatnonzero(sent.sum(axis=0) > 0)
     intervals = [(_loss_interval(scenario, sent, lost, q, used, level / 2.0), "all directions")]
     share = level / (2.0 * max(len(used), 1))
@@ -226,7 +211,7 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
     do not share one fate, and between links.
     """
     scenario, fates = samples.scenario, samples.fates
-    q, sent = loss_probabilities(scenario), fates.sent
+    q, sent = loss_probabilities(scenario), fates.sent.sum(axis=1)
     pairs = np.maximum(sent - 1, 0)
     jobs = [(fates.repeated - pairs * q**2, pairs, q * (1.0 - q), "a message and the one before")]
     if _directions_apart(scenario):
@@ -290,8 +275,11 @@ def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str
     for k, (i, j) in enumerate(scenario.topology.directions):
         seen.setdefault((min(i, j), max(i, j)), k)
     columns = np.array(list(seen.values()))
-    excess = (fates.lost - fates.sent * loss_probabilities(scenario))[:, columns]
-    found = _largest_correlation_of(excess, level / 2.0)
+    excess = (fates.lost - fates.sent * loss_probabilities(scenario)).reshape(
+        -1, fates.sent.shape[2]
+    )
+    excess = excess[:, columns]
+    found = _largest_correlation(excess, level / 2.0)
     if found is None:
         return []
     interval, (a, b) = found
@@ -318,11 +306,11 @@ def _mean_correlation(ratio: Interval, links: int) -> Interval:
     return Interval(value, low - 0.02 * scale, high + 0.02 * scale, ratio.detectable * scale)
 
 
-def _largest_correlation_of(
+def _largest_correlation(
     values: FloatArray, level: float
 ) -> tuple[Interval, tuple[int, int]] | None:
-    """Return an interval for the largest correlation of two columns (R, L), by the spread of their
-    products over the runs.
+    """Return an interval for the largest correlation of two columns of values (K, L) of mean 0, by
+    the spread of their products over the K independent rows.
     """
     some = values[:, :MAX_CLOCKS]
     kept = np.flatnonzero(some.var(axis=0) > 0.0)

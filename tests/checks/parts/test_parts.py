@@ -76,6 +76,8 @@ CLOCKS = {
     },
     "filter": {"kind": "hybrid", "epsilon": 0.3},
 }
+# Without increments, which take most of the time in the engine that runs classes of users.
+TICKS = {**CLOCKS, "sensors": CLOCKS["sensors"][1:]}
 BURSTS = {"kind": "gilbert-elliott", "mean_loss": 0.3, "mean_burst": 4.0}
 GAMMA = {"kind": "renewal", "distribution": "gamma", "shape": 3.0, "mean": 0.5}
 HEALTHY = {
@@ -83,9 +85,9 @@ HEALTHY = {
     "bursts": (SLOTS, {"network.channel.loss": BURSTS}),
     "maximal": (SLOTS, {"network.activation": {"kind": "matching", "protocol": "maximal"}}),
     "clocks": (CLOCKS, {}),
-    "one fate": (CLOCKS, {"network.channel.symmetric": True}),
-    "gamma": (CLOCKS, {"network.activation": GAMMA}),
-    "nodes": (CLOCKS, {"network.activation": {"kind": "poisson", "rate": 2.0, "at": "nodes"}}),
+    "one fate": (TICKS, {"network.channel.symmetric": True}),
+    "gamma": (TICKS, {"network.activation": GAMMA}),
+    "nodes": (TICKS, {"network.activation": {"kind": "poisson", "rate": 2.0, "at": "nodes"}}),
 }
 
 
@@ -121,12 +123,12 @@ WRONG = {
     "Biased": (SLOTS, "sensors[0]", "readings have no bias"),
     "Louder": (SLOTS, "sensors[0]", "noises of the sensors have their covariance"),
     "Coloured": (SLOTS, "sensors[0]", "noises of the sensors are white and independent"),
-    "Slower": (CLOCKS, "network.activation", "clocks tick at the rates"),
-    "OneSlower": (CLOCKS, "network.activation", "clocks tick at the rates"),
-    "Even": (CLOCKS, "network.activation", "gaps between ticks are"),
-    "Lossier": (CLOCKS, "network.channel.loss", "messages are lost as often as"),
-    "OneWay": (CLOCKS, "network.channel.loss", "messages are lost as often as"),
-    "Sticky": (CLOCKS, "network.channel.loss", "messages are lost independently"),
+    "Slower": (TICKS, "network.activation", "clocks tick at the rates"),
+    "OneSlower": (TICKS, "network.activation", "clocks tick at the rates"),
+    "Even": (TICKS, "network.activation", "gaps between ticks are"),
+    "Lossier": (TICKS, "network.channel.loss", "messages are lost as often as"),
+    "OneWay": (TICKS, "network.channel.loss", "messages are lost as often as"),
+    "Sticky": (TICKS, "network.channel.loss", "messages are lost independently"),
     "Preferring": (SLOTS, "network.activation", "links are paired as often"),
 }
 

@@ -122,5 +122,5 @@ class Preferring(Matching):
     def draw(self, topology, random):
         pairs = super().draw(topology, random)
         return (
-            [topology.links[1]] if pairs == [topology.links[0]] and random.random() < 0.1 else pairs
+            [topology.links[1]] if pairs == [topology.links[0]] and random.random() < 0.4 else pairs
         )
