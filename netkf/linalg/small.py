@@ -112,16 +112,9 @@ def solve(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 @kernel
-def copy_vector(target: FloatArray, source: FloatArray) -> None:
-    """Write a vector into another of its size."""
-    # A compiled assignment of arrays brings messages about shapes: seconds of compiling.
-    for i in range(len(source)):
-        target[i] = source[i]
-
-
-@kernel
 def copy_matrix(target: FloatArray, source: FloatArray) -> None:
     """Write a matrix into another of its size."""
+    # A compiled assignment of arrays brings messages about shapes: seconds of compiling.
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]

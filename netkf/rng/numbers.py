@@ -74,15 +74,6 @@ def _tail(states: np.ndarray, k: int, negative: bool) -> float:
 
 
 @kernel
-def fill_normals(
-    states: np.ndarray, k: int, ziggurat: NormalZiggurat, out: FloatArray, count: int
-) -> None:
-    """Write the next ``count`` standard normal numbers of stream ``k`` into ``out`` (>= count,)."""
-    for i in range(count):
-        out[i] = next_normal(states, k, ziggurat)
-
-
-@kernel
 def next_half(states: np.ndarray, k: int) -> Any:
     """The next 32 bits of stream ``k`` of states (K, 6): the lower half of a word, then the upper
     half.

@@ -50,9 +50,7 @@ def test_a_singular_matrix_has_no_solution():
 
 
 def test_copies():
-    a, b = drawn(1, (2, 3), 3)
-    target, vector = np.zeros((2, 3)), np.zeros(3)
+    (a,) = drawn(1, (2, 3))
+    target = np.zeros((2, 3))
     small.copy_matrix(target, a)
-    small.copy_vector(vector, b)
     assert np.array_equal(target, a)
-    assert np.array_equal(vector, b)

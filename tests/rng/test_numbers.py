@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from netkf.rng.draws import StreamBatch
-from netkf.rng.numbers import fill_normals, next_integer, normal_ziggurat, shuffle
+from netkf.rng.normals import fill_normals_of_all
+from netkf.rng.numbers import next_integer, normal_ziggurat, shuffle
 from netkf.rng.streams import Streams
 
 
@@ -19,7 +20,7 @@ def test_normals_with_the_tails_of_the_ziggurat():
     """A million numbers reach the lowest layer some 260 times and wedges 7000 times."""
     states, random = both(5)
     drawn = np.empty(1_000_000)
-    fill_normals(states, 0, normal_ziggurat(), drawn, len(drawn))
+    fill_normals_of_all(states, normal_ziggurat(), drawn[None])
     np.testing.assert_array_equal(drawn, random.standard_normal(len(drawn)))
     assert (np.abs(drawn) > 3.7).any()
 

@@ -7,7 +7,6 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, UNKNOWN_LAW, AssumptionRow, is_recorded
 from netkf.theory.common.plant_assumptions import start_rows
@@ -29,11 +28,6 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
         _arrival_row(scenario),
         *start_rows(scenario, "P_i consistent from the start; D does without"),
     ]
-
-
-def weight_matrix(scenario: Scenario) -> FloatArray:
-    """Return the weights (N, N) of D (8) as a dense matrix, see :func:`sparse_weights`."""
-    return np.asarray(sparse_weights(scenario).toarray())
 
 
 def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
