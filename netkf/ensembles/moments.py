@@ -82,16 +82,23 @@ def merge_leaves(
     """Write mean and M2 (S, C) of R observations (R, S, C), merged in the binary tree over R; size
     (R, S) and values are overwritten, ``work`` (R, 1, C) is scratch.
     """
-    runs, rows, columns = values.shape
     # Row by row, so that the values of a row are still close by when they are merged again.
-    for s in range(rows):
-        for r in range(runs):
-            for c in range(columns):
-                work[r, 0, c] = 0.0
-        stride = 1
-        while stride < runs:
-            for a in range(0, runs - stride, 2 * stride):
-                merge_pair(size, values, work, a, a + stride, s, 0)
-            stride *= 2
-        for c in range(columns):
+    for s in range(values.shape[1]):
+        merge_row(size, values, work, s)
+        for c in range(values.shape[2]):
             mean[s, c], M2[s, c] = values[0, s, c], work[0, 0, c]
+
+
+@kernel
+def merge_row(size: FloatArray, values: FloatArray, work: FloatArray, s: int) -> None:
+    """Merge row ``s`` of R observations into the first, whose M2 is that of ``work``; arrays as in
+    ``merge_leaves``.
+    """
+    runs, stride = len(values), 1
+    for r in range(runs):
+        for c in range(values.shape[2]):
+            work[r, 0, c] = 0.0
+    while stride < runs:
+        for a in range(0, runs - stride, 2 * stride):
+            merge_pair(size, values, work, a, a + stride, s, 0)
+        stride *= 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -88,10 +88,14 @@ def block_statistics(
     """
     tree, done = MergeTree(merge), 0
     for batch, fingerprint, kept in _batches(scenario, seed, replicas, engine, traces):
-        values = run_values(batch, scenario)
-        for level, k in aligned_pieces(done, done + len(batch)):
-            first = (k << level) - done
-            piece = merge_runs(values, slice(first, first + (1 << level)))
+        pieces = list(aligned_pieces(done, done + len(batch)))
+        firsts = [(k << level) - done for level, k in pieces]
+        parts = [
+            slice(at, at + (1 << level)) for at, (level, _) in zip(firsts, pieces, strict=True)
+        ]
+        values = run_values(batch, scenario, parts)
+        for number, (level, k) in enumerate(pieces):
+            piece = merge_runs(values, number)
             tree.add(k, piece._replace(fingerprint=fingerprint, traces=kept), level)
         done += len(batch)
     whole: RunStatistics = tree.result()
@@ -127,15 +131,15 @@ def _recorded_run(
 
 
 class RunValues(NamedTuple):
-    """Values of R runs that statistics are over.
+    """Values of R runs that statistics are over, and of K ``pieces`` of them.
 
-    ``samples`` (R, T, F, 2 u + 1) of F filters with ``size`` (R, T) 1 or 0, each ``shown`` by so
-    many nodes (N where the filter is pooled, else 1); ``averages`` (R, N + 1, 3); ``messages``
-    (R, 5); ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
+    ``samples`` of each piece, the moments (T, F (2 u + 1)) of F filters, each ``shown`` by so many
+    nodes (N where the filter is pooled, else 1); ``averages`` (R, N + 1, 3); ``messages`` (R, 5);
+    ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
     """
 
-    samples: FloatArray
-    size: FloatArray
+    pieces: Sequence[slice]
+    samples: Sequence[Moments]
     shown: int
     averages: FloatArray
     messages: FloatArray
@@ -145,15 +149,15 @@ class RunValues(NamedTuple):
     sums: dict[str, FloatArray]
 
 
-def run_values(batch: RunBatch, scenario: Scenario) -> RunValues:
+def run_values(batch: RunBatch, scenario: Scenario, pieces: Sequence[slice]) -> RunValues:
     """Values of the runs of a batch, for every node where the filter is pooled."""
-    reduced, nodes = reduce_batch(batch), len(scenario.nodes)
-    shown, averages = nodes // reduced.samples.shape[2], reduced.averages
+    reduced, nodes = reduce_batch(batch, pieces), len(scenario.nodes)
+    shown, averages = nodes // batch.error.shape[2], reduced.averages
     if shown > 1:
         averages = np.repeat(averages, nodes, axis=1)
     return RunValues(
+        pieces,
         reduced.samples,
-        reduced.size,
         shown,
         np.concatenate([averages, _mean_of_nodes(averages)], axis=1),
         count_messages(batch.counts, scenario.slotted),
@@ -171,9 +175,10 @@ def _mean_of_nodes(averages: FloatArray) -> FloatArray:
     return np.asarray(total / averages.shape[1])
 
 
-def merge_runs(values: RunValues, runs: slice) -> RunStatistics:
-    """Statistics of some of the runs, merged by the tree over them; overwrites their values."""
-    samples, averages, messages = values.samples[runs], values.averages[runs], values.messages[runs]
+def merge_runs(values: RunValues, piece: int) -> RunStatistics:
+    """Statistics of one piece of the runs, merged by the tree over them."""
+    runs, found = values.pieces[piece], values.samples[piece]
+    averages, messages = values.averages[runs], values.messages[runs]
     count, one = len(messages), np.ones((len(messages), 1))
     conserved = {
         name: (
@@ -182,14 +187,17 @@ def merge_runs(values: RunValues, runs: slice) -> RunStatistics:
         )
         for name, sums in values.sums.items()
     }
-    found = moments_of(samples.reshape(*samples.shape[:2], -1), values.size[runs])
     if values.shown > 1:
         # All nodes show the same filter.
         found = Moments(found.size, *(np.tile(v, values.shown) for v in (found.mean, found.M2)))
+    # Averages and messages in one call: columns do not see each other.
+    both = np.concatenate([averages.reshape(count, -1), messages], axis=1)
+    size, mean, M2 = moments_of(both[:, None], one)
+    of_averages, of_messages = slice(0, -len(MESSAGES)), slice(-len(MESSAGES), None)
     return RunStatistics(
         found,
-        moments_of(averages.reshape(count, 1, -1), one.copy()),
-        moments_of(messages.reshape(count, 1, -1), one.copy()),
+        Moments(size, mean[:, of_averages].copy(), M2[:, of_averages].copy()),
+        Moments(size.copy(), mean[:, of_messages].copy(), M2[:, of_messages].copy()),
         np.array([values.events[runs].sum(), values.diverged[runs].sum()]),
         conserved,
         float(values.rounding_from[runs].min()),
