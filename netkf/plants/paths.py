@@ -20,7 +20,6 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.local import local_vector
-from netkf.linalg.series import fill_series
 from netkf.linalg.structs import Size
 from netkf.plants.laws import GridLaws, grid_time
 from netkf.plants.transitions import Transitions
@@ -403,57 +402,102 @@ def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     # The moments of a whole piece were drawn from their exact law: no cubic is needed.
     if start == step.start and end == step.end:
         return step.moments
-    out, work = np.empty((2, n)), (np.empty(2 * n * n), np.empty(n))
     since, gap, length = start - step.start, end - start, step.end - step.start
-    path = step.x_start[None], step.cubic[None]
-    fill_seen(np.zeros(n), out, laws.to_end, laws.to_moments, since, gap, length, *path, 0, *work)
+    out, course = np.empty((2, n)), np.empty(course_shape(laws.to_end, n))
+    size = np.zeros(n)
+    path, scratch = (step.x_start[None], step.cubic[None]), np.empty(4 * n)
+    fill_course(size, course, laws.to_end, length, *path, 0, scratch)
+    fill_seen(size, out, course, since, gap, length, scratch)
     return out
+
+
+def course_shape(to_end: FloatArray, n: int) -> tuple[int, int, int]:
+    """The shape of what ``fill_course`` writes for responses ``to_end`` and n states."""
+    # The cubic has four terms, however few the response needs.
+    return max(len(to_end), 4), 2, n
+
+
+@kernel(fused=True)
+def fill_course(
+    size: Size,
+    out: FloatArray,
+    to_end: FloatArray,
+    length: float,
+    x_start: FloatArray,
+    cubic: FloatArray,
+    k: int,
+    scratch: FloatArray,
+) -> None:
+    """Write piece ``k`` of ``length`` seconds as a polynomial in the share u of the piece: (D, 2,
+    n) coefficients such that ``u sum_d u^d out[d, 0]`` is the integral of x up to there, and ``u^2
+    sum_d u^d out[d, 1]`` that of x times the share; ``scratch`` has n entries.
+    """
+    n, power = len(size), length
+    x = local_vector(size, scratch[:n])
+    for i in range(n):
+        x[i] = x_start[k, i]
+    for d in range(len(out)):
+        # Integrals of u^d and of u u^d, over the share of the piece.
+        plain, tilted = power / (d + 1), power / (d + 2)
+        for i in range(n):
+            # The response to the state at the start: exp(A s) x by powers of s = u length.
+            total = 0.0
+            if d < len(to_end):
+                for j in range(n):
+                    total += to_end[d, i * n + j] * x[j]
+            out[d, 0, i], out[d, 1, i] = plain * total, tilted * total
+        power *= length
+    for i in range(n):
+        # P_0 to P_3 of 2 u - 1, by powers of u.
+        mean, slope = length * cubic[k, 0, i], length * cubic[k, 1, i]
+        second, third = length * cubic[k, 2, i], length * cubic[k, 3, i]
+        by_power = (
+            mean - slope + second - third,
+            2.0 * slope - 6.0 * second + 12.0 * third,
+            6.0 * second - 30.0 * third,
+            20.0 * third,
+        )
+        for d in range(4):
+            out[d, 0, i] += by_power[d] / (d + 1)
+            out[d, 1, i] += by_power[d] / (d + 2)
 
 
 @kernel(fused=True)
 def fill_seen(
     size: Size,
     out: FloatArray,
-    to_end: FloatArray,
-    to_moments: FloatArray,
+    course: FloatArray,
     since: float,
     gap: float,
     length: float,
-    x_start: FloatArray,
-    cubic: FloatArray,
-    k: int,
-    responses: FloatArray,
     scratch: FloatArray,
 ) -> None:
-    """Write the moments (2, n) of x over ``gap`` seconds from ``since`` on in piece ``k`` of
-    ``length`` seconds into ``out``; ``responses`` (>= 2 n n,) and ``scratch`` (n,) are scratch.
+    """Write the moments (2, n) of x over ``gap`` seconds from ``since`` on in a piece of ``length``
+    seconds into ``out``; ``course`` is what ``fill_course`` wrote for it, ``scratch`` has 4 n
+    entries.
     """
-    n, x = len(size), local_vector(size, scratch)
+    n = len(size)
+    early, early_tilted = local_vector(size, scratch[:n]), local_vector(size, scratch[n : 2 * n])
+    late, late_tilted = (
+        local_vector(size, scratch[2 * n : 3 * n]),
+        local_vector(size, scratch[3 * n : 4 * n]),
+    )
     for i in range(n):
-        x[i] = x_start[k, i]
-    # x(since) by the response alone; the cubic below contains all that noise adds since the piece
-    # began.
-    if since > 0.0:
-        fill_series(responses, n * n, to_end, to_end, to_end.shape[1] - 1, since)
+        early[i] = early_tilted[i] = late[i] = late_tilted[i] = 0.0
+    # Both integrals up to the start and up to the end of the gap, by Horner's rule.
+    first, share = since / length, gap / length
+    last = first + share
+    for d in range(len(course) - 1, -1, -1):
         for i in range(n):
-            x[i] = 0.0
-            for j in range(n):
-                x[i] += responses[i * n + j] * x_start[k, j]
-    # P_2 and P_3 of the piece over the gap, at z = middle + share v with v in [-1, 1].
-    share, middle = gap / length, 2.0 * (since + 0.5 * gap) / length - 1.0
-    square, part = middle * middle, share * share
-    second = 1.5 * square + 0.5 * part - 0.5
-    third = middle * (2.5 * (square + part) - 1.5)
-    tilted = share * (2.5 * square + 0.5 * part - 0.5)
-    last = to_moments.shape[1] - 1
-    fill_series(responses, 2 * n * n, to_moments, to_moments, last, gap)
-    # Response to x over the gap, and the moments of the cubic.
+            plain, tilted = course[d, 0, i], course[d, 1, i]
+            early[i] = plain + first * early[i]
+            early_tilted[i] = tilted + first * early_tilted[i]
+            late[i] = plain + last * late[i]
+            late_tilted[i] = tilted + last * late_tilted[i]
+    # P_1 of the gap is (u - middle) times 2 over its share of the piece.
+    middle = first + 0.5 * share
     for i in range(n):
-        plain = cubic[k, 0, i] + middle * cubic[k, 1, i]
-        plain += second * cubic[k, 2, i] + third * cubic[k, 3, i]
-        slope = share / 3.0 * cubic[k, 1, i]
-        slope += share * middle * cubic[k, 2, i] + tilted * cubic[k, 3, i]
-        out[0, i], out[1, i] = gap * plain, gap * slope
-        for j in range(n):
-            out[0, i] += responses[i * n + j] * x[j]
-            out[1, i] += responses[(n + i) * n + j] * x[j]
+        plain = last * late[i] - first * early[i]
+        tilted = last * last * late_tilted[i] - first * first * early_tilted[i]
+        out[0, i] = plain
+        out[1, i] = 2.0 / share * (tilted - middle * plain)

@@ -153,7 +153,8 @@ def begin(state: Simulation, batch: BatchArrays, run: int, ziggurat: NormalZiggu
     reset_filters(state, batch)
     reset_messages(state)
     # Positions in the arrays of draws: the run begins at the first frame, piece, tick and sample.
-    state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
+    state.frame_at = state.piece = state.course = state.grid_at = state.wake_at = 0
+    state.instant_at = 0
     state.tick_at = state.probe_at = state.row = state.samples = 0
     for kind in range(len(state.counts)):
         state.counts[kind] = 0

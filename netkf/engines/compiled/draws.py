@@ -115,14 +115,12 @@ class Paths:
             last=ends[block.step],
             grid=ends[ends < self._horizon] if self._senses else np.empty(0),
             to_end=laws.to_end,
-            to_moments=laws.to_moments,
         )
 
 
 def no_path(n: int) -> PathBlock:
     """Return one piece without an end, for runs in which nothing senses increments."""
     rows = {name: np.zeros((1, n)) for name in ("x_start", "x_stop")}
-    responses = {name: np.zeros((1, 1)) for name in ("to_end", "to_moments")}
     return PathBlock(
         end=math.inf,
         start=np.zeros(1),
@@ -133,7 +131,7 @@ def no_path(n: int) -> PathBlock:
         last=np.array([math.inf]),
         grid=np.empty(0),
         **rows,
-        **responses,
+        to_end=np.zeros((1, 1)),
     )
 
 

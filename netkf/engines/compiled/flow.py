@@ -67,7 +67,17 @@ from netkf.trace.schema import EVENT
 FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 AT_START = (
-    *("frame_at", "piece", "grid_at", "wake_at", "instant_at", "tick_at", "probe_at", "row"),
+    *(
+        "frame_at",
+        "piece",
+        "course",
+        "grid_at",
+        "wake_at",
+        "instant_at",
+        "tick_at",
+        "probe_at",
+        "row",
+    ),
     *("free", "flying", "order", "receivers", "absorbing", "samples"),
 )
 """Numbers of a Simulation that are 0 when a run begins."""
@@ -199,7 +209,8 @@ class Workspace:
         pool = self._pool[0]
         # All messages are free, in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
-        scratch, flow, update = scratch_arrays(start.table, start.gains, instants)
+        path = draws.path()
+        scratch, flow, update = scratch_arrays(start.table, start.gains, instants, path.to_end)
         n = start.xhat.shape[1]
         # A class for this n, so that loops over few states are unrolled.
         state: Simulation = Simulation.of_size(n)(
@@ -219,7 +230,7 @@ class Workspace:
             waiting=self._waiting,
             instants=instants,
             sensing=draws.sensing,
-            path=draws.path(),
+            path=path,
             ticks=Ticks(**draws.window()._asdict()),
             frames=draws.states.frame_times,
             probes=self._probes,
@@ -304,7 +315,7 @@ class FlowRun:
         elif wanted == WANT_STEPS:
             state.path = self._draws.path()
             # Positions count from the first piece and grid point of the new block.
-            state.piece = state.grid_at = 0
+            state.piece = state.course = state.grid_at = 0
         elif wanted == WANT_CUTS:
             self._draws.more_cuts()
         elif wanted == WANT_MESSAGES:

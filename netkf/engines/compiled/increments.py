@@ -11,7 +11,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import copy_matrix
 from netkf.linalg.structs import Size
-from netkf.plants.paths import fill_seen
+from netkf.plants.paths import fill_course, fill_seen
 from netkf.plants.sensors import divide, fill_reading
 
 
@@ -59,19 +59,19 @@ def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float)
     if now == start and end == stop:
         copy_matrix(scratch.state_moments, path.moments[piece])
         return
+    # The same for all nodes that read a part of the piece.
+    if state.course != piece + 1:
+        state.course = piece + 1
+        x, cubic, course = path.x_start, path.cubic, scratch.course
+        fill_course(state.size, course, path.to_end, stop - start, x, cubic, piece, scratch.values)
     fill_seen(
         state.size,
         scratch.state_moments,
-        path.to_end,
-        path.to_moments,
+        scratch.course,
         now - start,
         end - now,
         stop - start,
-        path.x_start,
-        path.cubic,
-        piece,
         scratch.values,
-        scratch.x,
     )
 
 

@@ -22,6 +22,7 @@ from netkf.algorithms.models import FlowModel, first_root
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.structs import Size, Struct
+from netkf.plants.paths import course_shape
 from netkf.scenario.scenario import Scenario
 
 
@@ -72,8 +73,8 @@ class Gains(Struct):
 class Scratch(Struct):
     """Scratch arrays: moments (2 p,) and noise ``early`` (2, p) for the most increments p of any
     node, moments of x (``state_moments``) and their ``total`` (2, n), ``values`` of the longest
-    series, ``x`` (n,); a sample of at most q rows: ``y`` (q,), ``H`` (q, n),
-    ``root_R`` (q, q).
+    series, the ``course`` (D, 2, n) of x in a piece, ``x`` (n,); a sample of at most q rows: ``y``
+    (q,), ``H`` (q, n), ``root_R`` (q, q).
     """
 
     moments: FloatArray
@@ -81,6 +82,7 @@ class Scratch(Struct):
     state_moments: FloatArray
     total: FloatArray
     values: FloatArray
+    course: FloatArray
     x: FloatArray
     y: FloatArray
     H: FloatArray
@@ -130,8 +132,8 @@ class PathBlock(Struct):
 
     K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both (K, n),
     moments (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid``
-    holds the times at which sensors wake; ``to_end`` and ``to_moments`` are those of the plant's
-    laws. Where nothing senses increments there is one piece without an end.
+    holds the times at which sensors wake; ``to_end`` is that of the plant's laws. Where
+    nothing senses increments there is one piece without an end.
     """
 
     end: float
@@ -145,7 +147,6 @@ class PathBlock(Struct):
     last: FloatArray
     grid: FloatArray
     to_end: FloatArray
-    to_moments: FloatArray
 
 
 class Ticks(Struct):
@@ -183,12 +184,12 @@ class Simulation(Struct):
     (len(KINDS),) of events.
 
     ``kind`` and ``at``: see COMBINATIONS and CLOCKS; ``..._at``: next frame, point of the sensing
-    grid, node that wakes there, instant of samples, tick and probe; the ``piece`` of the path; the
-    next ``row``, and how many one event may need (``most_rows``); the first ``free`` message and
-    how many are (``free_count``, ``most_messages``); messages on the heap (``flying``) and how many
-    were put there (``order``); nodes with mail (``receivers``), of which so many are done
-    (``absorbing``) at ``mail_time``; samples not handed on yet (``samples``); messages older than
-    ``age_limit`` seconds are late.
+    grid, node that wakes there, instant of samples, tick and probe; the ``piece`` of the path and,
+    plus 1, that of ``scratch.course`` (``course``, 0: none); the next ``row``, and how many one
+    event may need (``most_rows``); the first ``free`` message and how many are (``free_count``,
+    ``most_messages``); messages on the heap (``flying``) and how many were put there (``order``);
+    nodes with mail (``receivers``), of which so many are done (``absorbing``) at ``mail_time``;
+    samples not handed on yet (``samples``); messages older than ``age_limit`` seconds are late.
     """
 
     size: Size
@@ -223,6 +224,7 @@ class Simulation(Struct):
     traced: int
     frame_at: int
     piece: int
+    course: int
     grid_at: int
     wake_at: int
     instant_at: int
@@ -318,7 +320,7 @@ def entity_records(scenario: Scenario, senders: Senders) -> tuple[np.ndarray, np
 
 
 def scratch_arrays(
-    table: FlowTable, gains: Gains, instants: Instants
+    table: FlowTable, gains: Gains, instants: Instants, to_end: FloatArray
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
     """Scratch arrays for all that is computed."""
     n, most, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
@@ -332,8 +334,9 @@ def scratch_arrays(
         early=np.zeros((2, most // 2)),
         state_moments=np.zeros((2, n)),
         total=np.zeros((2, n)),
-        # fill_seen() needs two responses (n, n).
-        values=np.zeros(max(width, 2 * n * n)),
+        # fill_seen() needs 4 n entries.
+        values=np.zeros(max(width, 4 * n)),
+        course=np.zeros(course_shape(to_end, n)),
         x=np.zeros(n),
         y=np.zeros(q),
         H=np.zeros((q, n)),
