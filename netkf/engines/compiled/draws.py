@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -145,6 +146,32 @@ class Own(NamedTuple):
     used: np.ndarray
 
 
+@once_per_scenario
+def _sensors(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
+    """The fields of a Sensing that all runs share, and the keys of the streams of its sensors."""
+    placed = increments(scenario)
+    # Many nodes may have the same sensor: its R is factored once.
+    used = {place.entry for _, place in placed}
+    roots = {entry: np.linalg.cholesky(scenario.sensors[entry].R) for entry in used}
+    rows = np.array([len(roots[place.entry]) for _, place in placed], dtype=np.int64)
+    # Sensors with fewer rows are padded to the most.
+    n, count, most = scenario.plant.n, len(placed), int(rows.max(initial=0))
+    H, root = np.zeros((count, most, n)), np.zeros((count, most, most))
+    for k, (_, place) in enumerate(placed):
+        p = rows[k]
+        H[k, :p], root[k, :p, :p] = scenario.sensors[place.entry].H, roots[place.entry]
+    index, pooled = scenario.topology.index, scenario.hosted.pooled
+    hosts = [0 if pooled else index[node] for node in scenario.increment_sensors]
+    shared = {
+        "rows": rows,
+        "H": H,
+        "root": root,
+        "host": np.array(hosts, dtype=np.int64),
+        "node": np.array(list(scenario.increment_sensors), dtype=np.int64),
+    }
+    return shared, [(node, place.ordinal) for node, place in placed]
+
+
 class Noise:
     """The noise of all sensors in some runs, drawn for stretches of so many ``steps``, and so many
     normals for cuts at once.
@@ -157,23 +184,13 @@ class Noise:
         steps: int,
         cuts: int,
     ) -> None:
-        placed = increments(scenario)
-        sensors = [scenario.sensors[place.entry] for _, place in placed]
-        keys = [(node, place.ordinal) for node, place in placed]
+        shared, keys = _sensors(scenario)
         self._noise = StreamNormals(streams.seed_words("noise", keys))
         self._cuts = StreamNormals(streams.seed_words("cut", keys))
         # Without increment sensors the period is not used; it only must not be None.
-        self._period, self._steps = (scenario.truth.sensing_period or 1.0) if placed else 1.0, steps
-        n, count, runs = scenario.plant.n, len(sensors), len(streams.per_replica)
-        self._rows = np.array([len(sensor.R) for sensor in sensors], dtype=np.int64)
-        # Sensors with fewer rows are padded to the most.
-        most = int(self._rows.max(initial=0))
-        H, root = np.zeros((count, most, n)), np.zeros((count, most, most))
-        for k, sensor in enumerate(sensors):
-            p = self._rows[k]
-            H[k, :p], root[k, :p, :p] = sensor.H, np.linalg.cholesky(sensor.R)
-        index, pooled = scenario.topology.index, scenario.hosted.pooled
-        hosts = [0 if pooled else index[node] for node in scenario.increment_sensors]
+        self._period, self._steps = (scenario.truth.sensing_period or 1.0) if keys else 1.0, steps
+        self._shared, self._rows, runs = shared, shared["rows"], len(streams.per_replica)
+        count, most = shared["H"].shape[:2]
         self._own = Own(
             rest=np.zeros((runs, count, 2, most)),
             step=np.full((runs, count), -1, dtype=np.int64),
@@ -182,13 +199,6 @@ class Noise:
             # All cuts count as used: the first prediction that ends inside a step asks for normals.
             used=np.full((runs, count), cuts, dtype=np.int64),
         )
-        self._shared: dict[str, Any] = {
-            "rows": self._rows,
-            "H": H,
-            "root": root,
-            "host": np.array(hosts, dtype=np.int64),
-            "node": np.array(list(scenario.increment_sensors), dtype=np.int64),
-        }
 
     def sensing(self, run: int) -> Sensing:
         """The sensors of one run with their noise."""
