@@ -89,11 +89,7 @@ def block_statistics(
     tree, done = MergeTree(merge), 0
     for batch, fingerprint, kept in _batches(scenario, seed, replicas, engine, traces):
         pieces = list(aligned_pieces(done, done + len(batch)))
-        firsts = [(k << level) - done for level, k in pieces]
-        parts = [
-            slice(at, at + (1 << level)) for at, (level, _) in zip(firsts, pieces, strict=True)
-        ]
-        values = run_values(batch, scenario, parts)
+        values = run_values(batch, scenario, done)
         for number, (level, k) in enumerate(pieces):
             piece = merge_runs(values, number)
             tree.add(k, piece._replace(fingerprint=fingerprint, traces=kept), level)
@@ -149,8 +145,14 @@ class RunValues(NamedTuple):
     sums: dict[str, FloatArray]
 
 
-def run_values(batch: RunBatch, scenario: Scenario, pieces: Sequence[slice]) -> RunValues:
-    """Values of the runs of a batch, for every node where the filter is pooled."""
+def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues:
+    """Values of the runs of a batch, for every node where the filter is pooled.
+
+    ``first`` is the number of the first run in the tree over all runs, whose pieces these are.
+    """
+    # The runs of a batch that the tree merges by themselves, counted from the first of the batch.
+    places = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
+    pieces = [slice(at - first, at - first + (1 << level)) for at, level in places]
     reduced, nodes = reduce_batch(batch, pieces), len(scenario.nodes)
     shown, averages = nodes // batch.error.shape[2], reduced.averages
     if shown > 1:
