@@ -187,7 +187,9 @@ def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> FloatArray:
         count = min(MAX_STEPS, len(times))
         path = scenario.sample_path(streams, law.node, law.place)
     else:
-        return np.concatenate([*_increment_noises(scenario, streams, law, random)])
+        # A run may be shorter than one step of the sensor, and then has no reading.
+        nothing = np.empty((0, len(law.root)))
+        return np.concatenate([nothing, *_increment_noises(scenario, streams, law, random)])
     x = _shown_states(scenario, random, count)
     if not count:
         return np.empty((0, len(law.root)))
