@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import netkf.algorithms
 from netkf.algorithms.filter import STEPS, Filter
+from netkf.core.fields import as_class
 
 F = TypeVar("F", bound=type[Filter])
 
@@ -55,6 +56,18 @@ def built_in_class(algorithm: object) -> type[Filter] | None:
     """The built-in class of a filter, or the one that a user's class is derived from."""
     known = set(built_in_filters().values())
     return next((cls for cls in type(algorithm).__mro__ if cls in known), None)
+
+
+def base_filter(algorithm: Filter) -> Filter:
+    """Return the built-in filter that a user's filter derives from, with the same parameters.
+
+    Raises TypeError if it derives from none.
+    """
+    known = built_in_class(algorithm)
+    if known is None:
+        raise TypeError(f"{type(algorithm).__name__} derives from no built-in filter")
+    made: Filter = as_class(algorithm, known)
+    return made
 
 
 def own_attributes(algorithm: object) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from netkf.algorithms.registry import LINK_WEIGHTS, built_in_class, own_attributes
+from netkf.algorithms.registry import LINK_WEIGHTS, base_filter, built_in_class, own_attributes
 from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
 from netkf.checks.laws import (
     EVERYTHING,
@@ -188,11 +188,8 @@ def with_base_filter(scenario: Scenario) -> Scenario:
     """Return the scenario with the built-in filter that a user's class derives from, with the same
     parameters; cached, since its tables take time and every replica asks for it.
     """
-    algorithm = scenario.filter.algorithm
-    known: Any = built_in_class(algorithm)
-    parameters = [field.name for field in dataclasses.fields(known) if field.init]
-    base = known(**{name: getattr(algorithm, name) for name in parameters})
-    filtering = dataclasses.replace(scenario.filter, algorithm=base)
+    algorithm: Any = scenario.filter.algorithm
+    filtering = dataclasses.replace(scenario.filter, algorithm=base_filter(algorithm))
     return dataclasses.replace(scenario, filter=filtering)
 
 
@@ -217,8 +214,7 @@ def promised_filter(algorithm: Any) -> Any:
         )
     if set(own_attributes(algorithm)) <= set(LINK_WEIGHTS):
         return algorithm
-    parameters = [field.name for field in dataclasses.fields(known) if field.init]
-    return known(**{name: getattr(algorithm, name) for name in parameters})
+    return base_filter(algorithm)
 
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -34,9 +33,9 @@ from netkf.checks.mode_sequences import (
     initial_roots,
     pair_sources,
     reference_count,
-    slots_until,
     token_positions,
     trace_tokens,
+    with_horizon,
 )
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
@@ -292,7 +291,7 @@ def _tokens(samples: GossipSamples, level: float) -> Finding:
         own = samples.runs.tokens[:, i]
         pairs.append(Pair(f"token {node}", own, everywhere, everywhere[origin == i]))
     found = compare_laws(pairs, level, samples.first_trace)
-    return _with_horizon(samples, found, _token_memory) if found.early else found
+    return with_horizon(samples, found, _token_memory, LAW_TOLERANCE) if found.early else found
 
 
 def _initial_condition_forgotten(samples: GossipSamples, level: float) -> Finding:
@@ -305,7 +304,7 @@ def _initial_condition_forgotten(samples: GossipSamples, level: float) -> Findin
         here = positions[:, -1] == i
         pairs.append(Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[here], P[-1, here]))
     found = compare_laws(pairs, level, samples.first_trace)
-    return _with_horizon(samples, found, _start_memory) if found.early else found
+    return with_horizon(samples, found, _start_memory, LAW_TOLERANCE) if found.early else found
 
 
 def _bounded(samples: GossipSamples, level: float) -> Finding:
@@ -318,7 +317,7 @@ def _bounded(samples: GossipSamples, level: float) -> Finding:
         before, after = positions[:, half - 1] == i, positions[:, -1] == i
         expected.append((drawn[-2, before], drawn[-1, after]))
     found = compare_growth(pairs, expected, level)
-    return _with_horizon(samples, found, _growth_of) if found.early else found
+    return with_horizon(samples, found, _growth_of, LAW_TOLERANCE) if found.early else found
 
 
 def _growth_of(chain: ChainSamples) -> float:
@@ -338,17 +337,6 @@ def _token_memory(chain: ChainSamples) -> float:
     return max(
         (float(diagonal_distances(last[origin == k], last).max()) for k in starts), default=math.nan
     )
-
-
-def _with_horizon(
-    samples: GossipSamples, found: Finding, apart: Callable[[ChainSamples], float]
-) -> Finding:
-    """Return the finding with the horizon at which the law of the chain is settled."""
-    slots = check_slots(samples.scenario)[-1]
-    enough = slots_until(
-        lambda count: apart(samples.later(count)), slots, samples.scenario.plant.n, LAW_TOLERANCE
-    )
-    return found._replace(horizon=enough * samples.scenario.slot_plant.period)
 
 
 CHAIN = ("every exchange is a swap", "slots are independent")

@@ -39,7 +39,7 @@ from netkf.checks.mode_sequences import (
     intermittent_modes,
     reference_count,
     sensing_neighbours,
-    slots_until,
+    with_horizon,
 )
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
@@ -310,7 +310,7 @@ def _bounded(samples: IntermittentSamples, level: float) -> Finding:
     ]
     expected = [(drawn[i, -2], drawn[i, -1]) for i in range(len(pairs))]
     found = compare_growth(pairs, expected, level)
-    return _with_horizon(samples, found, _growth_of) if found.early else found
+    return with_horizon(samples, found, _growth_of, LAW_TOLERANCE) if found.early else found
 
 
 def _initial_condition_forgotten(samples: IntermittentSamples, level: float) -> Finding:
@@ -321,7 +321,7 @@ def _initial_condition_forgotten(samples: IntermittentSamples, level: float) -> 
         for i, node in enumerate(samples.nodes)
     ]
     found = compare_laws(pairs, level, samples.first_trace)
-    return _with_horizon(samples, found, _memory_of) if found.early else found
+    return with_horizon(samples, found, _memory_of, LAW_TOLERANCE) if found.early else found
 
 
 def _growth_of(drawn: ArrivalSamples) -> float:
@@ -333,17 +333,6 @@ def _memory_of(drawn: ArrivalSamples) -> float:
     """Return the largest distance of a law from that of another start."""
     pairs = zip(drawn.P, drawn.restarted, strict=True)
     return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
-
-
-def _with_horizon(
-    samples: IntermittentSamples, found: Finding, apart: Callable[[ArrivalSamples], float]
-) -> Finding:
-    """Return the finding with the horizon at which the law of independent arrivals is settled."""
-    slots = check_slots(samples.scenario)[-1]
-    enough = slots_until(
-        lambda count: apart(samples.later(count)), slots, samples.scenario.plant.n, LAW_TOLERANCE
-    )
-    return found._replace(horizon=enough * samples.scenario.slot_plant.period)
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.kernels.chains import Letters, advance, alphabet
+from netkf.checks.evidence import Finding
 from netkf.checks.points import MAX_NODES, check_slots, sampled_nodes
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
 from netkf.scenario.scenario import Scenario
@@ -58,6 +59,22 @@ def reference_count(scenario: Scenario, laws: int) -> int:
     budget = MAX_OPERATIONS if len(scenario.nodes) <= MAX_NODES else 0.1 * MAX_OPERATIONS
     wanted = budget / (laws * check_slots(scenario)[-1] * step)
     return int(np.clip(wanted, MIN_CHAINS, MAX_CHAINS))
+
+
+def with_horizon(
+    samples: Any, found: Finding, apart: Callable[[Any], float], tolerance: float
+) -> Finding:
+    """Return a finding with the horizon at which a law has settled: ``apart`` is its distance from
+    its limit in chains of ``samples.later``, a number of slots.
+    """
+    scenario = samples.scenario
+    enough = slots_until(
+        lambda count: apart(samples.later(count)),
+        check_slots(scenario)[-1],
+        scenario.plant.n,
+        tolerance,
+    )
+    return found._replace(horizon=enough * scenario.slot_plant.period)
 
 
 def slots_until(apart: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:

@@ -48,6 +48,14 @@ def detectable_shift(deviation: float, level: float) -> float:
     return deviation * float(_normal_quantile(1.0 - level / 2.0) + _normal_quantile(POWER))
 
 
+def student_interval(value: float, deviation: float, count: int, level: float) -> Interval:
+    """Return the interval of Student for an estimate whose standard deviation was estimated from so
+    many independent values.
+    """
+    reach = -deviation * float(scipy.special.stdtrit(count - 1.0, level / 2.0))
+    return Interval(value, value - reach, value + reach, detectable_shift(deviation, level))
+
+
 def _normal_quantile(probability: float) -> float:
     return float(scipy.special.ndtri(probability))
 

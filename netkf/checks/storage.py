@@ -15,11 +15,10 @@ import numpy as np
 
 from netkf.checks.check import ReplicaResult, Verdict, find_checks, with_check_times
 from netkf.checks.evidence import Evidence
-from netkf.checks.parts.samples import PartSummary
+from netkf.checks.parts.samples import PART_TYPES, PartSummary
 from netkf.checks.report import verdict_json, verdict_text
 from netkf.core.errors import ScenarioError
 from netkf.runs.files import (
-    new_directory,
     scenario_digest,
     write_atomically,
     write_json,
@@ -50,11 +49,6 @@ def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: st
         "spent": verdict.spent,
     }
     write_json(directory / VERDICT, document)
-
-
-def verdict_directory(out: Path, scenario: Scenario) -> Path:
-    """Create the directory of a new verdict; raises ScenarioError if it is not empty."""
-    return new_directory(out, scenario.name)
 
 
 def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
@@ -118,7 +112,7 @@ def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
     chosen = with_check_times(scenario)
-    summary_type, part_types = find_checks(chosen).summary_type, _part_types()
+    summary_type = find_checks(chosen).summary_type
     results, place = [], 0
     for k, diverged in enumerate(columns["diverged"].tolist()):
         difference, expected = float(columns["difference"][k]), bool(columns["expected"][k])
@@ -129,7 +123,7 @@ def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
         summary = summary_type(**_fields(at, "summary"))
         parts = {
             part: cls(**_fields(at, part)) if _fields(at, part) else None
-            for part, cls in part_types.items()
+            for part, cls in PART_TYPES.items()
         }
         results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts)))
         place += 1
@@ -141,16 +135,4 @@ def _fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
         name.split(".", 1)[1]: value
         for name, value in values.items()
         if name.split(".", 1)[0] == prefix
-    }
-
-
-def _part_types() -> dict[str, Any]:
-    from netkf.checks.parts import events, moments
-
-    return {
-        "ticks": events.TickCounts,
-        "fates": events.FateCounts,
-        "pairs": events.PairCounts,
-        "steps": moments.Moments,
-        "readings": moments.Moments,
     }

@@ -98,11 +98,12 @@ def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
             remedy = "add --out DIR with the directory of the verdict"
             raise ScenarioError("--resume", "needs a verdict to add runs to", None, remedy)
         return None
-    from netkf.checks.storage import load_verdict, verdict_directory
+    from netkf.checks.storage import load_verdict
+    from netkf.runs.files import new_directory
 
     if options.resume:
         return load_verdict(options.out, scenario, scenario.seed)
-    verdict_directory(options.out, scenario)
+    new_directory(options.out, scenario.name)
     return None
 
 

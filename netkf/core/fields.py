@@ -418,3 +418,9 @@ def _source_file(value: Any) -> SourceFile:
 source_file = Rule(
     "must be the path of a file", _source_file, "give a path relative to the scenario file"
 )
+
+
+def as_class(part: Component, cls: type[Component]) -> Any:
+    """Return an object of a base class ``cls`` of a part, with the same fields."""
+    names = [one.name for one in dataclasses.fields(cls) if one.init]
+    return cls(**{name: getattr(part, name) for name in names})

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from collections.abc import Iterator
 from typing import NamedTuple
 
 from netkf.algorithms.filter import STEPS
-from netkf.algorithms.registry import built_in_class, own_attributes
+from netkf.algorithms.registry import base_filter, built_in_class, own_attributes
 from netkf.testing.clocked import ClockTrial
 from netkf.testing.shifts import differences
 from netkf.testing.slotted import SlotTrial, slots_of
@@ -40,9 +39,7 @@ def check_parent(watched: Watched, same_as_parent: bool | None) -> None:
     own = own_attributes(part)
     if same_as_parent is False or known is None or not own:
         return
-    parameters = [field.name for field in dataclasses.fields(known) if field.init]
-    parent = known(**{name: getattr(part, name) for name in parameters})
-    found = largest_difference(watched.once(), Watched(parent).once())
+    found = largest_difference(watched.once(), Watched(base_filter(part)).once())
     if found is None or found.apart <= TOLERANCE:
         return
     words = f"{found.what} differs by {found.apart:.3g} of its size {found.where}"

@@ -7,7 +7,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
-from netkf.theory.common.errors import error_law, replayed_covariances
+from netkf.theory.common.errors import error_law
 from tests.engines.linearity import OneDraw, run
 
 POISSON = {"kind": "poisson", "rate": 2.0}
@@ -124,7 +124,7 @@ def test_covariances_are_those_of_the_run(name, at, sensors, channel, tmp_path):
         pytest.skip("samples only")
     scenario = scenario_of(name, at, channel, sensors, tmp_path)
     run = netkf.simulate(scenario, engine="simpy")
-    P, stacked = replayed_covariances(scenario, run)
+    P, stacked = error_law(scenario, run).P, theory.error_covariance(scenario, run, stacked=True)
     close(P, run.P, 1e-9)
     if name != "push-sum":  # what a node counts twice it takes for certain
         least = np.linalg.eigvalsh(P - theory.error_covariance(scenario, run))[..., 0]
@@ -146,7 +146,7 @@ def test_filters_with_another_plant_and_other_noises(tmp_path):
     scenario = scenario.replace({"filter.model": belief, "horizon": 1.6, "probe": [0.4, 1.5]})
     expected, run = engine_covariance(scenario)
     close(theory.error_covariance(scenario, run), expected, 1e-9)
-    close(replayed_covariances(scenario, run)[0], run.P, 1e-9)
+    close(error_law(scenario, run).P, run.P, 1e-9)
 
 
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])

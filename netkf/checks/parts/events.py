@@ -137,7 +137,7 @@ def count_fates(scenario: Scenario, run: Run) -> FateCounts | None:
     width = int(sends["message"].max()) + 2
     keys = lost_at * width + number
     after = np.isin(keys - 1, keys) & (number > 0)
-    back = _reversed_places(scenario)[lost_at]
+    back = reversed_directions(scenario)[lost_at]
     both = np.isin(back * width + number, keys) & (back >= 0)
     return FateCounts(
         sent,
@@ -154,7 +154,7 @@ def _by_direction(rows: np.ndarray, places: dict[tuple[int, int], int]) -> np.nd
 
 
 @lru_cache(maxsize=8)
-def _reversed_places(scenario: Scenario) -> np.ndarray:
+def reversed_directions(scenario: Scenario) -> np.ndarray:
     """Return the place of the other direction of each, -1 without one."""
     places = _direction_places(scenario)
     return np.array([places.get((j, i), -1) for i, j in places], dtype=np.int64)

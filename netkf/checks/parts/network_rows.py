@@ -11,7 +11,7 @@ import scipy.special
 
 from netkf.checks.evidence import Finding, Promise
 from netkf.checks.laws import find_largest
-from netkf.checks.parts.events import CELLS, clock_entities
+from netkf.checks.parts.events import CELLS, clock_entities, reversed_directions
 from netkf.checks.parts.moments import (
     CORRELATION_TOLERANCE,
     correlation_interval,
@@ -26,10 +26,10 @@ from netkf.checks.statistics import (
     deviation_interval,
     probability_interval,
     scale_interval,
+    student_interval,
 )
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
-from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching
 from netkf.network.recorded import RecordedLoss
 from netkf.scenario.scenario import Scenario
@@ -39,17 +39,15 @@ FIRST_TICK = 1.0
 """Ticks by which a clock that is not memoryless may be off its rate in a run: it has begun."""
 
 
+def _stated_clock(scenario: Scenario) -> Any:
+    return stated_part(scenario.network.activation, "activation")
+
+
 @lru_cache(maxsize=8)
 def clock_rates(scenario: Scenario) -> FloatArray:
     """Return the stated rates (E,) of all clocks in ticks per second; nan if unknown."""
-    clock: Any = scenario.network.activation
-    stated = stated_part(clock, "activation") or clock
+    stated = _stated_clock(scenario)
     return np.array([stated.mean_rate(entity) for entity in clock_entities(scenario)])
-
-
-def _is_poisson(scenario: Scenario) -> bool:
-    clock: Any = scenario.network.activation
-    return bool((stated_part(clock, "activation") or clock).memoryless)
 
 
 def _clock_labels(scenario: Scenario) -> list[str]:
@@ -60,7 +58,7 @@ def _rates(samples: PartSamples, level: float) -> Finding:
     """Compare the ticks of all runs with the rates, all clocks together and one by one."""
     scenario, counts = samples.scenario, samples.ticks.ticks.sum(axis=1)
     expected = clock_rates(scenario) * scenario.horizon
-    poisson, found = _is_poisson(scenario), counts.sum(axis=0).astype(float)
+    poisson, found = bool(_stated_clock(scenario).memoryless), counts.sum(axis=0).astype(float)
     intervals = []
     share = level / (2.0 * len(expected))
     jobs = [(counts.sum(axis=1), float(expected.sum()), level / 2.0, "all clocks together")]
@@ -91,8 +89,7 @@ def _count_interval(
         spread = math.sqrt(runs * mean)
     else:
         spread = math.sqrt(max(float(values.var(ddof=1)), 0.25) * runs)
-        reach = -spread * float(scipy.special.stdtrit(runs - 1.0, level / 2.0))
-        low, high = total - reach, total + reach
+        _, low, high = student_interval(total, spread, runs, level)[:3]
     whole = runs * mean
     ratio = Interval(
         total / whole, low / whole, high / whole, detectable_shift(spread, level) / whole
@@ -145,8 +142,7 @@ MAX_CLOCKS = 60
 
 
 def _stated_loss(scenario: Scenario) -> Any:
-    loss = scenario.network.channel.loss
-    return stated_part(loss, "loss") or loss
+    return stated_part(scenario.network.channel.loss, "loss")
 
 
 @lru_cache(maxsize=8)
@@ -199,11 +195,8 @@ def _loss_interval(
         return deviation_interval(expected, found)
     # A spread of at least one message of all: a few rare losses may show none.
     spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, 1.0))
-    reach = -spread * float(scipy.special.stdtrit(runs - 1.0, level / 2.0))
     seen = expected + float(excess.sum()) / total
-    detectable = detectable_shift(spread, level) / total
-    found = Interval(seen, seen - reach / total, seen + reach / total, detectable)
-    return deviation_interval(expected, found)
+    return deviation_interval(expected, student_interval(seen, spread / total, runs, level))
 
 
 def _losses_apart(samples: PartSamples, level: float) -> Finding:
@@ -216,7 +209,8 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
     jobs = [(fates.repeated - pairs * q**2, pairs, q * (1.0 - q), "a message and the one before")]
     if _directions_apart(scenario):
         # In each of two directions of a link the same pairs are counted.
-        other = _other_loss(scenario, q)
+        back = reversed_directions(scenario)
+        other = np.where(back >= 0, q[back], math.nan)
         known = np.isfinite(other)
         spread = np.sqrt(q * (1.0 - q) * other * (1.0 - other))
         excess = np.where(known, fates.both - sent * q * np.nan_to_num(other), 0.0)
@@ -239,13 +233,6 @@ def _directions_apart(scenario: Scenario) -> bool:
     return at_once and not scenario.network.channel.symmetric
 
 
-def _other_loss(scenario: Scenario, q: FloatArray) -> FloatArray:
-    """Return the loss (D,) of the other direction of each, nan without one."""
-    places = {d: k for k, d in enumerate(scenario.topology.directions)}
-    back = [places.get((j, i), -1) for i, j in scenario.topology.directions]
-    return np.array([q[k] if k >= 0 else math.nan for k in back])
-
-
 def _correlation_of_runs(
     excess: FloatArray, count: np.ndarray, scale: FloatArray, level: float
 ) -> Interval | None:
@@ -258,11 +245,8 @@ def _correlation_of_runs(
     values = excess.sum(axis=1)
     runs = len(values)
     spread = math.sqrt(max(float(values.var(ddof=1)) * runs, 1.0))
-    reach = -spread * float(scipy.special.stdtrit(runs - 1.0, level / 2.0))
     seen = float(values.sum()) / weight
-    detectable = detectable_shift(spread, level) / weight
-    found = Interval(seen, seen - reach / weight, seen + reach / weight, detectable)
-    return deviation_interval(0.0, found)
+    return deviation_interval(0.0, student_interval(seen, spread / weight, runs, level))
 
 
 def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str]]:
@@ -324,18 +308,14 @@ def _largest_correlation(
     a, b = int(upper[0][worst]), int(upper[1][worst])
     products = z[:, a] * z[:, b]
     spread = max(float(products.std(ddof=1)), 1.0) / math.sqrt(runs)
-    share = level / len(upper[0])
-    reach = -spread * float(scipy.special.stdtrit(runs - 1.0, share / 2.0))
-    value = float(related[upper][worst])
-    found = Interval(value, value - reach, value + reach, detectable_shift(spread, share))
+    found = student_interval(float(related[upper][worst]), spread, runs, level / len(upper[0]))
     return deviation_interval(0.0, found), (int(kept[a]), int(kept[b]))
 
 
 @lru_cache(maxsize=8)
 def pair_probabilities(scenario: Scenario) -> FloatArray | None:
     """Return the stated probability (L,) of each link in a matching; None if it is not known."""
-    activation: Any = scenario.network.activation
-    stated = stated_part(activation, "slot activation")
+    stated = stated_part(scenario.network.activation, "slot activation")
     if not isinstance(stated, Matching):
         return None
     try:
@@ -395,22 +375,21 @@ MATCHINGS = Promise(
 )
 
 
-def network_promises(scenario: Scenario) -> list[Promise]:
-    """Return the promises about the network that have a stated law."""
+def network_promises(samples: PartSamples) -> list[Promise]:
+    """Return the promises about the network that have a stated law and were seen in the runs."""
     found: list[Promise] = []
-    clock, loss = scenario.network.activation, _stated_loss(scenario)
-    ticks = isinstance(clock, LinkClock) and bool(clock_entities(scenario))
-    if ticks and np.isfinite(clock_rates(scenario)).all():
+    scenario = samples.scenario
+    if samples.ticks is not None and np.isfinite(clock_rates(scenario)).all():
         found.append(CLOCK_RATES)
-        if _is_poisson(scenario):
+        if _stated_clock(scenario).memoryless:
             found += [CLOCK_GAPS, CLOCKS_APART]
-    if pair_probabilities(scenario) is not None and scenario.hosted.talks:
+    drawn = samples.pairs is not None and scenario.hosted.talks
+    if drawn and pair_probabilities(scenario) is not None:
         found.append(MATCHINGS)
-    sends = scenario.hosted.talks and bool(scenario.topology.directions)
-    if sends and not isinstance(loss, RecordedLoss):
+    if samples.fates is not None and not isinstance(_stated_loss(scenario), RecordedLoss):
         q = loss_probabilities(scenario)
         if np.isfinite(q).all():
             found.append(LOSSES)
-            if loss.independent and ((q > 0.0) & (q < 1.0)).any():
+            if _stated_loss(scenario).independent and ((q > 0.0) & (q < 1.0)).any():
                 found.append(LOSSES_APART)
     return found

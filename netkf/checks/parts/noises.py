@@ -48,12 +48,12 @@ def path_law(scenario: Scenario) -> PathLaw | None:
     if not scenario.plant.is_random:
         return None
     if scenario.slotted:
-        plant: Any = stated_part(scenario.plant, "plant") or scenario.plant
+        plant: Any = stated_part(scenario.plant, "plant")
         slots = min(MAX_STEPS, int(scenario.horizon / plant.period))
         times = plant.period * np.arange(slots + 1)
         Phi, W = np.asarray(plant.F), np.asarray(plant.Q)
     else:
-        stated: Any = stated_part(scenario.plant, "plant") or scenario.plant
+        stated: Any = stated_part(scenario.plant, "plant")
         times = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
         Phi, W = _discretised(stated.A, stated.B, float(times[1]))
     size = float(np.sqrt(np.diagonal(W).max()))
@@ -135,7 +135,7 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
             sensor = scenario.sensors[place.entry]
             if not sensor.is_random or isinstance(sensor, RecordedSensor):
                 continue
-            stated: Any = stated_part(sensor, "sensor") or sensor
+            stated: Any = stated_part(sensor, "sensor")
             rows += len(stated.R)
             if rows > MAX_ROWS:
                 return tuple(found)

@@ -106,9 +106,4 @@ def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
         found += PLANT_ROWS
     if samples.readings is not None:
         found += SENSOR_ROWS
-    wanted = {"clock": samples.ticks, "messages": samples.fates, "links": samples.pairs}
-    for promise in network_promises(scenario):
-        key = next((k for k in wanted if promise.statement.startswith(k)), "clock")
-        if wanted[key] is not None:
-            found.append(promise)
-    return tuple(found)
+    return (*found, *network_promises(samples))

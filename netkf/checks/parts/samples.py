@@ -33,6 +33,16 @@ class PartSummary(NamedTuple):
     readings: Moments | None
 
 
+PART_TYPES: dict[str, type[Any]] = {
+    "ticks": TickCounts,
+    "fates": FateCounts,
+    "pairs": PairCounts,
+    "steps": Moments,
+    "readings": Moments,
+}
+"""The classes of the fields of :class:`PartSummary`."""
+
+
 def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
     """Return the summary of one run."""
     streams = Streams(run.seed, run.replica)

@@ -13,7 +13,7 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.replay import ErrorLaw, replay_errors, replay_law
+from netkf.theory.common.replay import ErrorLaw, replay_covariances, replay_law
 from netkf.trace.run import Run
 
 
@@ -27,7 +27,7 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     subclass that overrides more than the weights, and for the push-sum filter with frozen or
     asymptotic gains.
     """
-    joint, _ = _replay_nodes(scenario, run)
+    joint = _replay_nodes(scenario, run)
     return joint if stacked else diagonal_blocks(joint, len(scenario.nodes))
 
 
@@ -39,18 +39,9 @@ def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
     return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
 
 
-def replayed_covariances(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return P_i (T, N, n, n) and the joint error covariance (T, N n, N n) at ``run.times``.
-
-    P_i is computed here from the filter's equations and the run's events, independently of the
-    engine; the joint covariance is that of :func:`error_covariance`, which has the errors raised.
-    """
-    joint, P = _replay_nodes(scenario, run)
-    return P, joint
-
-
 def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
-    """Return the joint Gaussian law of all errors at all ``run.times``, given the run's events.
+    """Return the joint Gaussian law of all errors at all ``run.times``, given the run's events, and
+    P_i by the filter's equations, independently of the engine.
 
     Unlike :func:`error_covariance` it relates different times, and includes the mean that errors
     have where filters start elsewhere than the plant. Nodes that share one pooled filter count
@@ -69,12 +60,10 @@ def _require_same_run(scenario: Scenario, run: Run) -> None:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
 
 
-def _replay_nodes(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the joint error covariance (T, N n, N n) and P (T, N, n, n) of all nodes."""
+def _replay_nodes(scenario: Scenario, run: Run) -> FloatArray:
+    """Return the joint error covariance (T, N n, N n) of all nodes."""
     _require_same_run(scenario, run)
-    joint, P = replay_errors(scenario, run)
-    nodes, n = len(scenario.nodes), scenario.plant.n
+    joint, nodes = replay_covariances(scenario, run), len(scenario.nodes)
     # A pooled filter is replayed once; all nodes share its estimate, and so its error.
-    if joint.shape[-1] < nodes * n:
-        joint, P = np.tile(joint, (1, nodes, nodes)), np.tile(P, (1, nodes, 1, 1))
-    return joint, P
+    shared = joint.shape[-1] < nodes * scenario.plant.n
+    return np.tile(joint, (1, nodes, nodes)) if shared else joint

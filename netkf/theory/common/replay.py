@@ -29,19 +29,17 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 
-def replay_errors(scenario: Scenario, run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the joint error covariance (T, M n, M n) of M hosts at ``run.times``, and their P.
+def replay_covariances(scenario: Scenario, run: Run) -> FloatArray:
+    """Return the joint error covariance (T, M n, M n) of M hosts at ``run.times``.
 
-    P is (T, M, n, n); M = 1 if all nodes share one pooled filter. Raises TheoryError for a filter
-    whose equations are not known here.
+    M = 1 if all nodes share one pooled filter. Raises TheoryError for a filter whose equations are
+    not known here.
     """
     errors = _stacked_errors(scenario)
     # The generator stops at each sample, when the errors have their values of that time.
-    pairs = [(errors.covariance(), errors.covariances()) for _ in _replay(scenario, run, errors)]
-    if not pairs:
-        n = errors.n
-        return np.empty((0, errors.hosts * n, errors.hosts * n)), np.empty((0, errors.hosts, n, n))
-    return np.array([joint for joint, _ in pairs]), np.array([P for _, P in pairs])
+    found = [errors.covariance() for _ in _replay(scenario, run, errors)]
+    size = errors.hosts * errors.n
+    return np.array(found).reshape(-1, size, size)
 
 
 class ErrorLaw(NamedTuple):
