@@ -12,9 +12,9 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, cached_property, update_wrapper
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar, cast, overload
 
 from netkf.linalg.linking import linked_once
 
@@ -25,14 +25,7 @@ MOST_STATES = 4
 """Of the sources, whose compiled code is kept."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "_nrt": True}
-_WITHOUT_ARRAYS: Any = {**_OPTIONS, "_nrt": False}
-_kernels: dict[Callable[..., Any], Callable[..., Any]] = {}
-"""The loops of each kernel."""
-_allocating: set[Callable[..., Any]] = set()
-_inlined: set[Callable[..., Any]] = set()
-_fused: set[Callable[..., Any]] = set()
-_overloaded: set[Callable[..., Any]] = set()
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy"}
 _said: set[Callable[..., Any]] = set()
 _spent: list[float] = []
 
@@ -67,41 +60,81 @@ def kernel(
     return _registered(function, allocates, inlined, fused)
 
 
+class Kernel:
+    """A numerical function written as loops. Python and other kernels call it alike."""
+
+    def __init__(self, loops: Callable[..., Any], options: dict[str, Any]) -> None:
+        self._loops, self._options = loops, options
+        update_wrapper(self, loops)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Compute, or compile first."""
+        return self._called_from_python(*args, **kwargs)
+
+    def __reduce__(self) -> str:
+        return self._loops.__qualname__
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Numba asks a name that compiled code uses for this attribute."""
+        return self._called_from_kernels._numba_type_
+
+    @cached_property
+    def _called_from_kernels(self) -> Any:
+        # Compiled with the first call: importing netkf must not import numba.
+        import numba
+
+        from netkf.linalg import (  # noqa: F401 - register what kernels use
+            lane_types,
+            local_types,
+            struct_types,
+        )
+
+        made = numba.njit(**self._options)(self._loops)
+        _for_any_constant(made)
+        return made
+
+    @cached_property
+    def _called_from_python(self) -> Callable[..., Any]:
+        import numba
+
+        from netkf.linalg import struct_types  # noqa: F401 - an argument may be a struct
+
+        config: Any = numba.config
+        before = config.CACHE_DIR
+        # numba looks at the file of the function alone, and what it calls may have changed.
+        config.CACHE_DIR = str(_folder(before))
+        try:
+            made: Callable[..., Any] = numba.njit(cache=True, **self._options)(self._loops)
+        finally:
+            config.CACHE_DIR = before
+        # numba's level is global: it is set while this function compiles.
+        _moderately_optimised(made, config)
+        return made
+
+
 def _registered(
     loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool
 ) -> Callable[..., Any]:
-    @wraps(loops)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        # Compiled with the first call: importing netkf must not import numba.
-        return _compiled(loops)(*args, **kwargs)
-
-    if allocates:
-        _allocating.add(loops)
+    options = {**_OPTIONS, "_nrt": allocates}
     if inlined:
-        _inlined.add(loops)
+        options["forceinline"] = True
     if fused:
-        _fused.add(loops)
-    _kernels[call] = loops
-    return call
+        options["fastmath"] = {"contract"}
+    return Kernel(loops, options)
 
 
-@cache
-def _compiled(loops: Callable[..., Any]) -> Callable[..., Any]:
-    import numba
+def _for_any_constant(function: Any) -> None:
+    """Compile a function once for the types of its arguments, whatever constants it is given."""
+    from numba.core import types
 
-    # Before each compilation, since modules imported meanwhile may have more kernels.
-    _overload_kernels()
-    config: Any = numba.config
-    before = config.CACHE_DIR
-    # numba looks at the file of the function alone, and what it calls may have changed.
-    config.CACHE_DIR = str(_folder(before))
-    try:
-        made: Callable[..., Any] = numba.njit(cache=True, **_options(loops))(loops)
-    finally:
-        config.CACHE_DIR = before
-    # numba's level is global: it is set while this function compiles.
-    _moderately_optimised(made, config)
-    return made
+    template_for, unliteral = function.get_call_template, cast(Any, types.unliteral)
+
+    def for_types(args: Any, kws: Any) -> Any:
+        named = {name: unliteral(kind) for name, kind in kws.items()}
+        return template_for(tuple(unliteral(kind) for kind in args), named)
+
+    function.get_call_template = for_types
 
 
 def _moderately_optimised(made: Any, config: Any) -> None:
@@ -137,43 +170,6 @@ def announce(function: Callable[..., Any]) -> None:
     if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
         words = "netkf: compiling, once after an installation (10 to 20 s) ..."
         print(words, file=sys.stderr, flush=True)
-
-
-def _overload_kernels() -> None:
-    """Let compiled code call all kernels known so far."""
-    from numba import extending
-
-    from netkf.linalg import (  # noqa: F401 - register what kernels use
-        lane_types,
-        local_types,
-        struct_types,
-    )
-
-    for call, loops in _kernels.items():
-        # An overload may be registered once only.
-        if call not in _overloaded:
-            _overloaded.add(call)
-            # The same options as for the function itself: inlining must be known to the caller.
-            extending.overload(call, jit_options=_options(loops))(_always(loops))
-
-
-def _options(loops: Callable[..., Any]) -> Any:
-    options = dict(_OPTIONS if loops in _allocating else _WITHOUT_ARRAYS)
-    if loops in _inlined:
-        options["forceinline"] = True
-    if loops in _fused:
-        options["fastmath"] = {"contract"}
-    return options
-
-
-def _always(loops: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what numba asks for an implementation; it must have the same signature."""
-
-    @wraps(loops)
-    def choose(*_types: Any) -> Callable[..., Any]:
-        return loops
-
-    return choose
 
 
 @cache

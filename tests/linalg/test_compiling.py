@@ -1,0 +1,57 @@
+"""Kernels: called alike from Python and from kernels, compiled once for given types."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from netkf.linalg.compiling import kernel
+
+
+@kernel
+def power(base, exponent, scale=1.0):
+    """Return scale * base^exponent for whole exponents."""
+    result = scale
+    for _ in range(exponent):
+        result *= base
+    return result
+
+
+@kernel
+def sum_of_powers(values):
+    """Return the sum of squares and of half the cubes."""
+    total = 0.0
+    for i in range(len(values)):
+        total += power(values[i], 2) + power(values[i], 3, scale=0.5)
+    return total
+
+
+@kernel(allocates=True)
+def copies(values):
+    """Return the values twice."""
+    made = np.empty(2 * len(values))
+    for i in range(len(made)):
+        made[i] = values[i % len(values)]
+    return made
+
+
+def test_python_and_kernels_call_a_kernel_alike():
+    values = np.array([1.0, 2.0, -3.0])
+    assert power(2.0, 3) == 8.0
+    assert power(2.0, exponent=2, scale=0.5) == 2.0
+    assert sum_of_powers(values) == pytest.approx((values**2 + 0.5 * values**3).sum(), rel=1e-15)
+    assert list(copies(values)) == [*values, *values]
+
+
+def test_a_kernel_is_compiled_once_for_all_constants():
+    sum_of_powers(np.ones(2))
+    signatures = power._called_from_kernels.signatures
+    # One without ``scale`` and one with it: the constants 2 and 3 are no types.
+    assert len(signatures) == 2
+    assert len({args[:2] for args in signatures}) == 1
+
+
+def test_kernels_are_found_by_name():
+    assert pickle.loads(pickle.dumps(power)) is power
+    assert power.__name__ == "power"
+    assert power.__doc__.startswith("Return scale")
