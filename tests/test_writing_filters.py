@@ -130,7 +130,7 @@ def test_both_kinds_of_time_are_the_formula(folder, slots):
 
 
 def test_a_filter_without_covariance_runs_from_the_command_line(folder, capsys):
-    assert main(["run", "averaging.toml"]) == 0
+    assert main(["run", "averaging.toml", "--trust"]) == 0
     said = capsys.readouterr().out
     rows = [line.split() for line in said.splitlines() if re.match(r" +(\d|all) ", line)]
     assert len(rows) == 6

@@ -128,6 +128,8 @@ def _replay_command(options: argparse.Namespace) -> str:
         words += ["--set", change]
     if options.seed is not None:
         words += ["--seed", str(options.seed)]
+    if options.trust:
+        words.append("--trust")
     return shlex.join([*words, "--replica"])
 
 

@@ -26,6 +26,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done. 1: a promise is broken or a target is not reached. 2: bad usage, a bad file, or a
     failure: reported in one line, or with a traceback where nobody foresaw it. 130: interrupted.
     """
+    if arguments is None:
+        # Processes that Python starts for workers would import from the current folder before they
+        # are told the path of this one; it may be that of a scenario of someone else.
+        os.environ["PYTHONSAFEPATH"] = "1"
     options = make_parser().parse_args(arguments)
     try:
         status: int = options.run(options)

@@ -55,6 +55,11 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
         metavar="KEY.PATH=VALUE",
         help="override a key of the scenario; VALUE is written as in TOML",
     )
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="import classes that the scenario names from modules in its folder or the current one",
+    )
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:
@@ -142,7 +147,7 @@ def load_scenario(
     changes = {**parse_changes(options.set), **ignored}
     if getattr(options, "seed", None) is not None:
         changes["seed"] = options.seed
-    return load(options.scenario, changes)
+    return load(options.scenario, changes, trust=options.trust)
 
 
 def print_notes(notes: Sequence[str]) -> None:

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from netkf.core.errors import EngineError
 from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.runs.failures import explain_failure
+from netkf.scenario.imports import forget_other
 from netkf.scenario.plugins import in_words, plugged_in
-from netkf.scenario.registry import forget_other
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]

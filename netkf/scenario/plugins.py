@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import traceback
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,14 @@ def module_files(scenario: Component) -> dict[str, Path | None]:
     for part in plugged_in(scenario):
         name = type(part).__module__
         beside = None if folder is None or "." in name else folder / f"{name}.py"
-        found[name] = beside if beside is not None and beside.is_file() else None
+        found[name] = beside if beside is not None and _is_file_of(beside, name) else None
     return found
+
+
+def _is_file_of(path: Path, module_name: str) -> bool:
+    """Return True if a loaded module came from that file, not from an installed package."""
+    file = getattr(sys.modules.get(module_name), "__file__", None)
+    return path.is_file() and (file is None or not Path(file).is_file() or path.samefile(file))
 
 
 def blame(scenario: Any, error: Exception) -> str | None:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.registry import built_in_filters
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
-from netkf.core.errors import ScenarioError, nearest, quote
+from netkf.core.errors import ScenarioError, nearest
 from netkf.core.fields import Component
 from netkf.network import channels, clocks, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
@@ -27,6 +23,7 @@ from netkf.plants.recorded import (
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.imports import Origin, find_class
 
 FAMILIES: dict[str, type[Component]] = {
     "plant": Plant,
@@ -127,15 +124,17 @@ def time_words(slotted: bool) -> str:
     return f"belongs to plants {needs}, and this plant is {has}"
 
 
-def find(family: str, kind: object, folder: Path) -> type[Component]:
-    """The class of ``kind``: a name of the table, or ``"package.module:Class"``, looked up beside
-    the scenario file and in the current folder too.
+def find(family: str, kind: object, origin: Origin) -> type[Component] | None:
+    """Return the class of ``kind``: a name of the table, or ``"package.module:Class"``.
+
+    It is None if the class waits for its import, see :class:`Origin`. Raises ScenarioError if there
+    is no such class, or if it may not be imported.
     """
     names = KINDS[family]
     if isinstance(kind, str) and kind in names:
         return names[kind]
     if isinstance(kind, str) and ":" in kind:
-        return _imported(family, kind, folder)
+        return _custom(family, kind, origin)
     words = other_time(family, kind)
     if words is not None:
         raise ScenarioError("kind", words, kind, "change the plant or choose another kind")
@@ -148,22 +147,10 @@ def find(family: str, kind: object, folder: Path) -> type[Component]:
     )
 
 
-def _imported(family: str, kind: str, folder: Path) -> type[Component]:
-    module_name, _, class_name = kind.partition(":")
-    places = [place for place in (str(folder), str(Path.cwd())) if place not in sys.path]
-    sys.path[:0] = places
-    try:
-        forget_other(module_name, folder)
-        found = getattr(importlib.import_module(module_name), class_name)
-    except (Exception, SystemExit) as error:
-        raise ScenarioError(
-            "kind",
-            f"could not be imported ({type(error).__name__}: {quote(str(error))})",
-            kind,
-            "put the module beside the scenario file or on the Python path",
-        ) from None
-    finally:
-        sys.path[: len(places)] = []
+def _custom(family: str, kind: str, origin: Origin) -> type[Component] | None:
+    found = find_class(kind, origin)
+    if found is None:
+        return None
     contract = FAMILIES[family]
     allowed = (contract, *FORMER.get(family, ()))
     if not (isinstance(found, type) and issubclass(found, allowed)):
@@ -179,17 +166,6 @@ def _imported(family: str, kind: str, folder: Path) -> type[Component]:
             "kind", f"must define {', '.join(missing)}", kind, "write what the contract asks for"
         )
     return found
-
-
-def forget_other(module_name: str, folder: Path) -> None:
-    """A module beside the scenario wins over one of that name imported from elsewhere."""
-    beside, loaded = folder / f"{module_name}.py", sys.modules.get(module_name)
-    other = getattr(loaded, "__file__", None)
-    if loaded is None or not beside.exists():
-        return
-    if other is None or not Path(other).exists() or not beside.samefile(other):
-        del sys.modules[module_name]
-        importlib.invalidate_caches()
 
 
 def _is_abstract(attribute: object) -> bool:

@@ -33,7 +33,11 @@ class Scenario(DerivedScenario):
 
         Derived values are computed again; the topology may come from a file that is elsewhere.
         """
-        kept = {field.name for field in dataclasses.fields(self)} | {"_folder", "topology"}
+        kept = {field.name for field in dataclasses.fields(self)} | {
+            "_folder",
+            "_trust",
+            "topology",
+        }
         return {name: value for name, value in self.__dict__.items() if name in kept}
 
     def __repr__(self) -> str:

@@ -12,14 +12,18 @@ from netkf.core.errors import ScenarioError, nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file
 from netkf.network.channels import Channel
 from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.plugins import blame, in_words, is_ours
-from netkf.scenario.registry import SLOTTED, find
+from netkf.scenario.registry import KINDS, SLOTTED, find
 from netkf.scenario.writing import as_table
 
 FORMAT = 1
 UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
+
+WAITING = object()
+"""Stands for a part whose class waits for its import, and for what holds such a part."""
 
 # The class to build is a parameter, so that Scenario.replace can call this module.
 S = TypeVar("S", bound=DerivedScenario)
@@ -31,7 +35,8 @@ def changed(scenario: S, changes: Mapping[str, Any]) -> S:
     if folder is None:  # built in Python
         folder = next((s.folder for s in source_files(scenario)), Path.cwd())
     try:
-        return build_scenario(type(scenario), with_changes(as_table(scenario), changes), folder)
+        origin = Origin(folder, getattr(scenario, "_trust", True))
+        return build_scenario(type(scenario), with_changes(as_table(scenario), changes), origin)
     except ScenarioError as error:
         raise explain_left_over(error, changes) from None
 
@@ -84,12 +89,24 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
     return {**node, key: _set(node.get(key), rest, value, path)}
 
 
-def build_scenario(cls: type[S], table: Mapping[str, Any], folder: Path) -> S:
-    """Return a scenario of class ``cls`` from the tables of a file that lies in ``folder``.
+def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
+    """Return a scenario of class ``cls`` from the tables of a file.
 
     Raises ScenarioError, with the path of the key, for the first mistake.
     """
-    table = dict(table)
+    # Importing a module executes it, and a file that is refused must execute nothing.
+    scenario = _build(cls, table, origin._replace(imports=False))
+    if scenario is WAITING:
+        scenario = _build(cls, table, origin)
+    # What replace needs to look up files and modules.
+    object.__setattr__(scenario, "_folder", origin.folder)
+    object.__setattr__(scenario, "_trust", origin.trust)
+    made: S = scenario
+    return made
+
+
+def _build(cls: type[S], given: Mapping[str, Any], origin: Origin) -> Any:
+    table = dict(given)
     version = table.pop("format", None)
     if version is None:
         raise ScenarioError("format", "is missing", None, f"write format = {FORMAT} first")
@@ -98,19 +115,18 @@ def build_scenario(cls: type[S], table: Mapping[str, Any], folder: Path) -> S:
     table.setdefault("sensors", [])
     time = ""
     if "plant" in table:
-        table["plant"] = _under("plant", lambda value: _plant(value, folder), table["plant"])
+        table["plant"] = _under("plant", lambda value: _plant(value, origin), table["plant"])
         time = "slot " if isinstance(table["plant"], SLOTTED) else ""
+        time = "unknown" if table["plant"] is WAITING else time
     readers: dict[str, Callable[[Any], Any]] = {
-        "sensors": lambda value: _list(value, folder),
-        "network": lambda value: _network(value, folder, time),
-        "filter": lambda value: _filtering(value, folder),
+        "sensors": lambda value: _list(value, origin),
+        "network": lambda value: _network(value, origin, time),
+        "filter": lambda value: _filtering(value, origin),
     }
     for key, reader in readers.items():
         if key in table:
             table[key] = _under(key, reader, table[key])
-    scenario: S = _part(cls, table, folder, ("format",))
-    object.__setattr__(scenario, "_folder", folder)  # where replace looks files and modules up
-    return scenario
+    return _part(cls, table, origin, ("format",))
 
 
 def _under(key: str, reader: Any, value: Any) -> Any:
@@ -120,8 +136,13 @@ def _under(key: str, reader: Any, value: Any) -> Any:
         raise error.under(key) from None
 
 
-def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str, ...] = ()) -> Any:
-    """``others`` are keys that stand in the same table and are read elsewhere."""
+def _part(
+    cls: type[Any], table: dict[str, Any], origin: Origin, others: tuple[str, ...] = ()
+) -> Any:
+    """Return an object of a class, or WAITING if a part of it waits.
+
+    ``others`` are keys that stand in the same table and are read elsewhere.
+    """
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for key, value in table.items():
         if key not in fields:
@@ -133,12 +154,22 @@ def _part(cls: type[Any], table: dict[str, Any], folder: Path, others: tuple[str
             remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
             raise ScenarioError(name, "is missing", None, remedy)
     values = {
-        name: SourceFile(value, folder)
+        name: SourceFile(value, origin.folder)
         if fields[name].metadata.get("rule") is source_file and isinstance(value, str)
         else value
         for name, value in table.items()
     }
+    if any(map(_waits, values.values())):
+        for name, value in values.items():
+            rule = fields[name].metadata.get("rule")
+            if rule is not None and not _waits(value):
+                rule(name, value)
+        return WAITING
     return _made(cls, values)
+
+
+def _waits(value: Any) -> bool:
+    return value is WAITING or (isinstance(value, tuple) and any(map(_waits, value)))
 
 
 def _made(cls: type[Any], values: dict[str, Any]) -> Any:
@@ -156,20 +187,21 @@ def _made(cls: type[Any], values: dict[str, Any]) -> Any:
         raise ScenarioError("", words, None, "mend the class or its settings") from error
 
 
-def _plant(value: Any, folder: Path) -> Any:
+def _plant(value: Any, origin: Origin) -> Any:
     table = _table(value)
     known = table.get("kind") in ("recorded", "unknown")
     continuous = known and ("A" in table or "B" in table)
-    return _kind("continuous plant" if continuous else "plant", folder, table)
+    return _kind("continuous plant" if continuous else "plant", origin, table)
 
 
-def _kind(family: str, folder: Path, value: Any, default: str | None = None) -> Any:
+def _kind(family: str, origin: Origin, value: Any, default: str | None = None) -> Any:
     table = _table(value)
     kind = table.pop("kind", default)
     if kind is None:
         raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
     others = ("kind", "mean", "cov", "model") if family == "filter" else ("kind",)
-    return _part(find(family, kind, folder), table, folder, others)
+    cls = find(family, kind, origin)
+    return WAITING if cls is None else _part(cls, table, origin, others)
 
 
 def _table(value: Any) -> dict[str, Any]:
@@ -178,51 +210,65 @@ def _table(value: Any) -> dict[str, Any]:
     return dict(value)
 
 
-def _list(value: Any, folder: Path) -> tuple[Any, ...]:
+def _list(value: Any, origin: Origin) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     return tuple(
-        _under(f"[{k}]", lambda item: _sensor(item, folder), item) for k, item in enumerate(value)
+        _under(f"[{k}]", lambda item: _sensor(item, origin), item) for k, item in enumerate(value)
     )
 
 
-def _sensor(value: Any, folder: Path) -> Any:
+def _sensor(value: Any, origin: Origin) -> Any:
     table = _table(value)
     if isinstance(table.get("sampling"), Mapping):
-        read = partial(_kind, "sampling", folder)
+        read = partial(_kind, "sampling", origin)
         table["sampling"] = _under("sampling", read, table["sampling"])
-    return _kind("sensor", folder, table, "linear")
+    return _kind("sensor", origin, table, "linear")
 
 
-def _network(value: Any, folder: Path, time: str) -> Network:
+def _network(value: Any, origin: Origin, time: str) -> Network:
     table = _table(value)
-    for key, family in (("graph", "graph"), ("activation", f"{time}activation")):
-        if key in table:
-            table[key] = _under(key, partial(_kind, family, folder), table[key])
+    if "graph" in table:
+        table["graph"] = _under("graph", partial(_kind, "graph", origin), table["graph"])
+    if "activation" in table:
+        read = partial(_activation, origin, time)
+        table["activation"] = _under("activation", read, table["activation"])
     if "channel" in table:
-        table["channel"] = _under("channel", lambda v: _channel(v, folder), table["channel"])
-    network: Network = _part(Network, table, folder)
+        table["channel"] = _under("channel", lambda v: _channel(v, origin), table["channel"])
+    network: Network = _part(Network, table, origin)
     return network
 
 
-def _channel(value: Any, folder: Path) -> Channel:
+def _activation(origin: Origin, time: str, value: Any) -> Any:
+    if time == "unknown":  # the plant waits
+        kind = _table(value).get("kind")
+        homes = [
+            t for t in ("", "slot ") if isinstance(kind, str) and kind in KINDS[f"{t}activation"]
+        ]
+        if len(homes) > 1:
+            return WAITING
+        time = homes[0] if homes else ""
+    return _kind(f"{time}activation", origin, value)
+
+
+def _channel(value: Any, origin: Origin) -> Channel:
     table = _table(value)
     for family in ("loss", "delay"):
         if family in table:
-            table[family] = _under(family, partial(_kind, family, folder), table[family])
-    channel: Channel = _part(Channel, table, folder)
+            table[family] = _under(family, partial(_kind, family, origin), table[family])
+    channel: Channel = _part(Channel, table, origin)
     return channel
 
 
-def _filtering(value: Any, folder: Path) -> Filtering:
+def _filtering(value: Any, origin: Origin) -> Filtering:
     table = _table(value)
     shared: dict[str, Any] = {
         key: table.pop(key) for key in ("mean", "cov", "model") if key in table
     }
     if "model" in shared:
         shared["model"] = _under(
-            "model", lambda v: _part(Belief, _table(v), folder), shared["model"]
+            "model", lambda v: _part(Belief, _table(v), origin), shared["model"]
         )
-    algorithm = _kind("filter", folder, table)
-    filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, folder)
+    algorithm = _kind("filter", origin, table)
+    filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, origin)
     return filtering

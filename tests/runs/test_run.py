@@ -174,7 +174,7 @@ def plugged(tmp_path):
 
 
 def test_a_filter_that_raises_is_named_in_one_line(plugged, tmp_path, capsys):
-    assert main(["run", str(plugged("Bad")), "--out", str(tmp_path / "out")]) == 2
+    assert main(["run", "--trust", str(plugged("Bad")), "--out", str(tmp_path / "out")]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith(
@@ -205,7 +205,7 @@ def test_a_module_beside_the_scenario_travels_with_the_run(tmp_path, ring, capsy
     text = (SCENARIOS / "poisson_ring.toml").read_text().replace("20.0", "2.0")
     (home / "ring.toml").write_text(text.replace('"hybrid"', '"fine_filters:Fine"'))
     out = tmp_path / "out"
-    assert main(["run", str(home / "ring.toml"), "--out", str(out), "--no-plot"]) == 0
+    assert main(["run", str(home / "ring.toml"), "--trust", "--out", str(out), "--no-plot"]) == 0
     assert capsys.readouterr().err == ""
     (home / "fine_filters.py").unlink()
     again = run_to_directory(netkf.load(out / "scenario.toml"), tmp_path / "again")
@@ -262,7 +262,7 @@ def test_a_class_that_cannot_be_made_is_refused(plugged):
 @pytest.mark.parametrize("command", ["run", "theory"])
 def test_a_class_that_fails_at_the_start_is_named_in_one_line(plugged, command, tmp_path, capsys):
     out = ["--out", str(tmp_path / "out")] if command == "run" else []
-    assert main([command, str(plugged("Weightless")), *out]) == 2
+    assert main([command, "--trust", str(plugged("Weightless")), *out]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("netkf: failing_filters:Weightless failed in weight: ZeroDiv")
@@ -270,7 +270,8 @@ def test_a_class_that_fails_at_the_start_is_named_in_one_line(plugged, command, 
 
 
 def test_a_covariance_that_is_not_a_number_is_not_called_an_overflow(plugged, tmp_path, capsys):
-    assert main(["run", str(plugged("Nan")), "--out", str(tmp_path / "out"), "--no-plot"]) == 0
+    file, out = str(plugged("Nan")), str(tmp_path / "out")
+    assert main(["run", file, "--trust", "--out", out, "--no-plot"]) == 0
     printed = capsys.readouterr()
     assert "overflow" not in printed.out
     assert printed.err.startswith("note: diverged, the estimate or covariance of node")

@@ -810,7 +810,7 @@ def test_the_unchanged_scenario_is_no_mistake(write):
 @pytest.mark.parametrize(("change", "key", "fragment"), rows(TABLE))
 def test_a_mistake_is_refused_in_one_line(change, key, fragment, write, refusal, tmp_path):
     path = write(change)
-    line = refusal("run", path, "--out", tmp_path / "out", "--no-plot")
+    line = refusal("run", path, "--trust", "--out", tmp_path / "out", "--no-plot")
     where = f"{path}: " if key is None else f"{path}: {key}"
     assert where in line
     if key is not None and "aaaa" not in key:

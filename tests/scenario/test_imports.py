@@ -1,0 +1,336 @@
+"""A scenario of a stranger executes nothing; see docs/security.md."""
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import netkf
+from netkf.cli.main import main
+from netkf.scenario import imports
+from netkf.scenario.plugins import module_files
+from netkf.scenario.writing import as_table, to_toml
+from tests.conftest import SCENARIOS
+
+PART = "from netkf.parts import Hybrid\n\n\nclass P(Hybrid):\n    pass\n"
+COMMANDS = (
+    ["theory"],
+    ["run", "--out", "out"],
+    ["check"],
+    ["sweep", "--vary", "horizon=1,2"],
+    ["size", "--vary", "horizon=1:2", "--target", "worst_rms<=1"],
+    ["consistency"],
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A stranger's folder; modules made by ``module`` note in ``ran`` that they were executed."""
+    place = tmp_path / "stranger"
+    place.mkdir()
+    before = dict(sys.modules)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield place
+    for name in [name for name in sys.modules if name not in before]:
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+
+
+def module(path, text=PART):
+    """Write a module that leaves a file ``ran`` beside it when it is executed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"open({str(path.with_suffix('.ran'))!r}, 'w').close()\n{text}")
+
+
+def ran(folder):
+    return sorted(file.name for file in folder.rglob("*.ran"))
+
+
+def scenario(folder, kind="evil:P", **changes):
+    table = as_table(netkf.load(SCENARIOS / "poisson_ring.toml"))
+    table["filter"]["kind"] = kind
+    file = folder / "ring.toml"
+    file.write_text(to_toml(table | changes))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("kind", "path"),
+    [
+        ("evil:P", "evil.py"),
+        ("evil:P", "evil/__init__.py"),
+        ("below.evil:P", "below/evil.py"),
+        ("stranger.evil:P", "evil.py"),
+        ("json_:P", "json_.py"),
+    ],
+)
+@pytest.mark.parametrize("current", [".", ".."])
+@pytest.mark.parametrize("on_path", [None, ".", ".."])
+def test_modules_of_the_folder_need_trust(folder, monkeypatch, kind, path, current, on_path):
+    module(folder / path)
+    file = scenario(folder, kind)
+    monkeypatch.chdir(folder / current)
+    if on_path is not None:
+        monkeypatch.syspath_prepend(folder / on_path)
+    found = kind != "stranger.evil:P" or current == ".." or on_path == ".."
+    words = "add --trust" if found else "could not be imported"
+    with pytest.raises(netkf.ScenarioError, match=rf"filter\.kind: .*{words}"):
+        netkf.load(file, trust=False)
+    assert not ran(folder)
+    if found:
+        assert type(netkf.load(file).filter.algorithm).__name__ == "P"
+        assert ran(folder)
+
+
+def test_modules_of_the_current_folder_need_trust(folder, tmp_path, monkeypatch):
+    here = tmp_path / "here"
+    module(here / "evil.py")
+    monkeypatch.chdir(here)
+    monkeypatch.syspath_prepend("")
+    with pytest.raises(netkf.ScenarioError, match="add --trust"):
+        netkf.load(scenario(folder), trust=False)
+    assert not ran(here)
+    netkf.load(scenario(folder))
+    with pytest.raises(netkf.ScenarioError, match="add --trust"):  # although it is loaded now
+        netkf.load(scenario(folder), trust=False)
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[0])
+def test_every_command_refuses_in_one_line(folder, capsys, monkeypatch, command):
+    module(folder / "evil.py")
+    monkeypatch.chdir(folder)
+    name, *options = command
+    assert main([name, str(scenario(folder)), *options]) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert err.count("\n") == 1
+    assert "--trust" in err
+    assert not ran(folder)
+    assert not (folder / "out").exists()
+
+
+def test_trust_is_an_option_and_run_directories_need_it_too(folder, capsys, monkeypatch):
+    module(folder / "evil.py")
+    file, out = str(scenario(folder, horizon=1.0)), folder / "out"
+    assert main(["run", file, "--trust", "--out", str(out), "--no-plot"]) == 0
+    assert ran(folder) == ["evil.ran"]
+    (folder / "evil.ran").unlink()
+    for again in (
+        ["theory", str(out / "scenario.toml")],
+        ["run", file, "--resume", "--out", str(out)],
+    ):
+        assert main(again) == 2
+        assert "--trust" in capsys.readouterr().err
+        assert not ran(folder)
+    assert main(["theory", str(out / "scenario.toml"), "--trust"]) == 0
+    assert main(["compare", str(out), str(out)]) == 0
+
+
+MISTAKES = {
+    "nonsense": 1,
+    "horizon": -1.0,
+    "plant": {"kind": "diffusion", "A": [[0.0, 1.0]], "B": [[1.0]]},
+    "sensors": [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[-1.0]]}],
+    "network": {"graph": {"kind": "cycle", "nodes": 6, "size": 1}},
+    "filter": {"kind": "evil:P", "cov": [[-1.0]]},
+}
+
+
+@pytest.mark.parametrize("key", MISTAKES)
+def test_a_file_that_is_refused_imports_nothing(folder, key):
+    module(folder / "evil.py")
+    with pytest.raises(netkf.ScenarioError, match=key):
+        netkf.load(scenario(folder, **{key: MISTAKES[key]}))
+    assert not ran(folder)
+
+
+def test_the_other_parts_are_checked_where_the_plant_waits(folder):
+    text = "from netkf.parts import LinearPlant\n\n\nclass P(LinearPlant):\n    pass\n"
+    module(folder / "evil.py", text)
+    plant = {"kind": "evil:P", "F": [[0.5]], "Q": [[1.0]], "period": 1.0}
+    activation = {"kind": "matching", "protocol": "one-edge"}
+    network = {"graph": {"kind": "path", "nodes": 2}, "activation": activation}
+    good = {
+        "plant": plant,
+        "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}],
+        "network": network,
+        "filter": {"kind": "gossip"},
+        "probe": 1.0,
+    }
+    wrong = network | {"activation": activation | {"protocol": "two-edges"}}
+    with pytest.raises(netkf.ScenarioError, match="protocol"):
+        netkf.load(scenario(folder, **good | {"network": wrong}))
+    assert not ran(folder)
+    assert netkf.load(scenario(folder, **good)).slotted
+
+
+def test_replace_and_pickle_keep_the_rule(folder):
+    module(folder / "evil.py")
+    stranger = netkf.load(scenario(folder, "hybrid"), trust=False)
+    for again in (stranger, pickle.loads(pickle.dumps(stranger)), stranger.replace({"seed": 5})):
+        with pytest.raises(netkf.ScenarioError, match="add --trust"):
+            again.replace({"filter.kind": "evil:P"})
+    assert not ran(folder)
+    netkf.load(scenario(folder, "hybrid")).replace({"filter.kind": "evil:P"})
+    assert ran(folder)
+
+
+@pytest.fixture
+def site(folder, monkeypatch):
+    """A folder of installed packages inside the stranger's folder, as that of a .venv can be."""
+    place = folder / ".venv" / "site-packages"
+    place.mkdir(parents=True)
+    folders = imports._package_folders()
+    monkeypatch.setattr(imports, "_package_folders", lambda: [*folders, place.resolve()])
+    monkeypatch.syspath_prepend(place)
+    return place
+
+
+PACKAGES = {
+    "good:P": {"good.py": PART},
+    "good.deep:P": {"good/__init__.py": "", "good/deep.py": PART},
+    "good:Q": {
+        "good/__init__.py": "from .deep import P as Q\n",
+        "good/deep.py": "from . import base\n\n\nclass P(base.P):\n    pass\n",
+        "good/base.py": "try:\n    import netkf.parts as parts\nexcept ImportError:\n    raise\n"
+        "class P(parts.Hybrid):\n    pass\n",
+    },
+    "good:R": {"good.py": "import netkf\n\n\nclass P(netkf.parts.Hybrid):\n    pass\n\n\nR = P\n"},
+    "good:S": {"good/__init__.py": "from good.all import *\n", "good/all.py": PART + "S = P\n"},
+}
+
+
+@pytest.mark.parametrize("kind", PACKAGES)
+def test_classes_of_installed_packages_are_imported(folder, site, monkeypatch, kind):
+    for path, text in PACKAGES[kind].items():
+        module(site / path, text)
+    monkeypatch.chdir(folder)
+    netkf.load(scenario(folder, kind), trust=False)
+    assert ran(site)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("side:P", "class P:\n    pass\n"),
+        ("side:Q", PART),
+        ("side:P", "from json import *\n\n\nclass P(JSONDecoder):\n    pass\n"),
+        ("side:P", "class P(P):\n    pass\n"),
+        ("side:P", "class P(Q):\n    pass\n\n\nclass Q(P):\n    pass\n"),
+        ("side:P", "def P(:\n"),
+        ("side.P:P", PART),
+        ("side:P()", PART),
+        ("antigravity:X", ""),
+        ("json:JSONDecoder", ""),
+        ("__main__:X", ""),
+        ("netkf.__main__:main", ""),
+        ("netkf.cli.main:make_parser", ""),
+        ("netkf.nonsense:P", ""),
+    ],
+)
+def test_installed_modules_without_such_a_part_are_not_imported(folder, site, kind, text):
+    module(site / "side.py", text)
+    with pytest.raises(netkf.ScenarioError, match=r"filter\.kind: "):
+        netkf.load(scenario(folder, kind), trust=False)
+    assert not ran(site)
+    assert "antigravity" not in sys.modules
+
+
+def test_installed_packages_win_over_the_folder_and_do_not_import_from_it(
+    folder, site, monkeypatch
+):
+    module(site / "good.py", "import helper\n" + PART)
+    module(site / "helper.py", "")
+    for name in ("good.py", "helper.py"):
+        module(folder / name)
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    loaded = netkf.load(scenario(folder, "good:P"), trust=False)
+    assert ran(site) == ["good.ran", "helper.ran"]
+    assert not list(folder.glob("*.ran"))
+    assert module_files(loaded) == {"good": None}  # the one beside the scenario is not copied
+
+
+@pytest.mark.parametrize(
+    ("line", "current", "file", "allowed"),
+    [
+        ("../../project", "project", "elsewhere", True),
+        ("../../project/src", "project", "project", True),
+        ("../../project", "elsewhere", "project", False),
+        ("../../project", "elsewhere", "project/scenarios", True),
+    ],
+)
+def test_editable_installs_are_installed(folder, site, monkeypatch, line, current, file, allowed):
+    """``.pth`` files name their folders, relative to the packages; see docs/security.md."""
+    (site / "mine.pth").write_text(f"# a comment\nimport os\n{line}\n")
+    root = (site / line).resolve()
+    module(root / "mine.py")
+    for name in (current, file):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(folder / current)
+    monkeypatch.syspath_prepend(root)
+    chosen = scenario(folder / file, "mine:P")
+    if allowed:
+        netkf.load(chosen, trust=False)
+    else:
+        with pytest.raises(netkf.ScenarioError, match="add --trust"):
+            netkf.load(chosen, trust=False)
+    assert bool(ran(root)) is allowed
+
+
+@pytest.mark.parametrize(("given", "allowed"), [("{}/lib", True), ("lib", False), ("{}", False)])
+def test_the_python_path_counts_where_it_does_not_depend_on_the_folder(
+    folder, monkeypatch, given, allowed
+):
+    """An absolute entry below the current folder is a choice of the user's."""
+    module(folder / "lib" / "mine.py")
+    module(folder / "mine.py")
+    monkeypatch.chdir(folder)
+    entry = given.format(folder)
+    monkeypatch.setenv("PYTHONPATH", entry)
+    monkeypatch.syspath_prepend(os.path.abspath(entry))
+    chosen = scenario(folder, "mine:P")
+    if allowed:
+        netkf.load(chosen, trust=False)
+    else:
+        with pytest.raises(netkf.ScenarioError, match="add --trust"):
+            netkf.load(chosen, trust=False)
+    assert bool(ran(folder)) is allowed
+
+
+def test_a_loaded_module_of_that_name_is_not_taken_for_an_installed_one(folder, site):
+    module(site / "good.py")
+    module(folder / "good.py")
+    assert "stranger/good" in str(sys.modules[_loaded(scenario(folder, "good:P"))].__file__)
+    with pytest.raises(netkf.ScenarioError, match="another module of that name is loaded"):
+        netkf.load(scenario(folder, "good:P"), trust=False)
+
+
+def _loaded(file):
+    return type(netkf.load(file).filter.algorithm).__module__
+
+
+def test_workers_import_nothing_from_the_current_folder(folder):
+    """Python starts them with ``-c``, which puts the current folder on the import path."""
+    for name in ("multiprocessing", "pickle", "numpy", "random"):
+        module(folder / f"{name}.py", "raise ImportError\n")
+    shutil.copy(SCENARIOS / "poisson_ring.toml", folder)
+    root = Path(netkf.__file__).parents[1]
+    (folder / "bin").mkdir()
+    script = folder / "bin" / "netkf"
+    script.write_text("import sys\nfrom netkf.cli.main import main\nsys.exit(main())\n")
+    options = ["--runs", "4", "--workers", "2", "--no-plot", "--out", "out", "--engine", "simpy"]
+    done = subprocess.run(
+        [sys.executable, str(script), "run", "poisson_ring.toml", *options],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not ran(folder)
