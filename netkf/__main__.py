@@ -1,7 +1,6 @@
 """``python -m netkf`` is ``netkf``."""
 
-import sys
-
 from netkf.cli.main import main
 
-sys.exit(main())
+if __name__ == "__main__":
+    main()

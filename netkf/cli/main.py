@@ -1,23 +1,33 @@
-"""The entry point of ``netkf``: the parser, and what each kind of error looks like to a user."""
+"""The entry point of ``netkf``: the parser, and what each kind of error looks like to a user.
+
+Imports little before signals are handled: an interrupt has to find a handler from the start.
+"""
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import os
 import sys
-import traceback
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import netkf
-from netkf.cli import check, compare, consistency, run, size, sweep, theory
-from netkf.core.errors import NetkfError
-
-BAD_USAGE, INTERRUPTED = 2, 130
-COMMANDS = tuple(
-    module.COMMAND for module in (run, check, theory, sweep, size, consistency, compare)
+from netkf.cli.process import (
+    INTERRUPTED,
+    Interruption,
+    OutputError,
+    discard_output,
+    run_as_process,
+    safe_streams,
 )
+from netkf.core.errors import NetkfError
+from netkf.core.printable import one_line
+
+if TYPE_CHECKING:
+    import argparse
+
+BAD_USAGE = 2
+COMMANDS = ("run", "check", "theory", "sweep", "size", "consistency", "compare")
+"""Modules of this package, each with a COMMAND."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,61 +35,103 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0: done. 1: a promise is broken or a target is not reached. 2: bad usage, a bad file, or a
     failure: reported in one line, or with a traceback where nobody foresaw it. 130: interrupted.
+
+    Without ``arguments`` it runs the command line of this process, and ends the process.
     """
     if arguments is None:
         # Processes that Python starts for workers would import from the current folder before they
         # are told the path of this one; it may be that of a scenario of someone else.
         os.environ["PYTHONSAFEPATH"] = "1"
-    options = make_parser().parse_args(arguments)
+        run_as_process(partial(_run_command, sys.argv[1:]))
+    with Interruption() as interruption:
+        return _run_command(arguments, interruption)
+
+
+class _Ending(NamedTuple):
+    """The exit status of a command and its line on standard error, if any."""
+
+    status: int
+    line: str = ""
+
+
+def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
+    """Run a command, print its line on standard error, and return the exit status."""
+    with safe_streams():
+        try:
+            interruption.arm()
+            ending = _attempt(arguments, interruption)
+            interruption.disarm()
+        except KeyboardInterrupt as stop:
+            ending = _interrupted(str(stop))
+        if ending.line:
+            print(f"netkf: {one_line(ending.line)}", file=sys.stderr)
+    return ending.status
+
+
+def _attempt(arguments: Sequence[str], interruption: Interruption) -> _Ending:
+    """Run a command; raises KeyboardInterrupt, and SystemExit for bad usage."""
     try:
+        options = make_parser().parse_args(arguments)
         status: int = options.run(options)
         # A full disk or a closed pipe must show here, where it can be reported in one line.
         sys.stdout.flush()
-    except NetkfError as error:
-        print(f"netkf: {error}", file=sys.stderr)
-        return BAD_USAGE
-    except KeyboardInterrupt as stop:
-        print(f"netkf: interrupted; {stop}" if str(stop) else "netkf: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
-    except OSError as error:
-        path = f" ({error.filename})" if error.filename else ""
-        print(f"netkf: cannot write: {error.strerror or error}{path}", file=sys.stderr)
-        _discard_output()
-        return BAD_USAGE
+    except OutputError as error:
+        discard_output()
+        if isinstance(error.__cause__, BrokenPipeError):
+            return _Ending(0)
+        return _Ending(BAD_USAGE, f"cannot write: {_reason(error.__cause__)}")
     except Exception as error:
-        # Python's own exit status would be 1, which says that a promise is broken.
-        traceback.print_exc()
-        print(f"netkf: failed with {type(error).__name__}, see above", file=sys.stderr)
-        return BAD_USAGE
-    return status
+        line = _explain(error)
+        if interruption.received:  # while it ended, or because a library met the interrupt
+            return _interrupted(line or "")
+        if line is None:
+            return _Ending(BAD_USAGE, _print_traceback(error))
+        return _Ending(BAD_USAGE, line)
+    return _Ending(status)
+
+
+def _interrupted(what: str) -> _Ending:
+    return _Ending(INTERRUPTED, f"interrupted; {what}" if what else "interrupted")
+
+
+def _explain(error: Exception) -> str | None:
+    """Return the line about an error, None if nobody foresaw it."""
+    if isinstance(error, NetkfError):
+        return str(error)
+    if isinstance(error, OSError):
+        path = f" ({error.filename})" if error.filename else ""
+        return f"{_reason(error)}{path}"
+    if isinstance(error, MemoryError):
+        return "the memory is too small; take fewer nodes, a shorter horizon or fewer probe times"
+    return None
+
+
+def _reason(error: BaseException | None) -> str:
+    return getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+
+
+def _print_traceback(error: Exception) -> str:
+    import traceback
+
+    traceback.print_exception(error)
+    # Python's own exit status would be 1, which says that a promise is broken.
+    return f"failed with {type(error).__name__}, see above"
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser; each command puts its function ``run`` into the namespace."""
-    parser = _Parser(
+    from importlib import import_module
+
+    import netkf
+    from netkf.cli.options import Parser
+
+    parser = Parser(
         prog="netkf",
         description="Simulate distributed Kalman filters on random networks and compare them with "
         "the guarantees of their papers.",
     )
     parser.add_argument("--version", action="version", version=f"netkf {netkf.__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-    for command in COMMANDS:
-        command.add_to(commands)
+    commands: Any = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
+    for name in COMMANDS:
+        import_module(f"netkf.cli.{name}").COMMAND.add_to(commands)
     return parser
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, without the usage text."""
-
-    def error(self, message: str) -> Any:
-        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
-        raise SystemExit(BAD_USAGE)
-
-
-def _discard_output() -> None:
-    """Send the rest of stdout to the null device, else Python fails again when it exits."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import quote
+from netkf.core.printable import one_line
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -23,6 +24,15 @@ if TYPE_CHECKING:
 FAILED = 1
 """Exit status of a command that ran and whose answer is no."""
 ENGINES = ("auto", "simpy", "processes", "compiled")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, without the usage text, and exit status 2."""
+
+    def error(self, message: str) -> Any:
+        """Print the line and end with SystemExit."""
+        print(f"{self.prog}: {one_line(message)}; see {self.prog} --help", file=sys.stderr)
+        raise SystemExit(2)
 
 
 @dataclass(frozen=True)
@@ -153,12 +163,12 @@ def load_scenario(
 def print_notes(notes: Sequence[str]) -> None:
     """Print notes to stderr, one per line."""
     for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+        print(f"note: {one_line(note)}", file=sys.stderr)
 
 
 def print_title(scenario: Scenario) -> None:
     """Print the name of a scenario and its claim."""
-    print(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name)
+    print(one_line(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name))
 
 
 def print_json(document: Any) -> None:

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from types import TracebackType
 
+from netkf.core.printable import one_line
+
 CLEAR_LINE = "\r\033[K"
 REPORT_SECONDS = 20.0
 """Seconds between two reports of a command that prints to a file or a pipe."""
@@ -32,13 +34,13 @@ class ProgressLine:
         trace: TracebackType | None,
     ) -> None:
         if self._printed:
-            print(CLEAR_LINE, end="", file=sys.stderr, flush=True)
+            _print_direct("")
 
     def show(self, text: str) -> None:
         """Replace the line by a text."""
         if self._is_terminal:
             self._printed = True
-            print(f"{CLEAR_LINE}{text}", end="", file=sys.stderr, flush=True)
+            _print_direct(one_line(text))
 
     def report(self, text: str) -> None:
         """Replace the line by a text; without a terminal print it every REPORT_SECONDS seconds."""
@@ -77,3 +79,10 @@ class ProgressLine:
             self.show(f"{done:,} of {wanted:,} {unit}{left}")
 
         return update
+
+
+def _print_direct(text: str) -> None:
+    """Replace the present line of the terminal by a text."""
+    write = getattr(sys.stderr, "direct", sys.stderr.write)
+    write(f"{CLEAR_LINE}{text}")
+    sys.stderr.flush()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import threading
 from functools import partial
@@ -64,9 +63,6 @@ def _run(options: argparse.Namespace) -> int:
 
         start_early()
     scenario = load_scenario(options)
-    if threading.current_thread() is threading.main_thread():
-        # Batch systems stop jobs with SIGTERM: finish the files as after Ctrl-C.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
-import threading
 import time
 from abc import ABC, abstractmethod
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import suppress
+from collections.abc import Collection
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from typing import Any
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.ensembles.blocks import Job, PackedScenario, packed, work
-from netkf.ensembles.process_start import context, main_hidden, one_blas_thread
+from netkf.ensembles.workers import WorkerProcesses
 from netkf.linalg.compiling import seconds_spent
 from netkf.scenario.scenario import Scenario
 
@@ -54,9 +51,9 @@ class Pool(ABC):
         """Runs of the next block, a power of two, where so many of all ``runs`` are left."""
         return block_size(runs, self.width)
 
-    def renew(self) -> bool:
-        """Replace workers that died; False where that is not ours to do."""
-        return False
+    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+        """Wait until one of the futures of ``submit`` is done; return all that are."""
+        return wait(futures, return_when=FIRST_COMPLETED).done
 
     def close(self, at_once: bool) -> None:  # noqa: B027 - most have nothing of their own
         """Give back what is ours; ``at_once`` without waiting for blocks that are being done."""
@@ -139,9 +136,9 @@ class Adaptive(Here):
             expected = max(expected, self._spent)
         return expected * (1.0 - 1.0 / self.width) > SAVING
 
-    def renew(self) -> bool:
-        """New processes, three times."""
-        return self._processes is not None and self._processes.renew()
+    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+        """Wait until one of the futures is done; return all that are."""
+        return (super() if self._processes is None else self._processes).wait(futures)
 
     def close(self, at_once: bool) -> None:
         """End the processes, if any were started."""
@@ -219,33 +216,18 @@ class Processes(Elsewhere):
     def __init__(self, workers: int) -> None:
         super().__init__()
         self.width = workers
-        self._renewed = 0
-        self._open()
-
-    def _open(self) -> None:
-        self._executor = ProcessPoolExecutor(self.width, context(), initializer=_prepare)
+        self._workers = WorkerProcesses(workers)
 
     def _send(self, job: Job) -> Future[Any]:
-        # Workers are started as they are needed: by the first blocks.
-        assert isinstance(job.scenario, PackedScenario)
-        with one_blas_thread(), main_hidden(b"__main__" not in job.scenario.payload):
-            return self._executor.submit(work, job)
+        return self._workers.submit(job)
 
-    def renew(self) -> bool:
-        """New processes, three times."""
-        self._renewed += 1
-        self.close(at_once=True)
-        self._open()
-        return self._renewed <= 3
+    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+        """Wait until one of the futures is done; return all that are."""
+        return self._workers.wait(futures)
 
     def close(self, at_once: bool) -> None:
         """End the processes."""
-        processes = list((getattr(self._executor, "_processes", None) or {}).values())
-        self._executor.shutdown(wait=not at_once, cancel_futures=True)
-        if at_once:
-            for process in processes:
-                with suppress(OSError, ValueError):
-                    process.kill()
+        self._workers.close(at_once)
 
 
 def cores() -> int:
@@ -295,17 +277,3 @@ def make_pool(
     if count == 1:
         return Here()
     return Adaptive(count, open_ended) if workers is None else Processes(count)
-
-
-def _prepare() -> None:
-    """Prepare a worker process: the parent handles Ctrl-C, and an orphan ends itself."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

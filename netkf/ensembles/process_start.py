@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,11 +34,39 @@ def context() -> Any:
 
 def start_early() -> None:
     """Let the process that workers are forked from load what they need, while this one goes on."""
-    if context().get_start_method() == "forkserver":
-        from multiprocessing.forkserver import ensure_running
+    start_server()
 
-        with one_blas_thread():
-            ensure_running()
+
+def start_server() -> None:
+    """Start the process that workers are forked from, if there is one and it does not run yet.
+
+    It and the workers never see Ctrl-C or SIGTERM, which reach all processes of a terminal or a
+    job: this process alone decides what they mean, and kills the workers.
+    """
+    if context().get_start_method() != "forkserver":
+        return
+    from multiprocessing import forkserver, resource_tracker
+
+    # Started first, because its start unblocks the signals again.
+    resource_tracker.ensure_running()
+    with one_blas_thread(), signals_blocked():
+        forkserver.ensure_running()
+
+
+@contextmanager
+def signals_blocked() -> Iterator[None]:
+    """Block Ctrl-C and SIGTERM for processes that are started meanwhile, which inherit this.
+
+    Signals for this process wait until the block is left.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

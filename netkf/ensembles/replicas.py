@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import BrokenExecutor, Executor, Future
 from functools import partial
 from typing import Any
 
@@ -150,44 +150,24 @@ def _blocks(
 
 
 def _completed(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
-    """Yield blocks and their results as they complete; those of workers that die are redone."""
+    """Yield blocks and their results as they complete.
+
+    Raises EngineError if workers die again and again, or are lost.
+    """
     waiting: dict[Future[Any], Job] = {}
-    again: list[Job] = []
     try:
         while True:
-            broken: BrokenExecutor | None = None
-            try:
-                while len(waiting) < pool.ahead:
-                    block = again.pop() if again else next(blocks, None)
-                    if block is None:
-                        break
-                    again.append(block)
-                    waiting[pool.submit(block)] = again.pop()
-            except BrokenExecutor as error:
-                broken = error
-            if not waiting and broken is None:
+            while len(waiting) < pool.ahead and (block := next(blocks, None)) is not None:
+                waiting[pool.submit(block)] = block
+            if not waiting:
                 return
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                block = waiting.pop(future)
-                try:
-                    result = future.result()
-                except BrokenExecutor as error:
-                    again.append(block)
-                    broken = error
-                    continue
-                yield block, result
-            if broken is not None:
-                again += waiting.values()
-                waiting.clear()
-                _renew(pool, broken)
-    finally:
-        for future in waiting:
-            future.cancel()
-
-
-def _renew(pool: Pool, error: BrokenExecutor) -> None:
-    if not pool.renew():
+            for future in pool.wait(waiting):
+                yield waiting.pop(future), future.result()
+    except BrokenExecutor as error:
         words = "workers ended again and again before their runs were done; perhaps the memory is"
         raise EngineError(
             f"{words} too small, or a class of the scenario ends the process"
         ) from error
+    finally:
+        for future in waiting:
+            future.cancel()

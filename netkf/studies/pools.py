@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ class _OpenPool(Pool):
         """Return the size of the next block."""
         return self._pool.next_size(left, runs)
 
-    def renew(self) -> bool:
-        """Replace workers that died, if the pool can."""
-        return self._pool.renew()
+    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+        """Wait until one of the futures is done; return all that are."""
+        return self._pool.wait(futures)
 
 
 @contextmanager

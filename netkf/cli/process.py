@@ -1,0 +1,225 @@
+"""How the process of a command begins and ends: standard streams, signals, the exit status."""
+
+from __future__ import annotations
+
+import _thread
+import atexit
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from types import FrameType, TracebackType
+from typing import Any, NoReturn, TextIO
+
+from netkf.core.printable import printable
+
+INTERRUPTED = 130
+END_SECONDS = 8.0
+"""Seconds in which an interrupted command ends by itself; then it is ended."""
+EXIT_SECONDS = 4.0
+"""Seconds that functions registered with ``atexit`` have."""
+AGAIN_SECONDS = 0.02
+
+
+class Interruption:
+    """Ctrl-C and SIGTERM raise one KeyboardInterrupt between ``arm`` and ``disarm``; use it as a
+    context manager.
+
+    Batch systems stop jobs with SIGTERM: it means the same as Ctrl-C. Later signals are ignored:
+    the command is ending. It has END_SECONDS for that, then the process ends with INTERRUPTED.
+    A signal that comes before ``arm`` raises there; one that comes after ``disarm`` does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.received = self._armed = self._ended = False
+        self._before: dict[int, Any] = {}
+        self._hook = sys.unraisablehook
+        self._watched = False
+
+    def __enter__(self) -> Interruption:
+        if threading.current_thread() is not threading.main_thread():
+            return self
+        self._hook, sys.unraisablehook = sys.unraisablehook, self._raise_again
+        for number in (signal.SIGINT, signal.SIGTERM):
+            found = signal.getsignal(number)
+            # What a shell or nohup made the process ignore stays ignored.
+            if found not in (signal.SIG_IGN, None):
+                self._before[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._armed = False
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if sys.unraisablehook == self._raise_again:
+            sys.unraisablehook = self._hook
+
+    def arm(self) -> None:
+        """Let signals raise from now on."""
+        self._armed = True
+        if self.received:
+            raise KeyboardInterrupt
+
+    def disarm(self) -> None:
+        """Let signals do nothing from now on: the command has ended."""
+        self._ended, self._armed = True, False
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self.received or self._ended:
+            return
+        self.received = True
+        self._watch()
+        if self._armed:
+            raise KeyboardInterrupt
+
+    def _watch(self) -> None:
+        """End the process later, if it is still there."""
+        if not self._watched:
+            self._watched = True
+            line = "netkf: interrupted; what was finished is kept"
+            end_later(INTERRUPTED, END_SECONDS, line)
+
+    def _raise_again(self, unraisable: Any) -> None:
+        """Raise an interrupt again that Python has dropped, as it does in finalizers and callbacks
+        of C code.
+        """
+        if unraisable.exc_type is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            self._hook(unraisable)
+        elif self._armed and self._before:
+            _thread.start_new_thread(self._send_again, (next(iter(self._before)),))
+
+    def _send_again(self, number: int) -> None:
+        time.sleep(AGAIN_SECONDS)
+        self.received = False
+        _thread.interrupt_main(number)
+
+
+def end_later(status: int, seconds: float, line: str = "") -> None:
+    """End the process with ``status`` after some seconds, whatever its main thread waits for."""
+
+    def end() -> None:
+        time.sleep(seconds)
+        if line:
+            with contextlib.suppress(Exception):
+                os.write(2, f"{line}\n".encode())
+        os._exit(status)
+
+    # A plain thread: threading.Thread takes locks that the main thread may hold.
+    _thread.start_new_thread(end, ())
+
+
+def end_process(status: int) -> NoReturn:
+    """Run what was registered with ``atexit`` and end the process without waiting for threads.
+
+    A command has written everything by now. The interpreter's own way to end joins threads, and
+    writes to closed streams once more.
+    """
+    end_later(status, EXIT_SECONDS)
+    with contextlib.suppress(BaseException):
+        atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):
+            stream.flush()
+    os._exit(status)
+
+
+def open_missing_streams() -> None:
+    """Open the null device for standard streams that are closed.
+
+    Files would get their numbers otherwise, and what is printed would end in them.
+    """
+    for number, flags in enumerate((os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, flags)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+
+
+class OutputError(OSError):
+    """Standard output cannot be written to."""
+
+
+class SafeStream:
+    """A text stream through which no control characters of files reach a terminal.
+
+    write  : a text with its control characters escaped, as far as the stream can encode it
+    direct : a text as it is
+    A ``lossy`` stream drops what cannot be written; else OutputError is raised.
+    """
+
+    def __init__(self, stream: TextIO, lossy: bool) -> None:
+        self._stream, self._lossy = stream, lossy
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write a text and return its length."""
+        return self.direct(printable(text))
+
+    def direct(self, text: str) -> int:
+        """Write a text of netkf's own that may move the cursor."""
+        with self._failures():
+            try:
+                self._stream.write(text)
+            except UnicodeEncodeError:
+                encoding = getattr(self._stream, "encoding", None) or "ascii"
+                self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        with self._failures():
+            self._stream.flush()
+
+    @contextlib.contextmanager
+    def _failures(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:  # ValueError: the stream is closed
+            if not self._lossy:
+                raise OutputError(getattr(error, "errno", None), str(error)) from error
+
+
+@contextlib.contextmanager
+def safe_streams() -> Iterator[None]:
+    """Put SafeStreams in place of the standard streams: errors and notes that nobody can read do
+    not stop a command, results that cannot be written do.
+    """
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = SafeStream(before[0], False), SafeStream(before[1], True)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def discard_output() -> None:
+    """Send the rest of standard output to the null device; it would fail again at the end."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def run_as_process(command: Callable[[Interruption], int]) -> NoReturn:
+    """Run the command of this process, and end the process with its status."""
+    with Interruption() as interruption:
+        open_missing_streams()
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")  # warnings of libraries are for those who write code
+        try:
+            status = command(interruption)
+        except SystemExit as stop:  # of the parser, which has printed its line
+            status = stop.code if isinstance(stop.code, int) else 0
+        end_process(status)

@@ -1,0 +1,210 @@
+"""Interrupt commands at random moments, from outside, and look at how they end.
+
+    python -m tests.stress.interrupts --trials 60 [--seed 1] [--only SUBSTRING]
+
+Every trial starts a command in a session of its own and sends SIGINT or SIGTERM to it or to its
+whole process group, twice in a few trials, or kills one of its workers. It fails unless the command ends within
+LIMIT seconds with status 130 and one line that says so (or is done: status 0), no process of the
+session is left, and ``--resume`` gives the same files to the bit as a run that was left alone. One
+process at a time, Linux only; a trial takes about 10 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+RING = str(ROOT / "scenarios" / "poisson_ring.toml")
+LIMIT = 10.0
+EARLIEST = 0.3
+"""Seconds after which Python itself has started."""
+RUNS = [
+    [f"--runs=400 --workers={workers} --trace={trace}"]
+    for workers in (1, 2, 4)
+    for trace in ("full", "first", "none")
+]
+COMMANDS = {
+    **{f"run {line}": ["run", RING, *line.split()] for (line,) in RUNS},
+    "run --runs=400 (adaptive)": ["run", RING, "--runs=400", "--trace=full"],
+    "run (single)": ["run", RING, "--set", "horizon=30000"],
+    "sweep": ["sweep", RING, "--vary", "filter.epsilon=0.1:0.5:9", "--runs=60", "--workers=2"],
+    "check": ["check", RING, "--runs=400", "--workers=2"],
+    "size": ["size", RING, "--vary", "network.activation.rate=0.5:20", "--target",
+             "worst_rms<=0.6", "--by=simulation", "--workers=2"],
+}  # fmt: skip
+SIGNALS = {
+    "SIGTERM": lambda pid: os.kill(pid, signal.SIGTERM),
+    "SIGINT": lambda pid: os.kill(pid, signal.SIGINT),
+    "SIGTERM to the group": lambda pid: os.killpg(pid, signal.SIGTERM),
+    "SIGINT to the group": lambda pid: os.killpg(pid, signal.SIGINT),
+}
+
+
+def begin(command: list[str], out: Path | None) -> subprocess.Popen[str]:
+    """Start a command in a session of its own."""
+    where = ["--out", str(out), "--no-plot"] if out is not None else []
+    return subprocess.Popen(
+        [sys.executable, "-m", "netkf", *command, *where],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        cwd=ROOT,
+    )
+
+
+def session(number: int) -> list[int]:
+    """Return the processes of a session, dead ones left out."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(fields[3]) == number and fields[0] != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+def workers_of(process: subprocess.Popen[str]) -> list[int]:
+    """Return the worker processes: children of the process that forks them."""
+    found = []
+    for pid in session(process.pid):
+        try:
+            parent = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+            line = Path(f"/proc/{parent}/cmdline").read_bytes()
+        except OSError:
+            continue
+        if b"forkserver" in line:
+            found.append(pid)
+    return found
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of all files of a directory."""
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+def strike(process: subprocess.Popen[str], draw: random.Random) -> str:
+    """Send a signal, or kill a worker; return what was done."""
+    workers = workers_of(process)
+    if workers and draw.random() < 0.25:
+        os.kill(draw.choice(workers), signal.SIGKILL)
+        return "killed a worker"
+    name = draw.choice(list(SIGNALS))
+    SIGNALS[name](process.pid)
+    if draw.random() < 0.3:
+        time.sleep(draw.uniform(0.0, 0.3))
+        if process.poll() is None:
+            SIGNALS[name](process.pid)
+        name += " twice"
+    return name
+
+
+def trial(name: str, whole: float, kept: Path | None, draw: random.Random) -> list[str]:
+    """Interrupt a command once; return what was wrong."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out" if takes_out(name) else None
+        process, after = begin(COMMANDS[name], out), draw.uniform(EARLIEST, whole)
+        time.sleep(after)
+        done = strike(process, draw) if process.poll() is None else "nothing"
+        killed = done == "killed a worker"
+        began = time.monotonic()
+        try:
+            _, printed = process.communicate(timeout=300 if killed else 2 * LIMIT)
+        except subprocess.TimeoutExpired:
+            for pid in session(process.pid):
+                os.kill(pid, signal.SIGKILL)
+            process.communicate()
+            return [f"{done} after {after:.2f} s: did not end"]
+        seconds = time.monotonic() - began
+        wrong = look(process, printed, seconds, killed)
+        if kept is not None and out is not None:
+            wrong += resume(name, out, kept)
+    print(f"  {name}: {done} after {after:.2f} s: status {process.returncode}, {seconds:.2f} s")
+    return [f"{done} after {after:.2f} s: {problem}" for problem in wrong]
+
+
+def look(
+    process: subprocess.Popen[str], printed: str, seconds: float, killed: bool
+) -> list[str]:
+    """Return what was wrong with how a command ended."""
+    wrong, lines = [], [line for line in printed.splitlines() if not line.startswith("note: ")]
+    if process.returncode == 130 and not killed:
+        if len(lines) != 1 or not lines[0].startswith("netkf: interrupted"):
+            wrong.append(f"printed {printed!r}")
+    elif process.returncode != 0 or lines:
+        wrong.append(f"status {process.returncode}, printed {printed!r}")
+    if seconds > LIMIT and not killed:
+        wrong.append(f"took {seconds:.1f} s")
+    time.sleep(0.2)
+    left = session(process.pid)
+    if left and (time.sleep(3.0) or session(process.pid)):
+        wrong.append(f"left processes {session(process.pid)}")
+        for pid in session(process.pid):
+            os.kill(pid, signal.SIGKILL)
+    return wrong
+
+
+def resume(name: str, out: Path, kept: Path) -> list[str]:
+    """Finish a run; return how its files differ from those of a run that was left alone."""
+    parts = [str(file) for file in out.rglob("*.part")]
+    process = begin([*COMMANDS[name], "--resume"], out)
+    _, printed = process.communicate(timeout=300)
+    wrong = [f"left {parts}"] if parts else []
+    if process.returncode != 0 or printed:
+        return [*wrong, f"--resume: status {process.returncode}, printed {printed!r}"]
+    if contents(out) != contents(kept):
+        wrong.append("--resume: other files")
+    return wrong
+
+
+def takes_out(name: str) -> bool:
+    """Return True for commands that write a directory."""
+    return name.startswith(("run", "sweep"))
+
+
+def main() -> int:
+    """Return the exit status: 1 if a trial failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    names = [name for name in COMMANDS if options.only in name]
+    draw, failed = random.Random(options.seed), 0
+    with tempfile.TemporaryDirectory() as folder:
+        known: dict[str, tuple[float, Path | None]] = {}
+        for k in range(options.trials):
+            name = names[k % len(names)]
+            if name not in known:
+                out = Path(folder) / str(k) if takes_out(name) else None
+                began = time.monotonic()
+                begin(COMMANDS[name], out).communicate()
+                kept = out if name.startswith("run") else None
+                known[name] = time.monotonic() - began, kept
+            wrong = trial(name, *known[name], draw)
+            failed += bool(wrong)
+            for problem in wrong:
+                print(f"FAILED {name}: {problem}", flush=True)
+        shutil.rmtree(folder, ignore_errors=True)
+    print(f"{options.trials} trials, {failed} failed")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
