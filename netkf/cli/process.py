@@ -12,6 +12,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, NoReturn, TextIO
 
@@ -30,15 +31,15 @@ class Interruption:
     context manager.
 
     Batch systems stop jobs with SIGTERM: it means the same as Ctrl-C. Later signals are ignored:
-    the command is ending. It has END_SECONDS for that, then the process ends with INTERRUPTED.
+    the command is ending. Where it ``ends_process``, the process ends after END_SECONDS anyway.
     A signal that comes before ``arm`` raises there; one that comes after ``disarm`` does nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ends_process: bool = False) -> None:
         self.received = self._armed = self._ended = False
-        self._before: dict[int, Any] = {}
+        self._before: dict[signal.Signals, Any] = {}
         self._hook = sys.unraisablehook
-        self._watched = False
+        self._watched = not ends_process
 
     def __enter__(self) -> Interruption:
         if threading.current_thread() is not threading.main_thread():
@@ -97,10 +98,15 @@ class Interruption:
         elif self._armed and self._before:
             _thread.start_new_thread(self._send_again, (next(iter(self._before)),))
 
-    def _send_again(self, number: int) -> None:
+    def _send_again(self, number: signal.Signals) -> None:
         time.sleep(AGAIN_SECONDS)
         self.received = False
-        _thread.interrupt_main(number)
+        # To the main thread itself: that ends what it waits for.
+        main = threading.main_thread().ident
+        if main is not None and hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(main, number)
+        else:
+            _thread.interrupt_main(number)
 
 
 def end_later(status: int, seconds: float, line: str = "") -> None:
@@ -144,7 +150,7 @@ def open_missing_streams() -> None:
             os.open(os.devnull, flags)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
 
 
 class OutputError(OSError):
@@ -199,7 +205,7 @@ def safe_streams() -> Iterator[None]:
     not stop a command, results that cannot be written do.
     """
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = SafeStream(before[0], False), SafeStream(before[1], True)  # type: ignore[assignment]
+    sys.stdout, sys.stderr = SafeStream(before[0], False), SafeStream(before[1], True)
     try:
         yield
     finally:
@@ -214,7 +220,7 @@ def discard_output() -> None:
 
 def run_as_process(command: Callable[[Interruption], int]) -> NoReturn:
     """Run the command of this process, and end the process with its status."""
-    with Interruption() as interruption:
+    with Interruption(ends_process=True) as interruption:
         open_missing_streams()
         if not sys.warnoptions:
             warnings.simplefilter("ignore")  # warnings of libraries are for those who write code

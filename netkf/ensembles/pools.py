@@ -138,7 +138,9 @@ class Adaptive(Here):
 
     def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
         """Wait until one of the futures is done; return all that are."""
-        return (super() if self._processes is None else self._processes).wait(futures)
+        if self._processes is None:
+            return super().wait(futures)
+        return self._processes.wait(futures)
 
     def close(self, at_once: bool) -> None:
         """End the processes, if any were started."""

@@ -212,8 +212,8 @@ def _serve(jobs: Connection, results: Connection) -> None:
 def _outcome(message: bytes) -> bytes:
     """Do a pickled job; return the pickle of (pickled result, pickled exception, traceback)."""
     try:
-        result = pickle.dumps(work(pickle.loads(message)), pickle.HIGHEST_PROTOCOL)
-        answer = result, None, ""
+        answer: tuple[bytes | None, bytes | None, str]
+        answer = pickle.dumps(work(pickle.loads(message)), pickle.HIGHEST_PROTOCOL), None, ""
     except Exception as error:
         answer = None, _pickled_error(error), "".join(traceback.format_exception(error))
     return pickle.dumps(answer, pickle.HIGHEST_PROTOCOL)

@@ -3,10 +3,10 @@
     python -m tests.stress.interrupts --trials 60 [--seed 1] [--only SUBSTRING]
 
 Every trial starts a command in a session of its own and sends SIGINT or SIGTERM to it or to its
-whole process group, twice in a few trials, or kills one of its workers. It fails unless the command ends within
-LIMIT seconds with status 130 and one line that says so (or is done: status 0), no process of the
-session is left, and ``--resume`` gives the same files to the bit as a run that was left alone. One
-process at a time, Linux only; a trial takes about 10 s.
+whole process group, twice in a few trials, or kills one of its workers. It fails unless the command
+ends within LIMIT seconds with status 130 and one line that says so (or is done: status 0), no
+process of the session is left, and ``--resume`` gives the same files to the bit as a run that was
+left alone. One process at a time, Linux only; a trial takes about 10 s.
 """
 
 from __future__ import annotations
@@ -139,9 +139,7 @@ def trial(name: str, whole: float, kept: Path | None, draw: random.Random) -> li
     return [f"{done} after {after:.2f} s: {problem}" for problem in wrong]
 
 
-def look(
-    process: subprocess.Popen[str], printed: str, seconds: float, killed: bool
-) -> list[str]:
+def look(process: subprocess.Popen[str], printed: str, seconds: float, killed: bool) -> list[str]:
     """Return what was wrong with how a command ended."""
     wrong, lines = [], [line for line in printed.splitlines() if not line.startswith("note: ")]
     if process.returncode == 130 and not killed:

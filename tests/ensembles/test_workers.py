@@ -1,0 +1,113 @@
+"""Worker processes: one that dies at any moment is replaced, an interrupt waits for none."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import netkf
+from netkf.ensembles.blocks import Job
+from netkf.ensembles.pools import Processes
+from netkf.ensembles.replicas import replicate
+from tests.conftest import SCENARIOS
+
+LARGE = 1 << 26
+"""Bytes that no pipe takes at once."""
+
+
+def dies_while_it_writes(scenario, seed, replicas):
+    """The first worker is killed in the middle of its result."""
+    mark = Path(scenario.claim)
+    if not mark.exists():
+        mark.touch()
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return b"x" * LARGE
+
+
+def test_a_worker_killed_while_it_writes_is_replaced(ring, tmp_path):
+    mark = tmp_path / "mark"
+    pool = Processes(1)
+    future = pool.submit(
+        Job(ring.replace({"claim": str(mark)}), dies_while_it_writes, 1, 0, 0, 1, 1)
+    )
+    while not mark.exists():
+        time.sleep(0.01)
+    time.sleep(0.6)  # nobody reads meanwhile: the worker dies with most of its result unwritten
+    assert pool.wait([future]) == [future]
+    assert len(future.result()) == LARGE
+    pool.close(at_once=False)
+
+
+def sleeps(scenario, seed, replica):
+    time.sleep(60.0)
+
+
+def test_workers_are_killed_at_once(ring):
+    began = time.monotonic()
+    threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        replicate(sleeps, ring, 2, workers=2)
+    assert time.monotonic() - began < 10.0
+
+
+class TwoArgumentsError(Exception):
+    """One that pickles and cannot be read back."""
+
+    def __init__(self, one, two):
+        super().__init__(one)
+
+
+ERRORS = {"plain": OSError(2, "gone"), "odd": TwoArgumentsError("a", "b")}
+
+
+def fails(scenario, seed, replica):
+    raise ERRORS[scenario.claim]
+
+
+@pytest.mark.parametrize(
+    ("claim", "kind"), [("plain", FileNotFoundError), ("odd", netkf.EngineError)]
+)
+def test_what_a_task_raises_comes_with_its_traceback(ring, claim, kind):
+    with pytest.raises(kind) as failed:
+        replicate(fails, ring.replace({"claim": claim}), 2, workers=2)
+    assert "in fails" in str(failed.value.__cause__)
+
+
+COMMAND = [sys.executable, "-m", "netkf"]
+RUN = ["run", str(SCENARIOS / "poisson_ring.toml"), "--runs", "400", "--trace", "full", "--no-plot"]
+
+
+@pytest.mark.parametrize(
+    ("number", "group"), [(signal.SIGTERM, False), (signal.SIGTERM, True), (signal.SIGINT, True)]
+)
+def test_an_interrupted_command_ends(tmp_path, number, group):
+    """Ctrl-C reaches all processes of a terminal, and what ends a job those of the job."""
+    command = [*COMMAND, *RUN, "--workers", "2", "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=Path.cwd()
+    )
+    while not list((tmp_path / "out").glob("blocks/*.npz")) and process.poll() is None:
+        time.sleep(0.01)
+    time.sleep(0.3)
+    (os.killpg if group else os.kill)(process.pid, number)
+    _, printed = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert printed.startswith("netkf: interrupted; what was finished is kept")
+    assert printed.count("\n") == 1
+    began = time.monotonic()
+    while group_exists(process.pid):
+        assert time.monotonic() - began < 5.0
+        time.sleep(0.05)
+
+
+def group_exists(number):
+    try:
+        os.killpg(number, 0)
+    except ProcessLookupError:
+        return False
+    return True

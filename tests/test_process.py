@@ -1,0 +1,154 @@
+"""How the process of a command ends: closed streams, signals, text from files."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from netkf.cli import process
+from netkf.cli.main import main
+from netkf.core.printable import one_line, printable
+from tests.conftest import SCENARIOS
+
+RING = str(SCENARIOS / "poisson_ring.toml")
+NETKF = f"{sys.executable} -m netkf"
+
+
+@pytest.mark.parametrize(
+    ("line", "status"),
+    [
+        (f"{NETKF} theory {RING} | head -c 0; exit ${{PIPESTATUS[0]}}", 0),
+        (f"{NETKF} theory {RING} >&-", 0),
+        (f"{NETKF} theory {RING} 2>&- >/dev/null", 0),
+        (f"{NETKF} theory {RING} >&- 2>&- <&-", 0),
+        (f"{NETKF} theory nowhere.toml 2>&-", 2),
+        (f"{NETKF} theory nowhere.toml 2> >(exec 0<&-)", 2),
+        (f"{NETKF} --help | head -c 0; exit ${{PIPESTATUS[0]}}", 0),
+    ],
+)
+def test_closed_streams_stop_nothing(line, status):
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, "")
+
+
+def test_a_run_without_streams_is_complete(tmp_path):
+    """The first files that are opened would get the numbers of the closed streams."""
+    out = tmp_path / "out"
+    line = f"{NETKF} run {RING} --set horizon=1.0 --no-plot --out {out} >&- 2>&- <&-"
+    assert subprocess.run(["bash", "-c", line], check=False).returncode == 0
+    assert '"complete"' in (out / "manifest.json").read_text()
+
+
+class Dropped:
+    """Python drops an interrupt that comes while this is finalized."""
+
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+
+
+def test_an_interrupt_that_python_drops_is_raised_again():
+    with process.Interruption() as interruption:
+        interruption.arm()
+        Dropped()
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(5.0)
+        interruption.disarm()
+    assert interruption.received
+
+
+def test_a_signal_before_the_command_counts_and_later_ones_do_not():
+    before = signal.getsignal(signal.SIGTERM)
+    with process.Interruption() as interruption:
+        os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            interruption.arm()
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_what_fails_because_of_an_interrupt_is_an_interrupt(monkeypatch, capsys):
+    """Libraries turn an interrupt in the middle of an import into errors of their own."""
+
+    def fail(*_):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1.0)
+        except KeyboardInterrupt:
+            raise ImportError("half") from None
+
+    monkeypatch.setattr("netkf.runs.promises.compute_promises", fail)
+    assert main(["theory", RING]) == 130
+    assert capsys.readouterr().err == "netkf: interrupted\n"
+
+
+STUCK = """
+import sys, threading
+from netkf.cli import process
+process.END_SECONDS = 0.2
+def command(interruption):
+    interruption.arm()
+    while True:
+        try:
+            print("ready", flush=True)
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            pass
+process.run_as_process(command)
+"""
+
+
+def test_a_command_that_does_not_end_is_ended():
+    stuck = subprocess.Popen(
+        [sys.executable, "-c", STUCK], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert stuck.stdout.readline() == "ready\n"
+    stuck.send_signal(signal.SIGTERM)
+    _, printed = stuck.communicate(timeout=10)
+    assert (stuck.returncode, printed.count("\n")) == (130, 1)
+
+
+def test_an_error_that_is_not_about_writing_is_not_called_one(monkeypatch, capsys):
+    def refuse(*_):
+        raise ConnectionRefusedError(111, "Connection refused")
+
+    monkeypatch.setattr("netkf.runs.promises.compute_promises", refuse)
+    assert main(["theory", RING]) == 2
+    assert capsys.readouterr().err == "netkf: Connection refused\n"
+
+
+HOSTILE = "a\x1b[31mb\x9bc\u202ed\u2066e\x00f\x7fg\u2028h\ud800i"
+
+
+def test_no_control_character_is_printed(capsys, tmp_path, monkeypatch):
+    escaped = "a\\x1b[31mb\\x9bc\\u202ed\\u2066e\\x00f\\x7fg\\u2028h\\ud800i"
+    assert printable(HOSTILE) == escaped
+    assert printable("é\tü\nx") == "é\tü\nx"
+    assert one_line("é\tü\r\nx") == "é\\tü\\r\\nx"
+    text = (SCENARIOS / "poisson_ring.toml").read_text()
+    (tmp_path / "x.toml").write_text(
+        text.replace('name    = "poisson-ring"', 'name = "a\\u001b[31m\\u202e\\nnetkf: kept"')
+    )
+    main(["theory", str(tmp_path / "x.toml")])
+    monkeypatch.chdir(tmp_path)
+    main(["theory", f"{HOSTILE[:-2]}\n.toml"])
+    printed = capsys.readouterr()
+    assert (printed.out + printed.err).replace("\n", "").isprintable()
+    assert len(printed.err.splitlines()) <= 2
+
+
+def test_what_a_stream_cannot_encode_is_escaped(tmp_path):
+    text = (SCENARIOS / "poisson_ring.toml").read_text()
+    (tmp_path / "x.toml").write_text(text.replace('"poisson-ring"', '"\u00e9\u4e2d"'), "utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "netkf", "theory", str(tmp_path / "x.toml")],
+        capture_output=True,
+        check=False,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"\\xe9\\u4e2d" in done.stdout
