@@ -10,7 +10,7 @@ from netkf import theory
 from netkf.checks.points import MAX_NODES, sampled_indices, sampling_note
 from netkf.core.errors import TheoryError
 from netkf.network import graphs
-from netkf.runs import plots
+from netkf.runs import plots, promises
 from netkf.runs.files import write_scenario
 from netkf.runs.promises import compute_promises, promises_text
 from netkf.theory.common.observations import increment_observations
@@ -178,7 +178,7 @@ def test_the_tables_of_a_scenario_build_the_network_once(tmp_path, monkeypatch):
 
 
 def test_elimination_is_refused_where_its_fill_in_has_no_bound(tmp_path, monkeypatch):
-    monkeypatch.setattr(linearised, "_solve_by_gmres", lambda linear, right: None)
+    monkeypatch.setattr(linearised, "_solve_by_gmres", lambda *_: None)
     graph = {"kind": "regular", "nodes": 3000, "degree": 4}
     packed = PackedRiccati(
         coupled.coupled_riccati(
@@ -187,3 +187,11 @@ def test_elimination_is_refused_where_its_fill_in_has_no_bound(tmp_path, monkeyp
     )
     with pytest.raises(TheoryError, match="GMRES did not converge for 9,000 unknowns"):
         linearised.solve_linearised(packed, packed.equations.start, packed.start)
+
+
+def test_a_steady_bound_with_many_unknowns_is_left_out_of_the_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(promises, "MAX_UNKNOWNS", 5)
+    found = compute_promises(ring(6, tmp_path))
+    assert found["steady_bound"]["trace"] is None
+    assert "18 unknowns, more than 5" in found["steady_bound"]["reason"]
+    assert found["bound_at_horizon"]["trace"] is not None

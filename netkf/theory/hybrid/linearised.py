@@ -21,19 +21,25 @@ from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
 FEW_UNKNOWNS = 2000
 MAX_ELIMINATED = 6000  # unknowns of a network without small cuts, whose fill-in is nearly full
 ROUNDS, ROUND_TOLERANCE = 4, 1e-7  # each round reduces the residual by this factor
-RESIDUAL_TOLERANCE = 1e-14
+RESIDUAL_TOLERANCE = 1e-14  # relative to the right-hand side
 RESTART, RESTARTS = 60, 3  # of GMRES
 
 
-def solve_linearised(packed: PackedRiccati, P: FloatArray, right: FloatArray) -> FloatArray:
+def solve_linearised(
+    packed: PackedRiccati,
+    P: FloatArray,
+    right: FloatArray,
+    tolerance: float = RESIDUAL_TOLERANCE,
+) -> FloatArray:
     """Return the solution X (N, m) for the gains of P (N, n, n); nan if the map is singular.
 
-    Raises TheoryError if neither method can solve for so many unknowns.
+    The norm of its residual is at most ``tolerance`` times that of ``right``, or as small as
+    rounding lets it be. Raises TheoryError if neither method can solve for so many unknowns.
     """
     linear = packed.linear(P)
     few = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
     with np.errstate(all="ignore"):
-        X = None if few else _solve_by_gmres(linear, right)
+        X = None if few else _solve_by_gmres(linear, right, tolerance)
         if X is None and not few and right.size > MAX_ELIMINATED:
             raise TheoryError(
                 f"not computed: GMRES did not converge for {right.size:,} unknowns, and the "
@@ -50,7 +56,9 @@ def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
     return np.asarray(X).reshape(right.shape)
 
 
-def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray | None:
+def _solve_by_gmres(
+    linear: LinearisedRiccati, right: FloatArray, tolerance: float
+) -> FloatArray | None:
     """Return the solution by GMRES with rounds of iterative refinement, None if it diverges.
 
     The preconditioner solves for a change that all nodes share, and then inverts each node's own
@@ -85,7 +93,7 @@ def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray 
         step, failed = scipy.sparse.linalg.gmres(
             operator,
             left,
-            rtol=ROUND_TOLERANCE,
+            rtol=max(ROUND_TOLERANCE, tolerance),
             M=preconditioner,
             restart=RESTART,
             maxiter=RESTARTS,
@@ -94,6 +102,6 @@ def _solve_by_gmres(linear: LinearisedRiccati, right: FloatArray) -> FloatArray 
             return None
         x = x + step
         left = -right.reshape(-1) - apply(x)
-        if np.linalg.norm(left) <= RESIDUAL_TOLERANCE * size:
+        if np.linalg.norm(left) <= tolerance * size:
             break
     return np.asarray(x).reshape(right.shape)

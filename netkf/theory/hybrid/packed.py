@@ -188,19 +188,6 @@ class PackedRiccati:
                 heard.append((group.heard, group.nodes, maps @ self._predicted))
         return LinearisedRiccati(np.asarray(blocks), heard, self)
 
-    def driven(self, P: FloatArray) -> FloatArray:
-        """Return the constant term (N, m) of H(12) linearised at P (N, n, n).
-
-        It is Q, the noises of readings through the gains, and the noise of messages under way.
-        """
-        G, q = self.equations.G, self.equations.q
-        right = self.pack(self.equations.Q + P @ G @ P + self.leaving[:, None, None] * q)
-        for group in self.equations.samples:
-            noise = self.pack(group.gain_noise(P))
-            np.add.at(right, group.nodes, group.rate[:, None] * noise)
-            right += group.heard @ (noise @ self._predicted)
-        return np.asarray(right)
-
 
 class LinearisedRiccati(NamedTuple):
     """H(12) linearised at some P, as a linear map on rows X (N, m).

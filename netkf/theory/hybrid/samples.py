@@ -52,11 +52,6 @@ class PoissonSamples(NamedTuple):
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         return np.asarray(C @ np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)))
 
-    def gain_noise(self, P: FloatArray) -> FloatArray:
-        """Return ``K R K'`` (S, n, n) at covariances P (N, n, n)."""
-        K, _ = self.update_gains(P)
-        return np.asarray(K @ self.R @ np.swapaxes(K, 1, 2))
-
     def restrict(self, node: int) -> PoissonSamples:
         """Return the sensors of one node as those of a network of that node alone."""
         mine = self.nodes == node

@@ -28,6 +28,7 @@ MAX_GROWTH = 1e9  # of P relative to its start, beyond which it is taken to grow
 RESIDUAL = 1e-9
 MAX_STEPS = 400  # implicit steps of the search for gains
 MAX_FACTOR = 1e6
+NEWTON_TOLERANCE = 1e-7  # of a change of P, relative to the slope that it has to undo
 POWER_STEPS = 60
 NEWTON_STEPS = 12
 MAX_FACTORED = 3000  # nodes of a network without small cuts up to which its coupling is factored
@@ -90,13 +91,16 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
     P = _find_stabilising(packed)
     if P is None:
         return None
-    # Newton's method converges monotonically from stabilising gains, quadratically in the end.
+    # Newton's method converges monotonically from stabilising gains, quadratically in the end,
+    # until rounding moves P to and fro.
+    before = np.inf
     for _ in range(60):
         following = _newton(packed, P)
-        change = np.abs(following - P).max()
+        change = float(np.abs(following - P).max() / np.abs(following).max())
         P = following
-        if change <= 1e-13 * np.abs(P).max():
+        if change <= 1e-13 or (change <= 1e-9 and change >= 0.5 * before):
             break
+        before = change
     Y = packed.pack(P)
     residual = np.abs(packed.slope(Y, Y)).max()
     sizes = [np.abs(x).max() for x in (equations.Q, P @ equations.G @ P, equations.A @ P)]
@@ -110,18 +114,24 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
 
 
 def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
-    """Return the fixed point (N, n, n) of H(12) with the gains of P held fixed (Kleinman)."""
-    return packed.unpack(solve_linearised(packed, P, packed.driven(P)))
+    """Return the fixed point (N, n, n) of H(12) with the gains of P held fixed (Kleinman).
+
+    Solved for the change of P, so that a few digits of it are enough.
+    """
+    Y = packed.pack(P)
+    change = solve_linearised(packed, P, packed.slope(Y, Y), NEWTON_TOLERANCE)
+    return packed.unpack(Y + change)
 
 
 def _is_stabilised(packed: PackedRiccati, P: FloatArray) -> bool:
     """Return True if the gains of P stabilise the linearisation X -> op(X) of H(12).
 
-    op generates positive maps, so that it is stable if and only if op(X) = -I has a positive
-    definite solution.
+    op generates positive maps, so that it is stable if and only if a positive definite X has a
+    negative definite op(X) at every node: op(X) = -I, with a residual that nowhere reaches I.
     """
     right = packed.pack(np.broadcast_to(np.eye(P.shape[-1]), P.shape))
-    X = packed.unpack(solve_linearised(packed, P, right))
+    tolerance = 0.1 / float(np.linalg.norm(right))
+    X = packed.unpack(solve_linearised(packed, P, right, tolerance))
     return bool(np.isfinite(X).all() and np.linalg.eigvalsh(X)[:, 0].min() > 0.0)
 
 
@@ -151,7 +161,7 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
             P = _newton(implicit, P)
         if not np.abs(P).max() < MAX_GROWTH * size:
             return None
-        step *= 1.5
+        step *= 3.0
     return None
 
 
