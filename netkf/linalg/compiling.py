@@ -60,6 +60,16 @@ def kernel(
     return _registered(function, allocates, inlined, fused)
 
 
+def _numba() -> Any:
+    """Return numba, which knows all that kernels use."""
+    # Imported with the first call: importing netkf must not import numba.
+    import numba
+
+    from netkf.linalg import lane_types, local_types, struct_types  # noqa: F401 - register types
+
+    return numba
+
+
 class Kernel:
     """A numerical function written as loops. Python and other kernels call it alike."""
 
@@ -81,26 +91,14 @@ class Kernel:
 
     @cached_property
     def _called_from_kernels(self) -> Any:
-        # Compiled with the first call: importing netkf must not import numba.
-        import numba
-
-        from netkf.linalg import (  # noqa: F401 - register what kernels use
-            lane_types,
-            local_types,
-            struct_types,
-        )
-
-        made = numba.njit(**self._options)(self._loops)
+        made = _numba().njit(**self._options)(self._loops)
         _for_any_constant(made)
         return made
 
     @cached_property
     def _called_from_python(self) -> Callable[..., Any]:
-        import numba
-
-        from netkf.linalg import struct_types  # noqa: F401 - an argument may be a struct
-
-        config: Any = numba.config
+        numba = _numba()
+        config = numba.config
         before = config.CACHE_DIR
         # numba looks at the file of the function alone, and what it calls may have changed.
         config.CACHE_DIR = str(_folder(before))
