@@ -206,24 +206,34 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
     scenario, fates = samples.scenario, samples.fates
     q, sent = loss_probabilities(scenario), fates.sent.sum(axis=1)
     pairs = np.maximum(sent - 1, 0)
-    jobs = [(fates.repeated - pairs * q**2, pairs, q * (1.0 - q), "a message and the one before")]
+    # Where both directions of a link share one fate, each is counted twice.
+    repeated = _neighbours_variance(q) * (2.0 if scenario.network.channel.symmetric else 1.0)
+    jobs = [("a message and the one before", fates.repeated, pairs, q, repeated)]
     if _directions_apart(scenario):
-        # In each of two directions of a link the same pairs are counted.
+        # In each of two directions of a link the same pairs are counted: messages of one number.
         back = reversed_directions(scenario)
-        other = np.where(back >= 0, q[back], math.nan)
-        known = np.isfinite(other)
-        spread = np.sqrt(q * (1.0 - q) * other * (1.0 - other))
-        excess = np.where(known, fates.both - sent * q * np.nan_to_num(other), 0.0)
-        jobs.append((excess, np.where(known, sent, 0), spread, "both directions of a link"))
+        pairs = np.where(back >= 0, np.minimum(sent, sent[:, back]), 0)
+        joint = q * q[back]
+        # Each pair is counted in both directions.
+        variance = 2.0 * joint * (1.0 - joint)
+        jobs.append(("both directions of a link", fates.both, pairs, q[back], variance))
     intervals = []
-    for excess, count, scale, label in jobs:
-        found = _correlation_of_runs(excess, count, scale, level / 3.0)
+    for label, both, count, other, variance in jobs:
+        scale = np.sqrt(q * (1.0 - q) * other * (1.0 - other))
+        found = _correlation_of_runs(both - count * q * other, count, scale, variance, level / 3.0)
         if found is not None:
             intervals.append((found, f"correlation of {label}"))
     intervals += _links_apart(samples, level / 3.0)
     if not intervals:
         return nothing_to_see(CORRELATION_TOLERANCE)
     return find_largest(intervals, CORRELATION_TOLERANCE, "largest difference")
+
+
+def _neighbours_variance(p: Any) -> Any:
+    """Return the variance for each pair of the number of pairs of neighbours in a long row of
+    independent events of probability p that both happened; neighbouring pairs share an event.
+    """
+    return p**2 * (1.0 - p**2) + 2.0 * p**3 * (1.0 - p)
 
 
 def _directions_apart(scenario: Scenario) -> bool:
@@ -234,17 +244,20 @@ def _directions_apart(scenario: Scenario) -> bool:
 
 
 def _correlation_of_runs(
-    excess: FloatArray, count: np.ndarray, scale: FloatArray, level: float
+    excess: FloatArray, count: np.ndarray, scale: FloatArray, variance: FloatArray, level: float
 ) -> Interval | None:
-    """Return an interval for a correlation: products beyond their mean, (R, D), of ``count`` pairs
-    whose deviations have the product ``scale`` (D,). Runs are independent.
+    """Return an interval for a correlation: how often both events of a pair happened beyond the
+    mean, (R, D), in ``count`` pairs (R, D) whose deviations have the product ``scale`` (D,).
+
+    Runs are independent. ``variance`` (D,) is that of each pair's count where nothing is
+    correlated, covariances with its neighbours included: few rare events spread less by chance.
     """
-    weight = float((count * np.nan_to_num(scale)).sum())
+    weight = float((count * scale).sum())
     if not weight > 0.0 or len(excess) < 10:
         return None
     values = excess.sum(axis=1)
-    runs = len(values)
-    spread = math.sqrt(max(float(values.var(ddof=1)) * runs, 1.0))
+    runs, least = len(values), float((count * variance).sum())
+    spread = math.sqrt(max(float(values.var(ddof=1)) * runs, least, 1.0))
     seen = float(values.sum()) / weight
     return deviation_interval(0.0, student_interval(seen, spread / weight, runs, level))
 
@@ -345,7 +358,11 @@ def _matchings(samples: PartSamples, level: float) -> Finding:
         # The pairs of neighbouring slots overlap, and the runs do not.
         excess = (again - (slots - 1.0) * p[k] ** 2)[:, None]
         related = _correlation_of_runs(
-            excess, np.full((runs, 1), slots - 1.0), np.array([p[k] * (1.0 - p[k])]), share
+            excess,
+            np.full((runs, 1), slots - 1.0),
+            np.array([p[k] * (1.0 - p[k])]),
+            np.array([_neighbours_variance(float(p[k]))]),
+            share,
         )
         if related is not None:
             intervals.append((related, f"{label} and the slot before, their correlation"))

@@ -18,6 +18,7 @@ from netkf.checks.parts.moments import (
     moments,
     whitening,
 )
+from netkf.checks.parts.network_rows import _correlation_of_runs, _neighbours_variance
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
 from netkf.checks.statistics import probability_interval, scale_interval
@@ -80,8 +81,18 @@ CLOCKS = {
 TICKS = {**CLOCKS, "sensors": CLOCKS["sensors"][1:]}
 BURSTS = {"kind": "gilbert-elliott", "mean_loss": 0.3, "mean_burst": 4.0}
 GAMMA = {"kind": "renewal", "distribution": "gamma", "shape": 3.0, "mean": 0.5}
+READINGS_SENT = {
+    **SLOTS,
+    "network": {
+        "graph": {"kind": "cycle", "nodes": 4},
+        "activation": {"kind": "broadcast"},
+        "channel": {"loss": {"kind": "bernoulli", "delivery": 0.4}, "symmetric": False},
+    },
+    "filter": {"kind": "intermittent"},
+}
 HEALTHY = {
     "slots": (SLOTS, {}),
+    "one direction of some links": (READINGS_SENT, {}),
     "bursts": (SLOTS, {"network.channel.loss": BURSTS}),
     "maximal": (SLOTS, {"network.activation": {"kind": "matching", "protocol": "maximal"}}),
     "clocks": (CLOCKS, {}),
@@ -207,6 +218,27 @@ def test_moments_find_what_they_say(name):
         found += TESTS[name](moments(z), level).margin[2] < 0.0
     assert probability_interval(found, trials, 0.001).high >= 0.9
     assert found >= 0.8 * trials
+
+
+@pytest.mark.parametrize("q", [0.03, 0.1, 0.5])
+def test_correlations_of_rare_losses_keep_their_level(q):
+    """With few joint losses, or none, the spread between runs says little about chance."""
+    random, level, runs = np.random.default_rng(5), 0.05, 30
+    accused, studies, directions, messages = 0, 400, 4, 12
+    probability = np.full(directions, q)
+    for _ in range(studies):
+        lost = random.random((runs, directions, messages)) < q
+        both = (lost[..., 1:] & lost[..., :-1]).sum(axis=2)
+        count = np.full((runs, directions), messages - 1)
+        found = _correlation_of_runs(
+            both - count * q**2,
+            count,
+            probability * (1.0 - probability),
+            _neighbours_variance(probability),
+            level,
+        )
+        accused += found.low > 0.0
+    assert accused <= scipy.stats.binom.ppf(0.999, studies, level)
 
 
 @pytest.mark.parametrize("freedom", [10.0, 200.0, 1e4])
