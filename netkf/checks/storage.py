@@ -6,8 +6,6 @@ are read; ``verdict.json`` the verdict and what it belongs to.
 
 from __future__ import annotations
 
-import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +16,37 @@ from netkf.checks.evidence import Evidence
 from netkf.checks.parts.samples import PART_TYPES, PartSummary
 from netkf.checks.report import verdict_json, verdict_text
 from netkf.core.errors import ScenarioError
+from netkf.core.interrupts import defer_signals
+from netkf.runs.documents import (
+    DamagedError,
+    check_files,
+    check_seal,
+    file_digests,
+    read_document,
+    write_sealed,
+)
 from netkf.runs.files import (
+    own_names,
     scenario_digest,
     write_atomically,
-    write_json,
     write_scenario,
     write_text,
 )
-from netkf.runs.provenance import versions
+from netkf.runs.provenance import machine, versions
 from netkf.scenario.scenario import Scenario
 
 RESULTS, VERDICT = "results.npz", "verdict.json"
+FILES = (RESULTS, "verdict.csv", "verdict.txt", "verdict.png")
+"""Files that a check writes before the verdict itself."""
 
 
 def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str = "") -> None:
     """Write scenario.toml, verdict.json, verdict.csv, verdict.txt and results.npz."""
+    with defer_signals():  # the verdict has the digest of the results
+        _save_verdict(directory, scenario, verdict, text or verdict_text(verdict, scenario.claim))
+
+
+def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str) -> None:
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
     with write_atomically(directory / RESULTS) as part, part.open("wb") as file:
@@ -40,15 +54,32 @@ def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: st
         np.savez_compressed(file, **columns)
     with write_atomically(directory / "verdict.csv") as part:
         verdict.table.to_csv(part, index=False)
-    write_text(directory / "verdict.txt", (text or verdict_text(verdict, scenario.claim)) + "\n")
+    write_text(directory / "verdict.txt", text + "\n")
     document = verdict_json(verdict)
     document |= {
         "digest": scenario_digest(scenario),
         "versions": versions(),
         "looks": verdict.looks,
         "spent": verdict.spent,
+        "machine": machine(),
+        "files": file_digests(directory, [RESULTS, "scenario.toml"]),
     }
-    write_json(directory / VERDICT, document)
+    write_sealed(directory / VERDICT, document)
+
+
+def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
+    """Return True if a directory holds no verdict yet; remove what a check left that was stopped
+    while it wrote its first one.
+    """
+    if not directory.is_dir():
+        return True
+    found = list(directory.iterdir())
+    own = {*FILES, *own_names(scenario)}
+    if any(file.name.removesuffix(".part") not in own or not file.is_file() for file in found):
+        return not found
+    for file in found:
+        file.unlink()
+    return True
 
 
 def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
@@ -58,18 +89,22 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
     """
     remedy = "give a directory that netkf check --out has written"
     try:
-        found = json.loads((directory / VERDICT).read_text(encoding="utf-8"))
+        found = read_document(directory / VERDICT)
         same = {
             "scenario": (found["digest"], scenario_digest(scenario)),
             "seed": (found["seed"], seed),
             "versions": (found["versions"], versions()),
+            "machine": (found["machine"], machine()),
         }
+        check_seal(found)
+        check_files(directory, found)
         looks, spent = int(found["looks"]), float(found["spent"])
         rows = tuple(_row(row) for row in found["rows"])
         results = _results(directory / RESULTS, scenario)
         count, confidence = int(found["runs"]), float(found["confidence"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        problem = f"has no verdict that can be read ({type(error).__name__})"
+    except Exception as error:  # whatever is in the files, which may be anybody's
+        reason = str(error) if isinstance(error, DamagedError) else type(error).__name__
+        problem = f"has no verdict that can be read: {reason}"
         raise ScenarioError("--resume", problem, str(directory), remedy) from None
     for name, (kept, wanted) in same.items():
         if kept != wanted:

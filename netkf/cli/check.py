@@ -98,10 +98,10 @@ def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
             remedy = "add --out DIR with the directory of the verdict"
             raise ScenarioError("--resume", "needs a verdict to add runs to", None, remedy)
         return None
-    from netkf.checks.storage import load_verdict
+    from netkf.checks.storage import clear_unfinished, load_verdict
     from netkf.runs.files import new_directory
 
-    if options.resume:
+    if options.resume and not clear_unfinished(options.out, scenario):
         return load_verdict(options.out, scenario, scenario.seed)
     new_directory(options.out, scenario.name)
     return None

@@ -70,13 +70,13 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
-    from netkf.ensembles.directory import clear_unfinished
+    from netkf.ensembles.resume import clear_unfinished
     from netkf.runs.run import run_to_directory
 
     if options.scheduler is not None:
         raise ScenarioError("--scheduler", "is for several runs", options.scheduler, "add --runs R")
     chosen = options.replica or 0
-    if options.resume and not clear_unfinished(options.out, scenario, chosen):
+    if options.resume and not clear_unfinished(options.out, scenario, chosen, _print_note):
         print(f"nothing left to do in {options.out}")
         return 0
     draw = None if options.no_plot else partial(pictures.draw_picture, pictures.RUN, scenario)
@@ -123,6 +123,7 @@ def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
             resume=options.resume,
             progress=line.counter("runs"),
             finish=draw,
+            note=_print_note,
         )
     if completed is None:
         print(f"nothing left to do in {options.out}")
@@ -130,6 +131,10 @@ def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
     _print_summary(scenario, completed)
     _print_ensemble(completed, options.runs)
     return 0
+
+
+def _print_note(line: str) -> None:
+    print_notes([line])
 
 
 def _print_summary(scenario: Scenario, completed: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 
 
@@ -15,6 +16,19 @@ class TheoryError(NetkfError, ValueError):
 
 class EngineError(NetkfError, RuntimeError):
     """An engine cannot run a scenario; the message names the cause and the remedy."""
+
+
+class WriteError(NetkfError, OSError):
+    """A file cannot be written; ``str(error)`` is one line with the reason and the path."""
+
+    def __init__(self, cause: OSError, path: object) -> None:
+        # With three arguments OSError would choose a subclass by the number.
+        known = os.strerror(cause.errno) if cause.errno else str(cause)
+        super().__init__(cause.errno, known)
+        self.filename = str(path)
+
+    def __str__(self) -> str:
+        return f"cannot write: {self.strerror} ({self.filename})"
 
 
 class ScenarioError(NetkfError, ValueError):

@@ -19,5 +19,11 @@ def one_line(text: object) -> str:
     return printable(str(text), keep="")
 
 
+def shorten(text: object, longest: int = 200) -> str:
+    """Return a text as one line, without its middle if it is long."""
+    line, half = one_line(text), (longest - 5) // 2
+    return line if len(line) <= longest else f"{line[:half]} ... {line[-half:]}"
+
+
 def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")

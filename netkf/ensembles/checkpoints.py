@@ -1,64 +1,243 @@
-"""Finished blocks on disk, ``blocks/000003.npz`` of a run directory: a kill loses little."""
+"""Finished blocks on disk, ``blocks/000003.npz`` of a run directory: a kill loses little.
+
+A block is used only if it proves itself: its last line is the digest of all bytes before it, and
+inside it says to which run, which number and which installation it belongs.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
+import os
 import shutil
-import zipfile
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
+from netkf.core.errors import EngineError
 from netkf.ensembles.moments import Moments
-from netkf.ensembles.statistics import RunStatistics, Trace
-from netkf.runs.files import write_atomically
+from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace
+from netkf.runs.documents import DamagedError
+from netkf.runs.files import BLOCKS, write_atomically, writing
+from netkf.scenario.scenario import Scenario
+from netkf.trace.schema import EVENT
 
 PARTS = ("samples", "averages", "messages")
+MARK = b"\nsha256 "
+SEAL_BYTES = len(MARK) + 64
+CHUNK = 1 << 20
+MAX_BLOCK = 1 << 32
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """What blocks must have in common to be merged: the digest of the resolved scenario with its
+    files, the seed, the number of runs, ``trace``, the engine, the digest of the installation
+    (versions of all packages and of netkf's own files, features of the processor), and the number
+    of runs in a block.
+    """
+
+    scenario: str
+    seed: int
+    runs: int
+    trace: str
+    engine: str
+    installation: str
+    block: int
+
+    def of(self, number: int) -> dict[str, Any]:
+        """Return the identity of a block."""
+        return {**asdict(self), "number": number}
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return -(-self.runs // self.block)
 
 
 class BlockCheckpoints:
-    """Statistics of the blocks that are done, a file each. Files are written beside and renamed:
-    each is there whole or not at all.
-    """
+    """Statistics of the blocks that are done, a file each, there whole or not at all."""
 
-    def __init__(self, directory: Path) -> None:
-        self._folder = directory / "blocks"
+    def __init__(self, directory: Path, scenario: Scenario) -> None:
+        self._folder, self._scenario = directory / BLOCKS, scenario
+        self._numbers: set[int] = set()
 
-    def numbers(self) -> list[int]:
-        """Those that are there, in order."""
-        files = self._folder.glob("*.npz") if self._folder.is_dir() else ()
-        return sorted(int(file.stem) for file in files if zipfile.is_zipfile(file))
+    def begun_with(self) -> int | None:
+        """Return the number of runs in a block, as the first block says that can be read."""
+        for file in self._files():
+            with contextlib.suppress(DamagedError), _opened(file) as arrays:
+                size = _words(arrays)["identity"]["block"]
+                if is_block_size(size):
+                    return int(size)
+        return None
 
-    def save(self, number: int, statistics: RunStatistics) -> None:
-        """Write a block with the traces that its runs left."""
-        self._folder.mkdir(exist_ok=True)
-        with write_atomically(self._file(number)) as part, part.open("wb") as opened:
-            np.savez(opened, **_as_arrays(statistics))
+    def find(self, identity: RunIdentity) -> tuple[list[int], list[str]]:
+        """Return the numbers of the blocks of a run, in order, and a line on those that are not of
+        this run or cannot be read; those are removed.
+        """
+        bad: list[tuple[str, str]] = []
+        for file in self._files():
+            try:
+                number = _number(file, identity)
+                self._check(file, identity.of(number))
+            except DamagedError as error:
+                bad.append((file.name, str(error)))
+                with contextlib.suppress(OSError):
+                    file.unlink()
+            else:
+                self._numbers.add(number)
+        return sorted(self._numbers), _describe(bad)
+
+    def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
+        """Write a block with the traces that its runs left; raises WriteError."""
+        with writing(self._folder):
+            self._folder.mkdir(exist_ok=True)
+        with write_atomically(self._file(number)) as part, part.open("w+b") as file:
+            arrays = _as_arrays(statistics, identity.of(number))
+            np.savez(file, **arrays)
+            file.write(MARK + _digest(file, file.tell()))
+        self._numbers.add(number)
 
     def load(self, number: int) -> RunStatistics:
-        """Return a block without its traces."""
-        with np.load(self._file(number)) as arrays:
+        """Return a block without its traces; raises EngineError if it was damaged meanwhile."""
+        with self._expected(number), _opened(self._file(number)) as arrays:
             return _statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
-        """Yield the traces of all blocks in the order of replicas."""
-        for number in self.numbers():
-            with np.load(self._file(number)) as arrays:
+        """Yield the traces of all blocks in the order of replicas; raises EngineError as ``load``
+        does.
+        """
+        for number in sorted(self._numbers):
+            file = self._file(number)
+            with self._expected(number), _opened(file, verified=False) as arrays:
                 for k in range(_words(arrays)["traces"]):
-                    fields = [arrays[f"trace_{k}_{name}"] for name in Trace._fields]
-                    yield Trace(int(fields[0]), *fields[1:])
+                    yield self._trace(arrays, k)
 
     def remove(self) -> None:
         """Delete all blocks."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
+    def _files(self) -> list[Path]:
+        found = self._folder.glob("*.npz") if self._folder.is_dir() else ()
+        return sorted(file for file in found if file.stem.isdecimal())
+
     def _file(self, number: int) -> Path:
         return self._folder / f"{number:06d}.npz"
 
+    def _check(self, file: Path, identity: dict[str, Any]) -> None:
+        """Raise DamagedError unless a file is whole, has this identity and fits the scenario."""
+        with _opened(file, verified=False) as arrays:
+            found = _words(arrays).get("identity")
+            for key, value in identity.items():
+                if not isinstance(found, dict) or found.get(key) != value:
+                    raise DamagedError(f"is of another {key}")
+            if not self._fits(_statistics(arrays)):
+                raise DamagedError("does not fit the scenario")
 
-def _as_arrays(statistics: RunStatistics) -> dict[str, Any]:
+    def _fits(self, found: RunStatistics) -> bool:
+        """Return True if all arrays have the shapes of statistics of the scenario."""
+        count, n = len(self._scenario.nodes), self._scenario.plant.n
+        columns = {"samples": count * (n * (n + 1) + 1), "averages": 3 * (count + 1)}
+        rows = {"samples": len(self._scenario.times)}
+        moments = [(getattr(found, name), name) for name in PARTS]
+        moments += [(sums, "conserved") for sums, _ in found.conserved.values()]
+        columns |= {"messages": len(MESSAGES), "conserved": 2}
+        totals = found.totals.shape == (2,) and found.totals.dtype == np.int64
+        return totals and all(
+            one.mean.shape == one.M2.shape == (rows.get(name, 1), columns[name])
+            and one.size.shape == (rows.get(name, 1),)
+            and all(values.dtype == np.float64 for values in one)
+            for one, name in moments
+        )
+
+    def _trace(self, arrays: Any, k: int) -> Trace:
+        """Return a trace; raises DamagedError if it does not fit the scenario."""
+        trace = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
+        T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
+        shapes = [(), (len(trace.log),), (T,), (T, n), (T, N, n), (T, N, n, n), (T, N, n)]
+        if trace.log.dtype != EVENT or [np.shape(one) for one in trace] != shapes:
+            raise DamagedError("does not fit the scenario")
+        return trace._replace(replica=int(trace.replica))
+
+    @contextlib.contextmanager
+    def _expected(self, number: int) -> Iterator[None]:
+        """Raise EngineError for a block that was there a moment ago and cannot be used now."""
+        try:
+            yield
+        except DamagedError as error:
+            words, remedy = f"{self._file(number)} {error}", "go on with --resume"
+            raise EngineError(f"{words}; {remedy}, which does it again") from None
+
+
+def is_block_size(value: object) -> bool:
+    """Return True for a power of two, as numbers of runs in a block are."""
+    known = isinstance(value, int) and not isinstance(value, bool)
+    return known and 0 < value <= MAX_BLOCK and value & (value - 1) == 0  # type: ignore[operator]
+
+
+def _number(file: Path, identity: RunIdentity) -> int:
+    number = int(file.stem[:12])
+    if file.name != f"{number:06d}.npz" or number >= identity.blocks:
+        raise DamagedError("has a number that no block has")
+    return number
+
+
+def _describe(bad: list[tuple[str, str]]) -> list[str]:
+    """Return no line, or one on all blocks that are done again."""
+    if not bad:
+        return []
+    shown = ", ".join(f"{name} {reason}" for name, reason in bad[:3])
+    more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
+    return [f"kept blocks that are not those of this run are done again: {shown}{more}"]
+
+
+def _verify(file: Path) -> None:
+    """Raise DamagedError unless a file ends with the digest of all bytes before its last line."""
+    try:
+        if not file.is_file():
+            raise DamagedError("is missing" if not file.exists() else "is no regular file")
+        with file.open("rb") as opened:
+            length = max(0, opened.seek(0, os.SEEK_END) - SEAL_BYTES)
+            opened.seek(length)
+            seal = opened.read()
+            if seal != MARK + _digest(opened, length):
+                raise DamagedError("was changed since it was written")
+    except OSError as error:
+        raise DamagedError(f"cannot be read ({type(error).__name__})") from None
+
+
+def _digest(file: BinaryIO, length: int) -> bytes:
+    """Return the SHA-256 of the first ``length`` bytes, in hexadecimal; leaves the file at them."""
+    digest, left = hashlib.sha256(), length
+    file.seek(0)
+    while left > 0 and (chunk := file.read(min(CHUNK, left))):
+        digest.update(chunk)
+        left -= len(chunk)
+    file.seek(length)
+    return digest.hexdigest().encode()
+
+
+@contextlib.contextmanager
+def _opened(file: Path, verified: bool = True) -> Iterator[Any]:
+    """Yield the arrays of a file; raises DamagedError for whatever is wrong with them. The digest
+    is compared unless it was ``verified`` before.
+    """
+    try:
+        if not verified:
+            _verify(file)
+        with np.load(file, allow_pickle=False) as arrays:
+            yield arrays
+    except (DamagedError, EngineError, KeyboardInterrupt, GeneratorExit):
+        raise
+    except Exception as error:  # of zipfile, zlib, numpy and json, whatever the bytes are
+        raise DamagedError(f"cannot be read ({type(error).__name__})") from None
+
+
+def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str, Any]:
     arrays: dict[str, Any] = {"totals": statistics.totals}
     moments = {name: getattr(statistics, name) for name in PARTS}
     moments |= {f"conserved_{name}": found for name, (found, _) in statistics.conserved.items()}
@@ -67,6 +246,7 @@ def _as_arrays(statistics: RunStatistics) -> dict[str, Any]:
     for k, trace in enumerate(statistics.traces):
         arrays |= {f"trace_{k}_{field}": getattr(trace, field) for field in Trace._fields}
     words = {
+        "identity": identity,
         "conserved": {name: drift for name, (_, drift) in statistics.conserved.items()},
         "rounding_from": statistics.rounding_from,
         "fingerprint": statistics.fingerprint,
@@ -90,7 +270,7 @@ def _statistics(arrays: Any) -> RunStatistics:
         moments("averages"),
         moments("messages"),
         arrays["totals"],
-        {name: (moments(f"conserved_{name}"), d) for name, d in words["conserved"].items()},
-        words["rounding_from"],
-        words["fingerprint"],
+        {name: (moments(f"conserved_{name}"), float(d)) for name, d in words["conserved"].items()},
+        float(words["rounding_from"]),
+        str(words["fingerprint"]),
     )

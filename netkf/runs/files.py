@@ -8,44 +8,58 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from netkf.core.errors import ScenarioError
-from netkf.linalg.arrays import FloatArray
+from netkf.core.errors import ScenarioError, WriteError
 from netkf.scenario.plugins import module_files
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolved, to_toml
-from netkf.trace.recorder import Sink
-from netkf.trace.run import StateSamples, event_columns, state_table
-from netkf.trace.schema import EVENT
 
-ROWS = 1 << 17
-EVENT_ENCODING = {
-    "use_dictionary": ["run", "kind", "node", "peer", "phase", "age"],
-    "column_encoding": dict.fromkeys(("seq", "message"), "DELTA_BINARY_PACKED"),
-}
-STATE_ENCODING = {"use_dictionary": ["run", "t", "node"]}
-"""Dictionaries only where values repeat: half the size in half the time."""
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Raise a WriteError about ``path`` in place of the body's OSErrors."""
+    try:
+        yield
+    except WriteError:
+        raise
+    except OSError as error:
+        raise WriteError(error, path) from error
+
+
+def publish(part: Path, path: Path) -> None:
+    """Give a finished file its name, once its contents are on the disk; raises OSError.
+
+    After a loss of power there is the whole file under that name, or none.
+    """
+    with part.open("rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(part, path)
+    with contextlib.suppress(OSError):  # not every system can open a directory
+        directory = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
 
 
 @contextlib.contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file that replaces ``path`` at the end of the body.
 
-    A reader never sees half a file; if the body raises, the temporary file is removed.
+    A reader never sees half a file; if the body raises, the temporary file is removed. Raises
+    WriteError where the body or the system fails to write.
     """
     part = path.with_name(path.name + ".part")
     try:
-        yield part
-        os.replace(part, path)
+        with writing(path):
+            yield part
+            publish(part, path)
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
@@ -118,6 +132,8 @@ def new_directory(wanted: Path | None, name: str) -> Path:
     return wanted
 
 
+BLOCKS = "blocks"
+"""Folder of the blocks of an unfinished ensemble."""
 OWN_FILES = (
     "scenario.toml",
     "manifest.json",
@@ -130,11 +146,30 @@ OWN_FILES = (
 """Files of a run directory that netkf writes."""
 
 
+def own_names(scenario: Scenario) -> list[str]:
+    """Return the names of all files that a run of this scenario may leave in its directory."""
+    modules = [file.name for file in module_files(scenario).values() if file is not None]
+    return [*OWN_FILES, *modules, *(source.name for source in source_files(scenario))]
+
+
+def only_own(directory: Path, scenario: Scenario) -> bool:
+    """Return True if a directory holds nothing but what a run of this scenario leaves there."""
+    names = own_names(scenario)
+    known = {*names, *(f"{name}.part" for name in names)}
+    folders = {str(folder) for name in names for folder in Path(name).parents} | {BLOCKS}
+    found = (path.relative_to(directory).as_posix() for path in directory.rglob("*"))
+    return all(name in known or name in folders or name.startswith(f"{BLOCKS}/") for name in found)
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def remove_own(directory: Path, scenario: Scenario) -> None:
     """Remove the files that a run of this scenario left in its directory, and no others."""
-    modules = [file.name for file in module_files(scenario).values() if file is not None]
-    names = [*OWN_FILES, *modules, *(source.name for source in source_files(scenario))]
-    for name in names:
+    for name in own_names(scenario):
         for file in (directory / name, directory / f"{name}.part"):
             file.unlink(missing_ok=True)
         for folder in Path(name).parents[:-1]:
@@ -156,15 +191,23 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
     ``seed`` replaces the root seed of the scenario. The copy reproduces the run.
     """
     for source in source_files(scenario):
-        target = directory / source.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source.full, target)
+        _copy(source.full, directory / source.name)
     for module in module_files(scenario).values():
         if module is not None:
-            shutil.copyfile(module, directory / module.name)
+            _copy(module, directory / module.name)
     table = resolved(scenario)
     table["seed"] = scenario.seed if seed is None else seed
     write_text(directory / "scenario.toml", to_toml(table))
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file, unless the copy is there: a scenario may be that of the directory itself."""
+    if target.is_file() and target.read_bytes() == source.read_bytes():
+        return
+    with writing(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    with write_atomically(target) as part:
+        shutil.copyfile(source, part)
 
 
 def scenario_digest(scenario: Scenario) -> str:
@@ -185,142 +228,3 @@ def missing_modules(scenario: Scenario) -> list[str]:
         for name, file in module_files(scenario).items()
         if file is None
     ]
-
-
-class ParquetSink(Sink):
-    """Streams events and states to Parquet, one row group per block, so that memory is bounded."""
-
-    thread_safe: ClassVar[bool] = True
-
-    def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
-        self._nodes, self._replica, self._first = scenario.nodes, replica, 0
-        self._shown = scenario.plant.truth_known
-        self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None
-        self._states = _Table(directory / "states.parquet", STATE_ENCODING) if events else None
-        self._samples: list[tuple[FloatArray, ...]] = []
-        self._rows = 0
-
-    def events(self, rows: np.ndarray) -> None:
-        """Write a block of EVENT rows as a row group."""
-        if self._events is not None:
-            self._events.write(event_columns(rows, self._replica, self._first))
-            self._first += len(rows)
-
-    def states(
-        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
-    ) -> None:
-        """Collect samples until they fill a row group."""
-        if self._states is not None:
-            self._samples.append((t, x, xhat, P, error))
-            self._rows += len(t) * len(self._nodes)
-            if self._rows >= ROWS:
-                self._flush()
-
-    def _flush(self) -> None:
-        if self._states is None or not self._samples:
-            return
-        columns = zip(*self._samples, strict=True)
-        times, x, xhat, P, error = (np.concatenate(column) for column in columns)
-        self._samples.clear()
-        self._rows = 0
-        self._states.write(
-            state_table(
-                self._replica, self._nodes, StateSamples(times, x, xhat, P, error), self._shown
-            )
-        )
-
-    def close(self) -> None:
-        """Finish the files and rename them from NAME.part."""
-        self._flush()
-        for table, empty in (
-            (self._events, lambda: event_columns(np.empty(0, dtype=EVENT), 0, 0)),
-            (self._states, None),
-        ):
-            if table is not None:
-                table.close(empty)
-
-
-class TraceTables:
-    """Writes events.parquet and states.parquet of several runs, one run after the other."""
-
-    def __init__(self, directory: Path, scenario: Scenario) -> None:
-        self._nodes, self._shown = scenario.nodes, scenario.plant.truth_known
-        self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
-        self._states = _Table(directory / "states.parquet", STATE_ENCODING)
-        self._gathered: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])
-        self._rows = 0
-
-    def add(
-        self,
-        replica: int,
-        log: np.ndarray,
-        times: FloatArray,
-        x: FloatArray,
-        xhat: FloatArray,
-        P: FloatArray,
-        error: FloatArray,
-    ) -> None:
-        """Append one run: its EVENT rows, and its samples with the shapes of ``netkf.Run``."""
-        samples = StateSamples(times, x, xhat, P, error)
-        states = state_table(replica, self._nodes, samples, self._shown)
-        for gathered, columns in zip(
-            self._gathered, (event_columns(log, replica, 0), states), strict=True
-        ):
-            gathered.append(pd.DataFrame(columns))
-        self._rows += max(len(log), len(times) * len(self._nodes))
-        if self._rows >= ROWS:
-            self._flush()
-
-    def _flush(self) -> None:
-        for gathered, table in zip(self._gathered, (self._events, self._states), strict=True):
-            if gathered:
-                table.write(pd.concat(gathered, ignore_index=True))
-                gathered.clear()
-        self._rows = 0
-
-    def close(self) -> None:
-        """Finish the files and rename them from NAME.part."""
-        self._flush()
-        self._events.close(None)
-        self._states.close(None)
-
-
-def write_table(path: Path, columns: dict[str, Any]) -> None:
-    """Write columns as a Parquet file."""
-    table = _Table(path)
-    table.write(columns)
-    table.close(None)
-
-
-class _Table:
-    """A Parquet file under construction; its schema is that of the first rows."""
-
-    def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
-        self._path, self._part = path, path.with_name(path.name + ".part")
-        self._encoding = encoding or {}
-        self._writer: Any = None
-        self._closed = self._failed = False
-
-    def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
-        table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
-        if self._writer is None:
-            schema, how = table.schema, self._encoding
-            self._writer = pq.ParquetWriter(self._part, schema, compression="zstd", **how)
-        self._failed = True  # stays so if writing raises: half a row group is no file
-        self._writer.write_table(table)
-        self._failed = False
-
-    def close(self, empty: Callable[[], dict[str, Any]] | None) -> None:
-        if self._closed:
-            return
-        self._closed = True
-        if self._writer is None and empty is not None:
-            self.write(empty())
-        if self._writer is None:
-            return
-        if self._failed:
-            with contextlib.suppress(OSError, pa.ArrowException):
-                self._writer.close()
-            return
-        self._writer.close()
-        os.replace(self._part, self._path)

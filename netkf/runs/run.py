@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,16 @@ from netkf.engines.base import Engine, Progress, silent
 from netkf.linalg import compiling
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.rng.streams import Streams
+from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failure
 from netkf.runs.files import (
-    ParquetSink,
     check_sources,
     new_directory,
+    own_names,
     write_json,
     write_scenario,
 )
+from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
 from netkf.runs.simulate import choose_engine
 from netkf.runs.summary import (
@@ -111,7 +113,7 @@ def run_to_directory(
         if explained is error:
             raise
         raise explained from error
-    output.manifest.write(status, _totals(recorder), done)
+    output.manifest.write(status, _totals(recorder), done, names=own_names(scenario))
     return completed
 
 
@@ -134,7 +136,8 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     output.write_summary(promise_traces(scenario, run.times), run.count, run.sums, run.status)
     totals: dict[str, Any] = {"events": len(run.log), "fingerprint": run.fingerprint}
     totals |= {"simpy": run.stats} if run.stats else {}
-    output.manifest.write(run.status, totals, run.status == "complete")
+    done = run.status == "complete"
+    output.manifest.write(run.status, totals, done, names=own_names(scenario))
     return output.directory
 
 
@@ -189,12 +192,12 @@ def _create_output(
     """
     check_sources(scenario)
     directory = new_directory(out, scenario.name)
-    write_scenario(directory, scenario, seed)
     channel = scenario.network.channel
     by_message = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
     manifest = Manifest(directory, scenario.name, seed, replica, engine)
-    # Written at once, so that a run that is killed outright says that it did not finish.
+    # Written first, so that a run that is killed outright says that it did not finish.
     manifest.write("interrupted", {})
+    write_scenario(directory, scenario, seed)
     return _Output(
         directory,
         scenario,
@@ -252,8 +255,11 @@ class Manifest:
         totals: dict[str, Any],
         done: int = 0,
         error: BaseException | None = None,
+        names: Iterable[str] = (),
     ) -> None:
-        """Write manifest.json with the status, the totals and the number of runs that are done."""
+        """Write manifest.json with the status, the totals, the number of runs that are done, the
+        digests of the files with these ``names``, and its own digest.
+        """
         manifest: dict[str, Any] = {
             "name": self.name,
             "versions": versions(),
@@ -268,4 +274,7 @@ class Manifest:
         if status == "failed" and error is not None:
             manifest["error"] = in_words(error)
             manifest["traceback"] = traceback.format_exception(error)
-        write_json(self.directory / "manifest.json", manifest)
+        others = [name for name in names if name != "manifest.json"]
+        if others:
+            manifest["files"] = file_digests(self.directory, others)
+        write_sealed(self.directory / "manifest.json", manifest)

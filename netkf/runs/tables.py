@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from netkf.core.printable import one_line
 from netkf.scenario.usage import usage_notes
 
 MAX_NODES = 30
@@ -35,7 +36,10 @@ def standard_error(error: float | None) -> str:
 
 
 def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
-    """Return aligned columns, the first ``left`` to the left and the others to the right."""
+    """Return aligned columns, the first ``left`` to the left and the others to the right. Cells may
+    hold text from files: line breaks and control characters in them are escaped.
+    """
+    header, rows = [*map(one_line, header)], [[*map(one_line, row)] for row in rows]
     widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
     lines = [
         "  ".join(
@@ -47,7 +51,7 @@ def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
 
-def shorten(rows: list[list[str]], most: int) -> list[list[str]]:
+def shorten_rows(rows: list[list[str]], most: int) -> list[list[str]]:
     """Return at most ``most`` rows, the first and the last, with a row that counts the rest."""
     if len(rows) <= most:
         return rows

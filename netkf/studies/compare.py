@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,12 +17,46 @@ import scipy.special
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import number
+from netkf.core.printable import shorten
+from netkf.runs.documents import (
+    COUNT,
+    NUMBER,
+    SEAL,
+    TEXT,
+    TEXTS,
+    DamagedError,
+    check_files,
+    check_seal,
+    read_document,
+    require,
+)
+from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.studies.metrics import mean_over_runs
 
 AVERAGES = ("rms_error", "mean_trace", "mean_nees")
 MESSAGES = ("sent", "delivered", "lost")
 TRACES = ("bound", "limit", "central")
 ENDED = ("complete", "diverged")
+DIAGONAL = re.compile(r"P(\d+)_?\1$")
+"""Columns of the diagonal of P: P11, or P1_1 where there are more than ten states."""
+ROW: dict[str, Any] = dict.fromkeys((*AVERAGES, "bound"), NUMBER)
+ROW |= {f"{name}_se?": NUMBER for name in ROW}
+MANIFEST: dict[str, Any] = {
+    "name?": TEXT,
+    "status": TEXT,
+    "seed?": COUNT,
+    "runs": {"done": COUNT},
+}
+SUMMARY: dict[str, Any] = {
+    "nodes": [{"node": COUNT, **ROW}],
+    "overall": ROW,
+    "limit": NUMBER,
+    "central": NUMBER,
+    "rounding_from?": NUMBER,
+    "notes?": TEXTS,
+    "messages": dict.fromkeys(MESSAGES, NUMBER),
+    "messages_se?": {f"{name}?": NUMBER for name in MESSAGES},
+}
 
 
 class Entry(NamedTuple):
@@ -81,13 +116,23 @@ class RunDirectory:
 
     @cached_property
     def samples(self) -> pd.DataFrame | None:
-        """Samples after time 0 of all runs, None if the directory does not have them all."""
+        """Samples after time 0 of all runs, None if the directory does not have them all.
+
+        Raises ScenarioError if states.parquet is damaged.
+        """
         file = self.directory / "states.parquet"
         if not file.exists() or self.runs < 2:
             return None
-        states = pd.read_parquet(file)
-        complete = states["run"].nunique() == self.runs and "sq_error" in states
-        states["mean_trace"] = states.filter(regex=r"^P(\d)\1$").sum(axis=1)
+        with damage_named(self.directory):
+            check_files(self.directory, self.manifest, [file.name])
+            names = column_names(file)
+            if "sq_error" not in names:
+                return None
+            traces = [name for name in names if DIAGONAL.match(name)]
+            truth = [name for name in names if name[:1] == "x" and name[1:].isdecimal()]
+            states = read_numbers(file, ["run", "t", "node", "sq_error", "nees", *traces, *truth])
+        complete = states["run"].nunique() == self.runs
+        states["mean_trace"] = states[traces].sum(axis=1)
         return states[states["t"] > 0.0] if complete else None
 
     @property
@@ -111,28 +156,49 @@ class RunDirectory:
 
 
 def read_directory(directory: Path) -> RunDirectory:
-    """Return the directory of a finished run; raises ScenarioError if it is not one."""
-    where = str(directory)
+    """Return the directory of a finished run; raises ScenarioError if it is not one, or if its
+    manifest, its summary or its scenario was changed since the run ended.
+    """
+    where = shorten(directory)
     if not directory.is_dir():
         raise ScenarioError(where, "is not a directory", None, "name run directories")
-    found = []
-    for name in ("manifest.json", "summary.json"):
-        try:
-            found.append(json.loads((directory / name).read_text(encoding="utf-8")))
-        except (OSError, ValueError):
-            rule = f"is not the directory of a run: {name} is missing or cannot be read"
-            raise ScenarioError(where, rule, None, "name what netkf run left") from None
-        if name == "manifest.json" and found[0].get("status") not in ENDED:
-            rule = f"holds a run that did not finish ({found[0].get('status')})"
+    with damage_named(directory):
+        manifest = _read(directory, "manifest.json", MANIFEST)
+        if manifest["status"] not in ENDED:
+            rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
+        summary = _read(directory, "summary.json", SUMMARY)
+        if SEAL in manifest:  # older versions wrote none
+            with _named("manifest.json"):
+                check_seal(manifest)
+        check_files(directory, manifest, ["scenario.toml", "summary.json"])
+    return RunDirectory(directory, manifest, summary)
+
+
+def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
+    with _named(name):
+        document = read_document(directory / name)
+        require(document, form, name)
+    return document
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Put the name of a file into a DamagedError about it."""
     try:
-        finished = RunDirectory(directory, found[0], found[1])
-        _ = finished.runs, [finished.value(q, -1) for q in (*AVERAGES, *MESSAGES, *TRACES)]
-        _ = [finished.value("rms_error", node) for node in finished.nodes]
-    except (KeyError, TypeError, ValueError, AttributeError):
-        rule = "is not the directory of a run: summary.json or manifest.json lacks what runs have"
-        raise ScenarioError(where, rule, None, "name what netkf run left") from None
-    return finished
+        yield
+    except DamagedError as error:
+        raise DamagedError(f"{name} {error}") from None
+
+
+@contextmanager
+def damage_named(directory: Path) -> Iterator[None]:
+    """Raise ScenarioError that names the directory in place of a DamagedError."""
+    try:
+        yield
+    except DamagedError as error:
+        rule = f"is not the directory of a run: {error}"
+        raise ScenarioError(shorten(directory), rule, None, "name what netkf run left") from None
 
 
 @dataclass(frozen=True)
@@ -250,10 +316,10 @@ def _welch(
     errors = [base[1], entry.se]
     if base[0] is None or entry.value is None:
         return entry
-    difference = entry.value - base[0]
+    difference = float(entry.value) - float(base[0])
     if any(e is None or not math.isfinite(e) for e in errors) or min(runs) < 2:
         return entry._replace(difference=difference, method="one run")
-    squares = [float(e or 0.0) ** 2 for e in errors]
+    squares = [float(e or 0.0) * float(e or 0.0) for e in errors]
     total = sum(squares)
     parts = sum(s * s / (n - 1) for s, n in zip(squares, runs, strict=True))
     freedom = total * total / parts if parts > 0.0 else float(min(runs) - 1)

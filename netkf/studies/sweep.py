@@ -16,15 +16,15 @@ import numpy as np
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer
 from netkf.ensembles.replicas import replicate_blocks
+from netkf.runs.documents import write_sealed
 from netkf.runs.failures import InterruptedRunError, explain_failures
 from netkf.runs.files import (
     check_sources,
     new_directory,
-    write_json,
     write_scenario,
-    write_table,
     write_text,
 )
+from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
@@ -231,4 +231,4 @@ def _write_manifest(
         "runs": {"wanted": plan.runs * len(plan.points), "done": plan.runs * done},
         "status": status,
     }
-    write_json(directory / "manifest.json", manifest)
+    write_sealed(directory / "manifest.json", manifest)

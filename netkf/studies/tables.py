@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from netkf.runs.tables import format_number, shorten, standard_error, table
+from netkf.core.printable import shorten
+from netkf.runs.tables import format_number, shorten_rows, standard_error, table
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.consistency import Consistency
 from netkf.studies.search import Sizing
@@ -30,7 +31,7 @@ def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
         ]
         for row in found.to_dict("records")
     ]
-    return table(header, shorten(rows, MAX_ROWS))
+    return table(header, shorten_rows(rows, MAX_ROWS))
 
 
 def _short(value: Any) -> str:
@@ -110,7 +111,7 @@ def consistency_text(found: Consistency) -> str:
     scaled = f"{found.low / found.n:.4g} .. {found.high / found.n:.4g}"
     return "\n".join(
         [
-            table(header, shorten(rows, MAX_ROWS)),
+            table(header, shorten_rows(rows, MAX_ROWS)),
             "",
             f"{found.runs:,} runs, n = {found.n}; +-: half width of the interval on the difference "
             f"from what NEES should be, all nodes together at confidence {found.confidence:g}",
@@ -125,7 +126,7 @@ def comparison_text(found: Comparison) -> str:
     """Return directories side by side; a star marks significant differences from the first."""
     numbered = [f"({k + 1})" for k in range(len(found.directories))]
     lines = [
-        f"{mark} {directory}: {name}, {runs:,} run{'s' if runs > 1 else ''}"
+        f"{mark} {shorten(directory)}: {shorten(name)}, {runs:,} run{'s' if runs > 1 else ''}"
         for mark, directory, name, runs in zip(
             numbered, found.directories, found.names, found.runs, strict=True
         )
@@ -142,7 +143,7 @@ def comparison_text(found: Comparison) -> str:
         rows = [*rows[: MAX_ROWS - 3], [left_out, *[""] * len(numbered)], *rows[-3:]]
     lines += ["", table(["", *numbered], rows, left=1)]
     notes = [
-        f"note: {mark} {note}"
+        f"note: {mark} {shorten(note, 500)}"
         for mark, told in zip(numbered, found.notes, strict=True)
         for note in told
     ]

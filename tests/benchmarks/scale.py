@@ -23,7 +23,7 @@ from pathlib import Path
 
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.rng.streams import Streams
-from netkf.runs.files import ParquetSink
+from netkf.runs.parquet_files import ParquetSink
 from netkf.trace.recorder import Recorder
 from tests.benchmarks.cases import SCENARIOS, load
 

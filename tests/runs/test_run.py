@@ -72,7 +72,7 @@ def test_tables_are_written_in_pieces(ring, tmp_path, monkeypatch, engine):
     monkeypatch.setattr("netkf.trace.recorder.BLOCK", 100)
     monkeypatch.setattr("netkf.engines.compiled.flow.FIRST_ROWS", 100)
     monkeypatch.setattr("netkf.engines.compiled.flow.MOST_SAMPLES", 10)
-    monkeypatch.setattr("netkf.runs.files.ROWS", 50)
+    monkeypatch.setattr("netkf.runs.parquet_files.ROWS", 50)
     import pyarrow.parquet as pq
 
     out = run_to_directory(ring, tmp_path / "pieces", engine=engine).directory

@@ -1,0 +1,180 @@
+"""Whether the runs in a directory can be gone on with: what must be the same, and is proved."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from netkf.core.errors import ScenarioError
+from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity, is_block_size
+from netkf.runs.documents import (
+    COUNT,
+    TEXT,
+    DamagedError,
+    check_files,
+    check_seal,
+    read_document,
+    require,
+)
+from netkf.runs.files import new_directory, only_own, remove_own
+from netkf.runs.provenance import machine, versions
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.writing import resolved, to_toml
+
+ENDED = ("complete", "diverged")
+MANIFEST = {
+    "name": TEXT,
+    "status": TEXT,
+    "engine": TEXT,
+    "seed": COUNT,
+    "replica": COUNT,
+    "runs": {"wanted": COUNT, "done": COUNT},
+    "versions": {},
+    "machine?": {},
+    "scenario?": TEXT,
+    "trace?": TEXT,
+    "block?": COUNT,
+}
+ANOTHER = "start in a new directory"
+
+
+class BegunEnsemble(NamedTuple):
+    """A directory to go on in, the number of runs in its blocks, and whether all is done."""
+
+    directory: Path
+    block: int
+    finished: bool
+
+
+def ensemble_to_resume(
+    out: Path | None, scenario: Scenario, plan: RunIdentity
+) -> BegunEnsemble | None:
+    """Return what is in the directory ``out``, None if it is new or empty.
+
+    Raises ScenarioError if it holds something else than a run with this plan on this installation,
+    or one that was changed since it was written.
+    """
+    if out is None:
+        remedy = "add --out DIR with the directory of the run that was stopped"
+        raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
+    size = BlockCheckpoints(out, scenario).begun_with() or plan.block
+    if not (out / "manifest.json").exists():
+        if not _has_own_files(out, scenario):
+            return None
+        _check_scenario(out, scenario)
+        return BegunEnsemble(out, size, False)
+    found = read_manifest(out)
+    if found["runs"]["wanted"] != plan.runs:
+        words, value = "the run was begun with another number of runs", found["runs"]["wanted"]
+        raise ScenarioError("--resume", words, value, "give the same --runs")
+    same = {
+        "scenario": (plan.scenario, "give the same scenario, seed and settings"),
+        "trace": (plan.trace, "give the same --trace"),
+        "engine": (plan.engine, "give the same --engine"),
+        "versions": (versions(), "go on with the versions that it was begun with"),
+        "machine": (machine(), "go on where it was begun, or start in a new directory"),
+    }
+    for key, (wanted, remedy) in same.items():
+        if found.get(key) != wanted:
+            words = f"{out} holds a run of another {key.removesuffix('s')}"
+            raise ScenarioError("--resume", words, _difference(found.get(key), wanted), remedy)
+    blocks_prove = "remove it: the blocks prove themselves"
+    _prove(out / "manifest.json", lambda: check_seal(found), blocks_prove)
+    _check_scenario(out, scenario)
+    finished = found["status"] in ENDED
+    if finished:
+        _prove(out, lambda: check_files(out, found), ANOTHER)
+    return BegunEnsemble(
+        out, found["block"] if is_block_size(found.get("block")) else size, finished
+    )
+
+
+def _difference(found: Any, wanted: Any) -> Any:
+    """Return the entries of a table that are not as wanted, and other values as they are."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        return {
+            key: found.get(key) for key in {**found, **wanted} if found.get(key) != wanted.get(key)
+        }
+    return found
+
+
+def clear_unfinished(
+    directory: Path,
+    scenario: Scenario,
+    replica: int = 0,
+    note: Callable[[str], None] | None = None,
+) -> bool:
+    """Make room for a single run that was stopped to be done again; False where it is finished.
+
+    ``note`` is called with a line if a finished run was changed since: it is done again too. Raises
+    ScenarioError where the directory holds a run of another scenario or replica.
+    """
+    if not (directory / "manifest.json").exists():
+        if _has_own_files(directory, scenario):
+            _check_scenario(directory, scenario)
+            remove_own(directory, scenario)
+        return True
+    found = read_manifest(directory)
+    if found["replica"] != replica:
+        rule, remedy = f"{directory} holds another replica", "give the same --replica"
+        raise ScenarioError("--resume", rule, found["replica"], remedy)
+    if found["runs"]["wanted"] != 1:
+        remedy = "give the same --runs"
+        raise ScenarioError("--resume", "the run was begun with several runs", 1, remedy)
+    _check_scenario(directory, scenario)
+    if found["status"] in ENDED:
+        try:
+            check_seal(found)
+            check_files(directory, found)
+        except DamagedError as error:
+            if note is not None:
+                note(f"the run in {directory} is done again: its record {error}")
+        else:
+            return False
+    remove_own(directory, scenario)
+    return True
+
+
+def _has_own_files(directory: Path, scenario: Scenario) -> bool:
+    """Return True if a directory without a manifest has files, all of a run that was stopped.
+
+    Raises ScenarioError if it has others.
+    """
+    if not directory.is_dir() or not any(directory.iterdir()):
+        return False
+    if not only_own(directory, scenario):
+        new_directory(directory, scenario.name)  # says that it is not empty
+    return True
+
+
+def _check_scenario(directory: Path, scenario: Scenario) -> None:
+    """Raise ScenarioError if scenario.toml of a directory is not that of its run."""
+    kept, text = directory / "scenario.toml", to_toml(resolved(scenario))
+    if not kept.exists():
+        return
+    with contextlib.suppress(OSError, ValueError):
+        if kept.is_file() and kept.read_text(encoding="utf-8") == text:
+            return
+    rule = f"{directory} holds a run of another scenario, or its scenario.toml was changed"
+    remedy = "give the same scenario, seed and settings, or move scenario.toml away"
+    raise ScenarioError("--resume", rule, scenario.name, remedy)
+
+
+def _prove(path: Path, check: Callable[[], None], remedy: str) -> None:
+    try:
+        check()
+    except DamagedError as error:
+        raise ScenarioError("--resume", f"{path}: {error}", None, remedy) from None
+
+
+def read_manifest(directory: Path) -> dict[str, Any]:
+    """Return ``manifest.json`` of a directory; raises ScenarioError where it is not one."""
+    try:
+        found = read_document(directory / "manifest.json")
+        require(found, MANIFEST, "manifest.json")
+    except DamagedError as error:
+        words = f"must be a directory that netkf run left: manifest.json {error}"
+        raise ScenarioError("--resume", words, str(directory), "give another --out") from None
+    return found

@@ -1,0 +1,252 @@
+"""Parquet tables of run directories, written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.documents import DamagedError
+from netkf.runs.files import publish, writing
+from netkf.scenario.scenario import Scenario
+from netkf.trace.recorder import Sink
+from netkf.trace.run import StateSamples, event_columns, state_table
+from netkf.trace.schema import EVENT
+
+ROWS = 1 << 17
+MAX_READ_ROWS = 1 << 28
+"""Rows of a table up to which it is read as a whole."""
+EVENT_ENCODING = {
+    "use_dictionary": ["run", "kind", "node", "peer", "phase", "age"],
+    "column_encoding": dict.fromkeys(("seq", "message"), "DELTA_BINARY_PACKED"),
+}
+STATE_ENCODING = {"use_dictionary": ["run", "t", "node"]}
+"""Dictionaries only where values repeat: half the size in half the time."""
+
+
+def read_numbers(path: Path, columns: Sequence[str]) -> pd.DataFrame:
+    """Return columns of numbers of a Parquet file; raises DamagedError for any other file, and for
+    one with more than MAX_READ_ROWS rows.
+    """
+    if not path.is_file():
+        raise DamagedError(f"{path.name} is no regular file")
+    try:
+        with pq.ParquetFile(path) as file:
+            names, types = file.schema_arrow.names, file.schema_arrow.types
+            known = dict(zip(names, types, strict=True))
+            wrong = [
+                name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])
+            ]
+            if wrong:
+                raise DamagedError(f"{path.name} has no column {wrong[0]} of numbers")
+            if file.metadata.num_rows > MAX_READ_ROWS:
+                raise DamagedError(f"{path.name} has more than {MAX_READ_ROWS:,} rows")
+            table = file.read(columns=list(columns))
+        if any(column.null_count for column in table.columns):
+            raise DamagedError(f"{path.name} has missing values")
+        return pd.DataFrame(table.to_pandas())
+    except DamagedError:
+        raise
+    except (OSError, ValueError, TypeError, MemoryError, OverflowError, pa.ArrowException) as error:
+        raise DamagedError(f"{path.name} cannot be read ({type(error).__name__})") from None
+
+
+def column_names(path: Path) -> list[str]:
+    """Return the names of the columns of a Parquet file; raises DamagedError."""
+    if not path.is_file():
+        raise DamagedError(f"{path.name} is no regular file")
+    try:
+        return list(pq.read_schema(path).names)
+    except (OSError, ValueError, TypeError, MemoryError, pa.ArrowException) as error:
+        raise DamagedError(f"{path.name} cannot be read ({type(error).__name__})") from None
+
+
+def _is_numeric(kind: Any) -> bool:
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+
+
+class ParquetSink(Sink):
+    """Streams events and states to Parquet, one row group per block, so that memory is bounded."""
+
+    thread_safe: ClassVar[bool] = True
+
+    def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
+        self._nodes, self._replica, self._first = scenario.nodes, replica, 0
+        self._shown = scenario.plant.truth_known
+        self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None
+        self._states = _Table(directory / "states.parquet", STATE_ENCODING) if events else None
+        self._samples: list[tuple[FloatArray, ...]] = []
+        self._rows = 0
+
+    def events(self, rows: np.ndarray) -> None:
+        """Write a block of EVENT rows as a row group."""
+        if self._events is not None:
+            self._events.write(event_columns(rows, self._replica, self._first))
+            self._first += len(rows)
+
+    def states(
+        self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+    ) -> None:
+        """Collect samples until they fill a row group."""
+        if self._states is not None:
+            self._samples.append((t, x, xhat, P, error))
+            self._rows += len(t) * len(self._nodes)
+            if self._rows >= ROWS:
+                self._flush()
+
+    def _flush(self) -> None:
+        if self._states is None or not self._samples:
+            return
+        columns = zip(*self._samples, strict=True)
+        times, x, xhat, P, error = (np.concatenate(column) for column in columns)
+        self._samples.clear()
+        self._rows = 0
+        self._states.write(
+            state_table(
+                self._replica, self._nodes, StateSamples(times, x, xhat, P, error), self._shown
+            )
+        )
+
+    def close(self) -> None:
+        """Finish the files and rename them from NAME.part."""
+        with contextlib.ExitStack() as last_first:
+            if self._states is not None:
+                last_first.callback(self._states.close, None)
+            if self._events is not None:
+                last_first.callback(self._events.close, _no_events)
+            # A full disk that fails here leaves the table that can be finished.
+            last_first.callback(self._flush)
+
+
+def _no_events() -> dict[str, Any]:
+    return event_columns(np.empty(0, dtype=EVENT), 0, 0)
+
+
+class TraceTables:
+    """Writes events.parquet and states.parquet of several runs, one run after the other; use it as
+    a context manager.
+    """
+
+    def __init__(self, directory: Path, scenario: Scenario) -> None:
+        self._nodes, self._shown = scenario.nodes, scenario.plant.truth_known
+        self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
+        self._states = _Table(directory / "states.parquet", STATE_ENCODING)
+        self._gathered: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])
+        self._rows = 0
+
+    def add(
+        self,
+        replica: int,
+        log: np.ndarray,
+        times: FloatArray,
+        x: FloatArray,
+        xhat: FloatArray,
+        P: FloatArray,
+        error: FloatArray,
+    ) -> None:
+        """Append one run: its EVENT rows, and its samples with the shapes of ``netkf.Run``."""
+        samples = StateSamples(times, x, xhat, P, error)
+        states = state_table(replica, self._nodes, samples, self._shown)
+        for gathered, columns in zip(
+            self._gathered, (event_columns(log, replica, 0), states), strict=True
+        ):
+            gathered.append(pd.DataFrame(columns))
+        self._rows += max(len(log), len(times) * len(self._nodes))
+        if self._rows >= ROWS:
+            self._flush()
+
+    def _flush(self) -> None:
+        for gathered, table in zip(self._gathered, (self._events, self._states), strict=True):
+            if gathered:
+                table.write(pd.concat(gathered, ignore_index=True))
+                gathered.clear()
+        self._rows = 0
+
+    def __enter__(self) -> TraceTables:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish the files, or remove them after an exception."""
+        try:
+            if error is None:
+                self._flush()
+                self._events.close(None)
+                self._states.close(None)
+        finally:
+            self._events.discard()
+            self._states.discard()
+
+
+def write_table(path: Path, columns: dict[str, Any]) -> None:
+    """Write columns as a Parquet file."""
+    table = _Table(path)
+    table.write(columns)
+    table.close(None)
+
+
+class _Table:
+    """A Parquet file under construction; its schema is that of the first rows.
+
+    The file has its name once it is whole and on the disk. If writing fails, nothing is left of it,
+    and WriteError is raised.
+    """
+
+    def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
+        self._path, self._part = path, path.with_name(path.name + ".part")
+        self._encoding = encoding or {}
+        self._writer: Any = None
+        self._closed = False
+
+    def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
+        table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
+        with self._or_nothing():
+            if self._writer is None:
+                schema, how = table.schema, self._encoding
+                self._writer = pq.ParquetWriter(self._part, schema, compression="zstd", **how)
+            self._writer.write_table(table)
+
+    def close(self, empty: Callable[[], dict[str, Any]] | None) -> None:
+        """Finish the file; without rows, one with the columns of ``empty``, if there are such."""
+        if self._closed:
+            return
+        if self._writer is None and empty is not None:
+            self.write(empty())
+        self._closed = True
+        if self._writer is not None:
+            with self._or_nothing():
+                self._writer.close()
+                publish(self._part, self._path)
+
+    def discard(self) -> None:
+        """Remove what was written, unless the file is finished."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._writer is not None:
+            with contextlib.suppress(OSError, pa.ArrowException):
+                self._writer.close()
+        with contextlib.suppress(OSError):
+            self._part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _or_nothing(self) -> Iterator[None]:
+        try:
+            with writing(self._path):
+                yield
+        except BaseException:
+            self._closed = False
+            self.discard()
+            raise

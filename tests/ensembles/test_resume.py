@@ -1,0 +1,337 @@
+"""What is kept of a stopped ensemble is proved before it is used."""
+
+import io
+import json
+import os
+import random
+import shutil
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.cli.main import main
+from netkf.core.errors import EngineError, ScenarioError, WriteError
+from netkf.ensembles import checkpoints
+from netkf.ensembles.checkpoints import BlockCheckpoints
+from netkf.ensembles.directory import runs_to_directory
+from netkf.runs import provenance
+from netkf.runs.documents import write_sealed
+from tests.conftest import SCENARIOS
+
+RUNS = {"runs": 12, "trace": "first", "workers": 1}
+RING = str(SCENARIOS / "poisson_ring.toml")
+
+
+def short(seed=1):
+    return netkf.load(RING, {"horizon": 1.0, "seed": seed})
+
+
+def files(folder):
+    return {f.relative_to(folder): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A whole ensemble, and two that were stopped: ``cut``, and ``other`` with another seed."""
+    folder = tmp_path_factory.mktemp("resume")
+
+    def stop(done, wanted):
+        if done >= 6:
+            raise KeyboardInterrupt
+
+    runs_to_directory(short(), out=folder / "whole", **RUNS)
+    for name, seed in (("cut", 1), ("other", 2)):
+        with pytest.raises(KeyboardInterrupt):
+            runs_to_directory(short(seed), out=folder / name, **RUNS, progress=stop)
+    return folder
+
+
+@pytest.fixture
+def cut(made, tmp_path):
+    return shutil.copytree(made / "cut", tmp_path / "cut")
+
+
+def resume(folder, scenario=None):
+    """Go on; return the notes and the number of runs that were simulated."""
+    notes = []
+    done = runs_to_directory(
+        scenario or short(), out=folder, **RUNS, resume=True, note=notes.append
+    )
+    return notes, None if done is None else done.simulated
+
+
+def assert_done_again(folder, made, blocks=1):
+    notes, simulated = resume(folder)
+    assert len(notes) == 1
+    assert "done again" in notes[0]
+    assert simulated == 6 + blocks
+    assert files(folder) == files(made / "whole")
+
+
+def seal(contents):
+    """A block that says of itself that it is whole."""
+    buffer = io.BytesIO(contents)
+    return contents + checkpoints.MARK + checkpoints._digest(buffer, len(contents))
+
+
+def forged(block, **changes):
+    """A block with other arrays and the right digest."""
+    with np.load(block) as found:
+        arrays = {**{name: found[name] for name in found.files}, **changes}
+    made = io.BytesIO()
+    np.savez(made, **arrays)
+    block.write_bytes(seal(made.getvalue()))
+
+
+def flip(block, draw):
+    found = bytearray(block.read_bytes())
+    found[draw.randrange(len(found))] ^= 1 << draw.randrange(8)
+    block.write_bytes(found)
+
+
+def as_fifo(block, draw):
+    block.unlink()
+    os.mkfifo(block)
+
+
+def as_other_number(block, draw):
+    shutil.copyfile(block.with_name("000000.npz"), block)
+
+
+DAMAGE = {
+    "truncated": lambda block, draw: block.write_bytes(block.read_bytes()[:-100]),
+    "without digest": lambda block, draw: block.write_bytes(block.read_bytes()[:-71]),
+    "empty": lambda block, draw: block.write_bytes(b""),
+    "fifo": as_fifo,
+    "other number": as_other_number,
+    "other shape": lambda block, draw: forged(block, samples_mean=np.zeros((2, 2))),
+    "other type": lambda block, draw: forged(block, totals=np.array(["a", "b"])),
+    "no words": lambda block, draw: forged(block, words=np.array("[" * 100_000)),
+    "no zip": lambda block, draw: block.write_bytes(seal(b"PK nothing")),
+}
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_a_damaged_block_is_done_again(cut, made, how):
+    DAMAGE[how](cut / "blocks" / "000003.npz", random.Random(1))
+    assert_done_again(cut, made)
+
+
+def test_every_byte_of_a_block_is_proved(cut):
+    block = cut / "blocks" / "000003.npz"
+    whole, draw = block.read_bytes(), random.Random(1)
+    for _ in range(200):
+        block.write_bytes(whole)
+        flip(block, draw)
+        with pytest.raises(checkpoints.DamagedError):
+            checkpoints._verify(block)
+
+
+def test_a_block_of_another_seed_is_done_again(cut, made):
+    for number in (1, 2):
+        name = f"{number:06d}.npz"
+        shutil.copyfile(made / "other" / "blocks" / name, cut / "blocks" / name)
+    assert_done_again(cut, made, blocks=2)
+
+
+@pytest.mark.parametrize(
+    "key", ["numpy", "scipy", "numba", "python", "netkf", "source", "features"]
+)
+def test_everything_that_decides_bits_decides_what_is_used(cut, monkeypatch, key):
+    """Neither the manifest nor, where that was removed, the blocks of another installation."""
+    before = {**provenance.versions()}, {**provenance.machine()}
+    assert key in before[0] or key in before[1]
+    for found in before:
+        if key in found:
+            found[key] = "other"
+    for room in ("netkf.runs.provenance", "netkf.ensembles.resume"):
+        monkeypatch.setattr(f"{room}.versions", lambda: before[0])
+        monkeypatch.setattr(f"{room}.machine", lambda: before[1])
+    with pytest.raises(ScenarioError, match=f"holds a run of another (version|machine).*{key}"):
+        resume(cut)
+    (cut / "manifest.json").unlink()
+    notes, simulated = resume(cut)
+    assert "is of another installation" in notes[0]
+    assert simulated == 12
+
+
+def test_blocks_do_without_a_manifest(cut, made):
+    (cut / "manifest.json").unlink()
+    assert resume(cut) == ([], 6)
+    assert files(cut) == files(made / "whole")
+
+
+def change(manifest, key, value):
+    found = json.loads(manifest.read_text())
+    table, _, last = key.rpartition(".")
+    (found[table] if table else found)[last] = value
+    manifest.write_text(json.dumps(found))
+
+
+CHANGES = {
+    "block": 2,
+    "runs.done": 12,
+    "runs.wanted": 13,
+    "seed": 2,
+    "replica": 1,
+    "status": "complete",
+    "scenario": "0" * 64,
+    "trace": "full",
+    "engine": "simpy",
+    "name": "other",
+    "versions": {},
+    "machine": None,
+    "sha256": "0" * 64,
+}
+
+
+@pytest.mark.parametrize("key", CHANGES)
+def test_a_changed_manifest_is_refused(cut, made, key):
+    change(cut / "manifest.json", key, CHANGES[key])
+    before = files(cut)
+    with pytest.raises(ScenarioError) as error:
+        resume(cut)
+    assert "\n" not in str(error.value)
+    assert files(cut) == before
+    (cut / "manifest.json").unlink()  # the remedy
+    assert resume(cut) == ([], 6)
+    assert files(cut) == files(made / "whole")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "null", "[]", "{}", "3", "{", '{"a": ' * 100_000, '"\\ud800"', "NaN", "1" * 10_000, "\0"],
+)
+def test_what_is_no_manifest_is_refused_in_one_line(cut, text, capsys):
+    for out, trace in ((cut, ["--runs", "12"]), (cut, [])):
+        (out / "manifest.json").write_text(text)
+        line = ["run", RING, "--set", "horizon=1.0", "--out", str(out), "--resume", *trace]
+        assert main(line) == 2
+        printed = capsys.readouterr().err
+        assert "manifest.json" in printed
+        assert len(printed.splitlines()) == 1
+
+
+def test_a_block_size_that_is_none_is_not_used(cut, made):
+    """Sealed, so that only the value itself tells."""
+    found = json.loads((cut / "manifest.json").read_text())
+    del found["sha256"]
+    write_sealed(cut / "manifest.json", {**found, "block": 3})
+    resume(cut)
+    assert files(cut) == files(made / "whole")
+
+
+def test_results_do_not_stay_beside_another_scenario(made, cut, tmp_path):
+    whole = shutil.copytree(made / "whole", tmp_path / "whole")
+    for folder in (cut, whole):
+        toml = folder / "scenario.toml"
+        toml.write_text(toml.read_text().replace("horizon = 1.0", "horizon = 2.0"))
+        with pytest.raises(ScenarioError, match=r"scenario\.toml was changed"):
+            resume(folder)
+        toml.unlink()
+    assert resume(cut) == ([], 6)
+    assert files(cut) == files(made / "whole")
+
+
+@pytest.mark.parametrize("name", ["summary.json", "ensemble.parquet", "events.parquet"])
+def test_a_finished_run_that_was_changed_is_not_called_done(made, tmp_path, name):
+    whole = shutil.copytree(made / "whole", tmp_path / "whole")
+    assert resume(whole) == ([], None)
+    with (whole / name).open("ab") as file:
+        file.write(b" ")
+    with pytest.raises(ScenarioError, match=f"{name} was changed since the run ended"):
+        resume(whole)
+    (whole / name).unlink()
+    with pytest.raises(ScenarioError, match=f"{name} is missing since the run ended"):
+        resume(whole)
+
+
+def test_a_block_that_is_damaged_meanwhile_is_one_line(cut, made, monkeypatch):
+    """After it was proved, before its traces are written."""
+    load = BlockCheckpoints.load
+
+    def damage(self, number):
+        (cut / "blocks" / "000002.npz").write_bytes(b"")
+        return load(self, number)
+
+    monkeypatch.setattr(BlockCheckpoints, "load", damage)
+    with pytest.raises(EngineError, match="go on with --resume"):
+        resume(cut)
+    monkeypatch.undo()
+    assert_done_again(cut, made)
+
+
+def test_a_single_run_that_was_changed_is_done_again(tmp_path, capsys):
+    line = ["run", RING, "--set", "horizon=1.0", "--no-plot", "--out", str(tmp_path / "out")]
+    assert main(line) == 0
+    before = files(tmp_path / "out")
+    assert main([*line, "--resume"]) == 0
+    assert "nothing left to do" in capsys.readouterr().out
+    for name in ("summary.json", "manifest.json"):
+        path = tmp_path / "out" / name
+        path.write_text(path.read_text().replace("1", "2", 1))
+        assert main([*line, "--resume"]) == 0
+        printed = capsys.readouterr()
+        assert len(printed.err.splitlines()) == 1
+        assert "is done again" in printed.err
+        assert files(tmp_path / "out") == before
+    # Killed before its first file was there.
+    for path in (tmp_path / "out").iterdir():
+        path.rename(path.with_name(f"{path.name}.part"))
+    assert main([*line, "--resume"]) == 0
+    assert files(tmp_path / "out") == before
+
+
+def test_contents_reach_the_disk_before_names(tmp_path, monkeypatch):
+    """Of every file that is written: fsync of the file, rename, fsync of the directory."""
+    calls = []
+
+    def record(name, call):
+        def recorded(*arguments):
+            inode = os.fstat(arguments[0]).st_ino if name == "fsync" else str(arguments[1])
+            calls.append((name, inode))
+            return call(*arguments)
+
+        return recorded
+
+    monkeypatch.setattr(os, "fsync", record("fsync", os.fsync))
+    monkeypatch.setattr(os, "replace", record("replace", os.replace))
+    runs_to_directory(short(), out=tmp_path / "out", **RUNS)
+    renamed = {path for name, path in calls if name == "replace"}
+    kept = {str(file) for file in (tmp_path / "out").iterdir()}
+    assert kept <= renamed
+    for k, (name, path) in enumerate(calls):
+        if name == "replace":
+            assert [calls[k - 1][0], calls[k + 1][0]] == ["fsync", "fsync"]
+            if path in kept - {str(tmp_path / "out" / "manifest.json")}:
+                assert calls[k - 1][1] == os.stat(path).st_ino
+
+
+@pytest.mark.parametrize("bytes_left", [0, 300, 3000, 20_000])
+@pytest.mark.parametrize("runs", ["1", "5"])
+def test_a_full_disk_leaves_nothing_behind(tmp_path, bytes_left, runs):
+    """Files of a process may be limited: writing fails as on a full disk."""
+    resource = pytest.importorskip("resource")
+    import subprocess
+    import sys
+
+    line = ["run", RING, "--set", "horizon=20.0", "--no-plot", "--runs", runs, "--trace", "full"]
+    done = subprocess.run(
+        [sys.executable, "-m", "netkf", *line, "--out", str(tmp_path / "out"), "--workers", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_left, bytes_left)),
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("netkf: cannot write: File too large (")
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_an_error_of_writing_is_an_oserror_too(tmp_path):
+    with pytest.raises(OSError, match="cannot write") as error:
+        raise WriteError(OSError(28, "No space left on device"), tmp_path)
+    assert error.value.errno == 28
+    assert error.value.filename == str(tmp_path)
