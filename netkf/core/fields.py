@@ -45,7 +45,7 @@ class Rule:
         except _SpecificError as error:
             remedy = error.remedy or self.remedy
             raise ScenarioError(key, str(error), value, remedy) from None
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, OverflowError, RecursionError):
             # These messages are Python's own; the requirement tells the user more.
             raise ScenarioError(key, self.requirement, value, self.remedy) from None
 
@@ -160,7 +160,24 @@ def number(
 
 
 positive = number(above=0.0)
+SHORTEST, LONGEST = 1e-9, 1e15
+"""Durations in seconds: times have 16 digits, and some are rounded to 1e-12 s."""
+
+
+def _seconds(value: Any) -> float:
+    result: float = positive.convert(value)
+    if not SHORTEST <= result <= LONGEST:
+        requirement = f"must be from {SHORTEST:g} to {LONGEST:g} seconds"
+        raise _SpecificError(requirement, "choose another unit of time")
+    return result
+
+
+seconds = Rule(positive.requirement, _seconds, positive.remedy)
 probability = number(low=0.0, high=1.0)
+
+
+MAX_BITS = 12_000
+"""Longer integers could not be written: Python prints at most 4300 digits."""
 
 
 def integer(low: int | None = None, high: int | None = None) -> Rule:
@@ -170,6 +187,8 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise TypeError
         if (low is not None and value < low) or (high is not None and value > high):
+            raise ValueError
+        if int(value).bit_length() > MAX_BITS:
             raise ValueError
         return int(value)
 

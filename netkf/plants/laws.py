@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, symmetric, symmetric_root
+from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.linalg.legendre import forward_coefficients
+from netkf.linalg.portable import (
+    apply,
+    gauss_legendre,
+    norm,
+    product,
+    pseudo_inverse,
+    symmetric_root,
+)
 from netkf.linalg.series import polynomial, with_reach
 
 MAX_LAWS = 256  # laws of states inside a step that are kept
 MAX_GRIDS = 256  # parts of the sensing grid that are kept
 DEPENDENT = 1e-9  # share of a row that is not rounding
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
-_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+_NODES, _WEIGHTS = gauss_legendre(20)
 
 
 def grid_time(period: float, k: int) -> float:
@@ -64,13 +71,12 @@ class GridLaws:
         if s >= end:
             return np.zeros((3 * self.n, self.B.shape[1]))
         since = max(s, start)
-        entry = self.responses(since - s)[0] @ self.B
+        entry = product(self.responses(since - s)[0], self.B)
         rest = end - since
         to_end, plain, tilted = self.responses(rest)
         share = rest / gap  # P_1 of the whole interval is (1 - share) + share P_1 of the rest
-        return np.asarray(
-            np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted]) @ entry
-        )
+        response = np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted])
+        return product(response, entry)
 
     def conditional_law(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
         """Return the conditional law of state and moments at ``left`` seconds of a step.
@@ -96,10 +102,10 @@ class GridLaws:
             for s, w in zip(places, weights, strict=True)
         ]
         factor = np.concatenate(columns, axis=1)
-        C = factor @ factor.T
+        C = product(factor, factor.T)
         known, asked, cross = C[: 3 * n, : 3 * n], C[3 * n :, 3 * n :], C[3 * n :, : 3 * n]
-        gain = cross @ np.linalg.pinv(known, rcond=1e-13, hermitian=True)
-        return gain, symmetric_root(symmetric(asked - gain @ cross.T))
+        gain = product(cross, pseudo_inverse(known, 1e-13))
+        return gain, symmetric_root(symmetric(asked - product(gain, cross.T)))
 
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
@@ -113,9 +119,9 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
         terms += 1
     exponential = [np.eye(n)]
     for k in range(1, terms):
-        exponential.append(exponential[-1] @ A / k)
+        exponential.append(product(exponential[-1], A) / k)
     end, moments = np.stack(exponential), np.zeros((terms + 1, 2, n, n))
-    moments[1:] = np.einsum("jk,kab->kjab", forward_coefficients(terms), end)
+    moments[1:] = forward_coefficients(terms).T[:, :, None, None] * end[:, None]
     to_end, to_moments = (
         with_reach(series.reshape(len(series), -1), longest) for series in (end, moments)
     )
@@ -133,11 +139,11 @@ def _factor(noise: FloatArray) -> FloatArray:
     for k, row in enumerate(noise):
         rest = row.copy()
         for _ in range(2):
-            along = directions[:k] @ rest
+            along = apply(directions[:k], rest)
             S[k, :k] += along
-            rest -= along @ directions[:k]
-        length = float(np.linalg.norm(rest))
-        if length > DEPENDENT * float(np.linalg.norm(row)):
+            rest -= apply(directions[:k].T, along)
+        length = float(norm(rest))
+        if length > DEPENDENT * float(norm(row)):
             S[k, k] = length
             directions[k] = rest / length
     return S

@@ -13,8 +13,9 @@ from typing import Protocol
 
 import numpy as np
 
-from netkf.core.fields import covariance, field, positive, square
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.core.fields import covariance, field, seconds, square
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import apply, cholesky, noise_root, product
 from netkf.plants.plant import Plant
 from netkf.plants.recursion import Recursion
 from netkf.plants.transitions import frame_slots
@@ -31,7 +32,7 @@ class LinearPlant(Plant):
 
     F: FloatArray = field(square)
     Q: FloatArray = field(covariance)
-    period: float = field(positive)
+    period: float = field(seconds)
 
     @property
     def n(self) -> int:
@@ -52,9 +53,14 @@ class LinearPlant(Plant):
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
         """The truth of one run; ``frames``: in frames, where the plant is unstable."""
-        start = self.start_mean + square_root(self.start_cov) @ random.standard_normal(self.n)
+        start = self.start_mean + apply(noise_root(self.start_cov), random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
-        return LinearPath(self._steps, square_root(self.Q), start, random, slots)
+        return LinearPath(self._steps, self.noise_root, start, random, slots)
+
+    @cached_property
+    def noise_root(self) -> FloatArray:
+        """The factor (n, n) of Q that standard normals are multiplied with."""
+        return noise_root(self.Q)
 
     @cached_property
     def _steps(self) -> Recursion:
@@ -126,7 +132,8 @@ class LinearPath:
 
     def _before(self, slot: int) -> FloatArray:
         while slot >= self._first + len(self._x):
-            noise = self._random.standard_normal((BLOCK, self._root.shape[1])) @ self._root.T
+            normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
+            noise = product(normals, self._root.T)
             self._first += len(self._x) - 1
             self._x = self._following(noise)
         return np.asarray(self._x[slot - self._first])
@@ -157,7 +164,7 @@ class LinearPath:
         x = self._origins[begun]
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(slot - begun if x.any() else 0):
-                x = self._steps.F @ x
+                x = apply(self._steps.F, x)
         return np.asarray(x)
 
     def rebase(self, slot: int) -> FloatArray:
@@ -177,7 +184,7 @@ class SlotReadings:
     """The readings of one sensor on one node, ``y = H x + v``, one a slot."""
 
     def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
-        self._H, self._root = H, np.linalg.cholesky(R)
+        self._H, self._root = H, cholesky(R)
         self._noise = Blocks(random, len(R))
         self._slot, self._v = -1, np.zeros(len(R))
 
@@ -188,9 +195,9 @@ class SlotReadings:
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """(p,) the reading of a slot not before the last one asked for; each has its own noise."""
         while self._slot < slot:
-            self._v = self._root @ self._noise.draw()
+            self._v = apply(self._root, self._noise.draw())
             self._slot += 1
-        return np.asarray(self.matrix(slot) @ x + self._v)
+        return apply(self.matrix(slot), x) + self._v
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
         """``matrix`` (S, p, n) of slots that ascend."""
@@ -202,9 +209,9 @@ class SlotReadings:
         ahead = np.array(slots) - self._slot - 1
         # Slot by slot, so that no reading is rounded as the slots happen to be taken together.
         normals = self._noise.draws(int(ahead[-1]) + 1)[ahead]
-        noise = (normals[:, None] @ self._root.T)[:, 0]
+        noise = apply(self._root, normals)
         self._slot, self._v = slots[-1], noise[-1]
-        return (H @ x[:, :, None])[:, :, 0] + noise, H
+        return apply(H, x) + noise, H
 
 
 class Blocks:

@@ -20,6 +20,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.local import local_vector
+from netkf.linalg.portable import apply, product
 from netkf.linalg.structs import Size
 from netkf.plants.laws import GridLaws, grid_time
 from netkf.plants.transitions import Transitions
@@ -192,7 +193,7 @@ class DiffusionPaths:
         x, end = pieces.x_start[:, rows], pieces.x_end[:, rows]
         known = np.concatenate([end[:, :, None], pieces.moments[:, rows]], axis=2)
         residual = (known - _moved(laws.responses(length), x)).reshape(*x.shape[:2], 3 * n)
-        noise = (residual @ gain.T + normals @ spread.T).reshape(known.shape)
+        noise = (product(residual, gain.T) + product(normals, spread.T)).reshape(known.shape)
         # Add the response to the start again.
         values = _moved(laws.responses(left), x) + noise
         middle, first = values[:, :, 0], values[:, :, 1:]
@@ -368,7 +369,7 @@ class DiffusionPath:
         # An origin at 0 stays there.
         if self._moves is None or not self._origin.any():
             return self._origin
-        return np.asarray(self._moves.transitions(np.array([gap]))[0] @ self._origin)
+        return apply(self._moves.transitions(np.array([gap]))[0], self._origin)
 
     def absolute(self, time: float) -> FloatArray:
         """(n,) x, as ``local``; ``rebase`` must have been called for all frame times so far."""
@@ -383,7 +384,7 @@ class DiffusionPath:
 
 def _moved(responses: FloatArray, x: FloatArray) -> FloatArray:
     """(B, K, m, n) of responses (m, n, n) to states (B, K, n)."""
-    return np.swapaxes(x[:, None] @ np.swapaxes(responses, 1, 2), 1, 2)
+    return np.swapaxes(product(x[:, None], np.swapaxes(responses, 1, 2)), 1, 2)
 
 
 def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import product
 
 
 class Recursion:
@@ -28,7 +29,7 @@ class Recursion:
         """(count, n, n): F, its square and so on."""
         found = self._powers
         while len(found) < count:
-            found = np.concatenate([found, found @ found[-1]])
+            found = np.concatenate([found, product(found, found[-1])])
         self._powers = found
         return found[:count]
 
@@ -41,7 +42,7 @@ def _one_by_one(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> F
     count, _, _, n = noise.shape
     x = [start[:, None]]
     for w in np.moveaxis(noise.reshape(count, -1, 1, n), 1, 0):
-        x.append(x[-1] @ to_later[0].T + w)
+        x.append(product(x[-1], to_later[0].T) + w)
     return np.concatenate(x, axis=1)
 
 
@@ -51,12 +52,12 @@ def _in_sums(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> Floa
     x[:, 0] = start
     added, far = noise.copy(), 1
     while far < length:  # what the last 1, 2, 4 ... steps added
-        added[:, :, far:] += added[:, :, :-far] @ to_later[far - 1].T
+        added[:, :, far:] += product(added[:, :, :-far], to_later[far - 1].T)
         far *= 2
     starts = np.empty((count, blocks + 1, 1, n))
     starts[:, 0, 0] = start
     for k in range(blocks):
-        starts[:, k + 1] = starts[:, k] @ to_later[-1].T + added[:, k, -1:]
-    moved = starts[:, :-1] @ to_later.reshape(-1, n).T
+        starts[:, k + 1] = product(starts[:, k], to_later[-1].T) + added[:, k, -1:]
+    moved = product(starts[:, :-1], to_later.reshape(-1, n).T)
     x[:, 1:] = (moved.reshape(added.shape) + added).reshape(count, -1, n)
     return x

@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from netkf.core.fields import covariance, definite_covariance, field, matrix, square, vector
-from netkf.linalg.arrays import FloatArray, readonly_array, square_root
+from netkf.linalg.arrays import FloatArray, readonly_array
+from netkf.linalg.portable import apply, noise_root, product
 from netkf.plants.linear import LinearPath, SlotReadings
 from netkf.plants.recursion import Recursion
 from netkf.plants.sensors import Sensor
@@ -43,7 +44,7 @@ class RegressorSensor(Sensor):
     @property
     def H(self) -> FloatArray:
         """(1, n): the row of slot 0."""
-        return readonly_array((self.C @ self.start)[None])
+        return readonly_array(apply(self.C, self.start)[None])
 
     @cached_property
     def steps(self) -> Recursion:
@@ -67,14 +68,14 @@ class RegressorReadings(SlotReadings):
         driving: np.random.Generator,
     ) -> None:
         super().__init__(sensor.H, sensor.R, random)
-        drive = sensor.B @ square_root(sensor.xi_cov)
+        drive = product(sensor.B, noise_root(sensor.xi_cov))
         self._C, self._s = sensor.C, LinearPath(sensor.steps, drive, sensor.start, driving)
 
     def matrix(self, slot: int) -> FloatArray:
         """``phi_k'`` (1, n) of a slot not before the last one asked for."""
-        return np.asarray((self._C @ self._s.state(slot))[None])
+        return apply(self._C, self._s.state(slot))[None]
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
         """Return the rows ``phi_k'`` (S, 1, n) of increasing slots."""
         states = np.stack([self._s.state(slot) for slot in slots])
-        return np.asarray(states[:, None] @ self._C.T)
+        return product(states[:, None], self._C.T)

@@ -28,6 +28,7 @@ from netkf.core.fields import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.portable import cholesky
 from netkf.linalg.structs import Size
 from netkf.plants.linear import Readings, SlotReadings
 from netkf.plants.paths import BLOCK, DiffusionPath
@@ -130,7 +131,7 @@ class SensorPath:
     ) -> None:
         self.H = H
         # Cholesky factor of R: the noise is drawn with unit intensity and multiplied by it.
-        self._root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
+        self._root = cholesky(R)
         self._random, self._cutting = random, cutting
         self._drawn = np.empty((0, 2, len(R)))
         self._used = 0

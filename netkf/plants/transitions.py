@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import apply, gauss_legendre, norm, product
 
 UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
 DEPENDENT = 1e-9  # share of a row's norm below which what is left of it counts as rounding
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)  # exact to rounding for gaps of that size
-_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+_NODES, _WEIGHTS = gauss_legendre(10)  # exact to rounding for gaps of that size
 
 
 class Transitions:
@@ -32,10 +32,10 @@ class Transitions:
         last, k = 1.0, 1
         while last > 1e-19:
             last *= UNIT_SIZE / k
-            powers.append(powers[-1] @ A / k)
+            powers.append(product(powers[-1], A) / k)
             k += 1
         self._series = np.stack(powers)
-        self._response = self._series @ B
+        self._response = product(self._series, B)
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """``Phi`` and ``L``, both (K, n, n), of K gaps in seconds, none below 0."""
@@ -46,8 +46,8 @@ class Transitions:
         with np.errstate(over="ignore", invalid="ignore"):  # unstable over a very long gap
             for level in range(int(doublings.max(initial=0))):
                 k = np.flatnonzero(doublings > level)
-                L[k] = noise_factors(np.concatenate([L[k], Phi[k] @ L[k]], axis=2))[0]
-                Phi[k] = Phi[k] @ Phi[k]
+                L[k] = noise_factors(np.concatenate([L[k], product(Phi[k], L[k])], axis=2))[0]
+                Phi[k] = product(Phi[k], Phi[k])
         return Phi[place], L[place]
 
     def transitions(self, gaps: FloatArray) -> FloatArray:
@@ -58,7 +58,7 @@ class Transitions:
         with np.errstate(over="ignore", invalid="ignore"):
             for level in range(int(doublings.max(initial=0))):
                 k = np.flatnonzero(doublings > level)
-                Phi[k] = Phi[k] @ Phi[k]
+                Phi[k] = product(Phi[k], Phi[k])
         return np.asarray(Phi[place])
 
     def bridges(self, before: FloatArray, after: FloatArray) -> FloatArray:
@@ -67,7 +67,7 @@ class Transitions:
         """
         pairs, place = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
         L1, (Phi2, L2) = self.laws(pairs[0])[1], self.laws(pairs[1])
-        directions = noise_factors(np.concatenate([Phi2 @ L1, L2], axis=2))[1]
+        directions = noise_factors(np.concatenate([product(Phi2, L1), L2], axis=2))[1]
         return np.asarray(directions[place.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
@@ -77,14 +77,15 @@ class Transitions:
 
     def _unit_transition(self, gaps: FloatArray) -> FloatArray:
         n, terms = self.n, len(self._series)
-        powers = gaps[:, None, None] ** np.arange(terms)
-        return np.asarray((powers @ self._series.reshape(terms, n * n)).reshape(-1, n, n))
+        powers = _powers(gaps, terms)
+        return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
         """(K, n, 10 m): a factor of the noise, ``e^{A s} B sqrt(weight)`` at the nodes s."""
         terms, n, m = self._response.shape
-        powers = (gaps[:, None] * _NODES)[:, :, None] ** np.arange(terms)
-        response = (powers @ self._response.reshape(terms, n * m)).reshape(-1, len(_NODES), n, m)
+        powers = _powers(gaps[:, None] * _NODES, terms)
+        response = product(powers, self._response.reshape(terms, n * m))
+        response = response.reshape(-1, len(_NODES), n, m)
         response *= np.sqrt(gaps[:, None] * _WEIGHTS)[:, :, None, None]
         return np.asarray(np.moveaxis(response, 1, 2).reshape(-1, n, len(_NODES) * m))
 
@@ -103,20 +104,25 @@ def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
         scale = np.abs(row).max(axis=1, initial=0.0)
         scale[scale == 0.0] = 1.0  # rows of any size, without underflow of their squares
         rest = row / scale[:, None]
-        length = whole = _norms(rest)
+        length = whole = norm(rest)
         for _ in range(2):
-            along = D[:, :k] @ rest[:, :, None]
-            S[:, k, :k] += along[:, :, 0] * scale[:, None]
-            rest = rest - (np.swapaxes(along, 1, 2) @ D[:, :k])[:, 0]
-        length = _norms(rest)
+            along = apply(D[:, :k], rest)
+            S[:, k, :k] += along * scale[:, None]
+            rest = rest - apply(np.swapaxes(D[:, :k], 1, 2), along)
+        length = norm(rest)
         free = length > DEPENDENT * whole
         S[free, k, k] = (length * scale)[free]
         D[free, k] = rest[free] / length[free, None]
     return S, D
 
 
-def _norms(rows: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt((rows[:, None] @ rows[:, :, None])[:, 0, 0]))
+def _powers(gaps: FloatArray, terms: int) -> FloatArray:
+    """Return (K, c, terms): the powers 0 .. terms - 1 of gaps (K, c) or (K,), where c is 1."""
+    # Products, since the last bit of a power depends on the CPU.
+    gaps = gaps if gaps.ndim > 1 else gaps[:, None]
+    factors = np.ones((*gaps.shape, terms))
+    factors[:, :, 1:] = gaps[:, :, None]
+    return np.asarray(np.multiply.accumulate(factors, axis=2))
 
 
 GROWTH = 10.0 * math.log(2.0)
@@ -128,7 +134,12 @@ def frame_period(A: FloatArray) -> float | None:
     spectral abscissa a of ``A`` (n, n); None for a plant that is not unstable.
     """
     abscissa = float(np.linalg.eigvals(A).real.max())
-    return GROWTH / abscissa if abscissa > 0.0 else None
+    return _rounded(GROWTH / abscissa) if abscissa > 0.0 else None
+
+
+def _rounded(seconds: float) -> float:
+    # Frames are to begin at the same times whatever the last bits of an eigenvalue.
+    return float(f"{seconds:.9g}")
 
 
 def frame_slots(F: FloatArray) -> int | None:
@@ -136,4 +147,4 @@ def frame_slots(F: FloatArray) -> int | None:
     radius of ``F`` (n, n); None for a plant that is not unstable.
     """
     radius = float(np.abs(np.linalg.eigvals(F)).max())
-    return max(1, int(GROWTH / math.log(radius))) if radius > 1.0 else None
+    return max(1, int(_rounded(GROWTH / math.log(radius)))) if radius > 1.0 else None

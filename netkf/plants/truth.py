@@ -16,6 +16,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import apply
 from netkf.plants.transitions import Transitions
 
 TOLERANCE = 1e-9  # seconds by which a recorded time may be off
@@ -61,7 +62,7 @@ def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
     found = np.zeros((len(offsets) + 1, offsets.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):
         for k, offset in enumerate(offsets):
-            found[k + 1] = Phi[k] @ found[k] + offset if found[k].any() else offset
+            found[k + 1] = apply(Phi[k], found[k]) + offset if found[k].any() else offset
     return found
 
 
@@ -73,7 +74,7 @@ def absolute_states(
     at = origins(moves.transitions(np.diff(starts)), offsets)
     frame = np.searchsorted(frame_times, t, side="right")
     with np.errstate(over="ignore", invalid="ignore"):
-        shift = (moves.transitions(t - starts[frame]) @ at[frame][:, :, None])[:, :, 0]
+        shift = apply(moves.transitions(t - starts[frame]), at[frame])
         shift[~at[frame].any(axis=1)] = 0.0
         return np.asarray(x + shift)
 
@@ -164,9 +165,9 @@ def _drawn(
         Phi, L = moves.laws(gaps[first : first + BLOCK])
         normals = random.standard_normal((len(Phi), moves.n))
         drawn.append(normals)
-        noise = (L @ normals[:, :, None])[:, :, 0]
+        noise = apply(L, normals)
         for k in range(len(Phi)):
-            x = states[first + k + 1] = Phi[k] @ x + noise[k]
+            x = states[first + k + 1] = apply(Phi[k], x) + noise[k]
             if rebased[first + k + 1]:
                 x = np.zeros(moves.n)
     return states, np.concatenate(drawn)
@@ -207,9 +208,9 @@ def _bridged(
             z = drawn[k]
             if not free[k]:
                 # What is left free by the noise of the whole gap, which is known.
-                z = D[k].T @ rest + (z - D[k].T @ (D[k] @ z))
+                z = apply(D[k].T, rest) + (z - apply(D[k].T, apply(D[k], z)))
                 rest = z[n:]
-            found[number] = Phi[k] @ x + L[k] @ z[:n]
+            found[number] = apply(Phi[k], x) + apply(L[k], z[:n])
     return found
 
 

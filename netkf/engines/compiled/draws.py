@@ -13,6 +13,7 @@ from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.portable import cholesky
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time
 from netkf.plants.paths import BLOCK, Block
@@ -152,7 +153,7 @@ def _sensors(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int,
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
     used = {place.entry for _, place in placed}
-    roots = {entry: np.linalg.cholesky(scenario.sensors[entry].R) for entry in used}
+    roots = {entry: cholesky(scenario.sensors[entry].R) for entry in used}
     rows = np.array([len(roots[place.entry]) for _, place in placed], dtype=np.int64)
     # Sensors with fewer rows are padded to the most.
     n, count, most = scenario.plant.n, len(placed), int(rows.max(initial=0))

@@ -35,9 +35,10 @@ from netkf.engines.compiled.slot_messages import (
     make_rows,
 )
 from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes
+from netkf.linalg.portable import noise_root, solve_lower
 from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
 from netkf.rng.draws import StreamBatch
@@ -110,9 +111,9 @@ class SlotRuns:
         self._plant_states = StreamBatch(self._streams, "plant", [()]).states
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
         # A root of the covariance, which may be singular.
-        root, room = square_root(plant.start_cov), np.zeros((setup.n, LANES))
+        root, room = noise_root(plant.start_cov), np.zeros((setup.n, LANES))
         draw_starts(MANY, self._plant_states, normal_ziggurat(), plant.start_mean, root, room, x)
-        self._path = Path(plant.F, square_root(plant.Q), setup.frame, x, origin)
+        self._path = Path(plant.F, plant.noise_root, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
         setup, streams = self.setup, self._streams
@@ -290,7 +291,7 @@ class SlotRuns:
             some = slice(s.row, s.row + len(s.root))
             values, matrices = path.several(slots, x[0, times.sensed, :, 0])
             # Whitened with the R that filters believe; all runs read the same.
-            white = np.linalg.solve(s.root, values.T).T, np.linalg.solve(s.root, matrices)
+            white = solve_lower(s.root, values.T).T, solve_lower(s.root, matrices)
             y[:, times.sensed, s.host, some] = white[0][..., None]
             H[:, times.sensed, s.host, some] = white[1][..., None]
         return SlotReadings(y, H, local, rebased)

@@ -17,8 +17,9 @@ from netkf.engines.compiled.slot_messages import (
     UNIFORM_MAXIMAL,
     Stages,
 )
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, aligned, blocks_of
+from netkf.linalg.portable import cholesky, noise_root, product, solve_lower
 from netkf.network.channels import GilbertElliott, identical_per_link
 from netkf.network.graphs import Link
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
@@ -129,7 +130,7 @@ class SlotSetup:
             host = 0 if pooled else scenario.topology.index[node]
             for place in scenario.placed[node]:
                 R = scenario.noise(place.entry, believed=True)
-                root = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
+                root = cholesky(R)
                 # A filter stacks the readings of its sensors: each begins where the one before
                 # ends.
                 self.placed.append(AssignedSensor(node, place, host, int(rows[host]), root))
@@ -151,15 +152,15 @@ class SlotSetup:
         for m, s in enumerate(self.drawn):
             sensor = scenario.sensors[s.place.entry]
             rows = len(s.root)
-            true = np.linalg.cholesky(sensor.R)
+            true = cholesky(sensor.R)
             # Noise L_b^-1 L of a whitened reading, with the believed R = L_b L_b' and the true R =
             # L L'.
-            noise[m, :rows, :rows] = np.linalg.solve(s.root, true)
+            noise[m, :rows, :rows] = solve_lower(s.root, true)
             if isinstance(sensor, RegressorSensor):
                 # A regressor's one row is random: H holds the whitening factor alone.
                 driven[m], H[m, 0, 0] = self.driven.index(s), 1.0 / s.root[0, 0]
                 continue
-            H[m, :rows] = np.linalg.solve(s.root, sensor.H)
+            H[m, :rows] = solve_lower(s.root, sensor.H)
             self.H[0, 0, s.host, s.row : s.row + rows] = H[m, :rows, :, None]
         regressors: list[Any] = [scenario.sensors[s.place.entry] for s in self.driven]
         # Regressors of different sizes are padded with zeros, which stay zero.
@@ -170,7 +171,7 @@ class SlotSetup:
         for d, sensor in enumerate(regressors):
             size = len(sensor.A)
             A, drive, start = np.zeros((k, k)), np.zeros((k, q)), np.zeros(k)
-            root = sensor.B @ square_root(sensor.xi_cov)
+            root = product(sensor.B, noise_root(sensor.xi_cov))
             A[:size, :size], drive[:size, : root.shape[1]] = sensor.A, root
             C[d, :, :size], start[:size] = sensor.C, sensor.start
             # Columns of noise are not padded: each takes as many numbers as it does alone.

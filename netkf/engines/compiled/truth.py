@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.engines.compiled.state import PathBlock
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import apply
 from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -92,4 +93,4 @@ class PathStates:
         if self._moves is None or not self._origin.any():
             return np.broadcast_to(self._origin, (len(times), len(self._origin)))
         moves = self._moves.transitions(times - self._begun)
-        return np.asarray((moves @ self._origin[:, None])[:, :, 0])
+        return apply(moves, self._origin)
