@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -91,7 +92,7 @@ def add_pool(parser: argparse.ArgumentParser) -> None:
     """Add ``--workers`` and ``--scheduler``, of which one may be given."""
     pool = parser.add_mutually_exclusive_group()
     pool.add_argument(
-        "--workers", type=parse_count, help="number of processes (default: one per core)"
+        "--workers", type=parse_workers, help="number of processes (default: one per core)"
     )
     pool.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
 
@@ -127,10 +128,24 @@ def parse_replica(text: str) -> int:
     return int(text)
 
 
+MAX_RUNS = 100_000_000
+WORKERS_PER_CORE = 8
+
+
 def parse_count(text: str) -> int:
-    """Return the positive integer of ``--runs`` or ``--workers``; raises ArgumentTypeError."""
-    if not text.isdecimal() or len(text) > 12 or int(text) < 1:
-        rule = "must be an integer of at least 1"
+    """Return the positive integer of ``--runs``; raises ArgumentTypeError."""
+    return _parse_positive(text, MAX_RUNS)
+
+
+def parse_workers(text: str) -> int:
+    """Return the positive integer of ``--workers``; raises ArgumentTypeError."""
+    # More processes than that only fill the memory.
+    return _parse_positive(text, max(64, WORKERS_PER_CORE * (os.cpu_count() or 1)))
+
+
+def _parse_positive(text: str, most: int) -> int:
+    if not text.isdecimal() or not 1 <= int(text[:20]) <= most:
+        rule = f"must be an integer of at least 1 and at most {most:,}"
         raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
     return int(text)
 

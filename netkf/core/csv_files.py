@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
+from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -11,6 +14,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.linalg.arrays import FloatArray
 
+MAX_BYTES = 256 << 20
 MAX_ID = 2**53  # larger integers are not exact as floating-point numbers
 
 
@@ -22,17 +26,21 @@ def read_columns(
     Raises ScenarioError, with the file and the line, for a missing column, a row of another
     length, or an entry that is not a finite number.
     """
-    header, rows = read_rows(source, required)
-    names = [name for name in (*required, *optional) if name in header]
-    places = [header.index(name) for name in names]
-    numbers = [finite_numbers(source, line, header, row, places) for line, row in rows]
-    columns = np.array(numbers, dtype=np.float64).reshape(len(rows), len(names)).T
+    numbers = array("d")
+    with _opened(source) as (header, rows):
+        _demand(source, header, required)
+        names = [name for name in (*required, *optional) if name in header]
+        places = [header.index(name) for name in names]
+        for line, row in rows:
+            numbers.extend(finite_numbers(source, line, header, row, places))
+    columns = np.array(numbers, dtype=np.float64).reshape(-1, len(names)).T
     return dict(zip(names, columns, strict=True))
 
 
 def read_header(source: SourceFile) -> list[str]:
     """Return the names of the columns; raises ScenarioError if the file is not a table."""
-    return read_rows(source, ())[0]
+    with _opened(source) as (header, _):
+        return header
 
 
 def read_rows(
@@ -42,20 +50,34 @@ def read_rows(
 
     Raises ScenarioError if the file is not a table or lacks a required column.
     """
-    header, rows = _read(source)
+    with _opened(source) as (header, rows):
+        _demand(source, header, required)
+        return header, list(rows)
+
+
+def _demand(source: SourceFile, header: list[str], required: tuple[str, ...]) -> None:
     missing = [name for name in required if name not in header]
     if missing:
         rule = f"{source.name} must have the columns {', '.join(required)}"
         raise ScenarioError("path", rule, header, f"add the column {missing[0]}")
-    return header, rows
 
 
-def _read(source: SourceFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
+@contextmanager
+def _opened(
+    source: SourceFile,
+) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str]]]]]:
+    """Give the names of the columns, and an iterator of (line, entries) of rows that are not
+    empty; raises ScenarioError if the file cannot be read as a table.
+    """
     try:
+        size = source.full.stat().st_size
+        if size > MAX_BYTES:
+            rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
+            raise ScenarioError("path", rule, f"{size:,} bytes", "leave out rows")
         with source.full.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
             header = [name.strip() for name in next(reader, [])]
-            return header, [(reader.line_num, row) for row in reader if row]
+            yield header, ((reader.line_num, row) for row in reader if row)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         rule = f"{source.name} cannot be read as a UTF-8 table of comma-separated values"
         raise ScenarioError("path", rule, str(error), "mend the file") from None

@@ -58,7 +58,7 @@ class ScenarioError(NetkfError, ValueError):
         got = "" if self.value is None else f"; got {quote(self.value)}"
         remedy = f"; {self.remedy}" if self.remedy else ""
         key = _printable(self.key)
-        where = ": ".join(part for part in (self.file, key) if part)
+        where = ": ".join(part for part in (_printable(self.file, 1000), key) if part)
         return f"{where}: {self.rule}{got}{remedy}" if where else f"{self.rule}{got}{remedy}"
 
 
@@ -67,10 +67,16 @@ def _printable(key: str, longest: int = 120) -> str:
     return shown if len(shown) <= longest else f"{shown[: longest // 2]} ... {shown[-20:]}"
 
 
+LONGEST_WORD = 100
+"""Characters of a word that is compared with the known ones."""
+
+
 def nearest(word: object, known: Iterable[str]) -> str:
     """Return ``did you mean "..."?`` and a space if a known word is close, else an empty text."""
     import difflib
 
+    if len(str(word)) > LONGEST_WORD:
+        return ""
     found = difflib.get_close_matches(str(word), list(known), n=1)
     return f'did you mean "{found[0]}"? ' if found else ""
 
@@ -78,6 +84,9 @@ def nearest(word: object, known: Iterable[str]) -> str:
 def quote(value: object, longest: int = 80) -> str:
     """Return ``repr(value)`` on one line, shortened in the middle if it is long."""
     tolist = getattr(value, "tolist", None)
-    text = " ".join(repr(tolist() if callable(tolist) else value).split())
+    try:
+        text = " ".join(repr(tolist() if callable(tolist) else value).split())
+    except (ValueError, RecursionError):  # an integer of thousands of digits, tables within tables
+        text = f"a large {type(value).__name__}"
     half = (longest - 5) // 2
     return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"

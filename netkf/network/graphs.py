@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
 Link = tuple[int, int]
 MAX_TRIES = 1000
-MAX_NODES, MAX_LINKS = 1_000_000, 10_000_000
+MAX_NODES, MAX_LINKS = 1_000_000, 2_000_000
+MAX_DRAWN = 20_000_000  # nodes and links of all graphs that are drawn until one is connected
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,16 +248,17 @@ class RandomGraph(Graph):
     ) -> networkx.Graph[Any]:
         import networkx
 
-        first = seed if self.seed is None else self.seed
-        for attempt in range(MAX_TRIES if self.connected else 1):
+        first, tries, drawn = seed if self.seed is None else self.seed, 0, 0
+        while tries < (MAX_TRIES if self.connected else 1) and drawn < MAX_DRAWN:
             # networkx takes legacy generators only for its older functions.
-            state = np.random.RandomState((first + attempt) % 2**32)
+            state = np.random.RandomState((first + tries) % 2**32)
             graph = make(state)
+            tries, drawn = tries + 1, drawn + len(graph) + graph.number_of_edges()
             if not self.connected or networkx.is_connected(graph):
                 return graph
         raise ScenarioError(
             "connected",
-            f"none of {MAX_TRIES} graphs drawn was connected",
+            f"none of {tries} graphs drawn was connected",
             self.connected,
             "make links more likely",
         )
@@ -322,6 +325,9 @@ class Geometric(RandomGraph):
         """Return networkx.random_geometric_graph with its positions."""
         import networkx
 
+        pairs = 0.5 * self.nodes * (self.nodes - 1)
+        _check_size(self.nodes, int(pairs * _chance_within(min(self.radius, 1.0))))
+
         def make(state: np.random.RandomState) -> networkx.Graph[Any]:
             points = {k: tuple(p) for k, p in enumerate(state.random_sample((self.nodes, 2)))}
             return networkx.random_geometric_graph(self.nodes, self.radius, pos=points)
@@ -329,6 +335,11 @@ class Geometric(RandomGraph):
         graph = self._draw(seed, make)
         positions = {k: (float(x), float(y)) for k, (x, y) in graph.nodes(data="pos")}
         return _from_networkx(graph, positions=positions)
+
+
+def _chance_within(radius: float) -> float:
+    """Return the probability that two points of the unit square are within ``radius`` <= 1."""
+    return math.pi * radius**2 - 8.0 / 3.0 * radius**3 + 0.5 * radius**4
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,6 +45,13 @@ def check_scenario(scenario: DerivedScenario) -> None:
 
 def _check_times(scenario: DerivedScenario) -> None:
     probe, horizon = scenario.probe, scenario.horizon
+    if scenario.slotted and horizon / scenario.slot_plant.period > MAX_STEPS:
+        raise ScenarioError(
+            "plant.period",
+            f"must make at most {MAX_STEPS:,} slots to the horizon",
+            scenario.slot_plant.period,
+            "lengthen it or shorten the horizon",
+        )
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
             raise ScenarioError(

@@ -25,7 +25,7 @@ from netkf.core.fields import (
     line,
     matrix,
     nested,
-    positive,
+    seconds,
     several,
     square,
     text,
@@ -118,14 +118,14 @@ class ScenarioModel(Component):
     """
 
     name: str = field(text)
-    horizon: float = field(positive)
+    horizon: float = field(seconds)
     plant: Plant = field(instance(Plant))
     sensors: tuple[LinearSensor | RegressorSensor | RecordedSensor, ...] = field(
         several(instance(Sensor), "sensors", least=0)
     )
     network: Network = field(instance(Network))
     filter: Filtering = field(instance(Filtering))
-    probe: float | FloatArray = field(either(positive, array(1, "list of times"), nested(1)))
+    probe: float | FloatArray = field(either(seconds, array(1, "list of times"), nested(1)))
     claim: str = field(line, default="")
     seed: int = field(integer(low=0), default=0)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import secrets
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +13,14 @@ from typing import Any
 from netkf.core.errors import ScenarioError
 from netkf.scenario.imports import Origin
 from netkf.scenario.scenario import Scenario
-from netkf.scenario.tables import build_scenario, explain_left_over, with_changes
+from netkf.scenario.tables import MAX_DEPTH, build_scenario, explain_left_over, with_changes
+
+MAX_BYTES = 64 << 20
+MAX_DOTS = 100
+LONG_TEXT, LONG_LINE = 100_000, 1000
+_NUMBERS = re.compile(r"([A-Za-z0-9_-]+)[ \t]*=[ \t]*(\[[0-9eE+\-., \t\[\]]*\])[ \t]*")
+_PART = r"""(?:[\w-]++|"[^"]*+"|'[^']*+')[ \t]*+"""
+_MANY_PARTS = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*+){{{MAX_DOTS}}}")
 
 
 def load(
@@ -39,7 +49,7 @@ def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Sc
 
 def _parsed(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return parse_toml(_text(path))
     except UnicodeDecodeError:
         raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8") from None
     except OSError as error:
@@ -48,6 +58,78 @@ def _parsed(path: Path) -> dict[str, Any]:
     except RecursionError:
         words = "is not valid TOML: nested too deep"
         raise ScenarioError("", words, None, "mend the brackets") from None
+    except ScenarioError:
+        raise
     except ValueError as error:  # TOMLDecodeError among them
         words = f"is not valid TOML: {' '.join(str(error).split())[:120]}"
         raise ScenarioError("", words, None, "mend that line") from None
+
+
+def _text(path: Path) -> str:
+    # Not all at once: the file may be a device that never ends.
+    with path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        words = f"must have at most {MAX_BYTES >> 20} MiB"
+        raise ScenarioError("", words, None, "put long lists into CSV files")
+    return content.decode("utf-8-sig")
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the tables of a TOML text.
+
+    Raises ScenarioError for keys of very many parts, which tomllib takes minutes and gigabytes for,
+    and for deep tables; ValueError and RecursionError as tomllib does.
+    """
+    lines = text.splitlines()
+    for number, line in enumerate(lines, 1):
+        if line.count(".") > MAX_DOTS and _MANY_PARTS.search(line):
+            words = f"line {number} has a key of more than {MAX_DOTS} parts"
+            raise ScenarioError("", words, None, "mend that line")
+    arrays: dict[str, Any] = {}
+    if len(text) > LONG_TEXT and '"""' not in text and "'''" not in text:
+        mark = secrets.token_hex(16)
+        text = "\n".join(_shortened(line, arrays, mark) for line in lines)
+    found: dict[str, Any] = _whole(tomllib.loads(text), arrays)
+    if _depth(found) > MAX_DEPTH:
+        raise ScenarioError("", "is nested too deep", None, "see the keys of a scenario file")
+    return found
+
+
+def _shortened(line: str, arrays: dict[str, Any], mark: str) -> str:
+    """Return a line ``key = [numbers]`` with a key of ``arrays`` for its value; others unchanged.
+
+    The json module reads such arrays fifty times faster than tomllib.
+    """
+    found = _NUMBERS.fullmatch(line) if len(line) > LONG_LINE else None
+    if found is None:
+        return line
+    try:
+        value = json.loads(found[2])
+    except (ValueError, RecursionError):
+        return line
+    place = f"{mark} {len(arrays)}"
+    arrays[place] = value
+    return f'{found[1]} = "{place}"'
+
+
+def _whole(value: Any, arrays: dict[str, Any]) -> Any:
+    """Return tables with arrays instead of their keys."""
+    if not arrays:
+        return value
+    if isinstance(value, dict):
+        return {key: _whole(entry, arrays) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_whole(entry, arrays) for entry in value]
+    return arrays.get(value, value) if isinstance(value, str) else value
+
+
+def _depth(value: Any) -> int:
+    """Return how many tables and lists are inside one another, without recursion."""
+    depth, level = 0, [value]
+    while level and depth <= MAX_DEPTH:
+        inside = [entry for entry in level if isinstance(entry, (dict, list))]
+        parts = (entry.values() if isinstance(entry, dict) else entry for entry in inside)
+        level = [entry for part in parts for entry in part]
+        depth += bool(inside)
+    return depth

@@ -19,6 +19,8 @@ from netkf.scenario.registry import KINDS, SLOTTED, find
 from netkf.scenario.writing import as_table
 
 FORMAT = 1
+MAX_DEPTH = 30
+"""Tables and lists within one another."""
 UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 
@@ -67,6 +69,10 @@ def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
     """A copy of the table with the values at some key paths replaced or added."""
     for path, value in changes.items():
         keys = path.replace("[", ".").replace("]", "").split(".")
+        if len(keys) > MAX_DEPTH:
+            raise ScenarioError(
+                path, "is not a key path of a scenario", None, "see the file's keys"
+            )
         table = _set(table, keys, value, path)
     return table
 
