@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import atexit
 import contextlib
+import logging
 import os
 import signal
 import sys
@@ -222,8 +223,10 @@ def run_as_process(command: Callable[[Interruption], int]) -> NoReturn:
     """Run the command of this process, and end the process with its status."""
     with Interruption(ends_process=True) as interruption:
         open_missing_streams()
+        # Warnings and logs of libraries are for those who write code.
         if not sys.warnoptions:
-            warnings.simplefilter("ignore")  # warnings of libraries are for those who write code
+            warnings.simplefilter("ignore")
+        logging.disable()
         try:
             status = command(interruption)
         except SystemExit as stop:  # of the parser, which has printed its line

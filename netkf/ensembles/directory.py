@@ -81,7 +81,7 @@ def runs_to_directory(
     """
     began = time.perf_counter()
     runs, trace = integer(low=1)("runs", runs), choice(*TRACES)("trace", trace)
-    engine_used = choose_engine(engine, scenario)
+    engine_used = choose_engine(engine, scenario, announce=False)
     check_sources(scenario)
     pool = make_pool(runs, workers, executor, scheduler)
     try:
@@ -95,6 +95,7 @@ def runs_to_directory(
     directory = keeper.directory
     try:
         keeper.begin(note)
+        engine_used.announce(scenario)
         task = partial(block_statistics, engine=engine_used, traces=keeper.traces)
         whole = keeper.simulate(task, pool, progress)
         written = _write(keeper, whole)

@@ -11,6 +11,8 @@ from typing import Any
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
+from netkf.core.printable import shorten
+from netkf.ensembles.ask_scheduler import scheduler_answers
 from netkf.ensembles.blocks import Job, PackedScenario, packed, work
 from netkf.ensembles.workers import WorkerProcesses
 from netkf.linalg.compiling import seconds_spent
@@ -31,8 +33,10 @@ LARGEST_BLOCK = 64
 MOST_BLOCKS = 4096
 ROUNDS = 16
 
-PATIENCE = 10
+PATIENCE = 8
 """Seconds to wait for a scheduler."""
+LOOK_SECONDS, CLOSE_SECONDS = 1.0, 2.0
+MAX_ADDRESS = 1024
 
 
 class Pool(ABC):
@@ -180,36 +184,69 @@ class Given(Elsewhere):
 
 
 class Cluster(Elsewhere):
-    """The workers of a Dask scheduler, which does the blocks of lost workers again."""
+    """The workers of a Dask scheduler, which does the blocks of lost workers again.
+
+    Raises ScenarioError for an address where no scheduler answers.
+    """
 
     def __init__(self, address: str) -> None:
         super().__init__()
+        _check_address(address)
         try:
             import distributed
         except ImportError:
             words = "a Dask scheduler needs the extra cluster; pip install 'netkf[cluster]'"
             raise EngineError(words) from None
+        # An address inside of this process cannot be asked from another one.
+        if not (address.startswith("inproc://") or scheduler_answers(address, PATIENCE)):
+            raise _unreachable(address, "no Dask scheduler answers there")
         connect: Any = distributed.Client
         try:
             self._client = connect(address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
-            raise ScenarioError(
-                "scheduler",
-                f"cannot be reached ({type(error).__name__})",
-                address,
-                'start one with "dask scheduler" and give its address, tcp://HOST:PORT',
-            ) from None
+            raise _unreachable(address, type(error).__name__) from None
         self._executor = self._client.get_executor(retries=3)
+        self._address = address
         self.width = max(1, sum(self._client.nthreads().values()))
 
     def _send(self, job: Job) -> Future[Any]:
         future: Future[Any] = self._executor.submit(work, job)
         return future
 
+    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+        """Wait until one of the futures is done; return all that are.
+
+        Raises EngineError if the scheduler does not answer for PATIENCE seconds.
+        """
+        answered = time.monotonic()
+        while True:
+            done = wait(futures, timeout=LOOK_SECONDS, return_when=FIRST_COMPLETED).done
+            lost = [future for future in done if future.cancelled()]
+            now = time.monotonic()
+            if self._client.status == "running":
+                answered = now
+            if lost or now - answered > PATIENCE:
+                words = f"the scheduler at {shorten(self._address)} does not answer any more"
+                raise EngineError(f"{words}, and the runs on it are lost")
+            if done:
+                return done
+
     def close(self, at_once: bool) -> None:
         """Leave the scheduler."""
         self._executor.shutdown(wait=False)
-        self._client.close()
+        self._client.close(timeout=CLOSE_SECONDS)
+
+
+def _check_address(address: object) -> None:
+    """Raise ScenarioError for what is no address of a scheduler."""
+    plain = isinstance(address, str) and address.isprintable() and " " not in address
+    if not (plain and 0 < len(str(address)) <= MAX_ADDRESS):
+        raise ScenarioError("scheduler", "must be an address", address, "give tcp://HOST:PORT")
+
+
+def _unreachable(address: str, reason: str) -> ScenarioError:
+    remedy = 'start one with "dask scheduler" and give its address, tcp://HOST:PORT'
+    return ScenarioError("scheduler", f"cannot be reached ({reason})", address, remedy)
 
 
 class Processes(Elsewhere):

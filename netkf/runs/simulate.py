@@ -21,9 +21,10 @@ LOAD = "load it first: netkf.simulate(netkf.load(path))"
 ENGINES = ("auto", "simpy", "compiled")
 
 
-def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
+def choose_engine(name: str | Engine, scenario: Scenario, announce: bool = True) -> Engine:
     """Return the engine of a name: ``simpy`` (or ``processes``), ``compiled``, or ``auto``, that is
-    ``compiled`` if that engine can run the scenario and ``simpy`` otherwise.
+    ``compiled`` if that engine can run the scenario and ``simpy`` otherwise. ``announce`` says so
+    where it will compile first.
 
     Raises EngineError for an unknown name and if the engine cannot run the scenario.
     """
@@ -40,7 +41,7 @@ def choose_engine(name: str | Engine, scenario: Scenario) -> Engine:
     refusal = engine.refusal(scenario)
     if refusal is not None:
         raise EngineError(refusal)
-    if engine is not name:
+    if announce and engine is not name:
         engine.announce(scenario)
     return engine
 

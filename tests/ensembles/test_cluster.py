@@ -2,13 +2,16 @@
 
 import contextlib
 import json
+import socket
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
 import netkf
+from netkf.ensembles.pools import Cluster
 from tests.ensembles.test_ensembles import assert_same_bits
 
 pytest.importorskip("distributed")
@@ -24,23 +27,24 @@ def begin(stack, module, *arguments):
 
 @pytest.fixture
 def cluster(tmp_path):
-    """The address of a scheduler, and two worker processes."""
+    """The address of a scheduler, two worker processes, and the scheduler itself."""
     file = tmp_path / "scheduler.json"
     with contextlib.ExitStack() as stack:
         local = ["--host", "127.0.0.1", "--port", "0"]
-        begin(stack, "dask_scheduler", *local, "--scheduler-file", str(file))
+        scheduler = begin(stack, "dask_scheduler", *local, "--scheduler-file", str(file))
         started = time.monotonic()
         while not file.exists() or not file.read_text():
             assert time.monotonic() - started < 60.0
             time.sleep(0.05)
         address = json.loads(file.read_text())["address"]
         one = ["--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path)]
-        yield address, [begin(stack, "dask_worker", address, *one) for _ in range(2)]
+        workers = [begin(stack, "dask_worker", address, *one) for _ in range(2)]
+        yield address, workers, scheduler
 
 
 def test_a_cluster_that_loses_a_worker_gives_the_same_bits(ring, cluster):
     short = ring.replace({"horizon": 2.0})
-    address, workers = cluster
+    address, workers, _ = cluster
     killed = []
 
     def kill(done, wanted):
@@ -58,6 +62,75 @@ def test_a_scheduler_that_is_not_there_is_told_in_one_line(ring, monkeypatch):
     monkeypatch.setattr("netkf.ensembles.pools.PATIENCE", 1)
     with pytest.raises(netkf.ScenarioError, match="scheduler: cannot be reached"):
         netkf.monte_carlo(ring, 2, scheduler="tcp://127.0.0.1:9")
+
+
+def silent(connection):
+    threading.Event().wait(60.0)
+
+
+def closes(connection):
+    connection.close()
+
+
+def is_a_web_server(connection):
+    connection.recv(100)
+    connection.sendall(b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n")
+
+
+def sends_noise(connection):
+    with contextlib.suppress(OSError):
+        while True:
+            connection.sendall(b"\0" * 8192)
+
+
+@pytest.fixture
+def listen():
+    """Start a server that treats every connection in the same way."""
+    with contextlib.ExitStack() as stack:
+
+        def begin(treat):
+            server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+
+            def accept():
+                with contextlib.suppress(OSError):
+                    while True:
+                        connection, _ = server.accept()
+                        threading.Thread(target=treat, args=(connection,), daemon=True).start()
+
+            threading.Thread(target=accept, daemon=True).start()
+            return f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+        yield begin
+
+
+@pytest.mark.parametrize("treat", [silent, closes, is_a_web_server, sends_noise])
+def test_what_is_no_scheduler_is_told_in_one_line(ring, monkeypatch, listen, treat):
+    monkeypatch.setattr("netkf.ensembles.pools.PATIENCE", 4)
+    address, began = listen(treat), time.monotonic()
+    before = threading.active_count()
+    with pytest.raises(netkf.ScenarioError, match="no Dask scheduler answers there"):
+        Cluster(address)
+    assert time.monotonic() - began < 8.0
+    others = {"silent", "closes", "is_a_web_server", "sends_noise"}
+    mine = [one for one in threading.enumerate() if not any(o in one.name for o in others)]
+    assert len(mine) <= before
+
+
+@pytest.mark.parametrize(
+    "address", ["", "a b", "tcp://\x1b[31m:1", "x" * 5000, None, 3, "tcp://\0"]
+)
+def test_what_is_no_address_is_refused_at_once(ring, address):
+    with pytest.raises(netkf.ScenarioError, match="must be an address") as error:
+        Cluster(address)
+    assert str(error.value).isprintable()
+
+
+def test_a_scheduler_that_dies_is_told_in_one_line(ring, cluster):
+    address, _, scheduler = cluster
+    with pytest.raises(netkf.EngineError, match="does not answer any more"):
+        netkf.monte_carlo(
+            ring, 2000, scheduler=address, progress=lambda done, wanted: scheduler.kill()
+        )
 
 
 def test_the_extra_is_named_where_distributed_is_missing(ring, monkeypatch):
