@@ -19,6 +19,7 @@ MAX_BYTES = 64 << 20
 MAX_DOTS = 100
 LONG_TEXT, LONG_LINE = 100_000, 1000
 _NUMBERS = re.compile(r"([A-Za-z0-9_-]+)[ \t]*=[ \t]*(\[[0-9eE+\-., \t\[\]]*\])[ \t]*")
+_LAST_COMMA, _FIRST_COMMA = re.compile(r",[ \t]*\]"), re.compile(r"\[[ \t]*,")
 _PART = r"""(?:[\w-]++|"[^"]*+"|'[^']*+')[ \t]*+"""
 _MANY_PARTS = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*+){{{MAX_DOTS}}}")
 
@@ -102,10 +103,10 @@ def _shortened(line: str, arrays: dict[str, Any], mark: str) -> str:
     The json module reads such arrays fifty times faster than tomllib.
     """
     found = _NUMBERS.fullmatch(line) if len(line) > LONG_LINE else None
-    if found is None:
+    if found is None or _FIRST_COMMA.search(found[2]):
         return line
     try:
-        value = json.loads(found[2])
+        value = json.loads(_LAST_COMMA.sub("]", found[2]))
     except (ValueError, RecursionError):
         return line
     place = f"{mark} {len(arrays)}"
