@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import SourceFile
+from netkf.core.fields import MAX_MAGNITUDE, SourceFile
 from netkf.linalg.arrays import FloatArray
 
 MAX_BYTES = 256 << 20
@@ -106,8 +106,11 @@ def finite_numbers(
                 "path",
                 f"{where}: {header[place]} must be a finite number",
                 entries[place],
-                "mend the row",
+                "mend the row, or leave it out",
             )
+        if abs(value) > MAX_MAGNITUDE:
+            rule = f"{where}: {header[place]} must be at most {MAX_MAGNITUDE:g} in size"
+            raise ScenarioError("path", rule, entries[place], "mend the row, or choose other units")
         numbers.append(value)
     return numbers
 
