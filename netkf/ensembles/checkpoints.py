@@ -156,19 +156,24 @@ class BlockCheckpoints:
 
     def _trace(self, arrays: Any, k: int) -> Trace:
         """Return a trace; raises DamagedError if it does not fit the scenario."""
-        trace = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
+        trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
         shapes = [(), (len(trace.log),), (T,), (T, n), (T, N, n), (T, N, n, n), (T, N, n)]
-        if trace.log.dtype != EVENT or [np.shape(one) for one in trace] != shapes:
+        types = [np.dtype(np.int64), EVENT, *[np.dtype(np.float64)] * 5]
+        if [(one.dtype, one.shape) for one in trace] != list(zip(types, shapes, strict=True)):
             raise DamagedError("does not fit the scenario")
-        return trace._replace(replica=int(trace.replica))
+        return Trace(int(trace.replica), *trace[1:])
 
     @contextlib.contextmanager
     def _expected(self, number: int) -> Iterator[None]:
-        """Raise EngineError for a block that was there a moment ago and cannot be used now."""
+        """Raise EngineError for a block that was there a moment ago and cannot be used now; it is
+        removed.
+        """
         try:
             yield
         except DamagedError as error:
+            with contextlib.suppress(OSError):
+                self._file(number).unlink()
             words, remedy = f"{self._file(number)} {error}", "go on with --resume"
             raise EngineError(f"{words}; {remedy}, which does it again") from None
 

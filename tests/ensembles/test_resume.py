@@ -259,7 +259,16 @@ def test_a_block_that_is_damaged_meanwhile_is_one_line(cut, made, monkeypatch):
     with pytest.raises(EngineError, match="go on with --resume"):
         resume(cut)
     monkeypatch.undo()
-    assert_done_again(cut, made)
+    assert resume(cut)[0] == []
+    assert files(cut) == files(made / "whole")
+
+
+def test_a_trace_that_does_not_fit_is_one_line_and_done_again(cut, made):
+    forged(cut / "blocks" / "000000.npz", trace_0_replica=np.array(1e300))
+    with pytest.raises(EngineError, match=r"000000\.npz does not fit the scenario"):
+        resume(cut)
+    assert resume(cut) == ([], 1)
+    assert files(cut) == files(made / "whole")
 
 
 def test_a_single_run_that_was_changed_is_done_again(tmp_path, capsys):

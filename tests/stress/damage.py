@@ -1,0 +1,302 @@
+"""Damage run directories at random, and look at what the commands that read them say.
+
+    python -m tests.stress.damage --cases 400 [--seed 1]
+
+Bytes are flipped, inserted, cut and swapped between files; values of JSON documents are replaced by
+others of every kind, some with control characters, with the digests as they were or made right
+again; columns of Parquet tables are renamed, retyped, emptied and repeated. Each case runs one of
+``compare``, ``run --resume`` (one run and many) and ``check --resume`` in this process. It fails
+unless the status is 0, 1 or 2, status 2 prints one line, nothing prints a traceback or a control
+character, and results of status 0 after --resume are those of a run that was left alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from netkf.cli.main import main as netkf
+from netkf.ensembles import checkpoints
+from netkf.runs.documents import file_digests, write_sealed
+
+RING = str(Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml")
+SHORT = ["--set", "horizon=1.0", "--no-plot"]
+MANY = [*SHORT, "--runs", "6", "--trace", "full", "--workers", "1"]
+HOSTILE = "x\x1b[31m\x9b2J\u202e\u2066\n\r\x00y"
+VALUES: list[Any] = [
+    None, True, 0, -1, 3, 2**70, 10**400, 1e308, -0.0, 1e-320, "", "1", HOSTILE, "x" * 100_000,
+    [], {}, [None], {"a": None}, [[[[]]]], "complete", "diverged", "interrupted",
+]  # fmt: skip
+TEXTS = [
+    "",
+    "null",
+    "[]",
+    "{",
+    '{"a":' * 50_000,
+    "[" * 50_000,
+    "NaN",
+    "9" * 9_999,
+    "\ufeff{}",
+    "\0",
+]
+LIMIT = 20.0
+
+
+def prepare(folder: Path) -> dict[str, tuple[Path, list[str]]]:
+    """Make the directories; return each with the command that reads it."""
+    commands: dict[str, tuple[Path, list[str]]] = {}
+    netkf(["run", RING, *MANY, "--out", str(folder / "many")])
+    netkf(["run", RING, *MANY, "--seed", "2", "--out", str(folder / "other")])
+    netkf(["run", RING, *SHORT, "--out", str(folder / "one")])
+    with contextlib.suppress(KeyboardInterrupt):
+        stop_in_the_middle(folder / "cut")
+    gossip = str(Path(RING).with_name("gossip_ring.toml"))
+    check = ["check", gossip, "--runs", "10", "--workers", "1", "--no-plot"]
+    assert netkf([*check, "--out", str(folder / "verdict")]) < 2
+    commands["many"] = folder / "many", ["run", RING, *MANY, "--resume", "--out"]
+    commands["cut"] = folder / "cut", ["run", RING, *MANY, "--resume", "--out"]
+    commands["one"] = folder / "one", ["run", RING, *SHORT, "--resume", "--out"]
+    more = ["check", gossip, "--runs", "12", "--workers", "1", "--no-plot"]
+    commands["verdict"] = folder / "verdict", [*more, "--resume", "--out"]
+    commands["compare many"] = folder / "many", ["compare", str(folder / "other")]
+    commands["compare one"] = folder / "one", ["compare", str(folder / "one")]
+    return commands
+
+
+def stop_in_the_middle(out: Path) -> None:
+    """Leave an ensemble with half of its blocks."""
+    from netkf.ensembles.directory import runs_to_directory
+    from netkf.scenario.reading import load
+
+    def stop(done: int, wanted: int) -> None:
+        if done >= wanted // 2:
+            raise KeyboardInterrupt
+
+    scenario = load(RING, {"horizon": 1.0})
+    runs_to_directory(scenario, 6, out, trace="full", workers=1, progress=stop)
+
+
+def damage(folder: Path, draw: random.Random) -> str:
+    """Change one file of a directory; return what was done."""
+    names = sorted(path for path in folder.rglob("*") if path.is_file())
+    path = draw.choice(names)
+    ways = [flip, cut, insert, swap, remove, replace_text]
+    if path.suffix == ".json":
+        ways = [change_json] * 8 + ways
+    if path.suffix == ".parquet":
+        ways = [change_table] * 6 + ways
+    if path.suffix == ".npz":
+        ways = [change_arrays] * 3 + ways
+    way = draw.choice(ways)
+    detail = None
+    with contextlib.suppress(Exception):  # an earlier change has left nothing to change
+        detail = way(path, draw)
+    return f"{way.__name__} {path.relative_to(folder)} {detail or ''}"
+
+
+def flip(path: Path, draw: random.Random) -> None:
+    found = bytearray(path.read_bytes())
+    for _ in range(draw.choice([1, 1, 10])):
+        found[draw.randrange(len(found))] ^= 1 << draw.randrange(8)
+    path.write_bytes(found)
+
+
+def cut(path: Path, draw: random.Random) -> None:
+    found = path.read_bytes()
+    path.write_bytes(found[: draw.randrange(len(found))])
+
+
+def insert(path: Path, draw: random.Random) -> None:
+    found, at = path.read_bytes(), 0
+    at = draw.randrange(len(found))
+    path.write_bytes(found[:at] + draw.randbytes(draw.choice([1, 8, 1000])) + found[at:])
+
+
+def swap(path: Path, draw: random.Random) -> str:
+    other = draw.choice([p for p in sorted(path.parents[0].iterdir()) if p.is_file()])
+    contents = other.read_bytes()
+    path.write_bytes(contents)
+    return other.name
+
+
+def remove(path: Path, draw: random.Random) -> None:
+    path.unlink()
+    if draw.random() < 0.3:
+        path.mkdir()
+
+
+def replace_text(path: Path, draw: random.Random) -> None:
+    path.write_text(draw.choice(TEXTS), encoding="utf-8")
+
+
+def reseal(path: Path) -> None:
+    """Make the digests of the directory right again."""
+    folder = path.parent
+    for name in ("manifest.json", "verdict.json"):
+        with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
+            found = json.loads((folder / name).read_text())
+            found.pop("sha256", None)
+            if "files" in found:
+                found["files"] = file_digests(folder, found["files"])
+            write_sealed(folder / name, found)
+
+
+def change_json(path: Path, draw: random.Random) -> str:
+    document = json.loads(path.read_text())
+    places: list[tuple[Any, Any]] = []
+
+    def collect(value: Any) -> None:
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, inner in list(items):
+            places.append((value, key))
+            if isinstance(inner, (dict, list)):
+                collect(inner)
+
+    collect(document)
+    table, key = draw.choice(places)
+    value = draw.choice(VALUES)
+    if draw.random() < 0.2:
+        del table[key]
+    else:
+        table[key] = value
+    path.write_text(json.dumps(document))
+    sealed = draw.random() < 0.7
+    if sealed:
+        reseal(path)
+    return f"{key} = {value!r:.40} {'sealed' if sealed else ''}"
+
+
+def change_table(path: Path, draw: random.Random) -> str:
+    table = pd.read_parquet(path)
+    column = draw.choice(list(table.columns))
+    how = draw.choice(["drop", "text", "null", "rename", "none", "object", "inf", "repeat", "bool"])
+    if how == "drop":
+        table = table.drop(columns=column)
+    elif how == "text":
+        table[column] = HOSTILE
+    elif how == "null":
+        table[column] = table[column].astype("Float64").where(table.index % 3 > 0)
+    elif how == "rename":
+        table = table.rename(columns={column: HOSTILE})
+    elif how == "none":
+        table = table.iloc[:0]
+    elif how == "object":
+        table[column] = [[1, 2]] * len(table)
+    elif how == "inf":
+        table[column] = np.inf
+    elif how == "repeat":
+        table = pd.concat([table] * 3)
+    else:
+        table[column] = True
+    table.to_parquet(path, index=False)
+    reseal(path)
+    return f"{column} {how}"
+
+
+def change_arrays(path: Path, draw: random.Random) -> str:
+    with np.load(path, allow_pickle=True) as found:
+        arrays = {name: found[name] for name in found.files}
+    name = draw.choice(list(arrays))
+    how = draw.choice(
+        [np.zeros(0), np.array("x"), np.array(None), np.ones((3, 3)), np.array(1e300)]
+    )
+    arrays[name] = how
+    made = io.BytesIO()
+    np.savez(made, **arrays)
+    contents = made.getvalue()
+    if path.parent.name == "blocks":
+        buffer = io.BytesIO(contents)
+        contents += checkpoints.MARK + checkpoints._digest(buffer, len(contents))
+    path.write_bytes(contents)
+    reseal(path)
+    return name
+
+
+def run(command: list[str]) -> tuple[Any, str, str]:
+    """Run a command in this process; return its status and what it printed."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            status: Any = netkf(command)
+        except BaseException as error:
+            status = repr(error)
+    return status, out.getvalue(), err.getvalue()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def look(status: Any, out: str, err: str, seconds: float) -> list[str]:
+    """Return what is wrong with how a command ended."""
+    wrong = []
+    if status not in (0, 1, 2):
+        wrong.append(f"status {status}")
+    lines = [line for line in err.splitlines() if not line.startswith("note: ")]
+    if (status == 2 and len(lines) != 1) or (status in (0, 1) and lines):
+        wrong.append(f"printed {err[-400:]!r}")
+    if "Traceback" in err:
+        wrong.append("traceback")
+    if not (out + err).replace("\n", "").isprintable():
+        wrong.append("control characters")
+    if max(map(len, err.splitlines()), default=0) > 3000:
+        wrong.append("a line of more than 3000 characters")
+    if seconds > LIMIT:
+        wrong.append(f"took {seconds:.1f} s")
+    return wrong
+
+
+def main() -> int:
+    """Return the exit status: 1 if a case failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    failed, statuses = 0, {}
+    with tempfile.TemporaryDirectory() as top, contextlib.redirect_stdout(sys.stdout):
+        folder = Path(top) / "made"
+        folder.mkdir()
+        with contextlib.redirect_stdout(io.StringIO()):
+            commands = prepare(folder)
+        for k in range(options.cases):
+            draw = random.Random(options.seed * 1_000_000 + k)
+            name = draw.choice(list(commands))
+            source, command = commands[name]
+            copy = Path(top) / "copy"
+            shutil.copytree(source, copy)
+            what = [damage(copy, draw) for _ in range(draw.choice([1, 1, 1, 2]))]
+            forged = any(word in str(what) for word in ("sealed", "change_table", "change_arrays"))
+            began = time.monotonic()
+            status, out, err = run([*command, str(copy)])
+            wrong = look(status, out, err, time.monotonic() - began)
+            whole = folder / ("many" if name == "cut" else name.split()[-1])
+            resumed = status == 0 and name in ("cut", "many", "one") and not forged
+            if resumed and contents(copy) != contents(whole):
+                wrong.append("other files")
+            statuses[name, status] = statuses.get((name, status), 0) + 1
+            failed += bool(wrong)
+            for problem in wrong:
+                print(f"FAILED case {k}, {name}, {what}: {problem}", flush=True)
+            shutil.rmtree(copy)
+    print(statuses)
+    print(f"{options.cases} cases, {failed} failed; threads: {threading.active_count()}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    sys.exit(main())
