@@ -75,9 +75,9 @@ def runs_to_directory(
     has are not done again, and the files come out the same to the last bit; None where all was
     done before. Blocks that are not of this run or damaged are done again, and ``note`` is called
     with a line that says so. ``finish`` adds what else belongs to the directory, before the
-    manifest says that it is complete. Raises
-    ScenarioError and EngineError before anything is written, InterruptedRunError (a
-    KeyboardInterrupt) when interrupted, and EngineError where a plugged-in class fails.
+    manifest says that it is complete. Raises ScenarioError and EngineError before anything is
+    written, WriteError, InterruptedRunError (a KeyboardInterrupt) when interrupted, and EngineError
+    where a plugged-in class fails.
     """
     began = time.perf_counter()
     runs, trace = integer(low=1)("runs", runs), choice(*TRACES)("trace", trace)
@@ -92,7 +92,6 @@ def runs_to_directory(
     if keeper is None:
         pool.close(at_once=True)
         return None
-    directory = keeper.directory
     try:
         keeper.begin(note)
         engine_used.announce(scenario)
@@ -105,11 +104,7 @@ def runs_to_directory(
         keeper.end(finished.status, whole)
     except BaseException as error:
         pool.close(at_once=True)
-        status = "failed" if isinstance(error, Exception) else "interrupted"
-        keeper.note(status, error)
-        reason = explain_failure(scenario, error, directory)
-        if isinstance(error, KeyboardInterrupt):
-            reason = InterruptedRunError(directory, f"; go on with --resume --out {directory}")
+        reason = keeper.stop(error)
         if reason is error:
             raise
         raise reason from error
@@ -223,6 +218,15 @@ class _Keeper:
         if not self._ended:
             self._manifest.write(status, self._entries(block=self.plan.block), self._done, error)
             self._noted = time.monotonic()
+
+    def stop(self, error: BaseException) -> BaseException:
+        """Write to the manifest why the runs end early, and return the exception to raise."""
+        self.note("failed" if isinstance(error, Exception) else "interrupted", error)
+        if isinstance(error, KeyboardInterrupt):
+            return InterruptedRunError(
+                self.directory, f"; go on with --resume --out {self.directory}"
+            )
+        return explain_failure(self.scenario, error, self.directory)
 
     def end(self, status: str, whole: RunStatistics) -> None:
         """Write the manifest of all runs, with the digests of the other files."""
