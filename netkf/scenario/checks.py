@@ -23,6 +23,8 @@ from netkf.scenario.shapes import demand_shape
 MAX_SAMPLES = 10_000_000
 MAX_STEPS = 100_000_000
 MAX_TICKS = 1e9
+MAX_CONSTANTS = 1e15  # as integers they can be counted
+MAX_GROWTH = 1e7  # the exponent: there is a frame for every seven
 
 
 def check_scenario(scenario: DerivedScenario) -> None:
@@ -40,6 +42,8 @@ def check_scenario(scenario: DerivedScenario) -> None:
         _check_slots(scenario)
     elif uses_grid(scenario):
         _check_sensing_period(scenario)
+    if not scenario.slotted:
+        _check_speed(scenario)
     scenario.hosted.check_scenario(scenario)
 
 
@@ -118,6 +122,32 @@ def _check_sensors(scenario: DerivedScenario) -> None:
                 list(sensor.nodes),
                 "write a second [[sensors]] entry for a second sensor",
             )
+
+
+def _check_speed(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if the plant or a filter is so fast that its steps cannot be counted."""
+    delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.truth.A
+    longest = max(scenario.horizon, delay)
+    believed, Q = scenario.belief
+    gains = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in scenario.sensors]
+    size = max((float(np.abs(G).max()) for G in gains), default=0.0) * float(np.abs(Q).max())
+    norm = max(float(np.abs(M).sum(axis=0).max()) for M in (A, believed))
+    if (norm + np.sqrt(size)) * longest > MAX_CONSTANTS:
+        raise ScenarioError(
+            "plant.A",
+            f"must have at most {MAX_CONSTANTS:g} time constants, or its filters must, within the "
+            f"horizon or delay of {longest:g} s",
+            A,
+            "shorten them, or choose another unit of time",
+        )
+    growth = float(np.linalg.eigvals(A).real.max()) * scenario.horizon
+    if growth > MAX_GROWTH:
+        raise ScenarioError(
+            "plant.A",
+            f"must grow by at most e^{MAX_GROWTH:g} up to the horizon",
+            A,
+            "shorten the horizon",
+        )
 
 
 def _ids(nodes: tuple[int, ...]) -> str:

@@ -142,7 +142,12 @@ def draw(seed: int) -> Case:
     text: str | None = None
     settings: list[str] = []
     kind = rng.random()
-    if kind < 0.5:
+    if kind < 0.2:
+        table = copy.deepcopy(_tables(base))
+        for _ in range(rng.choice((1, 2, 3))):
+            scale(table, rng)
+        text = to_toml(table)
+    elif kind < 0.5:
         table = copy.deepcopy(_tables(base))
         for _ in range(rng.choice((1, 1, 1, 2, 3))):
             mutate(table, rng)
@@ -277,6 +282,29 @@ def mutate(table: dict[str, Any], rng: random.Random) -> None:
         node[last] = rng.choice(NUMBERS)
     else:
         node[last] = anything(rng)
+
+
+def scale(table: dict[str, Any], rng: random.Random) -> None:
+    """Multiply one number of a table, which often leaves a scenario that can be run."""
+    factor = rng.choice((0.0, -1.0, 1e-12, 1e-6, 1e-3, 0.5, 2.0, 10.0, 1e3, 1e6, 1e12, 1e20))
+    leaves = [path for path in paths(table) if isinstance(_at(table, path), (int, float, list))]
+    path = rng.choice(leaves).split(".")
+    node, value = _at(table, ".".join(path[:-1])), _at(table, ".".join(path))
+    node[int(path[-1]) if isinstance(node, list) else path[-1]] = _scaled(value, factor)
+
+
+def _at(table: Any, path: str) -> Any:
+    for key in path.split(".") if path else ():
+        table = table[int(key)] if isinstance(table, list) else table[key]
+    return table
+
+
+def _scaled(value: Any, factor: float) -> Any:
+    if isinstance(value, list):
+        return [_scaled(entry, factor) for entry in value]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value
+    return int(value * factor) if isinstance(value, int) else value * factor
 
 
 def perturbed(value: list[Any], rng: random.Random) -> list[Any]:

@@ -50,6 +50,9 @@ def test_drawn_cases_are_refused_in_one_line_or_are_scenarios(folder, first):
 
 
 RING, SLOTS = "poisson_ring.toml", "gossip_ring.toml"
+CLOCK = {"kind": "poisson", "rate": 1}
+CLOCKED = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[1.0]], "sampling": CLOCK}]
+FAR = {"kind": "constant", "seconds": 2.0**63}
 LIMITS = [
     (SLOTS, {"plant.period": 5e-324}, "plant.period", "from 1e-09 to 1e"),
     (SLOTS, {"plant.period": 1e-9, "horizon": 3.0, "probe": 1.0}, "plant.period", "slots"),
@@ -59,6 +62,9 @@ LIMITS = [
     (RING, {"probe": 5e-324}, "probe", "from 1e-09 to 1e"),
     (RING, {"probe": 1e-9}, "probe", "at most 10,000,000 samples"),
     (RING, {"plant.sensing_period": 5e-324}, "plant.sensing_period", "100,000,000 steps"),
+    (RING, {"plant.A": [[0.0, 1e20], [-1.0, 0.1]], "sensors": CLOCKED}, "plant.A", "1e+15 time"),
+    (RING, {"plant.A": [[1e8, 0.0], [0.0, 1e8]], "sensors": CLOCKED}, "plant.A", "grow"),
+    (RING, {"network.channel.delay": FAR}, "plant.A", "delay of 9.2"),
     (RING, {"seed": 16**10_000}, "seed", "integer"),
     (RING, {"seed.x": [1] * 1_000_000}, "seed.x", "is not a key path"),
     (RING, {"name": [1] * 1_000_000}, "name", "one line of text"),
