@@ -88,7 +88,8 @@ def test_detecting_walk_has_an_invertible_gramian():
     for node in scenario.nodes:
         H = scenario.observation(node)[0]
         own = np.concatenate([H @ np.linalg.matrix_power(F, k) for k in range(4)])
-        assert np.linalg.matrix_rank(own) < 4
+        # numpy 2.0 knows no rank of nothing
+        assert not len(H) or np.linalg.matrix_rank(own) < 4
 
 
 def test_detecting_walk_of_two_that_always_swap():
