@@ -287,7 +287,8 @@ def _pivot_layout(topology: Topology) -> Positions:
     """Return the two principal axes of the distances to a few nodes (Pivot MDS: Brandes and Pich,
     Graph Drawing 2006), which takes one search of the network per pivot.
     """
-    ends = np.array([(topology.index[i], topology.index[j]) for i, j in topology.links])
+    pairs = [(topology.index[i], topology.index[j]) for i, j in topology.links]
+    ends = np.array(pairs, dtype=np.int32)  # the only indices that scipy 1.13 searches graphs with
     size, (rows, columns) = len(topology.nodes), ends.reshape(-1, 2).T
     adjacency = scipy.sparse.csr_array((np.ones(len(ends)), (rows, columns)), shape=(size, size))
     pivots = np.linspace(0, size - 1, PIVOTS).astype(int)

@@ -68,8 +68,10 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 def _text(path: Path) -> str:
     # Not all at once: the file may be a device that never ends.
+    content = b""
     with path.open("rb") as file:
-        content = file.read(MAX_BYTES + 1)
+        while len(content) <= MAX_BYTES and (part := file.read(1 << 20)):
+            content += part
     if len(content) > MAX_BYTES:
         words = f"must have at most {MAX_BYTES >> 20} MiB"
         raise ScenarioError("", words, None, "put long lists into CSV files")

@@ -138,8 +138,9 @@ def test_large_tables_are_refused_or_read_in_bounded_memory(tmp_path):
     (tmp_path / "ring.toml").write_text((SCENARIOS / RING).read_text())
     rows = "".join(f"{0.001 * k:.3f},{k % 6},{(k + 1) % 6}\n" for k in range(1, 300_000))
     (tmp_path / "ticks.csv").write_text("t,node,peer\n" + rows)
-    code = "import netkf, sys; print(netkf.load('ring.toml', {'network.activation': "
-    code += "{'kind': 'recorded', 'path': sys.argv[1]}}).network.activation.rows.size)"
+    code = "import netkf, resource, sys; print(netkf.load('ring.toml', {'network.activation': "
+    code += "{'kind': 'recorded', 'path': sys.argv[1]}}).network.activation.rows.size, "
+    code += "resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     command = [sys.executable, "-c", code]
 
     def run(name):
@@ -148,8 +149,9 @@ def test_large_tables_are_refused_or_read_in_bounded_memory(tmp_path):
         )
         return done.stdout + done.stderr
 
-    assert run("ticks.csv").strip() == "299999"
-    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < MEMORY >> 10
+    rows_read, kilobytes = run("ticks.csv").split()
+    assert int(rows_read) == 299_999
+    assert int(kilobytes) < MEMORY >> 10
     with (tmp_path / "large.csv").open("wb") as file:
         os.truncate(file.fileno(), 10**12)
     assert "large.csv must have at most 256 MiB" in run("large.csv")
@@ -175,3 +177,10 @@ def test_long_lines_of_numbers_are_read_as_toml_reads_them(tmp_path):
     for wrong in ("01, " * 50_000, " , " * 50_000, "1, " * 50_000 + ", 1", "1 2," * 50_000):
         with pytest.raises(tomllib.TOMLDecodeError):
             parse_toml(f"a = [{wrong}]\n")
+
+
+def test_a_regressor_that_overflows_is_named():
+    regression = netkf.load(SCENARIOS / "diffusion_regression.toml")
+    A = (1e20 * regression.sensors[0].A).tolist()
+    with pytest.raises(netkf.TheoryError, match="regressor sensor overflows"):
+        netkf.theory.information_level(regression.replace({"sensors.0.A": A}))

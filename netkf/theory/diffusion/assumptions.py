@@ -78,7 +78,10 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
             if positive
             else (None, evidence)
         )
-    distances = scipy.sparse.csgraph.shortest_path(W, method="D", unweighted=True)
+    # scipy 1.13 searches graphs with 32-bit indices only.
+    indices, indptr = W.indices.astype(np.int32), W.indptr.astype(np.int32)
+    graph = scipy.sparse.csr_array((W.data, indices, indptr), shape=W.shape)
+    distances = scipy.sparse.csgraph.shortest_path(graph, method="D", unweighted=True)
     # D needs W^l > 0 for some l; with positive own weights the diameter suffices.
     diameter = int(distances.max())
     least = float(np.linalg.matrix_power(W.toarray(), max(diameter, 1)).min())

@@ -133,9 +133,12 @@ def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator
     states, mean, cov = np.empty_like(drawn), source.start, np.zeros_like(source.A)
     for slot in range(int(slots.max()) + 1):
         chosen = slots == slot
+        if not np.isfinite(cov).all():
+            raise TheoryError(f"the state of a regressor sensor overflows up to slot {slot}")
         if chosen.any():
             states[chosen] = mean + drawn[chosen] @ square_root(cov).T
-        mean, cov = source.A @ mean, source.A @ cov @ source.A.T + source.drive
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean, cov = source.A @ mean, source.A @ cov @ source.A.T + source.drive
     return states
 
 
