@@ -112,6 +112,30 @@ def test_a_command_that_does_not_end_is_ended():
     assert (stuck.returncode, printed.count("\n")) == (130, 1)
 
 
+SERVER = """
+import sys
+from netkf.cli.process import end_process
+from netkf.ensembles import process_start
+process_start.PRELOADED = ["slow_to_import"]
+process_start.start_early()
+end_process(3)
+"""
+
+
+def test_nothing_waits_for_the_process_that_workers_are_forked_from(tmp_path):
+    """It has the standard streams of the command; who reads them waits for their end."""
+    (tmp_path / "slow_to_import.py").write_text("import time; time.sleep(30)")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", SERVER],
+        capture_output=True,
+        check=False,
+        timeout=15,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert (done.returncode, done.stderr) == (3, b"")
+
+
 def test_an_error_that_is_not_about_writing_is_not_called_one(monkeypatch, capsys):
     def refuse(*_):
         raise ConnectionRefusedError(111, "Connection refused")

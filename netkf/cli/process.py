@@ -5,15 +5,12 @@ from __future__ import annotations
 import _thread
 import atexit
 import contextlib
-import logging
 import os
 import signal
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, NoReturn, TextIO
 
@@ -131,6 +128,9 @@ def end_process(status: int) -> NoReturn:
     writes to closed streams once more.
     """
     end_later(status, EXIT_SECONDS)
+    starting = sys.modules.get("netkf.ensembles.process_start")
+    if starting is not None:
+        starting.kill_server()
     with contextlib.suppress(BaseException):
         atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
@@ -151,7 +151,7 @@ def open_missing_streams() -> None:
             os.open(os.devnull, flags)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
 
 
 class OutputError(OSError):
@@ -223,6 +223,10 @@ def run_as_process(command: Callable[[Interruption], int]) -> NoReturn:
     """Run the command of this process, and end the process with its status."""
     with Interruption(ends_process=True) as interruption:
         open_missing_streams()
+        # Imported when signals are handled: an interrupt before that ends Python in its own way.
+        import logging
+        import warnings
+
         # Warnings and logs of libraries are for those who write code.
         if not sys.warnoptions:
             warnings.simplefilter("ignore")

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 ONE_THREAD = (
@@ -51,6 +51,18 @@ def start_server() -> None:
     resource_tracker.ensure_running()
     with one_blas_thread(), signals_blocked():
         forkserver.ensure_running()
+
+
+def kill_server() -> None:
+    """Kill the process that workers are forked from, if this one has started it.
+
+    It would end by itself, but only once it has imported what workers need.
+    """
+    module = sys.modules.get("multiprocessing.forkserver")
+    number = getattr(getattr(module, "_forkserver", None), "_forkserver_pid", None)
+    if number is not None:
+        with suppress(OSError):
+            os.kill(number, signal.SIGKILL)
 
 
 @contextmanager

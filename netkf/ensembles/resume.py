@@ -20,7 +20,9 @@ from netkf.runs.documents import (
 )
 from netkf.runs.files import new_directory, only_own, remove_own
 from netkf.runs.provenance import machine, versions
+from netkf.scenario.plugins import module_files
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolved, to_toml
 
 ENDED = ("complete", "diverged")
@@ -114,6 +116,7 @@ def clear_unfinished(
     if not (directory / "manifest.json").exists():
         if _has_own_files(directory, scenario):
             _check_scenario(directory, scenario)
+            _check_sources_elsewhere(directory, scenario)
             remove_own(directory, scenario)
         return True
     found = read_manifest(directory)
@@ -133,8 +136,22 @@ def clear_unfinished(
                 note(f"the run in {directory} is done again: its record {error}")
         else:
             return False
+    _check_sources_elsewhere(directory, scenario)
     remove_own(directory, scenario)
     return True
+
+
+def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
+    """Raise ScenarioError if the tables and modules of a scenario are those in the directory that
+    is cleared: they may be the only copies.
+    """
+    files = [source.full for source in source_files(scenario)]
+    files += [file for file in module_files(scenario).values() if file is not None]
+    for file in files:
+        if Path(file).resolve().is_relative_to(directory.resolve()):
+            rule = f"{file} is in the directory whose run is done again"
+            remedy = "copy the scenario with its files to another folder, and run that"
+            raise ScenarioError("--resume", rule, None, remedy)
 
 
 def _has_own_files(directory: Path, scenario: Scenario) -> bool:

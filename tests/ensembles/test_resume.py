@@ -292,6 +292,27 @@ def test_a_single_run_that_was_changed_is_done_again(tmp_path, capsys):
     assert files(tmp_path / "out") == before
 
 
+def test_the_only_copy_of_a_table_is_not_removed(tmp_path, capsys):
+    """``--resume`` of a single run with the scenario of its own directory."""
+    out = tmp_path / "out"
+    text = (SCENARIOS / "poisson_ring.toml").read_text()
+    (tmp_path / "links.csv").write_text("sender,receiver\n" + "0,1\n1,0\n1,2\n2,1\n2,3\n3,2\n")
+    lines = [
+        'graph = { kind = "csv", path = "links.csv" }' if line.startswith("graph") else line
+        for line in text.splitlines()
+    ]
+    (tmp_path / "x.toml").write_text("\n".join(lines))
+    short = ["--set", "horizon=1.0", "--no-plot", "--out", str(out)]
+    assert main(["run", str(tmp_path / "x.toml"), *short]) == 0
+    (out / "summary.json").unlink()
+    before = files(out)
+    capsys.readouterr()
+    assert main(["run", str(out / "scenario.toml"), *short, "--resume"]) == 2
+    assert "links.csv is in the directory" in capsys.readouterr().err
+    assert files(out) == before
+    assert main(["run", str(tmp_path / "x.toml"), *short, "--resume"]) == 0
+
+
 def test_contents_reach_the_disk_before_names(tmp_path, monkeypatch):
     """Of every file that is written: fsync of the file, rename, fsync of the directory."""
     calls = []

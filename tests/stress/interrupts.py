@@ -27,18 +27,20 @@ RING = str(ROOT / "scenarios" / "poisson_ring.toml")
 LIMIT = 10.0
 EARLIEST = 0.3
 """Seconds after which Python itself has started."""
+SHORT = ["--set", "horizon=2.0"]
 RUNS = [
     [f"--runs=400 --workers={workers} --trace={trace}"]
     for workers in (1, 2, 4)
     for trace in ("full", "first", "none")
 ]
 COMMANDS = {
-    **{f"run {line}": ["run", RING, *line.split()] for (line,) in RUNS},
-    "run --runs=400 (adaptive)": ["run", RING, "--runs=400", "--trace=full"],
-    "run (single)": ["run", RING, "--set", "horizon=30000"],
-    "sweep": ["sweep", RING, "--vary", "filter.epsilon=0.1:0.5:9", "--runs=60", "--workers=2"],
-    "check": ["check", RING, "--runs=400", "--workers=2"],
-    "size": ["size", RING, "--vary", "network.activation.rate=0.5:20", "--target",
+    **{f"run {line}": ["run", RING, *SHORT, *line.split()] for (line,) in RUNS},
+    "run --runs=400 (adaptive)": ["run", RING, *SHORT, "--runs=400", "--trace=full"],
+    "run (single)": ["run", RING, "--set", "horizon=10000"],
+    "sweep": ["sweep", RING, *SHORT, "--vary", "filter.epsilon=0.1:0.5:9", "--runs=60",
+              "--workers=2"],
+    "check": ["check", RING, *SHORT, "--runs=200", "--workers=2"],
+    "size": ["size", RING, *SHORT, "--vary", "network.activation.rate=0.5:20", "--target",
              "worst_rms<=0.6", "--by=simulation", "--workers=2"],
 }  # fmt: skip
 SIGNALS = {
