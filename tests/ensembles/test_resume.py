@@ -17,6 +17,7 @@ from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import runs_to_directory
 from netkf.runs import provenance
 from netkf.runs.documents import write_sealed
+from netkf.runs.parquet_files import TraceTables
 from tests.conftest import SCENARIOS
 
 RUNS = {"runs": 12, "trace": "first", "workers": 1}
@@ -290,6 +291,26 @@ def test_a_single_run_that_was_changed_is_done_again(tmp_path, capsys):
         path.rename(path.with_name(f"{path.name}.part"))
     assert main([*line, "--resume"]) == 0
     assert files(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
+def test_tables_that_are_stopped_leave_no_part(cut, made, monkeypatch, error):
+    """While the traces of all runs are written, after the last block."""
+
+    def stop(self, *trace):
+        add(self, *trace)
+        self._flush()
+        assert list(cut.glob("*.part"))
+        raise error
+
+    add = TraceTables.add
+    monkeypatch.setattr(TraceTables, "add", stop)
+    with pytest.raises((KeyboardInterrupt, OSError)):
+        resume(cut)
+    assert not list(cut.glob("*.part"))
+    monkeypatch.undo()
+    assert resume(cut) == ([], 0)
+    assert files(cut) == files(made / "whole")
 
 
 def test_the_only_copy_of_a_table_is_not_removed(tmp_path, capsys):
