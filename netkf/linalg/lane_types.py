@@ -19,6 +19,7 @@ from numba.extending import models, register_model
 from netkf.linalg import lanes as names
 
 DOUBLE, BYTE, BIT, I32 = ir.DoubleType(), ir.IntType(8), ir.IntType(1), ir.IntType(32)
+I64 = ir.IntType(64)
 
 
 class LaneValue(types.Type):
@@ -113,7 +114,9 @@ def _pointer(context: Any, builder: Any, sig: Any, args: Any, last: int) -> Any:
         context.cast(builder, value, number, types.intp)
         for value, number in zip(args[2:last], sig.args[2:last], strict=True)
     ]
-    places.append(context.get_constant(types.intp, 0))
+    # The last axis is that of the lanes, unless places name an entry.
+    if len(places) < kind.ndim:
+        places.append(context.get_constant(types.intp, 0))
     return cgutils.get_item_pointer(context, builder, kind, array, places, wraparound=False)
 
 
@@ -147,6 +150,132 @@ def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     value = _spread(context, builder, args[-1], sig.args[-1], count)
     builder.store(value, _as_vector(builder, pointer, DOUBLE, count), align=8)
     return context.get_dummy_value()
+
+
+@_typed(names.turn)
+def _turn(_lanes: Any, _rows: Any, _column: Any, _out: Any) -> Any:
+    return types.none
+
+
+@_typed(names.gather)
+def _gather(_lanes: Any, _array: Any, _places: Any, _first: Any, _out: Any) -> Any:
+    return types.none
+
+
+@_typed(names.scatter)
+def _scatter(*_: Any) -> Any:
+    return types.none
+
+
+@lower_builtin(names.turn, types.BaseTuple, types.Array, types.Integer, types.Array)
+def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """A transposition by shuffles."""
+    count = len(sig.args[0])
+    rows, out = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 3))
+    begin = context.cast(builder, args[2], sig.args[2], types.intp)
+    found = [
+        builder.load(rows.place(ir.Constant(I64, k), begin, count), align=8) for k in range(count)
+    ]
+    for k, value in enumerate(_turned(builder, found)):
+        builder.store(value, out.line(builder.add(begin, ir.Constant(I64, k)), count), align=8)
+    return context.get_dummy_value()
+
+
+@lower_builtin(names.gather, types.BaseTuple, types.Array, types.Array, types.Integer, types.Array)
+def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """A load for each place, turned."""
+    count = len(sig.args[0])
+    array, out = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 4))
+    begin, zero = context.cast(builder, args[3], sig.args[3], types.intp), ir.Constant(I64, 0)
+    found = []
+    for k in range(count):
+        place = _place_of(context, builder, sig, args, 2, k)
+        known = builder.select(builder.icmp_signed("<", place, zero), zero, place)
+        found.append(builder.load(array.place(known, begin, count), align=8))
+    for k, value in enumerate(_turned(builder, found)):
+        row = builder.add(begin, ir.Constant(I64, k))
+        builder.store(value, out.line(row, count), align=8)
+    return context.get_dummy_value()
+
+
+@lower_builtin(
+    names.scatter,
+    *(types.BaseTuple, types.Array, types.Integer, types.Array, types.Array, types.Integer),
+)
+def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """A store for each place, of the entries that are wanted."""
+    count = len(sig.args[0])
+    rows, array = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 3))
+    begin, zero = context.cast(builder, args[2], sig.args[2], types.intp), ir.Constant(I64, 0)
+    most = _splat(builder, context.cast(builder, args[5], sig.args[5], types.intp), count)
+    wanted = builder.icmp_signed(
+        "<", ir.Constant(ir.VectorType(I64, count), list(range(count))), most
+    )
+    lines = [rows.line(builder.add(begin, ir.Constant(I64, k)), count) for k in range(count)]
+    found = [builder.load(line, align=8) for line in lines]
+    vector = found[0].type
+    flags = ir.VectorType(BIT, count)
+    kinds = ir.FunctionType(ir.VoidType(), [vector, vector.as_pointer(), I32, flags])
+    name = f"llvm.masked.store.v{count}f64.p0v{count}f64"
+    masked = cgutils.get_or_insert_function(builder.module, kinds, name)
+    for k, value in enumerate(_turned(builder, found)):
+        place = _place_of(context, builder, sig, args, 4, k)
+        there = _splat(builder, builder.icmp_signed(">=", place, zero), count)
+        where = array.place(place, begin, count)
+        builder.call(masked, [value, where, I32(8), builder.and_(wanted, there)])
+    return context.get_dummy_value()
+
+
+def _place_of(context: Any, builder: Any, sig: Any, args: Any, which: int, k: int) -> Any:
+    """Entry k of an argument, an array of int64."""
+    kind = sig.args[which]
+    array = context.make_array(kind)(context, builder, args[which])
+    number = context.get_constant(types.intp, k)
+    return builder.load(
+        cgutils.get_item_pointer(context, builder, kind, array, [number], wraparound=False)
+    )
+
+
+class _Matrix:
+    """An array as a matrix, of the first axis and all others together."""
+
+    def __init__(self, context: Any, builder: Any, kind: Any, value: Any) -> None:
+        array = context.make_array(kind)(context, builder, value)
+        shape = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
+        self._data, self._builder, self._columns = array.data, builder, ir.Constant(I64, 1)
+        for size in shape[1:]:
+            self._columns = builder.mul(self._columns, size)
+
+    def place(self, row: Any, column: Any, count: int) -> Any:
+        """Address of ``count`` neighbours in a row."""
+        offset = self._builder.add(self._builder.mul(row, self._columns), column)
+        return _as_vector(self._builder, self._builder.gep(self._data, [offset]), DOUBLE, count)
+
+    def line(self, row: Any, count: int) -> Any:
+        """Address of the row, if rows have ``count`` entries."""
+        offset = self._builder.mul(row, ir.Constant(I64, count))
+        return _as_vector(self._builder, self._builder.gep(self._data, [offset]), DOUBLE, count)
+
+
+def _turned(builder: Any, rows: list[Any]) -> list[Any]:
+    """The transposed matrix: blocks of half the size change places, then half of that."""
+    rows, half = list(rows), len(rows) // 2
+    while half > 0:
+        for k in range(len(rows)):
+            if not k & half:
+                rows[k], rows[k + half] = _exchanged(builder, rows[k], rows[k + half], half)
+        half //= 2
+    return rows
+
+
+def _exchanged(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]:
+    """Rows ``a`` and ``b``, ``half`` apart, with the blocks off the diagonal exchanged."""
+    count = a.type.count
+    upper = [q if not q & half else count + q - half for q in range(count)]
+    lower = [q + half if not q & half else count + q for q in range(count)]
+    masks = (ir.Constant(ir.VectorType(I32, count), places) for places in (upper, lower))
+    first, second = (builder.shuffle_vector(a, b, mask) for mask in masks)
+    return first, second
 
 
 @_typed(names.spread)

@@ -6,7 +6,8 @@ comparisons, and the functions below. ``lanes`` is a tuple of L zeros, whose len
 the kernel is compiled; with one lane the value is a plain float, so that the same kernel serves a
 single run. Operations are those of floats, lane by lane: a run has the same bits in any company.
 
-A comparison gives flags: one truth value for each lane.
+A comparison gives flags: one truth value for each lane. An array without a last axis of lanes gives
+L neighbours from ``array[place]`` on; with one lane that is the entry itself.
 """
 
 from __future__ import annotations
@@ -37,6 +38,12 @@ def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
+def with_spare(shape: tuple[int, ...]) -> Any:
+    """Zeros as ``aligned``, with memory for a block of L by L behind them."""
+    entries = math.prod(shape)
+    return aligned((entries + LANES * LANES,))[:entries].reshape(shape)
+
+
 def blocks_of(runs: int, lanes: int = LANES) -> int:
     """Number of blocks of so many ``lanes`` that hold the runs; the last may have idle lanes."""
     return -(-runs // lanes)
@@ -58,6 +65,28 @@ def by_run(values: Any, runs: int) -> Any:
 
 def load(lanes: Lanes, array: FloatArray, *place: int) -> Any:
     """Return ``array[place]`` (L,) as one value."""
+    raise _only_in_kernels()
+
+
+def turn(lanes: Lanes, rows: FloatArray, column: int, out: FloatArray) -> None:
+    """Write ``rows[q, column + k]`` into ``out[column + k, q]``, for all lanes q and k < L."""
+    raise _only_in_kernels()
+
+
+def gather(
+    lanes: Lanes, array: FloatArray, places: np.ndarray, first: int, out: FloatArray
+) -> None:
+    """Write the L entries from ``first`` on of ``array[places[q]]`` into the L rows of ``out`` from
+    there on, lane q of each. Both arrays are taken as matrices, and have memory behind their last
+    entries (``with_spare``). Where a place is negative, lane q gets something.
+    """
+    raise _only_in_kernels()
+
+
+def scatter(
+    lanes: Lanes, rows: FloatArray, first: int, array: FloatArray, places: np.ndarray, count: int
+) -> None:
+    """Write them back, the ``count`` first of them, where the place is not negative."""
     raise _only_in_kernels()
 
 

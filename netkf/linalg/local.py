@@ -9,6 +9,7 @@ used.
 from __future__ import annotations
 
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.lanes import Lanes
 from netkf.linalg.structs import Size
 
 
@@ -22,3 +23,13 @@ def local_matrix(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
 def local_vector(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
     """Return, in kernels, an uninitialised (n,), as ``local_matrix``."""
     raise TypeError("local_vector is for kernels")
+
+
+def local_lanes_matrix(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
+    """Return, in kernels, an uninitialised (n, n, L), as ``local_matrix``."""
+    raise TypeError("local_lanes_matrix is for kernels")
+
+
+def local_lanes_vector(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
+    """Return, in kernels, an uninitialised (n, L), as ``local_matrix``."""
+    raise TypeError("local_lanes_vector is for kernels")

@@ -9,10 +9,12 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, MANY, load, store
 
 ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
 NOTHING = 1e-30  # of the largest entry
-ORDER_8, ORDER_12, ORDER_16 = (0,) * 8, (0,) * 12, (0,) * 16
+ORDER_8, ORDER_10, ORDER_12, ORDER_16 = (0,) * 8, (0,) * 10, (0,) * 12, (0,) * 16
+MANY_TERMS = (9, 11, 13)
 OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in steps of an octave
 
 
@@ -96,6 +98,44 @@ def add_terms(
         for j in range(width):
             out[j] += odd * series[k + 1, j] + even * series[k + 2, j]
         k += 2
+
+
+@kernel(inlined=True)
+def fill_row(out: FloatArray, row: int, series: FloatArray, m: int, cell: int, gap: float) -> None:
+    """Write the sums of the table ``series[m, cell]`` (terms, W), W a multiple of L, into a ``row``
+    of ``out``; as many terms as MANY_TERMS has are added up fastest.
+    """
+    terms = series.shape[2]
+    if terms == len(ORDER_8) + 1:
+        fill_blocks(ORDER_8, out, row, series, m, cell, gap)
+    elif terms == len(ORDER_10) + 1:
+        fill_blocks(ORDER_10, out, row, series, m, cell, gap)
+    elif terms == len(ORDER_12) + 1:
+        fill_blocks(ORDER_12, out, row, series, m, cell, gap)
+    else:
+        for j in range(0, series.shape[3], LANES):
+            total = load(MANY, series, m, cell, terms - 1, j)
+            for k in range(terms - 2, -1, -1):
+                total = load(MANY, series, m, cell, k, j) + gap * total
+            store(MANY, out, row, j, total)
+
+
+@kernel(inlined=True, fused=True)
+def fill_blocks(
+    order: tuple[int, ...],
+    out: FloatArray,
+    row: int,
+    series: FloatArray,
+    m: int,
+    cell: int,
+    gap: float,
+) -> None:
+    """``horner`` for whole blocks of L entries, each of which is one value of lanes."""
+    for j in range(0, series.shape[3], LANES):
+        total = load(MANY, series, m, cell, len(order), j)
+        for k in range(len(order) - 1, -1, -1):
+            total = load(MANY, series, m, cell, k, j) + gap * total
+        store(MANY, out, row, j, total)
 
 
 @kernel(allocates=True)

@@ -1,5 +1,7 @@
 """Values of lanes in kernels against numpy, for one lane and for several."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -11,16 +13,20 @@ from netkf.linalg.lanes import (
     aligned,
     any_lane,
     by_run,
+    gather,
     in_lanes,
     load,
     load_flags,
     magnitude,
     root_of,
+    scatter,
     select,
     spread,
     store,
     store_flags,
+    turn,
     with_sign,
+    with_spare,
 )
 
 SIZES = pytest.mark.parametrize("lanes", [ONE, MANY], ids=["one", "many"])
@@ -106,3 +112,31 @@ def test_runs_are_laid_out_by_blocks():
     assert runs.shape == (LANES + 3, 2, 3)
     assert runs[LANES + 2, 0, 0] == 50.0
     assert (runs[:, 1, 2] == 5.0).all()
+
+
+@kernel
+def move_rows(array, places, entries, lanes, rows, out, turned):
+    """Gather rows into lanes, scatter them into ``out``, and turn ``rows``."""
+    for first in range(0, entries, 8):
+        gather(MANY, array, places, first, lanes)
+    for first in range(0, entries, 8):
+        scatter(MANY, lanes, first, out, places, entries - first)
+    for first in range(0, rows.shape[1], 8):
+        turn(MANY, rows, first, turned)
+
+
+@pytest.mark.parametrize("shape", [(1,), (3,), (2, 2), (3, 3), (4, 4), (5, 5)])
+def test_rows_go_into_lanes_and_back(shape):
+    random, entries = np.random.default_rng(3), math.prod(shape)
+    array, out, lanes = with_spare((20, *shape)), with_spare((20, *shape)), with_spare((entries, 8))
+    array[:], out[:] = random.normal(size=array.shape), 7.0
+    places = random.permutation(20)[:8]
+    places[3] = -1
+    rows, turned = random.normal(size=(8, 16)), np.empty((16, 8))
+    move_rows(array, places, entries, lanes, rows, out, turned)
+    known = places[places >= 0]
+    np.testing.assert_array_equal(lanes[:, places >= 0], array.reshape(20, -1)[known].T)
+    expected = np.full(array.shape, 7.0)
+    expected[known] = array[known]
+    np.testing.assert_array_equal(out, expected)
+    np.testing.assert_array_equal(turned, rows.T)

@@ -45,6 +45,7 @@ from netkf.algorithms.kernels.root_update import rotate_out
 from netkf.algorithms.kernels.square_root import reflect_row
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, ONE, Lanes, aligned, load, root_of, select, spread, store
 from netkf.linalg.local import local_matrix, local_vector
 from netkf.linalg.series import fill_series, with_reach
 from netkf.linalg.structs import Size, Struct, sized, struct_at
@@ -71,7 +72,7 @@ class FlowTable(Struct):
     size   : (M,) trace of G, 1/s
     reach  : (M, cells, terms, 1) up to which gap the terms so far are enough, see linalg/series
     series : (M, cells, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g)
-             and, where something is observed, F and G_g
+             and, where something is observed, F and G_g; then zeros up to whole lanes
     gamma  : (M, blocks, terms, 1 + q n) the reach of ``c_j / (g^j sqrt(2 j + 1))``, and its terms
     bound  : (M, blocks) bounds of ``|row block j of Gamma|^2 / g^(2 j + 1)``
     levels : (M, levels, 4, n, n) ``exp(A g)``, F, Gamma (upper) and T (lower triangular) for
@@ -91,15 +92,17 @@ class FlowTable(Struct):
 
 
 class FlowScratch(Struct):
-    """The ``size`` n of states, and scratch arrays: values of the series, ``wide`` (n, n), ``T``
-    (n, n), ``mean`` (n,), rows (q, n), an observation (1, n), its gain (1, n).
+    """The ``size`` n of states, and scratch arrays: values of the series, ``S``, ``wide`` and ``T``
+    (n, n), ``mean`` and ``moved`` (n,), rows (q, n), an observation (1, n), its gain (1, n).
     """
 
     size: Size
     values: FloatArray
+    S: FloatArray
     wide: FloatArray
     T: FloatArray
     mean: FloatArray
+    moved: FloatArray
     rows: FloatArray
     observed: FloatArray
     gain: FloatArray
@@ -116,9 +119,11 @@ def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
     return cls(
         size=sized(n) if unrolled else np.zeros(n),
         values=np.zeros(table.series.shape[3]),
+        S=np.zeros((n, n)),
         wide=np.zeros((n, n)),
         T=np.zeros((n, n)),
         mean=np.zeros(n),
+        moved=np.zeros(n),
         rows=np.zeros(max(q, 1) * n),
         observed=np.zeros((1, n)),
         gain=np.zeros((1, n)),
@@ -162,11 +167,7 @@ def flow_table(
         middles = unit * (np.arange(2**octaves) + 0.5)
         middles[0] = 0.0
         E, F, grown, G = transition_series(A, Q, seen, middles)
-    rows, columns = np.tril_indices(n)
-    parts = [grown[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
-    if len(seen):
-        parts += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
-    cells = np.concatenate(parts, axis=2).astype(np.float64)
+    cells = packed(E, F, grown, G, len(seen) > 0)
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     series = np.stack(
         [with_reach(cell, unit if k == 0 else 0.5 * unit) for k, cell in enumerate(cells)]
@@ -188,6 +189,20 @@ def flow_table(
         levels=levels[None],
         seen=seen[None].copy(),
     )
+
+
+def packed(
+    E: FloatArray, F: FloatArray, grown: FloatArray, G: FloatArray, observed: bool
+) -> FloatArray:
+    """The series (C, terms, width) of a FlowTable from those of exp(A g), F, Q_g and G_g."""
+    rows, columns = np.tril_indices(E.shape[2])
+    parts = [grown[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
+    if observed:
+        parts += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
+    # Rows of whole blocks of lanes, see series.fill_row.
+    spare = -sum(part.shape[2] for part in parts) % LANES
+    parts.append(wide_zeros(*parts[0].shape[:2], spare))
+    return np.concatenate(parts, axis=2).astype(np.float64)
 
 
 def whitened(H: FloatArray, R: FloatArray) -> FloatArray:
@@ -405,7 +420,8 @@ def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
         # The padding is never read: ``sizes`` and the infinite last reach end every loop before it.
         shape = np.max([part.shape for part in parts], axis=0)
-        out = np.full((sum(len(part) for part in parts), *shape[1:]), fill, dtype=parts[0].dtype)
+        out: FloatArray = aligned((sum(len(part) for part in parts), *shape[1:]), parts[0].dtype)
+        out[:] = fill
         row = 0
         for part in parts:
             out[(slice(row, row + len(part)), *map(slice, part.shape[1:]))] = part
@@ -437,14 +453,29 @@ def move_root(
         gap = move_levels(table, m, octaves, root, x, k, gap, scratch)
     if not gap > 0.0:
         return
-    # Narrow P: rounding of G_g times P is harmless, and one step inside a cell suffices.
-    if table.sizes[m, 1] == 0 or table.size[m] * gap * root_size(scratch.size, root, k) < NARROW:
+    if is_narrow(scratch.size, table, m, root, k, gap):
         move_narrow(table, m, root, x, k, gap, scratch)
         return
     # Wide P: whole units by levels, and the rest row by row of Gamma.
     gap = move_levels(table, m, 0, root, x, k, gap, scratch)
     if gap > 0.0:
         move_wide(table, m, root, x, k, gap, scratch)
+
+
+@kernel
+def is_narrow(size: Size, table: FlowTable, m: int, root: FloatArray, k: int, gap: float) -> bool:
+    """Return True if one step inside a cell suffices: rounding of G_g times P is harmless."""
+    # A P that is not a number is not wide.
+    if table.sizes[m, 1] == 0:
+        return True
+    return not table.size[m] * gap * root_size(size, root, k) >= NARROW
+
+
+@kernel
+def is_quick(size: Size, table: FlowTable, m: int, root: FloatArray, k: int, gap: float) -> bool:
+    """Return True if ``move_root`` takes one step inside a cell."""
+    longest = table.unit[m] * (1 << table.sizes[m, 4])
+    return gap < longest and is_narrow(size, table, m, root, k, gap)
 
 
 @kernel
@@ -513,7 +544,7 @@ def move_level(
             T[i, j] = levels[m, level, 3, i, j]
         for j in range(n):
             scratch.values[i * n + j] = levels[m, level, flow, i, j]
-    transform(scratch.size, root, k, scratch.values, 0, scratch.wide, T)
+    transform(ONE, scratch.size, root[k], scratch.values, 0, scratch.wide, T)
     # The estimate moves open loop, by exp(A g): gain_root() corrects it when the readings are used.
     for i in range(n):
         total = 0.0
@@ -539,8 +570,9 @@ def move_wide(
     use_readings(table, m, root, k, gap, scratch)
     n = len(scratch.size)
     # Without G_g, the last part of the series: Gamma has replaced it.
-    fill_cell(scratch.values, table, m, 0, n * (n + 1) // 2 + 2 * n * n, gap)
-    move_by_series(table, m, root, x, k, scratch)
+    width = n * (n + 1) // 2 + 2 * n * n
+    fill_series(scratch.values, width, table.series[m, 0], table.reach[m, 0], 0, gap)
+    move_by_series(table, m, root, x, k, False, scratch)
 
 
 @kernel
@@ -554,91 +586,129 @@ def move_narrow(
     scratch: FlowScratch,
 ) -> None:
     """``move_root`` over a gap inside a cell, where nothing is observed or P is not too wide."""
-    unit, n, values = table.unit[m], len(scratch.size), scratch.values
+    fill_values(scratch.values, table, m, gap)
+    move_by_series(table, m, root, x, k, True, scratch)
+
+
+@kernel
+def fill_values(out: FloatArray, table: FlowTable, m: int, gap: float) -> None:
+    """Write Q_g, exp(A g) and, where something is observed, F and G_g for a gap inside a cell."""
+    cell, since = cell_of(table.unit[m], gap)
+    width = width_of(table.levels.shape[4], table.sizes[m, 1] > 0)
+    fill_series(out, width, table.series[m, cell], table.reach[m, cell], 0, since)
+
+
+@kernel(inlined=True)
+def cell_of(unit: float, gap: float) -> tuple[int, float]:
+    """Return the cell that a gap lies in, and the gap as its series counts it."""
     # Cell 0 is expanded at 0 and the others at their middles.
     cell = int(gap / unit)
-    since = gap if cell == 0 else gap - (cell + 0.5) * unit
-    lower = n * (n + 1) // 2
-    if table.sizes[m, 1] == 0:
-        fill_cell(values, table, m, cell, lower + n * n, since)
-    else:
-        fill_cell(values, table, m, cell, 2 * (lower + n * n), since)
-        # P (I + G_g P)^-1; G_g lies behind Q_g, exp(A g) and F.
-        shrink_root(scratch.size, root, k, values, lower + 2 * n * n, scratch.wide)
-    move_by_series(table, m, root, x, k, scratch)
+    return cell, gap if cell == 0 else gap - (cell + 0.5) * unit
+
+
+@kernel(inlined=True)
+def width_of(n: int, observed: bool) -> int:
+    """Return the number of values for n states."""
+    width = n * (n + 1) // 2 + n * n
+    return 2 * width if observed else width
 
 
 @kernel
 def move_by_series(
-    table: FlowTable, m: int, root: FloatArray, x: FloatArray, k: int, scratch: FlowScratch
+    table: FlowTable,
+    m: int,
+    root: FloatArray,
+    x: FloatArray,
+    k: int,
+    reads: bool,
+    scratch: FlowScratch,
 ) -> None:
-    """``x = exp(A g) x`` and ``P = Q_g + F P F'``, with what is in ``values``."""
-    size, n, values = scratch.size, len(scratch.size), scratch.values
-    begin, moved = n * (n + 1) // 2, local_vector(size, scratch.mean)
+    """``move_root`` with what is in ``values``; the readings of the gap are used already where it
+    does not read.
+    """
+    size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
+    S, mean = local_matrix(size, scratch.S), local_vector(size, scratch.mean)
     for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += values[begin + i * n + j] * x[k, j]
-        moved[i] = total
+        mean[i] = x[k, i]
+        for j in range(i + 1):
+            S[i, j] = root[k, i, j]
+    V, T, moved = (
+        local_matrix(size, scratch.wide),
+        local_matrix(size, scratch.T),
+        local_vector(size, scratch.moved),
+    )
+    if observed and reads:
+        shrink_root(ONE, size, S, scratch.values, V)
+    move_mean(ONE, size, mean, scratch.values, moved)
+    take_root(ONE, size, T, scratch.values)
+    transform(ONE, size, S, scratch.values, place_of_flow(n, observed), V, T)
     for i in range(n):
-        x[k, i] = moved[i]
+        x[k, i] = mean[i]
+        for j in range(i + 1):
+            root[k, i, j] = S[i, j]
+
+
+@kernel(inlined=True)
+def place_of_flow(n: int, observed: bool) -> int:
+    """Return where F begins in ``values``."""
     # Without sensors F = exp(A g), and the series holds it once.
-    if table.sizes[m, 1] > 0:
-        begin += n * n
-    T = local_matrix(size, scratch.T)
-    take_root(size, T, values)
-    transform(size, root, k, values, begin, scratch.wide, T)
+    return n * (n + 1) // 2 + (n * n if observed else 0)
 
 
-@kernel
-def fill_cell(
-    out: FloatArray, table: FlowTable, m: int, cell: int, width: int, since: float
+@kernel(inlined=True, fused=True)
+def move_mean(
+    lanes: Lanes, size: Size, x: FloatArray, values: FloatArray, moved: FloatArray
 ) -> None:
-    """Write the first ``width`` values of the series of a cell, ``since`` seconds from its middle,
-    see linalg/series.
-    """
-    fill_series(out, width, table.series[m, cell], table.reach[m, cell], 0, since)
+    """``x = exp(A g) x`` (n, L); ``moved`` is scratch of the same shape."""
+    n, begin = len(size), len(size) * (len(size) + 1) // 2
+    for i in range(n):
+        total = spread(lanes, 0.0)
+        for j in range(n):
+            total += load(lanes, values, begin + i * n + j) * load(lanes, x, j)
+        store(lanes, moved, i, total)
+    for i in range(n):
+        store(lanes, x, i, load(lanes, moved, i))
 
 
-@kernel(fused=True)
-def shrink_root(
-    size: Size, root: FloatArray, k: int, G: FloatArray, begin: int, scratch: FloatArray
-) -> None:
-    """Make place ``k`` the root of ``P (I + G P)^-1``; G is packed by rows of its lower triangle,
-    from ``begin`` on; ``scratch`` is (n, n).
+@kernel(inlined=True, fused=True)
+def shrink_root(lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray) -> None:
+    """Make S (n, n, L) the root of ``P (I + G P)^-1``, where G is packed by rows of its lower
+    triangle behind Q_g, exp(A g) and F in ``values``; V (n, n, L) is scratch.
     """
-    n, V = len(size), local_matrix(size, scratch)
+    n = len(size)
+    begin = n * (n + 1) // 2 + 2 * n * n
     # V = I + S' G S by columns: G S first, whose column j is not needed by the ones before.
     for j in range(n):
         for i in range(n):
-            total = 0.0
+            total = spread(lanes, 0.0)
             for r in range(j, n):
                 # G is symmetric and packed: (i, r) and (r, i) are one entry.
                 g = i * (i + 1) // 2 + r if r <= i else r * (r + 1) // 2 + i
-                total += G[begin + g] * root[k, r, j]
-            V[i, j] = total
+                total += load(lanes, values, begin + g) * load(lanes, S, r, j)
+            store(lanes, V, i, j, total)
         for i in range(j + 1):
-            total = 1.0 if i == j else 0.0
+            total = spread(lanes, 1.0 if i == j else 0.0)
             for r in range(i, n):
-                total += root[k, r, i] * V[r, j]
-            V[i, j] = total
+                total += load(lanes, S, r, i) * load(lanes, V, r, j)
+            store(lanes, V, i, j, total)
     # V V' from the last column on, V upper triangular.
     for j in range(n - 1, -1, -1):
         # The reciprocal is stored on the diagonal: the substitution below multiplies by it.
-        pivot = 1.0 / math.sqrt(V[j, j])
-        V[j, j] = pivot
+        pivot = 1.0 / root_of(load(lanes, V, j, j))
+        store(lanes, V, j, j, pivot)
         for i in range(j):
-            V[i, j] *= pivot
+            store(lanes, V, i, j, load(lanes, V, i, j) * pivot)
         for i in range(j):
             for r in range(i + 1):
-                V[r, i] -= V[r, j] * V[i, j]
+                product = load(lanes, V, r, j) * load(lanes, V, i, j)
+                store(lanes, V, r, i, load(lanes, V, r, i) - product)
     # S V^-T by rows.
     for i in range(n):
         for j in range(i, -1, -1):
-            total = root[k, i, j]
+            total = load(lanes, S, i, j)
             for r in range(j + 1, i + 1):
-                total -= root[k, i, r] * V[j, r]
-            root[k, i, j] = total * V[j, j]
+                total -= load(lanes, S, i, r) * load(lanes, V, j, r)
+            store(lanes, S, i, j, total * load(lanes, V, j, j))
 
 
 @kernel
@@ -678,52 +748,56 @@ def use_readings(
 
 
 @kernel(inlined=True, fused=True)
-def take_root(size: Size, T: FloatArray, packed: FloatArray) -> None:
-    """Cholesky's root of a lower triangle packed by rows; pivots that are rounding count as 0."""
+def take_root(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> None:
+    """Cholesky's root T (n, n, L) of a lower triangle packed by rows; pivots that are rounding
+    count as 0.
+    """
     n = len(size)
     for j in range(n):
         for i in range(j, n):
-            total = packed[i * (i + 1) // 2 + j]
+            total = load(lanes, packed, i * (i + 1) // 2 + j)
             for r in range(j):
-                total -= T[i, r] * T[j, r]
-            T[i, j] = total
-        pivot = T[j, j]
-        # A pivot that is rounding zeroes its column: no noise in this direction.
-        inverse = 0.0
-        if pivot > PIVOT * packed[j * (j + 1) // 2 + j]:
-            inverse = 1.0 / math.sqrt(pivot)
+                total -= load(lanes, T, i, r) * load(lanes, T, j, r)
+            store(lanes, T, i, j, total)
+        pivot = load(lanes, T, j, j)
+        counts = pivot > PIVOT * load(lanes, packed, j * (j + 1) // 2 + j)
+        inverse = select(counts, 1.0 / root_of(select(counts, pivot, 1.0)), 0.0)
         for i in range(j, n):
-            T[i, j] *= inverse
+            store(lanes, T, i, j, load(lanes, T, i, j) * inverse)
 
 
-@kernel(fused=True)
+@kernel(inlined=True, fused=True)
 def transform(
+    lanes: Lanes,
     size: Size,
-    root: FloatArray,
-    k: int,
+    S: FloatArray,
     F: FloatArray,
     begin: int,
-    scratch: FloatArray,
+    wide: FloatArray,
     T: FloatArray,
 ) -> None:
-    """Make place ``k`` the lower triangular root of ``F P F' + T T'``; F lies by rows from
-    ``begin`` on, T (n, n) is lower triangular and used up; ``scratch`` is (n, n).
+    """Make S (n, n, L) the lower triangular root of ``F P F' + T T'``; F lies by rows from
+    ``begin`` on, T (n, n, L) is lower triangular and used up; ``wide`` (n, n, L) is scratch.
     """
-    n, wide, noise = len(size), local_matrix(size, scratch), local_matrix(size, T)
+    n = len(size)
     # F S; S is lower triangular, so the sum begins at r = j.
     for i in range(n):
         for j in range(n):
-            total = 0.0
+            total = spread(lanes, 0.0)
             for r in range(j, n):
-                total += F[begin + i * n + r] * root[k, r, j]
-            wide[i, j] = total
-        for j in range(i + 1):
-            noise[i, j] = T[i, j]
+                total += load(lanes, F, begin + i * n + r) * load(lanes, S, r, j)
+            store(lanes, wide, i, j, total)
     for i in range(n):
-        reflect_row(size, i, n, wide, noise)
-    for i in range(n):
+        square = spread(lanes, 0.0)
+        for j in range(i, n):
+            square += load(lanes, wide, i, j) * load(lanes, wide, i, j)
+        # Columns of T beyond i do not reach row i yet.
         for j in range(i + 1):
-            root[k, i, j] = wide[i, j]
+            square += load(lanes, T, i, j) * load(lanes, T, i, j)
+        # A zero row needs no reflection.
+        reflect_row(lanes, size, i, n, wide, T, square, square != 0.0)
+        for j in range(i + 1):
+            store(lanes, S, i, j, load(lanes, wide, i, j))
 
 
 @kernel(fused=True)
@@ -740,7 +814,7 @@ def information_rate(size: Size, table: FlowTable, m: int, root: FloatArray, k: 
     return rate
 
 
-@kernel(fused=True)
+@kernel
 def gain_root(
     size: Size,
     moments: FloatArray,
@@ -757,29 +831,49 @@ def gain_root(
     ``x += (U + S S' W) innovations``. ``series`` is that of a GainTable, its reach is in a
     ``column`` of ``reach``, and ``values`` is room for a row.
     """
+    fill_series(values, 3 * len(size) * len(moments), series, reach, column, gap)
+    use_moments(ONE, size, root[k], x[k], values, moments)
+
+
+@kernel(inlined=True, fused=True)
+def use_moments(
+    lanes: Lanes,
+    size: Size,
+    S: FloatArray,
+    x: FloatArray,
+    values: FloatArray,
+    moments: FloatArray,
+) -> None:
+    """``gain_root`` with S (n, n, L), x (n, L), moments (q, L) and what ``values`` of the gap the
+    series has: U and W (n, q), C (q, n); C is used up.
+    """
     n, q = len(size), len(moments)
-    fill_series(values, 3 * n * q, series, reach, column, gap)
     # Innovations: the moments minus C x.
     for m in range(q):
+        total = load(lanes, moments, m)
         for j in range(n):
-            moments[m] -= values[(2 * q + m) * n + j] * x[k, j]
+            total -= load(lanes, values, (2 * q + m) * n + j) * load(lanes, x, j)
+        store(lanes, moments, m, total)
     # C is not needed any more, and q >= 1: its room holds W innovations, and S' times that.
     first = 2 * q * n
     for i in range(n):
-        total = 0.0
+        mean, total = load(lanes, x, i), spread(lanes, 0.0)
         for m in range(q):
-            x[k, i] += values[i * q + m] * moments[m]
-            total += values[(n + i) * q + m] * moments[m]
-        values[first + i] = total
+            mean += load(lanes, values, i * q + m) * load(lanes, moments, m)
+            total += load(lanes, values, (n + i) * q + m) * load(lanes, moments, m)
+        store(lanes, x, i, mean)
+        store(lanes, values, first + i, total)
     for j in range(n):  # S' w: place j is not read again
-        total = 0.0
+        total = spread(lanes, 0.0)
         for i in range(j, n):
-            total += root[k, i, j] * values[first + i]
-        values[first + j] = total
+            total += load(lanes, S, i, j) * load(lanes, values, first + i)
+        store(lanes, values, first + j, total)
     # x += S (S' W innovations), the part of the gain that depends on P.
     for i in range(n):
+        total = load(lanes, x, i)
         for j in range(i + 1):
-            x[k, i] += root[k, i, j] * values[first + j]
+            total += load(lanes, S, i, j) * load(lanes, values, first + j)
+        store(lanes, x, i, total)
 
 
 # For Python.

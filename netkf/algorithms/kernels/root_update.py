@@ -31,6 +31,7 @@ import numpy as np
 from netkf.algorithms.kernels.square_root import lower_triangular, reflect_row
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE, Lanes, load, spread
 from netkf.linalg.local import local_matrix
 from netkf.linalg.structs import Size, Struct, sized
 
@@ -249,24 +250,25 @@ def add_root(
         x[k, i] += weight * other_x[m, i]
         for j in range(i + 1):
             S[i, j], wide[i, j] = root[k, i, j], factor * other[m, i, j]
-    absorb_columns(size, S, wide)
+    absorb_columns(ONE, size, S, wide)
     for i in range(n):
         for j in range(i + 1):
             root[k, i, j] = S[i, j]
 
 
 @kernel(inlined=True, fused=True)
-def absorb_columns(size: Size, S: FloatArray, wide: FloatArray) -> None:
-    """Make S (n, n) the root of ``S S' + wide wide'``; both are lower triangular, and ``wide`` is
-    used up.
+def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) -> None:
+    """Make S (n, n, L) the root of ``S S' + wide wide'``; both are lower triangular, and ``wide``
+    is used up.
     """
     for i in range(len(size)):
-        below = 0.0
+        pivot, below = load(lanes, S, i, i), spread(lanes, 0.0)
         for j in range(i + 1):
-            below += wide[i, j] * wide[i, j]
-        if below > NEGLIGIBLE * S[i, i] * S[i, i] + TINY:
-            # Column i of S with the columns of ``wide`` that reach row i.
-            reflect_row(size, i, i + 1, S, wide)
+            below += load(lanes, wide, i, j) * load(lanes, wide, i, j)
+        square = pivot * pivot
+        # Column i of S with the columns of ``wide`` that reach row i.
+        active = below > NEGLIGIBLE * square + TINY
+        reflect_row(lanes, size, i, i + 1, S, wide, square + below, active)
 
 
 def combine_roots(

@@ -9,11 +9,13 @@ Linear Estimation, section 12.3).
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, store
 from netkf.linalg.structs import Size
 
 
@@ -50,40 +52,44 @@ def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
 
 
 @kernel(inlined=True, fused=True)
-def reflect_row(size: Size, i: int, end: int, wide: FloatArray, T: FloatArray) -> None:
+def reflect_row(
+    lanes: Lanes,
+    size: Size,
+    i: int,
+    end: int,
+    wide: FloatArray,
+    T: FloatArray,
+    square: Any,
+    active: Any,
+) -> None:
     """Apply the reflection from the right that leaves row ``i`` of [wide, T] its diagonal alone, to
-    the rows from ``i`` on; row ``i`` of ``wide`` has entries from column ``i`` up to ``end``, T is
-    lower triangular, and both are (n, n). Entry (i, i) becomes nonnegative.
+    the rows from ``i`` on, in the lanes that are ``active``; row ``i`` has the length squared
+    ``square``, and in ``wide`` entries from column ``i`` up to ``end``; T is lower triangular, and
+    both are (n, n, L). Entry (i, i) becomes nonnegative.
     """
-    n, square = len(size), 0.0
-    for j in range(i, end):
-        square += wide[i, j] * wide[i, j]
-    # Columns of T beyond i do not reach row i yet.
-    for j in range(i + 1):
-        square += T[i, j] * T[i, j]
-    # A zero row needs no reflection.
-    if not square > 0.0:
-        wide[i, i] = 0.0
-        return
-    pivot, length = wide[i, i], math.sqrt(square)
+    n, pivot = len(size), load(lanes, wide, i, i)
+    length = root_of(select(active, square, 1.0))
     # The sign that does not cancel in pivot + signed; the column is flipped so that its diagonal is
     # nonnegative.
-    signed = length if pivot >= 0.0 else -length
-    inverse, scale = 1.0 / length, 1.0 / (square + pivot * signed)
-    wide[i, i] = length
+    signed = select(pivot >= 0.0, length, -length)
+    head = magnitude(pivot + signed)
+    scale = select(active, 1.0 / (length * head), 0.0)
+    inverse = scale * head
+    store(lanes, wide, i, i, select(active, length, pivot))
     for r in range(i + 1, n):
-        inner = pivot * wide[r, i]
+        first = load(lanes, wide, r, i)
+        inner = pivot * first
         for j in range(i + 1, end):
-            inner += wide[i, j] * wide[r, j]
+            inner += load(lanes, wide, i, j) * load(lanes, wide, r, j)
         for j in range(i + 1):
-            inner += T[i, j] * T[r, j]
-        share = (inner + signed * wide[r, i]) * scale
+            inner += load(lanes, T, i, j) * load(lanes, T, r, j)
+        share = (inner + signed * first) * scale
         # The part of row r along row i: the reflection turns row i into its length.
-        wide[r, i] = inner * inverse
+        store(lanes, wide, r, i, select(active, inner * inverse, first))
         for j in range(i + 1, end):
-            wide[r, j] -= share * wide[i, j]
+            store(lanes, wide, r, j, load(lanes, wide, r, j) - share * load(lanes, wide, i, j))
         for j in range(i + 1):
-            T[r, j] -= share * T[i, j]
+            store(lanes, T, r, j, load(lanes, T, r, j) - share * load(lanes, T, i, j))
 
 
 @kernel

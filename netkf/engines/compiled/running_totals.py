@@ -15,6 +15,7 @@ from netkf.engines.compiled.late_readings import use_instant
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Struct
 
 TERMS = 18  # of the exponential, for a norm of at most 1/2
@@ -278,7 +279,7 @@ def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArr
         for j in range(i + 1):
             root[h, i, j] = 1.0 if i == j else 0.0
             noise[i, j] = 0.0
-    transform(state.size, root, h, F, 0, wide, noise)
+    transform(ONE, state.size, root[h], F, 0, wide, noise)
 
 
 @kernel
