@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import netkf
+from netkf.engines.compiled.agenda import simulate_agenda
 from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.linalg import compiling
 from netkf.scenario.reading import from_table
@@ -19,7 +20,7 @@ SLOT_FILTERS = (
     netkf.parts.PushSum,
     netkf.parts.Local,
 )
-ONCE = {simulate_runs, *(kind.slot_kernel for kind in SLOT_FILTERS)}
+ONCE = {simulate_agenda, simulate_runs, *(kind.slot_kernel for kind in SLOT_FILTERS)}
 
 
 def scenario_files():

@@ -19,6 +19,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, MANY, load, store
 from netkf.linalg.local import local_vector
 from netkf.linalg.portable import apply, product
 from netkf.linalg.structs import Size
@@ -404,18 +405,18 @@ def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     if start == step.start and end == step.end:
         return step.moments
     since, gap, length = start - step.start, end - start, step.end - step.start
-    out, course = np.empty((2, n)), np.empty(course_shape(laws.to_end, n))
+    out, course = np.empty((2, n)), np.zeros(course_shape(laws.to_end, n))
     size = np.zeros(n)
-    path, scratch = (step.x_start[None], step.cubic[None]), np.empty(4 * n)
+    path, scratch = (step.x_start[None], step.cubic[None]), np.empty(2 * course.shape[1])
     fill_course(size, course, laws.to_end, length, *path, 0, scratch)
     fill_seen(size, out, course, since, gap, length, scratch)
     return out
 
 
-def course_shape(to_end: FloatArray, n: int) -> tuple[int, int, int]:
+def course_shape(to_end: FloatArray, n: int) -> tuple[int, int]:
     """The shape of what ``fill_course`` writes for responses ``to_end`` and n states."""
-    # The cubic has four terms, however few the response needs.
-    return max(len(to_end), 4), 2, n
+    # The cubic has four terms, however few the response needs; rows are whole lanes.
+    return max(len(to_end), 4), -(-2 * n // LANES) * LANES
 
 
 @kernel(fused=True)
@@ -429,9 +430,10 @@ def fill_course(
     k: int,
     scratch: FloatArray,
 ) -> None:
-    """Write piece ``k`` of ``length`` seconds as a polynomial in the share u of the piece: (D, 2,
-    n) coefficients such that ``u sum_d u^d out[d, 0]`` is the integral of x up to there, and ``u^2
-    sum_d u^d out[d, 1]`` that of x times the share; ``scratch`` has n entries.
+    """Write piece ``k`` of ``length`` seconds as a polynomial in the share u of the piece:
+    coefficients (D, W >= 2 n) such that ``u sum_d u^d out[d, :n]`` is the integral of x up to
+    there, and ``u^2 sum_d u^d out[d, n : 2 n]`` that of x times the share; ``scratch`` has n
+    entries.
     """
     n, power = len(size), length
     x = local_vector(size, scratch[:n])
@@ -446,7 +448,7 @@ def fill_course(
             if d < len(to_end):
                 for j in range(n):
                     total += to_end[d, i * n + j] * x[j]
-            out[d, 0, i], out[d, 1, i] = plain * total, tilted * total
+            out[d, i], out[d, n + i] = plain * total, tilted * total
         power *= length
     for i in range(n):
         # P_0 to P_3 of 2 u - 1, by powers of u.
@@ -459,8 +461,8 @@ def fill_course(
             20.0 * third,
         )
         for d in range(4):
-            out[d, 0, i] += by_power[d] / (d + 1)
-            out[d, 1, i] += by_power[d] / (d + 2)
+            out[d, i] += by_power[d] / (d + 1)
+            out[d, n + i] += by_power[d] / (d + 2)
 
 
 @kernel(fused=True)
@@ -474,31 +476,26 @@ def fill_seen(
     scratch: FloatArray,
 ) -> None:
     """Write the moments (2, n) of x over ``gap`` seconds from ``since`` on in a piece of ``length``
-    seconds into ``out``; ``course`` is what ``fill_course`` wrote for it, ``scratch`` has 4 n
-    entries.
+    seconds into ``out``; ``course`` is what ``fill_course`` wrote for it, ``scratch`` has two rows
+    of it.
     """
-    n = len(size)
-    early, early_tilted = local_vector(size, scratch[:n]), local_vector(size, scratch[n : 2 * n])
-    late, late_tilted = (
-        local_vector(size, scratch[2 * n : 3 * n]),
-        local_vector(size, scratch[3 * n : 4 * n]),
-    )
-    for i in range(n):
-        early[i] = early_tilted[i] = late[i] = late_tilted[i] = 0.0
+    n, width = len(size), course.shape[1]
     # Both integrals up to the start and up to the end of the gap, by Horner's rule.
     first, share = since / length, gap / length
     last = first + share
-    for d in range(len(course) - 1, -1, -1):
-        for i in range(n):
-            plain, tilted = course[d, 0, i], course[d, 1, i]
-            early[i] = plain + first * early[i]
-            early_tilted[i] = tilted + first * early_tilted[i]
-            late[i] = plain + last * late[i]
-            late_tilted[i] = tilted + last * late_tilted[i]
+    for j in range(0, width, LANES):
+        early = late = load(MANY, course, len(course) - 1, j)
+        for d in range(len(course) - 2, -1, -1):
+            terms = load(MANY, course, d, j)
+            early = terms + first * early
+            late = terms + last * late
+        store(MANY, scratch, j, first * early)
+        store(MANY, scratch, width + j, last * late)
     # P_1 of the gap is (u - middle) times 2 over its share of the piece.
-    middle = first + 0.5 * share
+    middle, scale = first + 0.5 * share, 2.0 / share
     for i in range(n):
-        plain = last * late[i] - first * early[i]
-        tilted = last * last * late_tilted[i] - first * first * early_tilted[i]
+        plain = scratch[width + i] - scratch[i]
         out[0, i] = plain
-        out[1, i] = 2.0 / share * (tilted - middle * plain)
+        out[1, i] = scale * (
+            last * scratch[width + n + i] - first * scratch[n + i] - middle * plain
+        )

@@ -34,6 +34,8 @@ from netkf.plants.linear import Readings, SlotReadings
 from netkf.plants.paths import BLOCK, DiffusionPath
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
 
+ROOT_3 = math.sqrt(3.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Sensor(Component):
@@ -236,9 +238,9 @@ def divide(
     w = 1.0 - u
     # At least 1 / 4 for every u in [0, 1], so that the divisions below are safe.
     spread = 1.0 - 3.0 * u * w
-    size_first = math.sqrt(u * w * spread * length)
-    size_slope = math.sqrt(u * w / spread * length)
-    size_other = math.sqrt(u * w / (3.0 * spread) * length)
+    root, size = math.sqrt(spread), math.sqrt(u * w * length)
+    size_first, size_slope = size * root, size / root
+    size_other = size_slope / ROOT_3
     for k in range(rest.shape[1]):
         # Given the sums the first moment has the mean u whole - 3 u w tilted; the rest gets the
         # same noise with the other sign.

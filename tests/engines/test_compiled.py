@@ -331,13 +331,14 @@ def test_recorded_ticks_and_losses_agree(ring, tmp_path):
     assert run.count("tick") == 4
 
 
-def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
+@pytest.mark.parametrize("delay", [{"kind": "exponential", "mean": 2.0}, {"kind": "none"}])
+def test_windows_rows_visits_and_mail_end_anywhere(ring, monkeypatch, delay):
     """Whatever is handed over in blocks, the run does not change."""
     busy = ring.replace(
         {
             "horizon": 4.0,
             "network.activation.rate": 40.0,
-            "network.channel.delay": {"kind": "exponential", "mean": 2.0},
+            "network.channel.delay": delay,
             "network.channel.symmetric": False,
         }
     )
@@ -350,8 +351,7 @@ def test_windows_rows_cuts_and_mail_end_anywhere(ring, monkeypatch):
     for room in ("plants.paths", "engines.compiled.draws", "engines.compiled.flow"):
         monkeypatch.setattr(f"netkf.{room}.BLOCK", 3)
     monkeypatch.setattr(f"{module}.draws.MOST_BLOCKS", 1)
-    monkeypatch.setattr(f"{module}.draws.LEAST_CUTS", 1)
-    monkeypatch.setattr(f"{module}.draws.MOST_CUTS", 1)
+    monkeypatch.setattr(f"{module}.visits.MOST_VISITS", 1)
     monkeypatch.setattr(f"{module}.poisson.TICKS", 5)
     monkeypatch.setattr(f"{module}.poisson.TICKS_A_LINK", 0)
     monkeypatch.setattr(f"{module}.schedule.LEAST_TICKS", 5)

@@ -10,18 +10,20 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
 from netkf.engines.base import batch_sink, silent
+from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
 from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
-from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace
+from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_shown
 from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.poisson import all_ticks, window_of
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.state import Filters, Instants, PathBlock
+from netkf.engines.compiled.state import Filters, PathBlock, Sensing
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
@@ -86,23 +88,45 @@ def _run_by_run(
 
 
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
-    """Simulate all runs by ``simulate_batch``."""
-    # All runs start from the same filters: the arrays hold the start once.
-    arrays = draws.arrays(workspace.filters)
-    simulate_batch(workspace.begin(draws.first_run(), traced=False), arrays)
+    """Simulate all runs in one call, or nearly so."""
+    start, runs = workspace.filters, len(draws.replicas)
+    shown = empty_shown((runs, len(scenario.times), *start.xhat.shape))
+    arrays = _batch_arrays(scenario, start, draws)
+    if is_immediate(scenario):
+        group = together(len(start.nodes), runs)
+        state = workspace.begin(draws, False, shown, group)
+        simulate_together(state, workspace.visits(group), arrays, group)
+    else:
+        simulate_batch(workspace.begin(draws, False, shown), arrays)
     x = draws.sampled_states(scenario.times)
     return RunBatch(
         replicas=draws.replicas,
         times=scenario.times,
         x=x,
-        xhat=arrays.shown_xhat,
-        P=arrays.shown_P,
+        xhat=shown.xhat,
+        P=shown.P,
         # No origin moves in these runs: local and absolute states are the same.
-        error=x[:, :, None] - arrays.shown_xhat,
+        error=x[:, :, None] - shown.xhat,
         lengths=arrays.lengths,
         counts=arrays.counts,
         status=np.where(arrays.diverged > 0, DIVERGED, COMPLETE),
         exact_errors=scenario.exact_errors,
+    )
+
+
+def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
+    """Where the runs begin, and space for how they end; ``start``: filters at time 0."""
+    runs = len(draws.replicas)
+    return BatchArrays(
+        nodes=start.nodes,
+        xhat=start.xhat,
+        root=start.root,
+        first=draws.ticks.first,
+        first_delay=draws.ticks.first_delay,
+        lengths=np.zeros(runs, dtype=np.int64),
+        counts=np.zeros((runs, len(KINDS)), dtype=np.int64),
+        diverged=np.zeros(runs, dtype=np.int64),
+        carriers=len(scenario.nodes) // len(start.nodes),
     )
 
 
@@ -149,59 +173,34 @@ class BatchDraws:
         self._scenario, self.replicas, blocks = scenario, replicas, blocks_to_the_end(scenario)
         self.ticks = all_ticks(scenario, streams)
         self.paths = Paths(scenario, streams, blocks)
-        self._block = self.paths.of_all_runs()
-        # Largest number of ticks of any run.
-        most = int(np.diff(self.ticks.first).max())
-        # A guess: samples cut steps, and each tick perhaps three, spread over the nodes. The loop
-        # asks for more if that is too few.
-        cuts = 16 + len(scenario.times) + 3 * most // len(scenario.nodes)
-        self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
+        self._block = self.paths.following()
+        noise = Noise(scenario, streams, blocks * BLOCK)
         # One stretch of noise reaches the horizon: it is drawn once.
-        self._noise.following()
+        noise.following()
+        self.sensing = noise.sensing
         # An empty table: increment sensors have no samples.
-        self._no_samples = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
+        self.instants = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
+        # Of runs that are simulated one by one, where origins move.
+        self.states: States = PathStates(scenario, np.empty(0))
+
+    def window(self) -> Window:
+        """The ticks of all runs, one after the other."""
+        return Window(math.inf, *self.ticks[:4])
+
+    def path(self, together: int = 1) -> PathBlock:
+        """All steps of all runs, of which so many are simulated together."""
+        return self.paths.block(self._block, together)
 
     def runs(self) -> Iterator[RunDraws]:
         """Yield the draws of each run."""
-        return (self._run(window_of(self.ticks, run), run) for run in range(len(self.replicas)))
+        return (RunDraws(self, self._scenario, run) for run in range(len(self.replicas)))
 
-    def first_run(self) -> RunDraws:
-        """The draws of the first run, in arrays with space for the ticks of any other."""
-        ticks, sent = (
-            int(np.diff(first).max()) for first in (self.ticks.first, self.ticks.first_delay)
-        )
-        # Contents do not matter: begin_run() overwrites the ticks before each run.
-        entity, at = (np.zeros(ticks, dtype=np.int64) for _ in range(2))
-        return self._run(Window(math.inf, np.empty(ticks), entity, at, np.empty(sent)), 0)
-
-    def _run(self, window: Window, run: int) -> RunDraws:
-        states = PathStates(self._scenario, self.paths.frame_times)
-        path = self.paths.of_run(self._block, run)
-        return RunDraws(window, path, self._noise, run, self._no_samples, states)
-
-    def arrays(self, start: Filters) -> BatchArrays:
-        """The draws of all runs with space for their samples; ``start``: filters at time 0."""
-        (filters, n), runs = start.xhat.shape, len(self.replicas)
-        samples, block = (runs, len(self._scenario.times), filters), self._block
-        noise, cuts = self._noise.of_all_runs
-        return BatchArrays(
-            nodes=start.nodes,
-            xhat=start.xhat,
-            root=start.root,
-            x_start=np.ascontiguousarray(block.x_start),
-            x_stop=np.ascontiguousarray(block.x_end),
-            moments=np.ascontiguousarray(block.moments),
-            cubic=np.ascontiguousarray(block.cubic),
-            noise=noise,
-            cuts=cuts,
-            **self.ticks._asdict(),
-            shown_xhat=np.zeros((*samples, n)),
-            shown_P=np.zeros((*samples, n, n)),
-            lengths=np.zeros(runs, dtype=np.int64),
-            counts=np.zeros((runs, len(KINDS)), dtype=np.int64),
-            diverged=np.zeros(runs, dtype=np.int64),
-            carriers=len(self._scenario.nodes) // filters,
-        )
+    def path_of(self, run: int) -> PathBlock:
+        """The steps of one run."""
+        block, one = self._block, slice(run, run + 1)
+        names = ("x_start", "x_end", "moments", "cubic")
+        mine: dict[str, Any] = {name: getattr(block, name)[one] for name in names}
+        return self.paths.block(block._replace(**mine))
 
     def sampled_states(self, times: FloatArray) -> FloatArray:
         """(R, T, n) states at the sample times, where no origin moves."""
@@ -213,28 +212,23 @@ class BatchDraws:
 
 
 class RunDraws:
-    """The draws of one run of a batch: all at once, but for cuts."""
+    """The draws of one run of a batch."""
 
-    def __init__(
-        self,
-        window: Window,
-        path: PathBlock,
-        noise: Noise,
-        run: int,
-        instants: Instants,
-        states: States,
-    ) -> None:
-        self._window, self._path, self._noise, self._run = window, path, noise, run
-        self.sensing, self.instants, self.states = noise.sensing(run), instants, states
+    def __init__(self, batch: BatchDraws, scenario: Scenario, run: int) -> None:
+        self._batch, self._run, self.instants = batch, run, batch.instants
+        self.states: States = PathStates(scenario, batch.paths.frame_times)
+        shared, count = batch.sensing, len(batch.sensing.rows)
+        one, streams = slice(run, run + 1), slice(run * count, (run + 1) * count)
+        mine = {name: getattr(shared, name)[one] for name in ("noise", "rest", "step")}
+        fixed = ("rows", "H", "root", "height", "width", "inside", "host", "node")
+        self.sensing = Sensing(
+            **{name: getattr(shared, name) for name in fixed}, **mine, cuts=shared.cuts[streams]
+        )
 
     def window(self) -> Window:
         """All ticks."""
-        return self._window
+        return window_of(self._batch.ticks, self._run)
 
-    def path(self) -> PathBlock:
+    def path(self, together: int = 1) -> PathBlock:
         """All steps."""
-        return self._path
-
-    def more_cuts(self) -> None:
-        """Draw new normals for cuts, as many as before."""
-        self._noise.more_cuts(self._run)
+        return self._batch.path_of(self._run)

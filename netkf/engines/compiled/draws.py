@@ -5,7 +5,6 @@ or for several together.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +12,11 @@ from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import aligned
 from netkf.linalg.portable import cholesky
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import grid_time
-from netkf.plants.paths import BLOCK, Block
+from netkf.plants.paths import BLOCK, Block, course_shape
 from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
@@ -24,7 +24,6 @@ from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
-LEAST_CUTS, MOST_CUTS = 64, 256  # normals that a sensor has ready
 MOST_BLOCKS = 16  # of steps that are drawn at once
 MOST_NORMALS = 1 << 20  # of all sensors
 
@@ -47,13 +46,12 @@ def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
     return [(node, place) for node, places in found for place in places]
 
 
-def sizes(scenario: Scenario) -> tuple[int, int]:
-    """Number of blocks of steps, and of cuts of each sensor, that a run draws at once."""
+def blocks_at_once(scenario: Scenario) -> int:
+    """Number of blocks of steps that a run draws at once."""
     rows = [len(scenario.sensors[place.entry].R) for _, place in increments(scenario)]
     # Two moments for each row of each sensor and step share the budget of normals.
     share = MOST_NORMALS // max(2 * sum(rows), 1)
-    blocks = min(MOST_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
-    return blocks, max(LEAST_CUTS, min(MOST_CUTS, share))
+    return min(MOST_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
 
 
 class Paths:
@@ -92,59 +90,51 @@ class Paths:
             times = np.array([grid_time(laws.period, steps * k) for k in range(1, count)])
             self.frame_times = times[times < scenario.horizon]
 
-    def following(self) -> list[PathBlock]:
-        """The next steps of each run; the last ones reach beyond the horizon."""
-        block = self.of_all_runs()
-        return [self.of_run(block, run) for run in range(len(block.x_start))]
-
-    def of_all_runs(self) -> Block:
-        """The next steps of all runs together."""
+    def following(self) -> Block:
+        """The next steps of all runs together; the last ones reach beyond the horizon."""
         return self._paths.following(self._blocks)
 
-    def of_run(self, block: Block, run: int) -> PathBlock:
-        """The part of one run."""
+    def block(self, block: Block, together: int = 1) -> PathBlock:
+        """The same for the event loop, which simulates so many runs ``together``."""
         ends, laws = block.ends, self._paths.laws
+        pieces, n = len(block.start), laws.n
+        # A Struct takes C-contiguous arrays only.
+        parts = (block.x_start, block.x_end, block.moments, block.cubic)
+        x_start, x_stop, moments, cubic = (np.ascontiguousarray(part) for part in parts)
         return PathBlock(
             end=float(ends[-1]),
             start=block.start,
             stop=block.end,
-            # C-contiguous copies: a Struct takes no other layout.
-            x_start=np.array(block.x_start[run], order="C"),
-            x_stop=np.array(block.x_end[run], order="C"),
-            moments=np.array(block.moments[run], order="C"),
-            cubic=np.array(block.cubic[run], order="C"),
+            x_start=x_start,
+            x_stop=x_stop,
+            moments=moments,
+            cubic=cubic,
             step=block.step,
             last=ends[block.step],
             grid=ends[ends < self._horizon] if self._senses else np.empty(0),
             to_end=laws.to_end,
+            course=aligned((together, pieces, *course_shape(laws.to_end, n))),
+            known=np.zeros((together, pieces), dtype=np.uint8),
         )
 
 
 def no_path(n: int) -> PathBlock:
     """Return one piece without an end, for runs in which nothing senses increments."""
-    rows = {name: np.zeros((1, n)) for name in ("x_start", "x_stop")}
+    rows = {name: np.zeros((1, 1, n)) for name in ("x_start", "x_stop")}
     return PathBlock(
         end=math.inf,
         start=np.zeros(1),
         stop=np.array([math.inf]),
-        moments=np.zeros((1, 2, n)),
-        cubic=np.zeros((1, 4, n)),
+        moments=np.zeros((1, 1, 2, n)),
+        cubic=np.zeros((1, 1, 4, n)),
         step=np.zeros(1, dtype=np.int64),
         last=np.array([math.inf]),
         grid=np.empty(0),
         **rows,
         to_end=np.zeros((1, 1)),
+        course=np.zeros((1, 1, *course_shape(np.zeros((1, 1)), n))),
+        known=np.zeros((1, 1), dtype=np.uint8),
     )
-
-
-class Own(NamedTuple):
-    """The fields of a Sensing that differ from run to run."""
-
-    rest: FloatArray
-    step: np.ndarray
-    noise: FloatArray
-    normals: FloatArray
-    used: np.ndarray
 
 
 @once_per_scenario
@@ -174,85 +164,53 @@ def _sensors(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int,
 
 
 class Noise:
-    """The noise of all sensors in some runs, drawn for stretches of so many ``steps``, and so many
-    normals for cuts at once.
-    """
+    """The noise of all sensors in some runs, drawn for stretches of so many ``steps``."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        streams: Streams | ReplicaStreams,
-        steps: int,
-        cuts: int,
-    ) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams, steps: int) -> None:
         shared, keys = _sensors(scenario)
         self._noise = StreamNormals(streams.seed_words("noise", keys))
-        self._cuts = StreamNormals(streams.seed_words("cut", keys))
+        cuts = StreamNormals(streams.seed_words("cut", keys))
         # Without increment sensors the period is not used; it only must not be None.
-        self._period, self._steps = (scenario.truth.sensing_period or 1.0) if keys else 1.0, steps
-        self._shared, self._rows, runs = shared, shared["rows"], len(streams.per_replica)
+        self._period = float(scenario.truth.sensing_period or 1.0) if keys else 1.0
+        runs, ziggurat = len(streams.per_replica), normal_ziggurat()
         count, most = shared["H"].shape[:2]
-        self._own = Own(
+        self.sensing = Sensing(
+            **shared,
+            noise=np.zeros((runs, count, steps, 2, most)),
             rest=np.zeros((runs, count, 2, most)),
             step=np.full((runs, count), -1, dtype=np.int64),
-            noise=np.zeros((runs, count, steps, 2, most)),
-            normals=np.zeros((runs, count, cuts, 2, most)),
-            # All cuts count as used: the first prediction that ends inside a step asks for normals.
-            used=np.full((runs, count), cuts, dtype=np.int64),
+            cuts=cuts.states,
+            **ziggurat._asdict(),
         )
-
-    def sensing(self, run: int) -> Sensing:
-        """The sensors of one run with their noise."""
-        # Views of one run: the loop writes its use of normals into these arrays.
-        own: dict[str, Any] = {name: array[run] for name, array in self._own._asdict().items()}
-        return Sensing(**self._shared, **own)
 
     def following(self) -> None:
         """Draw the noise of the next stretch."""
-        own, shape = self._own, self._own.noise.shape
+        sensing, shape = self.sensing, self.sensing.noise.shape
         # Streams of all runs and sensors, run by run.
-        every = np.arange(shape[0] * shape[1])
-        normals = own.noise.reshape(len(every), *shape[2:])
-        fill_sensor_normals(self._noise.states, every, self._rows, normal_ziggurat(), normals)
+        normals = sensing.noise.reshape(shape[0] * shape[1], *shape[2:])
         # Standard normals become moments of white noise over one step: variances h and h / 3.
-        own.noise[:] = step_noise(own.noise, self._period)
+        scales = step_noise(np.ones((2, 1)), self._period)[:, 0]
+        fill_noise(self._noise.states, sensing.rows, normal_ziggurat(), scales, normals)
         # No sensor has begun a step of this stretch.
-        own.step[:] = -1
-
-    @property
-    def of_all_runs(self) -> tuple[FloatArray, np.ndarray]:
-        """Noise (R, S, steps, 2, p) of the present stretch, and the states (R S, 4) of the streams
-        of normals for cuts.
-        """
-        return self._own.noise, self._cuts.states
-
-    def more_cuts(self, run: int) -> None:
-        """Draw new normals where they are used up."""
-        used, shape = self._own.used[run], self._own.normals.shape
-        # Only streams whose normals are used up: the others keep their place.
-        empty = np.flatnonzero(used == shape[2]) + run * shape[1]
-        normals = self._own.normals.reshape(shape[0] * shape[1], *shape[2:])
-        fill_sensor_normals(self._cuts.states, empty, self._rows, normal_ziggurat(), normals)
-        used[used == shape[2]] = 0
+        sensing.step[:] = -1
 
 
 @kernel
-def fill_sensor_normals(
+def fill_noise(
     states: np.ndarray,
-    which: np.ndarray,
     rows: np.ndarray,
     ziggurat: NormalZiggurat,
+    scales: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write standard normals into ``out[k]`` (C, 2, >= p) for each k of ``which``: the next numbers
-    of stream k, which belongs to sensor k modulo S with ``rows`` (S,) p.
+    """Write normals with the standard deviations ``scales`` (2,) into ``out`` (K, C, 2, >= p): the
+    next numbers of stream k, which belongs to sensor k modulo S with ``rows`` (S,) p.
     """
-    for m in range(len(which)):
-        k = which[m]
+    for k in range(len(out)):
         # Streams are numbered run by run, so the sensor is the remainder.
         p = rows[k % len(rows)]
         # Rows beyond p draw nothing: a stream gives what it gives without padding.
         for c in range(out.shape[1]):
             for half in range(2):
                 for i in range(p):
-                    out[k, c, half, i] = next_normal(states, k, ziggurat)
+                    out[k, c, half, i] = scales[half] * next_normal(states, k, ziggurat)

@@ -11,6 +11,7 @@ import numpy as np
 from netkf.algorithms.registry import built_in_filters
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
+from netkf.engines.compiled.agenda import is_immediate, simulate_agenda
 from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.engines.compiled.batches import flow_batches
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
@@ -70,7 +71,7 @@ class CompiledEngine(Engine):
         if scenario.slotted:
             compiling.announce(type(scenario.hosted).slot_kernel)
         else:
-            compiling.announce(simulate_runs)
+            compiling.announce(simulate_agenda if is_immediate(scenario) else simulate_runs)
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

@@ -3,8 +3,7 @@
 ``event_loop`` finds the next event, predicts the nodes that take part in it, and calls its handler;
 the order is (time, rank, entity) as ``engines.base`` says. It stops and says why where Python has
 something to do: draw more, pass rows on, show samples, move the origin. All state is in one struct,
-so that it goes on where it stopped: a prediction that needs more draws is repeated, and changes
-nothing that was done before.
+so that it goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -50,10 +49,10 @@ SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT = (
     CODES[kind]
     for kind in ("sense", "tick", "send", "deliver", "lost", "late", "absorb", "transmit")
 )
-(GO_ON, WANT_TICKS, WANT_STEPS, WANT_CUTS, WANT_MESSAGES, WANT_ROWS, WANT_SHOWN, WANT_REBASE,
- WANT_PAST, DONE) = range(10)  # fmt: skip
-"""Why the loop stopped: it needs the next window of ticks, the next steps of the path, normals for
-cuts, a larger pool of messages, space for rows, for samples; the origin moves; a longer history.
+(GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SHOWN, WANT_REBASE,
+ WANT_PAST, DONE) = range(9)  # fmt: skip
+"""Why the loop stopped: it needs the next window of ticks, the next steps of the path, a larger
+pool of messages, space for rows, for samples; the origin moves; a longer history.
 """
 ON_REBASE, ON_SENSE, ON_SAMPLE, ON_TICK, ON_DELIVER, ON_ABSORB, ON_PROBE = range(7)
 """Events, in the order in which those of one instant happen."""
@@ -73,16 +72,15 @@ def event_loop(state: Simulation, totals: Totals | None, history: History | None
         # The piece of the path that the event lies in; events come in the order of time.
         while state.path.stop[state.piece] < now:
             state.piece += 1
-        # Participants are predicted first, which may be repeated after a stop.
+        # Participants are predicted first.
         lost = event == ON_TICK and totals is None and history is None and is_lost(state)
-        if not predict_participants(state, event, lost, now):
-            return WANT_CUTS
+        predict_participants(state, event, lost, now)
         if event == ON_TICK:
             on_tick(state, totals, now)
             # The next events, unless there are others at this instant.
             alone = totals is None and history is None and ends_instant(state, now)
-            if alone and not absorb_mail(state, totals, history, now):
-                return WANT_CUTS
+            if alone:
+                absorb_mail(state, totals, history, now)
         elif event == ON_ABSORB:
             on_absorb(state, totals, history, now)
         elif event == ON_SENSE:
@@ -133,7 +131,7 @@ def next_event(state: Simulation) -> tuple[int, float]:
     sample = next_of(state.instants.t, state.instant_at)
     if sample < now:
         event, now = ON_SAMPLE, sample
-    tick = next_of(state.ticks.t, state.tick_at)
+    tick = next_tick(state)
     if tick < now:
         event, now = ON_TICK, tick
     # The heap is ordered by arrival, so its top is the next delivery.
@@ -151,25 +149,25 @@ def next_event(state: Simulation) -> tuple[int, float]:
 
 
 @kernel
+def next_tick(state: Simulation) -> float:
+    """Time of the next tick of the run, or never."""
+    return float(state.ticks.t[state.tick_at]) if state.tick_at < state.ticks_stop else NEVER
+
+
+@kernel
 def next_of(times: FloatArray, k: int) -> float:
     """``times[k]``, or never."""
     return float(times[k]) if k < len(times) else NEVER
 
 
 @kernel
-def predict_participants(state: Simulation, event: int, lost: bool, now: float) -> bool:
-    """Predict the nodes that take part in an event; ``lost``: all messages of the tick are. False
-    where one of them needs more normals for cuts first.
-    """
+def predict_participants(state: Simulation, event: int, lost: bool, now: float) -> None:
+    """Predict the nodes that take part in an event; ``lost``: all messages of the tick are."""
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
         # The sender of a message that is lost needs no prediction, unless it reads increments.
-        if lost and state.nodes[h].sensors == state.nodes[h].sensor:
-            continue
-        # A node that is there already is skipped.
-        if not predict(state, h, now):
-            return False
-    return True
+        if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
+            predict(state, h, now)
 
 
 @kernel
@@ -244,20 +242,20 @@ def note_age(
 
 
 @kernel
-def predict(state: Simulation, h: int, time: float) -> bool:
-    """Predict node ``h`` to ``time``; False where it needs more normals for cuts first."""
-    node = state.nodes[h]
+def predict(state: Simulation, h: int, time: float) -> None:
+    """Predict node ``h`` to ``time``, unless it is there already."""
+    node, now = state.nodes[h], state.now[h]
     # ``not <`` also stops at a time that is not a number.
-    if not node.now < time:
-        return True
+    if not now < time:
+        return
+    state.now[h] = time
     # With increment sensors the gap is cut into stretches.
     if node.sensors > node.sensor:
-        return predict_with_increments(state, h, time)
-    gap = time - node.now
-    # One step of the Riccati flow, exact for a gap of any length.
-    move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
-    node.now = time
-    return True
+        predict_with_increments(state, state.run, h, h, state.piece, now, time)
+    else:
+        # One step of the Riccati flow, exact for a gap of any length.
+        gap = time - now
+        move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
 
 
 @kernel
@@ -314,7 +312,7 @@ def on_tick(state: Simulation, totals: Totals | None, now: float) -> None:
         note(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
     # Outcomes of a tick lie one after the other in the order of its directed links.
-    first = ticks.at[k] - entity.first
+    first = state.delays + ticks.at[k] - entity.first
     for m in range(entity.first, entity.after):
         send(state, totals, state.hearing[m], ticks.delay[first + m], now)
 
@@ -362,7 +360,8 @@ def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: fl
 def is_lost(state: Simulation) -> bool:
     """Return True if all messages of the next tick are lost."""
     ticks = state.ticks
-    entity, first = state.entities[ticks.entity[state.tick_at]], ticks.at[state.tick_at]
+    entity = state.entities[ticks.entity[state.tick_at]]
+    first = state.delays + ticks.at[state.tick_at]
     heard = False
     for m in range(entity.after - entity.first):
         heard = heard or ticks.delay[first + m] >= 0.0
@@ -373,22 +372,18 @@ def is_lost(state: Simulation) -> bool:
 def ends_instant(state: Simulation, now: float) -> bool:
     """Return True if mail is absorbed before any other tick or delivery."""
     flying = state.flying > 0 and state.pool[state.heap[0]].arrival <= now
-    return not flying and next_of(state.ticks.t, state.tick_at) > now
+    return not flying and next_tick(state) > now
 
 
 @kernel
 def absorb_mail(
     state: Simulation, totals: Totals | None, history: History | None, now: float
-) -> bool:
-    """Let all receivers absorb their mail; False where one of them needs more normals for cuts
-    first.
-    """
+) -> None:
+    """Let all receivers absorb their mail."""
     sort_places(state.waiting, state.receivers)
     while state.receivers > 0:
-        if not predict(state, state.waiting[state.absorbing], now):
-            return False
+        predict(state, state.waiting[state.absorbing], now)
         on_absorb(state, totals, history, now)
-    return True
 
 
 @kernel
@@ -529,31 +524,45 @@ def intersect(state: Simulation, h: int, own: float, total: float) -> None:
 
 @kernel
 def on_probe(state: Simulation, totals: Totals | None) -> bool:
-    """Keep a sample of all nodes: estimates and covariances ``P = S S'``. False once there is no
-    space for another one.
-    """
-    shown, root, n, k = state.shown, state.root, len(state.size), state.samples
-    for h in range(len(state.nodes)):
-        for i in range(n):
-            shown.xhat[k, h, i] = state.xhat[h, i]
-            for j in range(i + 1):
-                # P = S S', with the lower triangle of S only.
-                total = 0.0
-                for r in range(j + 1):
-                    total += root[h, i, r] * root[h, j, r]
-                shown.P[k, h, i, j] = shown.P[k, h, j, i] = total
+    """Keep a sample of all nodes. False once there is no space for another one."""
+    show_all(state, state.run, 0, state.samples)
     # The weight of the whole network: held by nodes, sent, and less what was heard.
     if totals is not None:
-        count = len(state.nodes)
+        shown, count, k = state.shown, len(state.nodes), state.samples
         for h in range(count):
             shown.terms[k, h] = totals.weight[h]
             shown.terms[k, count + h] = totals.sent[h, 0]
         for w in range(len(state.ways)):
             shown.terms[k, 2 * count + w] = totals.heard[w, 0]
+    return note_sample(state)
+
+
+@kernel
+def show_all(state: Simulation, run: int, first: int, k: int) -> None:
+    """Keep estimates and covariances ``P = S S'`` of the nodes from place ``first`` on as sample
+    ``k`` of a run.
+    """
+    xhat, P, root, n = state.shown.xhat, state.shown.P, state.root, len(state.size)
+    for h in range(len(state.nodes)):
+        place = first + h
+        for i in range(n):
+            xhat[run, k, h, i] = state.xhat[place, i]
+            for j in range(i + 1):
+                # With the lower triangle of S only.
+                total = 0.0
+                for r in range(j + 1):
+                    total += root[place, i, r] * root[place, j, r]
+                P[run, k, h, i, j] = P[run, k, h, j, i] = total
+
+
+@kernel
+def note_sample(state: Simulation) -> bool:
+    """Count a sample that is kept. False once there is no space for another one."""
     # Counts and rows at the sample: a run that diverges here ends with them.
+    shown, run, k = state.shown, state.run, state.samples
     for kind in range(len(state.counts)):
-        shown.counts[k, kind] = state.counts[kind]
-    shown.rows[k], shown.piece[k] = state.row, state.piece
+        shown.counts[run, k, kind] = state.counts[kind]
+    shown.rows[run, k], shown.piece[run, k] = state.row, state.piece
     state.probe_at += 1
     state.samples += 1
-    return state.samples < len(shown.rows)
+    return bool(state.samples < shown.rows.shape[1])

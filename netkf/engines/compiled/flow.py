@@ -14,11 +14,11 @@ import numpy as np
 from netkf.algorithms.models import FlowModel
 from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
+from netkf.engines.compiled.agenda import advance_alone, is_immediate
 from netkf.engines.compiled.batch_loop import run_alone
-from netkf.engines.compiled.draws import Noise, Paths, no_path, sizes
+from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path
 from netkf.engines.compiled.event_loop import (
     DONE,
-    WANT_CUTS,
     WANT_MESSAGES,
     WANT_PAST,
     WANT_REBASE,
@@ -53,7 +53,9 @@ from netkf.engines.compiled.state import (
     scratch_arrays,
 )
 from netkf.engines.compiled.truth import KnownStates, PathStates, States
+from netkf.engines.compiled.visits import Visits, empty_visits
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import Streams
@@ -68,9 +70,11 @@ FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
 MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 AT_START = (
     *(
+        "run",
+        "first_run",
+        "delays",
         "frame_at",
         "piece",
-        "course",
         "grid_at",
         "wake_at",
         "instant_at",
@@ -100,13 +104,10 @@ class Draws(Protocol):
     def window(self) -> Window:
         """The next ticks."""
 
-    def path(self) -> PathBlock:
-        """The next steps of the path; the noise of them is in ``sensing``, and what is sampled
-        meanwhile in ``instants``.
+    def path(self, together: int = 1) -> PathBlock:
+        """The next steps of the path, of so many runs ``together``; the noise of them is in
+        ``sensing``, and what is sampled meanwhile in ``instants``.
         """
-
-    def more_cuts(self) -> None:
-        """New normals for cuts in ``sensing``."""
 
 
 class Source:
@@ -121,10 +122,10 @@ class Source:
         self.instants = samples.instants
         self._windows = _windows(scenario, streams, samples.instants)
         self._grid = uses_grid(scenario)
-        # Without a grid there are no steps and no cuts.
-        blocks, cuts = sizes(scenario) if self._grid else (0, 0)
-        self._noise = Noise(scenario, streams, blocks * BLOCK, cuts)
-        self.sensing = self._noise.sensing(0)
+        # Without a grid there are no steps.
+        blocks = blocks_at_once(scenario) if self._grid else 0
+        self._noise = Noise(scenario, streams, blocks * BLOCK)
+        self.sensing = self._noise.sensing
         self._read, self._n = -math.inf, scenario.plant.n
         if self._grid:
             # Cut the path where a state is sampled: it is drawn there from its own stream.
@@ -139,13 +140,13 @@ class Source:
         """Some ticks of each entity."""
         return self._windows.following()
 
-    def path(self) -> PathBlock:
+    def path(self, together: int = 1) -> PathBlock:
         """A block of steps."""
         if not self._grid:
             return no_path(self._n)
         # Noise and path advance together, a block of steps at a time.
         self._noise.following()
-        path = self._paths.following()[0]
+        path = self._paths.block(self._paths.following(), together)
         # Samples in (read, end]: a time at the border of two blocks is read once.
         first, last = np.searchsorted(self._sampled, [self._read, path.end], side="right")
         if first < last:
@@ -156,10 +157,6 @@ class Source:
             self._samples.read(x, times, self._read, path.end)
         self._read = path.end
         return path
-
-    def more_cuts(self) -> None:
-        """A block for each sensor that has none left."""
-        self._noise.more_cuts(0)
 
 
 def _windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
@@ -186,38 +183,47 @@ class Workspace:
         terms = 2 * size + len(self._senders.ways) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
         room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
-        self._shown = Shown(
-            xhat=np.zeros((room, size, n)),
-            P=np.zeros((room, size, n, n)),
-            rows=np.zeros(room, dtype=np.int64),
-            counts=np.zeros((room, len(schema.KINDS)), dtype=np.int64),
-            piece=np.zeros(room, dtype=np.int64),
-            terms=np.zeros((room, terms)),
-        )
+        self._shown = empty_shown((1, room, size, n), terms)
+        self._visits: Visits | None = None
 
     @property
     def filters(self) -> Filters:
         """The filters at time 0."""
         return self._start
 
-    def begin(self, draws: Draws, traced: bool) -> Simulation:
-        """The state of a run at time 0."""
-        start, instants = self._start, draws.instants
+    def visits(self, together: int = 1) -> Visits:
+        """Space for the visits of so many runs."""
+        places = together * len(self._start.nodes)
+        if self._visits is None or len(self._visits.level) < places:
+            period = float(self._scenario.truth.sensing_period or 0.0)
+            self._visits = empty_visits(self._start, self._records[1]["weight"], places, period)
+        return self._visits
+
+    def begin(
+        self, draws: Draws, traced: bool, shown: Shown | None = None, together: int = 1
+    ) -> Simulation:
+        """The state of a run at time 0, or of runs of which so many are simulated together and
+        which are ``shown`` there.
+        """
+        start, instants, window = self._start, draws.instants, draws.window()
         entities, ways = self._records
         # Records are shared by all runs of the workspace: numbers of messages start again.
         ways["messages"] = 0
         pool = self._pool[0]
         # All messages are free, in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
-        path = draws.path()
-        scratch, flow, update = scratch_arrays(start.table, start.gains, instants, path.to_end)
-        n = start.xhat.shape[1]
+        path = draws.path(together)
+        scratch, flow, update = scratch_arrays(start.table, start.gains, instants)
+        nodes, n = start.xhat.shape
+        xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
+        xhat[:], root[:] = np.tile(start.xhat, (together, 1)), np.tile(start.root, (together, 1, 1))
         # A class for this n, so that loops over few states are unrolled.
         state: Simulation = Simulation.of_size(n)(
             size=sized(n),
             nodes=start.nodes.copy(),
-            xhat=start.xhat.copy(),
-            root=start.root.copy(),
+            xhat=xhat,
+            root=root,
+            now=np.zeros(together * nodes),
             table=start.table,
             gains=start.gains,
             entities=entities,
@@ -231,10 +237,11 @@ class Workspace:
             instants=instants,
             sensing=draws.sensing,
             path=path,
-            ticks=Ticks(**draws.window()._asdict()),
+            ticks=ticks_of(window),
+            ticks_stop=len(window.t),
             frames=draws.states.frame_times,
             probes=self._probes,
-            shown=self._shown,
+            shown=self._shown if shown is None else shown,
             rows=self._rows,
             counts=np.zeros(len(schema.KINDS), dtype=np.int64),
             scratch=scratch,
@@ -265,6 +272,24 @@ class Workspace:
         }
 
 
+def ticks_of(window: Window) -> Ticks:
+    """The ticks of a window."""
+    return Ticks(**window._asdict(), heard=np.zeros(len(window.t), dtype=np.int64))
+
+
+def empty_shown(shape: tuple[int, int, int, int], terms: int = 0) -> Shown:
+    """Space for samples, ``shape`` (R, B, N, n), with so many terms of sums."""
+    runs, count, _, n = shape
+    return Shown(
+        xhat=np.zeros(shape),
+        P=np.zeros((*shape, n)),
+        rows=np.zeros((runs, count), dtype=np.int64),
+        counts=np.zeros((runs, count, len(schema.KINDS)), dtype=np.int64),
+        piece=np.zeros((runs, count), dtype=np.int64),
+        terms=np.zeros((count, terms)),
+    )
+
+
 class FlowRun:
     """One run."""
 
@@ -279,6 +304,7 @@ class FlowRun:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         recorder.exact_errors = scenario.exact_errors
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
+        self._visits = workspace.visits() if is_immediate(scenario) else None
         self._totals = _totals(scenario, self._state)
         self._history = _history(scenario, self._state)
 
@@ -304,6 +330,8 @@ class FlowRun:
         return "complete"
 
     def _advance(self) -> int:
+        if self._visits is not None:
+            return advance_alone(self._state, self._visits)
         if self._totals is None and self._history is None:
             return run_alone(self._state)
         return int(event_loop(self._state, self._totals, self._history))
@@ -311,13 +339,13 @@ class FlowRun:
     def _give(self, wanted: int) -> None:
         state = self._state
         if wanted == WANT_TICKS:
-            state.ticks, state.tick_at = Ticks(**self._draws.window()._asdict()), 0
+            window = self._draws.window()
+            state.ticks, state.tick_at = ticks_of(window), 0
+            state.ticks_stop = len(window.t)
         elif wanted == WANT_STEPS:
             state.path = self._draws.path()
             # Positions count from the first piece and grid point of the new block.
-            state.piece = state.course = state.grid_at = 0
-        elif wanted == WANT_CUTS:
-            self._draws.more_cuts()
+            state.piece = state.grid_at = 0
         elif wanted == WANT_MESSAGES:
             self._more_messages()
         elif wanted == WANT_ROWS:
@@ -370,14 +398,14 @@ class FlowRun:
         if not count:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
-        local, x = self._draws.states.shown(times, state.path, shown.piece[:count])
+        local, x = self._draws.states.shown(times, state.path, shown.piece[0, :count])
         # Index of the sample at which the run stands: the last, or the first that is broken.
         lost = [count - 1]
 
         def pass_rows_on(k: int) -> None:
             lost[0] = k
             # Rows up to that sample, and no row after it.
-            self._pass_rows_on(int(shown.rows[k]), shown.counts[k])
+            self._pass_rows_on(int(shown.rows[0, k]), shown.counts[0, k])
 
         fine = recorded(
             self._scenario,
@@ -387,8 +415,8 @@ class FlowRun:
             x,
             local,
             # Copies: the loop writes the next samples into the same space.
-            shown.xhat[:count].copy(),
-            shown.P[:count].copy(),
+            shown.xhat[0, :count].copy(),
+            shown.P[0, :count].copy(),
             pass_rows_on,
         )
         if self._totals is not None:

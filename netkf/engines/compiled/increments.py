@@ -10,64 +10,73 @@ from netkf.engines.compiled.state import Sensing, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import copy_matrix
-from netkf.linalg.structs import Size
 from netkf.plants.paths import fill_course, fill_seen
 from netkf.plants.sensors import divide, fill_reading
+from netkf.rng.numbers import NormalZiggurat, next_normal
 
 
 @kernel
 def read_increments(
-    size: Size,
-    out: FloatArray,
-    sensing: Sensing,
-    first: int,
-    x: FloatArray,
-    step: int,
-    u: float,
-    length: float,
-    early: FloatArray,
+    state: Simulation, run: int, h: int, step: int, u: float, length: float, out: FloatArray
 ) -> None:
-    """Moments (2 p,) of the readings of sensors from ``first`` on, as many as fill ``out``, where x
-    has the moments ``x``, over the first share ``u`` of the ``length`` seconds left of a step (-1:
-    all of it). ``early`` (2, most p) is a scratch array.
+    """Moments (2 p,) of the readings of node ``h``, where x has the moments
+    ``scratch.state_moments``, over the first share ``u`` of the ``length`` seconds left of a step
+    (-1: all of it).
     """
-    rows, rest, used, H, root = sensing.rows, sensing.rest, sensing.used, sensing.H, sensing.root
-    s, row = first, 0
-    # ``out`` holds the first moments of all rows and then the second: 2 rows of it per row of H.
-    while 2 * row < len(out):
+    sensing, early = state.sensing, state.scratch.early
+    x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0
+    for s in range(state.nodes[h].sensor, state.nodes[h].sensors):
         # The first reading of a step takes over the noise of that step.
-        if sensing.step[s] != step:
-            sensing.step[s] = step
-            copy_matrix(rest[s], sensing.noise[s, step])
-        noise = rest[s]
+        if sensing.step[run, s] != step:
+            sensing.step[run, s] = step
+            copy_matrix(sensing.rest[run, s], sensing.noise[run, s, step])
+        noise = sensing.rest[run, s]
         # A part of the step: divide its noise exactly, and keep the rest for the next call.
         if u >= 0.0:
+            draw_cut(sensing, run, s, state.scratch.cut)
+            divide(early, noise, state.scratch.cut, u, length)
             noise = early
-            divide(early, rest[s], sensing.normals[s, used[s]], u, length)
-            used[s] += 1
-        fill_reading(size, out, row, rows[s], x, H, noise, root, s)
-        row += rows[s]
-        s += 1
+        fill_reading(state.size, out, row, sensing.rows[s], x, H, noise, root, s)
+        row += sensing.rows[s]
 
 
 @kernel
-def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float) -> None:
+def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
+    """The next standard normals (2, p) that cut a step of sensor ``s``."""
+    ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
+    # Streams are numbered run by run, sensor by sensor.
+    stream = run * len(sensing.rows) + s
+    for half in range(2):
+        for i in range(sensing.rows[s]):
+            normals[half, i] = next_normal(sensing.cuts, stream, ziggurat)
+
+
+@kernel
+def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
     """Write the moments of x over [now, end], inside one piece, into ``scratch.state_moments``."""
-    path, scratch = state.path, state.scratch
+    path, scratch, k = state.path, state.scratch, run - state.first_run
     start, stop = path.start[piece], path.stop[piece]
     # A whole piece has its moments already, drawn from their exact law.
     if now == start and end == stop:
-        copy_matrix(scratch.state_moments, path.moments[piece])
+        copy_matrix(scratch.state_moments, path.moments[run, piece])
         return
     # The same for all nodes that read a part of the piece.
-    if state.course != piece + 1:
-        state.course = piece + 1
-        x, cubic, course = path.x_start, path.cubic, scratch.course
-        fill_course(state.size, course, path.to_end, stop - start, x, cubic, piece, scratch.values)
+    if path.known[k, piece] == 0:
+        path.known[k, piece] = 1
+        fill_course(
+            state.size,
+            path.course[k, piece],
+            path.to_end,
+            stop - start,
+            path.x_start[run],
+            path.cubic[run],
+            piece,
+            scratch.values,
+        )
     fill_seen(
         state.size,
         scratch.state_moments,
-        scratch.course,
+        path.course[k, piece],
         now - start,
         end - now,
         stop - start,
@@ -76,16 +85,16 @@ def fill_moments_of_piece(state: Simulation, piece: int, now: float, end: float)
 
 
 @kernel
-def fill_moments(state: Simulation, now: float, end: float) -> None:
+def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
     """Write the moments of x over [now, end], inside one step that samples of other nodes may cut,
-    into ``scratch.state_moments``.
+    into ``scratch.state_moments``; ``end`` is not after ``piece``.
     """
-    path, k = state.path, state.piece
+    path, k = state.path, piece
     # Back to the piece that ``end`` lies in: the node may be behind the present piece.
     while k > 0 and path.stop[k - 1] >= end:
         k -= 1
     if now >= path.start[k]:
-        fill_moments_of_piece(state, k, now, end)
+        fill_moments_of_piece(state, run, k, now, end)
         return
     # The interval covers several pieces: sum their moments, from the last to the first.
     seen, total, gap = state.scratch.state_moments, state.scratch.total, end - now
@@ -93,7 +102,7 @@ def fill_moments(state: Simulation, now: float, end: float) -> None:
         total[0, i] = total[1, i] = 0.0
     while True:
         first, last = max(now, path.start[k]), min(end, path.stop[k])
-        fill_moments_of_piece(state, k, first, last)
+        fill_moments_of_piece(state, run, k, first, last)
         # P_1 of the whole interval on this part of it.
         middle, share = ((first - now) - (end - last)) / gap, (last - first) / gap
         for i in range(seen.shape[1]):
@@ -108,54 +117,65 @@ def fill_moments(state: Simulation, now: float, end: float) -> None:
 
 
 @kernel
-def predict_with_increments(state: Simulation, h: int, time: float) -> bool:
-    """Bring node ``h`` to ``time``; False where it needs more normals for cuts first, and then goes
-    on where it stopped.
+def fill_readings(
+    state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
+) -> None:
+    """Write the moments of the readings of node ``h`` over [now, end] into ``out`` (2 p,); ``end``
+    is not after ``piece``, and in its step.
     """
-    node, path, piece = state.nodes[h], state.path, state.piece
-    scratch, sensing = state.scratch, state.sensing
-    k, xhat, root, table = node.model, state.xhat, state.root, state.table
-    gains, reach, last = state.gains.series[k], state.gains.reach[k], path.last[piece]
-    readings = scratch.moments[: state.gains.moments[k]]
-    # The state of a node is whole after each stretch, so that a stop for normals may come in
-    # between.
-    while node.now < time:
-        now, end = node.now, time
-        # How much of the gap may be used at once depends on the rate of information, trace(P G).
-        stretch = usable(information_rate(state.size, table, k, root, h))
-        if stretch < time - now:
-            # A lower bound that is set once per gap, else an exploding P asks for ever shorter
-            # stretches.
-            if node.least == 0.0:
-                node.least = SHORTEST_SHARE * (time - now)
-            end = stretch_end(now, time, max(stretch, node.least))
-        # Only a stretch that ends inside a step cuts it and needs normals of each sensor.
-        if end < last:
-            for s in range(node.sensor, node.sensors):
-                if sensing.used[s] == sensing.normals.shape[1]:
-                    return False
-        # The bound grows geometrically, so that a gap takes about a thousand stretches at most.
-        node.least *= LONGER
-        # Predict first, with the moments of the reading used at the end: they belong to the whole
-        # stretch.
-        move_root(table, k, root, xhat, h, end - now, state.flow_scratch)
-        fill_moments(state, now, end)
-        # Share of what is left of the step; -1 takes all of it.
-        share = (end - now) / (last - now) if end < last else -1.0
-        step = path.step[piece]
-        read_increments(
-            state.size,
-            readings,
-            sensing,
-            node.sensor,
-            scratch.state_moments,
-            step,
-            share,
-            last - now,
-            scratch.early,
-        )
-        gain_root(state.size, readings, gains, reach, 0, root, xhat, h, end - now, scratch.values)
-        node.now = end
-    # The next gap sets its own bound.
-    node.least = 0.0
-    return True
+    path = state.path
+    last = path.last[piece]
+    fill_moments(state, run, piece, now, end)
+    # Share of what is left of the step; -1 takes all of it.
+    share = (end - now) / (last - now) if end < last else -1.0
+    read_increments(state, run, h, path.step[piece], share, last - now, out)
+
+
+@kernel
+def next_stretch(
+    state: Simulation, m: int, k: int, now: float, time: float, least: float
+) -> tuple[float, float]:
+    """Return until when the readings of a node at place ``k`` may be used at once, ``time`` at
+    most, and the shortest stretch that may follow (``least`` is what this returned for the stretch
+    before, or 0).
+    """
+    end = time
+    # How much of the gap may be used at once depends on the rate of information, trace(P G).
+    stretch = usable(information_rate(state.size, state.table, m, state.root, k))
+    if stretch < time - now:
+        # A lower bound that is set once per gap, else an exploding P asks for ever shorter
+        # stretches.
+        if least == 0.0:
+            least = SHORTEST_SHARE * (time - now)
+        end = stretch_end(now, time, max(stretch, least))
+    # The bound grows geometrically, so that a gap takes about a thousand stretches at most.
+    return end, LONGER * least
+
+
+@kernel
+def use_stretch(
+    state: Simulation, run: int, h: int, k: int, piece: int, now: float, end: float
+) -> None:
+    """Bring node ``h`` of a run, which is at place ``k``, from ``now`` to ``end``, which is not
+    after ``piece``, and use all readings between them at once.
+    """
+    table, m, scratch, gap = state.table, state.nodes[h].model, state.scratch, end - now
+    xhat, root, readings = state.xhat, state.root, scratch.moments[: state.gains.moments[m]]
+    # Predict first, with the moments of the reading used at the end: they belong to the whole
+    # stretch.
+    move_root(table, m, root, xhat, k, gap, state.flow_scratch)
+    fill_readings(state, run, h, piece, now, end, readings)
+    gains, reach = state.gains.series[m], state.gains.reach[m]
+    gain_root(state.size, readings, gains, reach, 0, root, xhat, k, gap, scratch.values)
+
+
+@kernel
+def predict_with_increments(
+    state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
+) -> None:
+    """``use_stretch`` up to ``time``, which is not after ``piece``, in as many as it takes."""
+    least = 0.0
+    while now < time:
+        end, least = next_stretch(state, state.nodes[h].model, k, now, time, least)
+        use_stretch(state, run, h, k, piece, now, end)
+        now = end

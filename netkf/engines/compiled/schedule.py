@@ -157,6 +157,12 @@ def plain(channel: Channel) -> bool:
     return fixed and identical_per_link(channel.loss)
 
 
+def delay_is_zero(channel: Channel) -> bool:
+    """Return True if no message takes time."""
+    delay = channel.delay
+    return delay.fixed == 0.0 and not delay.is_random and not delay_depends_on_message(delay)
+
+
 def delivery_chances(scenario: Scenario, ways: tuple[Link, ...]) -> FloatArray:
     """(W,) delivery probability of all messages of each directed link."""
     loss = scenario.network.channel.loss

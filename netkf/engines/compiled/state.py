@@ -32,11 +32,10 @@ def _record(integers: str, floats: str = "") -> np.dtype:
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
 
 
-NODE = _record("model id sensor sensors inbox last sent reading", "now least own")
+NODE = _record("model id sensor sensors inbox last sent reading", "own")
 """One filter: its model, the id in the trace (-1: pooled), its increment sensors from ``sensor`` up
 to ``sensors``, first and last message of its inbox (-1: none), how many transmissions it ``sent``,
-the instant of its newest sample (``reading``), the time it has reached (``now``), the shortest
-stretch of increments it uses on its way (``least``; 0: it stands), and its ``own`` weight.
+the instant of its newest sample (``reading``), and its ``own`` weight.
 """
 
 WAY = _record("sender receiver messages", "weight")
@@ -71,39 +70,41 @@ class Gains(Struct):
 
 
 class Scratch(Struct):
-    """Scratch arrays: moments (2 p,) and noise ``early`` (2, p) for the most increments p of any
-    node, moments of x (``state_moments``) and their ``total`` (2, n), ``values`` of the longest
-    series, the ``course`` (D, 2, n) of x in a piece, ``x`` (n,); a sample of at most q rows: ``y``
-    (q,), ``H`` (q, n), ``root_R`` (q, q).
+    """Scratch arrays: moments (2 p,), noise ``early`` and normals of a ``cut`` (2, p) for the most
+    increments p of any node, moments of x (``state_moments``) and their ``total`` (2, n),
+    ``values`` of the longest series; a sample of at most q rows: ``y`` (q,), ``H`` (q, n),
+    ``root_R`` (q, q).
     """
 
     moments: FloatArray
     early: FloatArray
+    cut: FloatArray
     state_moments: FloatArray
     total: FloatArray
     values: FloatArray
-    course: FloatArray
-    x: FloatArray
     y: FloatArray
     H: FloatArray
     root_R: FloatArray
 
 
 class Sensing(Struct):
-    """S increment sensors: rows p (S,), H (S, p, n), root of R (S, p, p), the rest of the present
-    step's noise (S, 2, p) and which step that is (S,); noise of the steps (S, steps, 2, p) and
-    normals for cuts (S, count, 2, p), of which ``used`` (S,) are gone. ``host`` and ``node`` (K,)
-    say who wakes at a grid point, in their order.
+    """S increment sensors of R runs: rows p (S,), H (S, p, n), root of R (S, p, p); noise of the
+    steps (R, S, steps, 2, p), the ``rest`` of that of the present step (R, S, 2, p) and which step
+    that is (R, S); the streams ``cuts`` (R S, 4) of normals for parts of a step, with numpy's table
+    for these (height, width, inside). ``host`` and ``node`` (K,) say who wakes at a grid point, in
+    their order.
     """
 
     rows: IntArray
     H: FloatArray
     root: FloatArray
+    noise: FloatArray
     rest: FloatArray
     step: IntArray
-    noise: FloatArray
-    normals: FloatArray
-    used: IntArray
+    cuts: np.ndarray
+    height: FloatArray
+    width: FloatArray
+    inside: np.ndarray
     host: IntArray
     node: IntArray
 
@@ -128,12 +129,13 @@ class Instants(Struct):
 
 
 class PathBlock(Struct):
-    """Some steps of the sensing grid, the last of which ends at ``end``.
+    """Some steps of the sensing grid of R runs, the last of which ends at ``end``.
 
-    K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both (K, n),
-    moments (K, 2, n), cubic (K, 4, n), whose step (K,) it is and where that ends (K,); ``grid``
-    holds the times at which sensors wake; ``to_end`` is that of the plant's laws. Where
-    nothing senses increments there is one piece without an end.
+    K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both
+    (R, K, n), moments (R, K, 2, n), cubic (R, K, 4, n), whose step (K,) it is and where that ends
+    (K,); ``grid`` holds the times at which sensors wake; ``to_end`` is that of the plant's laws.
+    The ``course`` (G, K, D, W) of x in the pieces that are ``known`` (G, K), of the G runs that
+    are simulated together. Where nothing senses increments there is one piece without an end.
     """
 
     end: float
@@ -147,23 +149,28 @@ class PathBlock(Struct):
     last: FloatArray
     grid: FloatArray
     to_end: FloatArray
+    course: FloatArray
+    known: np.ndarray
 
 
 class Ticks(Struct):
-    """A ``schedule.Window`` of ticks."""
+    """The ticks of a ``schedule.Window``, or those of several runs one after the other; where no
+    message takes time, which of them arrive: a bit for each outcome (``heard``, (K,)).
+    """
 
     end: float
     t: FloatArray
     entity: IntArray
     at: IntArray
     delay: FloatArray
+    heard: IntArray
 
 
 class Shown(Struct):
-    """Space for B samples of all N nodes: xhat (B, N, n), P (B, N, n, n), how many ``rows`` (B,) or
-    events by kind (B, len(KINDS)) came before, in which ``piece`` (B,) of the path each is, and
-    ``terms`` (B, T) of sums that are conserved. They are handed on many at a time, since a call of
-    the loop costs more than a sample.
+    """Space for B samples of all N nodes in R runs: xhat (R, B, N, n), P (R, B, N, n, n), how many
+    ``rows`` (R, B) or events by kind (R, B, len(KINDS)) came before, in which ``piece`` (R, B) of
+    the path each is, and ``terms`` (B, T) of sums that are conserved, of one run. They are handed
+    on many at a time, since a call of the loop costs more than a sample.
     """
 
     xhat: FloatArray
@@ -175,17 +182,19 @@ class Shown(Struct):
 
 
 class Simulation(Struct):
-    """A run, and where it stands.
+    """Runs, and where they stand.
 
-    The ``size`` n of states. Filters: ``nodes`` (N,), xhat (N, n), root (N, n, n), the ``table`` of
-    their models and, last, of prediction alone. Messages: ``pool`` (C,), what they carry (C, n),
-    (C, n, n), the ``heap`` of arrivals (C,), ``waiting`` (N,) nodes with mail. Times of ``frames``
-    (F,) and ``probes`` (T,). The trace: ``rows``, or where it is not ``traced`` only ``counts``
-    (len(KINDS),) of events.
+    The ``size`` n of states. Filters: ``nodes`` (N,), of the G runs that are simulated together
+    xhat (G N, n), root (G N, n, n) and the time that each has reached, ``now`` (G N,); the
+    ``table`` of their models and, last, of prediction alone. Messages: ``pool`` (C,), what they
+    carry (C, n), (C, n, n), the ``heap`` of arrivals (C,), ``waiting`` (N,) nodes with mail. Times
+    of ``frames`` (F,) and ``probes`` (T,). The trace: ``rows``, or where it is not ``traced`` only
+    ``counts`` (len(KINDS),) of events.
 
     ``kind`` and ``at``: see COMBINATIONS and CLOCKS; ``..._at``: next frame, point of the sensing
-    grid, node that wakes there, instant of samples, tick and probe; the ``piece`` of the path and,
-    plus 1, that of ``scratch.course`` (``course``, 0: none); the next ``row``, and how many one
+    grid, node that wakes there, instant of samples, tick and probe; the ``run`` of R, which is one
+    of those from ``first_run`` on; where its ticks end (``ticks_stop``) and its outcomes begin
+    (``delays``); the ``piece`` of the path; the next ``row``, and how many one
     event may need (``most_rows``); the first ``free`` message and how many are (``free_count``,
     ``most_messages``); messages on the heap (``flying``) and how many were put there (``order``);
     nodes with mail (``receivers``), of which so many are done (``absorbing``) at ``mail_time``;
@@ -196,6 +205,7 @@ class Simulation(Struct):
     nodes: np.ndarray
     xhat: FloatArray
     root: FloatArray
+    now: FloatArray
     table: FlowTable
     gains: Gains
     entities: np.ndarray
@@ -222,9 +232,12 @@ class Simulation(Struct):
     at: int
     keep_own: int
     traced: int
+    run: int
+    first_run: int
+    ticks_stop: int
+    delays: int
     frame_at: int
     piece: int
-    course: int
     grid_at: int
     wake_at: int
     instant_at: int
@@ -320,7 +333,7 @@ def entity_records(scenario: Scenario, senders: Senders) -> tuple[np.ndarray, np
 
 
 def scratch_arrays(
-    table: FlowTable, gains: Gains, instants: Instants, to_end: FloatArray
+    table: FlowTable, gains: Gains, instants: Instants
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
     """Scratch arrays for all that is computed."""
     n, most, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
@@ -332,12 +345,11 @@ def scratch_arrays(
         moments=np.zeros(most),
         # moments come in pairs: two for each row.
         early=np.zeros((2, most // 2)),
+        cut=np.zeros((2, most // 2)),
         state_moments=np.zeros((2, n)),
         total=np.zeros((2, n)),
-        # fill_seen() needs 4 n entries.
-        values=np.zeros(max(width, 4 * n)),
-        course=np.zeros(course_shape(to_end, n)),
-        x=np.zeros(n),
+        # fill_seen() needs two rows of a course.
+        values=np.zeros(max(width, 2 * course_shape(np.zeros(0), n)[1])),
         y=np.zeros(q),
         H=np.zeros((q, n)),
         root_R=np.zeros((q, q)),

@@ -61,7 +61,7 @@ class PathStates:
         """(T, n) states in the present frame, which are 0 where one begins."""
         # A time is the end of its piece, or the start of the first one.
         ends = (times == path.stop[pieces])[:, None]
-        x = np.where(ends, path.x_stop[pieces], path.x_start[pieces])
+        x = np.where(ends, path.x_stop[0, pieces], path.x_start[0, pieces])
         # A frame begins there: its local state is 0 after the origin has moved.
         if len(self.frame_times):
             x[np.isin(times, self.frame_times)] = 0.0
@@ -69,7 +69,7 @@ class PathStates:
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
         """(n,) the local state just before ``frame_times[k]``; from now on its frame counts."""
-        x, time = path.x_stop[piece], float(self.frame_times[k])
+        x, time = path.x_stop[0, piece], float(self.frame_times[k])
         with np.errstate(over="ignore", invalid="ignore"):
             # The new origin: the old one moved to now, plus the local state.
             self._origin = self._moved(np.array([time]))[0] + x

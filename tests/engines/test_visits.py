@@ -1,0 +1,141 @@
+"""Filters side by side in lanes against the same filters one by one in the event loop, and against
+themselves in other company.
+"""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import netkf
+from netkf.engines.compiled import agenda, batches, flow, visits
+from netkf.engines.compiled.flow import Workspace
+from netkf.engines.compiled.visits import fill_row
+from netkf.linalg.compiling import kernel
+from netkf.linalg.series import polynomial
+from tests.benchmarks.cases import planar
+
+TWO_ROWS = {"nodes": [3, 5], "H": np.eye(2).tolist(), "R": [[0.5, 0.1], [0.1, 0.3]]}
+ONE_ROW = {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}
+PRECISE = {"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[1e-6]]}
+UNSTABLE = {"kind": "diffusion", "A": [[0.6, 1.0], [0.0, 0.4]], "B": [[0.0], [1.0]]}
+CASES = {
+    "links": {},
+    "each way": {"network.channel.symmetric": False},
+    "directions": {"network.activation": {"kind": "poisson", "rate": 1.0, "at": "directions"}},
+    "nodes": {"network.activation": {"kind": "poisson", "rate": 1.0, "at": "nodes"}},
+    "bursts": {
+        "network.channel.loss": {"kind": "gilbert-elliott", "mean_loss": 0.3, "mean_burst": 3.0}
+    },
+    "blind": {"sensors": []},
+    "two kinds of sensors": {"sensors": [ONE_ROW, TWO_ROWS]},
+    "several stretches of a step": {"sensors": [PRECISE]},
+    "wide": {"filter.cov": [[1e9, 0.0], [0.0, 1e9]]},
+    "long gaps": {"network.activation": {"kind": "poisson", "rate": 0.05}, "horizon": 40.0},
+    "unstable": {"plant": {**UNSTABLE, "cov": np.eye(2).tolist()}},
+}
+
+
+def one_by_one(monkeypatch):
+    for module in (flow, batches):
+        monkeypatch.setattr(module, "is_immediate", lambda _: False)
+
+
+def dimensions(build, n):
+    """n states, of which all nodes but one read the first."""
+    random = np.random.default_rng(n)
+    A = random.normal(size=(n, n)) / np.sqrt(n)
+    plant = {"kind": "diffusion", "A": A.tolist(), "B": np.eye(n).tolist()}
+    eye, H = np.eye(n).tolist(), np.eye(1, n).tolist()
+    return build(
+        horizon=3.0,
+        plant={**plant, "cov": eye},
+        sensors=[{"nodes": [0, 1], "H": H, "R": [[0.3]]}],
+        filter={"kind": "hybrid", "epsilon": 0.3, "cov": eye},
+    )
+
+
+def assert_close(case, monkeypatch):
+    assert agenda.is_immediate(case)
+    found = netkf.simulate(case, 3, engine="compiled")
+    with monkeypatch.context() as patch:
+        one_by_one(patch)
+        expected = netkf.simulate(case, 3, engine="compiled")
+    assert found.fingerprint == expected.fingerprint
+    np.testing.assert_array_equal(found.x, expected.x)
+    size = np.abs(expected.P).max(axis=(2, 3))
+    scale = np.sqrt(np.maximum(size, 1.0))[..., None]
+    np.testing.assert_allclose(found.xhat / scale, expected.xhat / scale, rtol=0.0, atol=1e-9)
+    assert (np.abs(found.P - expected.P).max(axis=(2, 3)) <= 1e-10 * size).all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_lanes_leave_what_the_event_loop_leaves(ring, monkeypatch, name):
+    assert_close(ring.replace({"horizon": 8.0, **CASES[name]}), monkeypatch)
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_states_of_any_size(build, monkeypatch, n):
+    assert_close(dimensions(build, n), monkeypatch)
+
+
+@pytest.mark.parametrize("name", ["links", "two kinds of sensors", "several stretches of a step"])
+def test_company_does_not_matter(ring, monkeypatch, name):
+    case = ring.replace({"horizon": 8.0, **CASES[name]})
+    (whole,) = batches.flow_batches(case, 5, range(20))
+    for places, most, largest in ((1, 1 << 14, 256), (400, 1, 256), (20, 50, 7)):
+        monkeypatch.setattr(agenda, "MOST_PLACES", places)
+        for module in (agenda, visits):
+            monkeypatch.setattr(module, "MOST_VISITS", most)
+        monkeypatch.setattr(batches, "LARGEST_BATCH", largest)
+        again = case.replace({})  # nothing is kept of the runs before
+        parts = list(batches.flow_batches(again, 5, range(20)))
+        for field in ("xhat", "P", "counts"):
+            found = np.concatenate([getattr(part, field) for part in parts])
+            np.testing.assert_array_equal(found, getattr(whole, field))
+
+
+def test_only_runs_whose_messages_take_no_time(ring):
+    assert agenda.is_immediate(ring)
+    for change in (
+        {"network.channel.delay": {"kind": "constant", "seconds": 0.1}},
+        {"network.activation": {"kind": "periodic", "period": 0.5}},
+        {"filter": {"kind": "covariance-intersection", "epsilon": 0.3}},
+        {"filter": {"kind": "local"}},
+        {"sensors.0.sampling": {"kind": "periodic", "period": 0.5}},
+    ):
+        assert not agenda.is_immediate(ring.replace(change))
+
+
+@kernel
+def summed(series, unit, gap, out):
+    """All columns of a table of one model at a gap."""
+    cell = int(gap / unit)
+    since = gap if cell == 0 else gap - (cell + 0.5) * unit
+    fill_row(out, 0, series, 0, cell, since)
+
+
+@pytest.mark.parametrize("case", ["ring", "two axes"])
+def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
+    case = ring if case == "ring" else planar(6)
+    workspace = Workspace(case)
+    waiting, filters = workspace.visits(), workspace.filters
+    A, n = np.array(case.plant.A), case.plant.n
+    lower = n * (n + 1) // 2
+    model = next(model for model in case.models if len(model.H))
+    places = {"blind": waiting.blind.place, "sensing": waiting.sensing.place}
+    # Two axes that are alike have few columns of their own.
+    assert (len(set(places["sensing"])) < 30) == (len(set(places["blind"])) < 10)
+    for kind, longest in (("blind", 0.9), ("sensing", 0.19)):
+        table = getattr(waiting, kind)
+        out = np.empty((1, table.series.shape[3]))
+        for gap in longest * np.random.default_rng(1).random(30):
+            summed(table.series, filters.table.unit[0], gap, out)
+            values = out[0][table.place]
+            E = values[lower : lower + n * n].reshape(n, n)
+            np.testing.assert_allclose(E, scipy.linalg.expm(A * gap), rtol=0.0, atol=1e-14)
+            if kind == "sensing":
+                gains, expected = (
+                    values[2 * lower + 2 * n * n :],
+                    polynomial(model.gains.series, gap),
+                )
+                np.testing.assert_allclose(gains, expected, rtol=0.0, atol=1e-13 * expected.max())
