@@ -61,7 +61,7 @@ PAUSE, FULL = -1, -2
 MOST_WAYS = 62
 """Directed links that one clock sends on, each of which is a bit."""
 
-MOST_PLACES = 400
+MOST_PLACES = 200
 """Filters that are simulated together, unless one run has more."""
 
 _POSITIONS = (
