@@ -6,6 +6,7 @@ are read; ``verdict.json`` the verdict and what it belongs to.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +50,11 @@ def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: st
 def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str) -> None:
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
-    with write_atomically(directory / RESULTS) as part, part.open("wb") as file:
-        columns: dict[str, Any] = _columns(verdict.results)
-        np.savez_compressed(file, **columns)
+    results = io.BytesIO()
+    columns: dict[str, Any] = _columns(verdict.results)
+    np.savez_compressed(results, **columns)
+    with write_atomically(directory / RESULTS) as part:
+        part.write_bytes(results.getbuffer())
     with write_atomically(directory / "verdict.csv") as part:
         verdict.table.to_csv(part, index=False)
     write_text(directory / "verdict.txt", text + "\n")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -96,10 +97,13 @@ class BlockCheckpoints:
         """Write a block with the traces that its runs left; raises WriteError."""
         with writing(self._folder):
             self._folder.mkdir(exist_ok=True)
-        with write_atomically(self._file(number)) as part, part.open("w+b") as file:
-            arrays = _as_arrays(statistics, identity.of(number))
-            np.savez(file, **arrays)
-            file.write(MARK + _digest(file, file.tell()))
+        # In memory first: where a disk is full, some versions of numpy leave their file open.
+        block = io.BytesIO()
+        arrays = _as_arrays(statistics, identity.of(number))
+        np.savez(block, **arrays)
+        block.write(MARK + _digest(block, block.tell()))
+        with write_atomically(self._file(number)) as part:
+            part.write_bytes(block.getbuffer())
         self._numbers.add(number)
 
     def load(self, number: int) -> RunStatistics:
