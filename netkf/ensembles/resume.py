@@ -190,7 +190,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     """Return ``manifest.json`` of a directory; raises ScenarioError where it is not one."""
     try:
         found = read_document(directory / "manifest.json")
-        require(found, MANIFEST, "manifest.json")
+        require(found, MANIFEST)
     except DamagedError as error:
         words = f"must be a directory that netkf run left: manifest.json {error}"
         raise ScenarioError("--resume", words, str(directory), "give another --out") from None

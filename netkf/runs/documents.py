@@ -100,30 +100,31 @@ TEXT = "a text"
 TEXTS = "a list of texts"
 
 
-def require(value: Any, form: Any, where: str) -> None:
-    """Raise DamagedError unless a JSON value has a form: NUMBER, COUNT, TEXT, TEXTS, a list with
-    the form of its items, or a dictionary with the forms of its keys, of which those that end in
-    ``?`` may be missing; there may be other keys.
+def require(value: Any, form: Any, where: str = "") -> None:
+    """Raise DamagedError unless a JSON value, found at the key path ``where``, has a form: NUMBER,
+    COUNT, TEXT, TEXTS, a list with the form of its items, or a dictionary with the forms of its
+    keys, of which those that end in ``?`` may be missing; there may be other keys.
     """
     if isinstance(form, dict):
-        _require_type(value, dict, where, "a table")
+        _demand(isinstance(value, dict), "a table", where)
         for key, inner in form.items():
             name = key.removesuffix("?")
+            place = f"{where}.{name}" if where else name
             if name in value:
-                require(value[name], inner, f"{where}.{name}")
+                require(value[name], inner, place)
             elif name == key:
-                raise DamagedError(f"lacks {where}.{name}")
+                raise DamagedError(f"lacks {place}")
     elif isinstance(form, list):
-        _require_type(value, list, where, "a list")
+        _demand(isinstance(value, list), "a list", where)
         for item in value:
             require(item, form[0], where)
-    elif not _FORMS[form](value):
-        raise DamagedError(f"has no {form.split(' ', 1)[1]} at {where}")
+    else:
+        _demand(_FORMS[form](value), form, where)
 
 
-def _require_type(value: Any, kind: type, where: str, name: str) -> None:
-    if not isinstance(value, kind):
-        raise DamagedError(f"has not {name} at {where}")
+def _demand(kept: bool, form: str, where: str) -> None:
+    if not kept:
+        raise DamagedError(f"needs {form} at {where}" if where else f"is not {form}")
 
 
 def _is_number(value: Any) -> bool:

@@ -178,7 +178,7 @@ def read_directory(directory: Path) -> RunDirectory:
 def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
     with _named(name):
         document = read_document(directory / name)
-        require(document, form, name)
+        require(document, form)
     return document
 
 

@@ -21,6 +21,19 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
+def alike(one, other):
+    """The same events, and states but for rounding: filters may move alone or many in lanes."""
+    assert netkf.first_difference(one, other) is None
+    assert one.fingerprint == other.fingerprint
+    np.testing.assert_array_equal(one.x, other.x)
+    close(one.xhat, other.xhat)
+    close(one.P, other.P)
+
+
+def close(one, other):
+    np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13 * np.abs(other).max())
+
+
 def busy(ring):
     """Ties, delays, losses and jitter at once."""
     return ring.replace(
@@ -111,7 +124,7 @@ def test_readings_do_not_depend_on_the_network(ring):
         {"network.graph": edges, "network.activation": {"kind": "poisson", "rates": rates}}
     )
     local = netkf.simulate(ring.replace({"filter": {"kind": "local"}}))
-    np.testing.assert_array_equal(netkf.simulate(quiet).xhat, local.xhat)
+    close(netkf.simulate(quiet).xhat, local.xhat)
 
 
 def test_a_new_node_shifts_no_other_stream(ring):
@@ -140,7 +153,7 @@ def test_rates_scale_the_same_gaps(ring):
 
 def test_erlang_of_shape_one_is_the_poisson_clock(ring):
     erlang = {"kind": "renewal", "distribution": "gamma", "shape": 1.0, "rate": 2.0}
-    same(netkf.simulate(ring), netkf.simulate(ring.replace({"network.activation": erlang})))
+    alike(netkf.simulate(ring), netkf.simulate(ring.replace({"network.activation": erlang})))
 
 
 def test_recorded_ticks_and_losses_replay_a_run(ring, tmp_path):
@@ -156,7 +169,7 @@ def test_recorded_ticks_and_losses_replay_a_run(ring, tmp_path):
             "network.channel.loss": {"kind": "recorded", "path": tmp_path / "lost.csv"},
         }
     )
-    same(run, netkf.simulate(replay))
+    alike(run, netkf.simulate(replay))
 
 
 def test_horizon_is_half_open(build):
@@ -184,8 +197,8 @@ def test_one_node_is_the_kalman_bucy_filter(build):
     clocks = {**graph, "activation": {"kind": "poisson", "rate": 1.0}}
     runs.append(netkf.simulate(build(network=clocks, filter=hybrid)))
     for run in runs[1:]:
-        np.testing.assert_array_equal(run.xhat, runs[0].xhat)
-        np.testing.assert_array_equal(run.P, runs[0].P)
+        close(run.xhat, runs[0].xhat)
+        close(run.P, runs[0].P)
     closed = netkf.theory.riccati_flow([[1.0]], [[-0.5]], [[1.0]], [[2.0]], 3.0)
     np.testing.assert_allclose(runs[0].P[-1, 0], closed, rtol=1e-12)
 

@@ -115,7 +115,7 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
 
 
 def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
-    """Where the runs begin, and space for how they end; ``start``: filters at time 0."""
+    """Return where the runs begin, from filters at time 0, and space for how they end."""
     runs = len(draws.replicas)
     return BatchArrays(
         nodes=start.nodes,
