@@ -227,8 +227,8 @@ def test_correct_filters_are_not_accused(table, tmp_path):
 @pytest.mark.parametrize("table", [GOSSIP, SCALAR], ids=["gossip", "scalar"])
 def test_false_alarms_stay_within_the_level(table, tmp_path):
     """The same in short."""
-    for level, count in alarms(table, tmp_path, 20, 20, (0.2,)).items():
-        assert count <= scipy.stats.binom.ppf(0.999, 20, level)
+    for level, count in alarms(table, tmp_path, 10, 20, (0.2,)).items():
+        assert count <= scipy.stats.binom.ppf(0.999, 10, level)
 
 
 @pytest.mark.parametrize(

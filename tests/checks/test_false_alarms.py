@@ -176,7 +176,7 @@ def test_few_runs_in_one_dimension_are_judged_by_their_exact_law(tmp_path):
     scenario = from_table(table, tmp_path)
     accused = [
         row.source
-        for seed in range(20)
+        for seed in range(10)
         for row in check(scenario, runs=10, seed=seed, workers=1).rows
         if row.verdict == BROKEN
     ]

@@ -33,12 +33,12 @@ def subtracted(run):
 
 
 def test_no_promise_is_broken_by_rounding(unstable):
-    found = netkf.check(unstable, 30, workers=1)
+    found = netkf.check(unstable, 15, workers=1)
     assert found, [row for row in found.rows if row.verdict == "broken"]
 
 
 def test_no_filter_is_inconsistent_by_rounding(unstable):
-    found = netkf.consistency(unstable, 20, confidence=0.999, workers=1)
+    found = netkf.consistency(unstable, 10, confidence=0.999, workers=1)
     assert found, found.rows
 
 

@@ -178,7 +178,7 @@ def scenarios(draw):
     }
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(scenarios())
 def test_drawn_scenarios_agree(tables):
     if tables["filter"]["kind"] in {"local", "central"}:

@@ -119,7 +119,7 @@ def broken(rows):
 @pytest.mark.parametrize("name", HEALTHY)
 def test_healthy_parts_are_not_accused(name):
     table, changes = HEALTHY[name]
-    rows = verdicts(from_table(table).replace(changes), 60)
+    rows = verdicts(from_table(table).replace(changes), 40)
     assert len(rows) >= 9
     assert not broken(rows)
     assert sum(row.verdict == HOLDS for row in rows) >= 3
