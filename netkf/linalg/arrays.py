@@ -50,14 +50,6 @@ def square_root(matrix: FloatArray) -> FloatArray:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def symmetric_root(matrix: FloatArray) -> FloatArray:
-    """The factor that is symmetric itself: it moves little where the matrix does, while the
-    vectors that ``square_root`` is made of may turn round.
-    """
-    values, vectors = np.linalg.eigh(matrix)
-    return symmetric((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
-
-
 def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
     """The blocks, possibly rectangular or empty, along the diagonal of one matrix."""
     rows = sum(b.shape[0] for b in blocks)
