@@ -1,0 +1,82 @@
+"""Sphinx builds the documentation: sphinx-build -W --keep-going -q docs build/docs."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from netkf import __version__
+
+project = "netkf"
+author = "The netkf developers"
+copyright = "The netkf developers"
+version = release = __version__
+language = "en"
+smartquotes = False
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
+html_theme = "furo"
+html_title = f"netkf {release}"
+html_copy_source = False
+
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"show-inheritance": True}
+autodoc_preserve_defaults = True
+
+CODE = re.compile(r"(``.+?``|`.+?`)", re.DOTALL)
+MARKUP = re.compile(r"([\\*|_])")
+ARRAY = re.compile(r"~?(?:numpy\.)?ndarray\[tuple\[.*?\], ~?(?:numpy\.)?dtype\[[^\]]*\]+")
+ARRAY_LIKE = re.compile(r"_Buffer \| _SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]")
+INDENTED = re.compile(r"^(\s{4,})")
+
+
+def literal_text(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Show docstrings as they are written: plain text with code between backticks.
+
+    Matrices and bars of norms would else be read as reStructuredText; indented lines and lists
+    are blocks of code.
+    """
+    lines[:] = [_literal(line) for line in _blocks(lines)]
+
+
+def _literal(line: str) -> str:
+    if INDENTED.match(line):
+        return line
+    parts = CODE.split(line)
+    return "".join(
+        f"``{part.strip('`')}``" if k % 2 else MARKUP.sub(r"\\\1", part)
+        for k, part in enumerate(parts)
+    )
+
+
+def _blocks(lines: list[str]) -> list[str]:
+    """The lines with a ``::`` before each indented block."""
+    found: list[str] = []
+    for line in lines:
+        after_text = not found or not INDENTED.match(found[-1])
+        if INDENTED.match(line) and after_text and (not found or found[-1] != "::"):
+            found += ["", "::", ""]
+        elif line.strip() and found and INDENTED.match(found[-1]) and not INDENTED.match(line):
+            found.append("")
+        found.append(line)
+    return found
+
+
+def short_types(
+    app: Any, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
+) -> tuple[str, str]:
+    """Write types of numpy as a reader would."""
+    return tuple(
+        text and ARRAY_LIKE.sub("ArrayLike", ARRAY.sub("ndarray", text))
+        for text in (signature, returns)
+    )
+
+
+def setup(app: Any) -> None:
+    """Connect the reading of docstrings and signatures."""
+    app.connect("autodoc-process-signature", short_types)
+    app.connect("autodoc-process-docstring", literal_text)

@@ -1,0 +1,209 @@
+"""Follow a page of docs/ as a reader would: write its files, give its commands, run its code.
+
+    python -m tests.documents docs/tutorials/first_verdict.md > follow.sh
+
+prints a shell script of the page, for an empty folder: `NETKF=/path/to/netkf bash -e follow.sh`.
+
+What a block is follows from its language and its first line:
+
+- `python` or `toml` beginning with `# NAME`: a file of that name;
+- `sh`: commands that set up a computer, of the script only;
+- `console`: commands after `$ `, each followed by what it prints;
+- `python` without a name: code that runs in one namespace a page; a `text` block directly below
+  is what it prints;
+- `toml` without a name: part of a scenario file, which has to be TOML.
+
+In what is printed `...` stands for any text in a line and, alone, for any number of lines.
+"""
+
+import contextlib
+import io
+import itertools
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from netkf.cli.main import main
+from tests.conftest import ROOT
+
+DOCS = ROOT / "docs"
+FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NAME = re.compile(r"# (\S+\.(?:py|toml|csv|sh))\n")
+LANGUAGES = {"python", "toml", "console", "sh", "text", "json"}
+
+
+@dataclass(frozen=True)
+class Block:
+    language: str
+    text: str
+    name: str  # of the file; "" for none
+    line: int
+
+
+def blocks(page):
+    """All blocks of a page but those of Sphinx, in order."""
+    text = page.read_text(encoding="utf-8")
+    found = []
+    for fence in FENCE.finditer(text):
+        language, content = fence.groups()
+        if language.startswith("{"):
+            continue
+        named = NAME.match(content) if language in ("python", "toml") else None
+        name = named[1] if named else ""
+        line = text[: fence.start()].count("\n") + 2
+        found.append(Block(language, content[named.end() :] if named else content, name, line))
+    return found
+
+
+def sessions(block):
+    """Pairs of a command and the lines that it prints, None where none is shown."""
+    pairs = []
+    for line in block.text.splitlines():
+        if line.startswith("$ "):
+            pairs.append((line[2:], []))
+        else:
+            pairs[-1][1].append(line)
+    return [(command, shown or None) for command, shown in pairs]
+
+
+def matches(shown, printed):
+    """Whether lines are as shown on the page, where `...` stands for what is left out."""
+    pattern = "".join(
+        r"(?:[^\n]*\n)*"
+        if line == "..."
+        else re.escape(line.rstrip()).replace(r"\.\.\.", ".*") + r"\n"
+        for line in shown
+    )
+    text = "".join(f"{line.rstrip()}\n" for line in printed)
+    return re.fullmatch(pattern, text.rstrip("\n") + "\n") is not None
+
+
+class Follower:
+    """A reader in an empty folder."""
+
+    def __init__(self, folder):
+        self.folder, self.names, self.status = Path(folder), {"__name__": "page"}, 0
+        self.before = set(sys.modules)
+
+    def close(self):
+        """Forget the modules that the page has written."""
+        for name in set(sys.modules) - self.before:
+            if (self.folder / f"{name}.py").exists():
+                del sys.modules[name]
+
+    def follow(self, page):
+        """Raise AssertionError at the first block that does not do what the page shows."""
+        found = blocks(page)
+        for block, after in itertools.zip_longest(found, found[1:]):
+            try:
+                self.take(block, after)
+            except Exception as error:
+                raise AssertionError(f"{page.name}, line {block.line}: {error}") from error
+
+    def take(self, block, after):
+        """Write, parse or run one block."""
+        assert block.language in LANGUAGES, f"a block of language {block.language!r}"
+        if block.name:
+            target = Path(block.name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(block.text, encoding="utf-8")
+        elif block.language == "toml":
+            tomllib.loads(block.text)
+        elif block.language == "console":
+            for command, shown in sessions(block):
+                compare(command, shown, self.give(command))
+        elif block.language == "python":
+            printed = captured(lambda: exec(compile(block.text, "page", "exec"), self.names))
+            shown = after.text.splitlines() if after and after.language == "text" else None
+            compare("the code", shown, printed)
+
+    def give(self, command):
+        """Run a command of a shell in this process and return what it prints."""
+        program, *words = shlex.split(os.path.expandvars(command), comments=True)
+        if program == "netkf":
+            return self.captured_status(lambda: main(words))
+        if program == "python":
+            return self.captured_status(lambda: script(*words))
+        if program == "pytest":
+            line = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *words]
+            done = subprocess.run(line, capture_output=True, text=True, check=False)
+            self.status = done.returncode
+            return done.stdout + done.stderr
+        if program == "echo" and words == ["$?"]:
+            return f"{self.status}\n"
+        if program == "mkdir":
+            Path(words[-1]).mkdir(parents=True, exist_ok=True)
+        elif program == "cd":
+            os.chdir(words[0])
+        elif program == "cp":
+            copy(*words)
+        else:
+            raise AssertionError(f"an unknown command {command!r}")
+        return ""
+
+    def captured_status(self, call):
+        def run():
+            self.status = call() or 0
+
+        return captured(run)
+
+
+def script(path, *words):
+    """`python PATH WORDS`."""
+    before, sys.argv = sys.argv, [path, *words]
+    try:
+        runpy.run_path(path, run_name="__main__")
+    finally:
+        sys.argv = before
+
+
+def copy(*words):
+    """`cp -r FROM TO` and `cp FROM TO`."""
+    *_, source, target = words
+    if Path(source).is_dir():
+        shutil.copytree(source, target)
+    else:
+        shutil.copy(source, target)
+
+
+def captured(call):
+    """What a call prints."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        call()
+    return out.getvalue()
+
+
+def compare(what, shown, printed):
+    """Raise AssertionError unless the lines are as shown."""
+    if shown is not None and not matches(shown, printed.splitlines()):
+        raise AssertionError(f"{what} prints\n{printed}")
+
+
+def shell_script(page):
+    """A shell script that writes the files of a page and gives its commands, in order."""
+    lines = ["set -e"]
+    code = 0
+    for block in blocks(page):
+        if block.name or block.language == "python":
+            code += not block.name
+            name = block.name or f"page_{code}.py"
+            lines += [f"mkdir -p $(dirname {name})"]
+            lines += [f"cat > {name} <<'END_OF_FILE'", block.text + "END_OF_FILE"]
+            lines += [] if block.name else [f"python {name}"]
+        elif block.language == "sh":
+            lines.append(block.text)
+        elif block.language == "console":
+            lines += [command for command, _ in sessions(block)]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(shell_script(Path(sys.argv[1])))

@@ -1,0 +1,95 @@
+"""Every block of every page of docs/ does what the page says, read from an empty folder."""
+
+import re
+import subprocess
+
+import pytest
+
+import netkf
+from tests.conftest import ROOT
+from tests.documents import DOCS, Follower, blocks, matches, shell_script
+
+PAGES = sorted(DOCS.rglob("*.md"))
+ELSEWHERE = {  # pages whose blocks have tests of their own
+    "errors_in_the_papers.md": "test_errors_in_the_papers.py",
+    "scenario_files.md": "test_docs.py",
+}
+FOLLOWED = [page for page in PAGES if page.name not in ELSEWHERE and blocks(page)]
+
+
+def page_name(page):
+    return str(page.relative_to(DOCS))
+
+
+@pytest.fixture
+def follower(tmp_path, monkeypatch):
+    monkeypatch.setenv("NETKF", str(ROOT))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = Follower(tmp_path)
+    yield found
+    found.close()
+
+
+@pytest.mark.parametrize("page", FOLLOWED, ids=page_name)
+def test_the_page_does_what_it_says(follower, page):
+    follower.follow(page)
+
+
+def test_pages_that_are_tested_elsewhere_are():
+    for page, test in ELSEWHERE.items():
+        assert page in (ROOT / "tests" / test).read_text(encoding="utf-8")
+
+
+def test_a_page_that_is_wrong_is_found(follower, tmp_path):
+    """The follower sees what is printed, and what is not as shown."""
+    page = tmp_path / "page.md"
+    right = "```python\nprint(2 + 2, 'and more')\nprint(1)\n```\n\n```text\n4 and ...\n...\n```\n"
+    page.write_text(right)
+    follower.follow(page)
+    for wrong in (
+        right.replace("4 and", "5 and"),
+        right.replace("\n...", ""),
+        "```console\n$ netkf run nowhere.toml\n$ echo $?\n0\n```\n",
+        "```console\n$ format disk\n```\n",
+        "```julia\n1\n```\n",
+    ):
+        page.write_text(wrong)
+        with pytest.raises(AssertionError, match=r"page\.md, line \d+"):
+            follower.follow(page)
+
+
+def test_dots_stand_for_what_is_left_out():
+    assert matches(["a", "...", "d"], ["a", "b", "c", "d"])
+    assert matches(["a", "...", "d"], ["a", "d"])
+    assert matches(["in ... s"], ["in 0.3 s"])
+    assert not matches(["a"], ["a", "b"])
+    assert not matches(["a...", "d"], ["a", "b", "d"])
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "tutorials").glob("*.md")), ids=page_name)
+def test_a_tutorial_is_a_script(page):
+    """It names every file that it writes, and bash can read what comes of it."""
+    assert all(block.name for block in blocks(page) if block.language in ("python", "toml"))
+    text = shell_script(page)
+    assert "pip install" in text
+    subprocess.run(["bash", "-n"], input=text, text=True, check=True)
+
+
+def test_every_public_name_is_in_the_reference():
+    """The modules are documented by what they export."""
+    for module in ("netkf", "netkf.parts", "netkf.testing", "netkf.theory"):
+        name = module.removeprefix("netkf.")
+        text = (DOCS / "api" / f"{name}.md").read_text(encoding="utf-8")
+        assert f".. automodule:: {module}\n   :members:" in text
+        excluded = re.search(r":exclude-members: (.*)", text)
+        for left_out in excluded[1].split(", ") if excluded else ():
+            assert left_out in netkf.__all__, left_out
+
+
+def test_pictures_are_small_and_used():
+    texts = "".join(page.read_text(encoding="utf-8") for page in [*PAGES, ROOT / "README.md"])
+    for picture in [*DOCS.rglob("*.svg"), *DOCS.rglob("*.png"), *DOCS.rglob("*.gif")]:
+        assert picture.name in texts, picture
+        limit = 1_500_000 if picture.parent == DOCS else 200_000
+        assert picture.stat().st_size < limit, picture
