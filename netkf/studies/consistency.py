@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 
 LOAD = "load it first: netkf.consistency(netkf.load(path))"
 MIN_RUNS = 10
+MAX_ERRORS = 256
+"""Errors of all nodes together (N n) up to which their exact covariance is computed: some seconds a
+run, in work that grows with the third power of the number of nodes.
+"""
 UNDECIDED = "undecided: rounding blurs the errors of too many samples"
 BIAS_TOLERANCE = 0.02
 """Relative distance of the expected value from n that is worth a remark in the verdict."""
@@ -69,10 +73,7 @@ def run_consistency(
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
     after = np.flatnonzero(run.times > 0.0)
-    try:
-        sigma = error_covariance(scenario, run)
-    except TheoryError:
-        sigma = None
+    sigma = _exact_covariance(scenario, run)
     lost = blurred(run, run.P)
     lost |= False if sigma is None else blurred(run, sigma)
     nis, expected_nis = _mean_nis(scenario, run, sigma, lost)
@@ -95,14 +96,29 @@ def _mean(values: FloatArray, lost: np.ndarray) -> FloatArray:
         return np.asarray(np.where(lost, 0.0, values).sum(axis=0) / np.where(count, count, np.nan))
 
 
+def _errors_of(scenario: Scenario) -> int:
+    return len(scenario.nodes) * scenario.plant.n
+
+
+def _exact_covariance(scenario: Scenario, run: Run) -> FloatArray | None:
+    """Return Sigma (T, N, n, n) given the events; None where it is unknown or out of reach."""
+    if _errors_of(scenario) > MAX_ERRORS:
+        return None
+    try:
+        return error_covariance(scenario, run)
+    except TheoryError:
+        return None
+
+
 def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
     """Return tr(P^-1 Sigma) (T, N); nan if Sigma is unknown or P is singular."""
     expected = np.full(P.shape[:2], np.nan)
     if sigma is None:
         return expected
-    for k in np.ndindex(*expected.shape):
-        if np.isfinite(P[k]).all() and np.linalg.matrix_rank(P[k]) == P.shape[-1]:
-            expected[k] = np.trace(np.linalg.solve(P[k], sigma[k]))
+    usable = np.isfinite(P).all(axis=(-2, -1))
+    usable[usable] = np.linalg.matrix_rank(P[usable]) == P.shape[-1]
+    scaled = np.linalg.solve(P[usable], sigma[usable])
+    expected[usable] = np.trace(scaled, axis1=-2, axis2=-1)
     return expected
 
 
@@ -297,6 +313,12 @@ def judge_consistency(
     ]
     given, blurred_from = _covariance_given(runs), _blurred_from(runs)
     notes = () if given else (NO_COVARIANCE,)
+    if _errors_of(scenario) > MAX_ERRORS:
+        reason = (
+            f"what NEES should be is left out: the exact covariance of {_errors_of(scenario):,} "
+            f"errors, more than {MAX_ERRORS}, takes long; netkf.theory.error_covariance computes it"
+        )
+        notes = (*notes, reason)
     if np.isfinite(blurred_from):
         reason = f"from {blurred_from:g} s on rounding of a large state blurs errors"
         notes = (*notes, f"{reason}: those samples are left out; shorten the horizon")

@@ -70,6 +70,15 @@ def test_what_is_not_known_is_not_judged(gossip):
         assert row.nees == pytest.approx(16.0, rel=0.3)
 
 
+def test_exact_covariances_of_large_networks_are_left_out_and_a_line_says_so(ring):
+    changes = {"network.graph": {"kind": "cycle", "nodes": 129}, "horizon": 1.0}
+    changes["filter"] = {"kind": "local"}  # exact, so that NEES is near n
+    found = consistency(ring.replace(changes), runs=10, workers=1, confidence=0.999)
+    assert "what NEES should be is left out: the exact covariance of 258 errors" in found.notes[0]
+    assert all(np.isnan(row.expected) for row in found.rows)
+    assert {row.verdict for row in found.rows} == {"near n; what it should be is not known"}
+
+
 def test_nis_is_the_textbook_one(gossip):
     """Local filters: the prediction from the last sample against the reading, in plain numpy."""
     local = gossip.replace({"filter": {"kind": "local"}})
