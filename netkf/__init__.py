@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
     from netkf.studies.compare import compare
     from netkf.studies.consistency import consistency
+    from netkf.studies.opening import open as open
     from netkf.studies.size import size
     from netkf.studies.sweep import sweep
     from netkf.trace.run import Run, first_difference
@@ -36,6 +37,7 @@ _WHERE = {
     "load": "netkf.scenario.reading",
     "check": "netkf.checks.check",
     "monte_carlo": "netkf.ensembles.monte_carlo",
+    "open": "netkf.studies.opening",
     "parts": "netkf.parts",
     "save": "netkf.runs.run",
     "simulate": "netkf.runs.simulate",
@@ -83,4 +85,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, "__version__"])
+    # Not in __all__: ``from netkf import *`` must leave Python's own ``open`` alone.
+    return sorted([*__all__, "__version__", "open"])

@@ -93,6 +93,19 @@ class BlockCheckpoints:
                 self._numbers.add(number)
         return sorted(self._numbers), _describe(bad)
 
+    def readable(self, scenario_digest: str, seed: int) -> list[RunStatistics]:
+        """Return the statistics of the blocks of a scenario and a seed that can be read, in order,
+        whatever installation made them; nothing is removed.
+        """
+        found = []
+        wanted = {"scenario": scenario_digest, "seed": seed}
+        for file in self._files():
+            with contextlib.suppress(DamagedError):
+                self._check(file, wanted)
+                with _opened(file) as arrays:
+                    found.append(_statistics(arrays))
+        return found
+
     def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
         """Write a block with the traces that its runs left; raises WriteError."""
         with writing(self._folder):

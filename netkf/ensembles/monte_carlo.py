@@ -37,7 +37,8 @@ class Ensemble:
     ``messages``: how many were sent, delivered, lost and still in flight in all runs; ``diverged``:
     how many runs did. ``fingerprint`` is that of replica 0. From ``rounding_from`` on, inf in most
     cases, rounding of the state blurs the errors: they and NEES are nan there and left out of
-    averages. P and NEES are nan where the filter gives no covariance.
+    averages. P and NEES are nan where the filter gives no covariance. ``scenario`` is what was
+    simulated.
     """
 
     times: FloatArray
@@ -59,6 +60,7 @@ class Ensemble:
     fingerprint: str
     shown: bool = True
     rounding_from: float = np.inf
+    scenario: Scenario | None = None
 
     def __repr__(self) -> str:
         return (
@@ -149,6 +151,7 @@ def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str
         found.fingerprint,
         scenario.plant.truth_known,
         found.rounding_from,
+        scenario,
     )
 
 

@@ -32,27 +32,59 @@ STATE_ENCODING = {"use_dictionary": ["run", "t", "node"]}
 """Dictionaries only where values repeat: half the size in half the time."""
 
 
-def read_numbers(path: Path, columns: Sequence[str]) -> pd.DataFrame:
-    """Return columns of numbers of a Parquet file; raises DamagedError for any other file, and for
-    one with more than MAX_READ_ROWS rows.
+def read_numbers(
+    path: Path, columns: Sequence[str], run: int | None = None, missing: bool = False
+) -> pd.DataFrame:
+    """Return columns of numbers of a Parquet file, of one ``run`` if it is given; with ``missing``
+    an empty cell of a float is nan.
+
+    Raises DamagedError for any other file, for one with more than MAX_READ_ROWS rows, and for
+    empty cells that are not allowed.
     """
+    with _readable(path), pq.ParquetFile(path) as file:
+        names, types = file.schema_arrow.names, file.schema_arrow.types
+        known = dict(zip(names, types, strict=True))
+        wrong = [name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])]
+        if wrong:
+            raise DamagedError(f"{path.name} has no column {wrong[0]} of numbers")
+        table = _read(file, path, columns, run)
+        empty = [name for name in columns if table[name].null_count]
+        if not all(missing and pa.types.is_floating(known[name]) for name in empty):
+            raise DamagedError(f"{path.name} has missing values")
+        return pd.DataFrame(table.to_pandas())
+
+
+def read_words(path: Path, column: str, run: int | None = None) -> pd.Series[str]:
+    """Return a column of texts of a Parquet file, of one ``run`` if it is given; raises
+    DamagedError for any other file.
+    """
+    with _readable(path), pq.ParquetFile(path) as file:
+        names = file.schema_arrow.names
+        if names.count(column) != 1:
+            raise DamagedError(f"{path.name} has no column {column}")
+        texts = _read(file, path, [column], run)[column].cast(pa.string()).combine_chunks()
+        if texts.null_count:
+            raise DamagedError(f"{path.name} has missing values")
+        return pd.Series(texts.dictionary_encode().to_pandas())
+
+
+def _read(file: Any, path: Path, columns: Sequence[str], run: int | None) -> Any:
+    """Return an Arrow table with the columns, of those rows that are of ``run``."""
+    if file.metadata.num_rows > MAX_READ_ROWS:
+        raise DamagedError(f"{path.name} has more than {MAX_READ_ROWS:,} rows")
+    if run is None:
+        return file.read(columns=list(columns))
+    # Row groups of other runs are not even read where their statistics say so.
+    return pq.read_table(path, columns=list(columns), filters=[("run", "==", run)])
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Raise DamagedError in place of what pyarrow raises about a file that is not as it should."""
     if not path.is_file():
         raise DamagedError(f"{path.name} is no regular file")
     try:
-        with pq.ParquetFile(path) as file:
-            names, types = file.schema_arrow.names, file.schema_arrow.types
-            known = dict(zip(names, types, strict=True))
-            wrong = [
-                name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])
-            ]
-            if wrong:
-                raise DamagedError(f"{path.name} has no column {wrong[0]} of numbers")
-            if file.metadata.num_rows > MAX_READ_ROWS:
-                raise DamagedError(f"{path.name} has more than {MAX_READ_ROWS:,} rows")
-            table = file.read(columns=list(columns))
-        if any(column.null_count for column in table.columns):
-            raise DamagedError(f"{path.name} has missing values")
-        return pd.DataFrame(table.to_pandas())
+        yield
     except DamagedError:
         raise
     except (OSError, ValueError, TypeError, MemoryError, OverflowError, pa.ArrowException) as error:
@@ -61,12 +93,14 @@ def read_numbers(path: Path, columns: Sequence[str]) -> pd.DataFrame:
 
 def column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file; raises DamagedError."""
-    if not path.is_file():
-        raise DamagedError(f"{path.name} is no regular file")
-    try:
+    with _readable(path):
         return list(pq.read_schema(path).names)
-    except (OSError, ValueError, TypeError, MemoryError, pa.ArrowException) as error:
-        raise DamagedError(f"{path.name} cannot be read ({type(error).__name__})") from None
+
+
+def is_numeric_column(path: Path, name: str) -> bool:
+    """Return True if a column of a Parquet file holds numbers; raises DamagedError."""
+    with _readable(path):
+        return _is_numeric(pq.read_schema(path).field(name).type)
 
 
 def _is_numeric(kind: Any) -> bool:

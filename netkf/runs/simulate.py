@@ -105,4 +105,5 @@ def collect(
         truth_known=scenario.plant.truth_known,
         exact_errors=recorder.exact_errors,
         stats=recorder.stats,
+        scenario=scenario,
     )

@@ -34,7 +34,8 @@ class Run:
     ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds what
     exchanges should conserve, summed over all nodes: at the start and at the last sample. Unless
     ``truth_known``, x is nan and tables have no columns of errors. ``stats`` holds the counts that
-    the engine keeps of its own work.
+    the engine keeps of its own work. ``scenario`` is the ``netkf.Scenario`` that was simulated,
+    None if nobody said.
     """
 
     times: FloatArray
@@ -53,6 +54,7 @@ class Run:
     truth_known: bool = True
     exact_errors: bool = False
     stats: dict[str, int] = field(default_factory=dict)
+    scenario: Any = None
 
     def __repr__(self) -> str:
         span = f"{self.times[0]:g} .. {self.times[-1]:g} s" if len(self.times) else "nothing"
@@ -81,6 +83,16 @@ class Run:
 
         samples = StateSamples(self.times, self.x, self.xhat, self.P, self.error)
         return pd.DataFrame(state_table(self.replica, self.nodes, samples, self.truth_known))
+
+    @cached_property
+    def sq_error(self) -> FloatArray:
+        """The squared errors (T, N) of the samples, nan without known truth."""
+        return errors(self.error, self.P)[0]
+
+    @cached_property
+    def nees(self) -> FloatArray:
+        """The NEES (T, N) of the samples, nan where P is singular or nobody knows the error."""
+        return errors(self.error, self.P)[1]
 
     @cached_property
     def rounding(self) -> FloatArray:

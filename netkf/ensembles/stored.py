@@ -1,0 +1,176 @@
+"""An ensemble that is read back from its directory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import integer
+from netkf.core.printable import shorten
+from netkf.ensembles.checkpoints import BlockCheckpoints
+from netkf.ensembles.monte_carlo import Ensemble, ensemble_of
+from netkf.ensembles.statistics import MESSAGES, merge
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.documents import COUNT, NUMBER, DamagedError, check_files
+from netkf.runs.files import scenario_digest
+from netkf.runs.parquet_files import column_names, read_numbers
+from netkf.runs.stored import SUMMARY, StoredRun, read_form, read_run
+from netkf.runs.summary import PromisedTraces, promise_traces
+from netkf.scenario.scenario import Scenario
+from netkf.trace.schema import ensemble_columns
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORM: dict[str, Any] = {**SUMMARY, "runs": COUNT, "diverged": COUNT}
+FORM["messages"] = {f"{name}?": NUMBER for name in MESSAGES}
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class StoredEnsemble(Ensemble):
+    """An ensemble that is read back from ``directory``, with its ``manifest`` and ``summary``.
+
+    ``status`` is complete, diverged, interrupted or failed; of one that did not finish it has the
+    runs that were kept, and no summary.
+    """
+
+    directory: Path
+    manifest: dict[str, Any]
+    summary: dict[str, Any]
+    status: str
+
+    @cached_property
+    def promised(self) -> PromisedTraces:
+        """What theory promises at the sample times: bound, limit, centralised filter."""
+        assert self.scenario is not None
+        return promise_traces(self.scenario, self.times)
+
+    @property
+    def bound(self) -> FloatArray | None:
+        """Traces (T, N) of the bound H(12) at the sample times, None if it does not apply."""
+        return self.promised.bound
+
+    def replica(self, number: int = 0) -> StoredRun:
+        """Return one run of the ensemble; raises ScenarioError if its trace was not kept."""
+        assert self.scenario is not None
+        where = shorten(self.directory)
+        number = integer(low=0)("replica", number)
+        try:
+            run = read_run(self.directory, self.scenario, self.manifest, number)
+        except DamagedError as error:
+            raise ScenarioError(where, f"cannot be read: {error}", None, "run it again") from None
+        if not len(run.times):
+            remedy = "run it with --trace full, or simulate that replica"
+            raise ScenarioError(where, "has not kept the trace of replica", number, remedy)
+        return run
+
+
+def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredEnsemble:
+    """Return the ensemble in a directory whose ``manifest`` has passed runs.stored.MANIFEST.
+
+    Raises DamagedError for files that are not as netkf writes them.
+    """
+    kept: dict[str, Any] = {
+        "directory": directory,
+        "manifest": manifest,
+        "status": str(manifest["status"]),
+    }
+    if not (directory / "ensemble.parquet").exists():
+        whole = _of_blocks(directory, scenario, manifest)
+        values: dict[str, Any] = {f.name: getattr(whole, f.name) for f in fields(Ensemble)}
+        return StoredEnsemble(**values, **kept, summary={})
+    check_files(directory, manifest, ["ensemble.parquet", "summary.json"])
+    summary = read_form(directory, "summary.json", FORM)
+    samples = _read_samples(directory / "ensemble.parquet", scenario)
+    rows = [*summary["nodes"], summary["overall"]]
+    if [row["node"] for row in summary["nodes"]] != list(scenario.nodes):
+        raise DamagedError("summary.json has other nodes than the scenario")
+    average, se_average = _averages(rows)
+    runs, messages = summary["runs"], summary["messages"]
+    blurred = summary.get("rounding_from")
+    return StoredEnsemble(
+        **samples,
+        nodes=scenario.nodes,
+        average=average,
+        se_average=se_average,
+        messages={k: round(v * runs) for k, v in messages.items() if v is not None},
+        diverged=summary["diverged"],
+        events=int(manifest.get("events", 0)),
+        seed=int(manifest["seed"]),
+        engine=str(manifest.get("engine", "")),
+        fingerprint=str(manifest.get("fingerprint", "")),
+        shown=scenario.plant.truth_known,
+        rounding_from=np.inf if blurred is None else float(blurred),
+        scenario=scenario,
+        **kept,
+        summary=summary,
+    )
+
+
+def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> Ensemble:
+    """Return the ensemble of the runs that an interrupted ensemble has kept."""
+    blocks = BlockCheckpoints(directory, scenario)
+    found = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
+    if not found:
+        raise DamagedError("no run of it was finished")
+    whole = found[0]
+    for block in found[1:]:
+        whole = merge(whole, block)
+    return ensemble_of(scenario, whole, int(manifest["seed"]), str(manifest.get("engine", "")))
+
+
+def _averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
+    """Return means and standard errors (N + 1, 3) of an ensemble from rows of its summary."""
+
+    def column(name: str) -> FloatArray:
+        return np.array([row.get(name) for row in rows], dtype=np.float64)
+
+    rms, rms_se = column("rms_error"), column("rms_error_se")
+    means = [rms**2, column("mean_trace"), column("mean_nees")]
+    errors = [2.0 * rms * rms_se, column("mean_trace_se"), column("mean_nees_se")]
+    return np.column_stack(means), np.column_stack(errors)
+
+
+def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
+    """Return the arrays of an ensemble that stand in ensemble.parquet."""
+    n, N = scenario.plant.n, len(scenario.nodes)
+    i, j = np.triu_indices(n)
+    names = ensemble_columns(n)
+    if not scenario.plant.truth_known:
+        names = names[: 3 + 2 * len(i)]
+    if column_names(path) != names:
+        raise DamagedError(f"{path.name} does not have the columns of this scenario")
+    table = read_numbers(path, names, missing=True)
+    T = len(scenario.times)
+    times = np.repeat(scenario.times, N)
+    if not (
+        np.array_equal(table["t"], times)
+        and np.array_equal(table["node"], np.tile(scenario.nodes, T))
+    ):
+        raise DamagedError(f"{path.name} does not have a row for each time and node")
+    runs = table["runs"]
+    if runs.dtype.kind != "i" or (runs < 0).any():
+        raise DamagedError(f"{path.name} has numbers of runs that are no counts")
+    values = _with_missing(table, ensemble_columns(n)[3:], (T, N))
+    matrices = np.empty((4, T, N, n, n))
+    for matrix, upper in zip(matrices, np.split(values[:, :, :-2], 4, axis=2), strict=True):
+        matrix[:, :, i, j] = matrix[:, :, j, i] = upper
+    return {
+        "times": scenario.times,
+        "runs": runs.to_numpy(dtype=np.int64)[::N],
+        **dict(zip(("mean_P", "se_P", "mean_error", "se_error"), matrices, strict=True)),
+        "mean_nees": values[:, :, -2],
+        "se_nees": values[:, :, -1],
+    }
+
+
+def _with_missing(table: pd.DataFrame, names: list[str], shape: tuple[int, int]) -> FloatArray:
+    """Return columns as an array (T, N, columns); those that the table lacks are nan."""
+    return np.asarray(
+        table.reindex(columns=names).to_numpy(dtype=np.float64).reshape(*shape, len(names))
+    )

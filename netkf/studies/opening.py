@@ -1,0 +1,106 @@
+"""``netkf.open``: read a run, an ensemble or a sweep back from its directory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from netkf.core.errors import ScenarioError
+from netkf.core.printable import shorten
+from netkf.ensembles.stored import StoredEnsemble, read_ensemble
+from netkf.runs.documents import TEXT, DamagedError, check_files, require
+from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbers, read_words
+from netkf.runs.stored import MANIFEST, StoredRun, read_form, read_run
+from netkf.scenario.reading import load
+from netkf.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RESULTS = ("worst_rms", "mean_rms", "mean_trace", "worst_trace", "bound", "central")
+"""Columns of numbers that every sweep has beside its keys."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSweep:
+    """A sweep that is read back from ``directory``.
+
+    ``scenario`` is what was varied, ``keys`` the paths of its keys that were varied, ``table`` has
+    a row for each point as ``netkf.sweep`` returns it: fewer than were wanted if ``status`` is
+    interrupted or failed.
+    """
+
+    directory: Path
+    scenario: Scenario
+    keys: tuple[str, ...]
+    table: pd.DataFrame
+    status: str
+    manifest: dict[str, Any]
+
+    def __repr__(self) -> str:
+        points = f"{len(self.table)} points of {', '.join(self.keys)}"
+        return f"<netkf sweep of {self.scenario.name!r}: {self.status}, {points}>"
+
+
+def open(directory: str | Path, *, trust: bool = False) -> StoredRun | StoredEnsemble | StoredSweep:
+    """Return what ``netkf run``, ``netkf run --runs``, ``netkf sweep`` or ``netkf.save`` left in a
+    directory: what ``netkf.simulate``, ``netkf.monte_carlo`` and ``netkf.sweep`` return, with the
+    scenario, the manifest and the summary. What was interrupted has what was kept.
+
+    Files are read without trust: with ``trust`` classes of modules in the directory, or in the
+    current folder, that its scenario names are imported, which executes them.
+
+    Raises ScenarioError for whatever is not as netkf writes it.
+    """
+    folder = Path(directory)
+    where = shorten(directory)
+    try:
+        manifest = _read_manifest(folder)
+        check_files(folder, manifest, ["scenario.toml"])
+        scenario = load(folder / "scenario.toml", trust=trust)
+        if "vary" in manifest:
+            return _read_sweep(folder, scenario, manifest)
+        if manifest["runs"]["wanted"] > 1:
+            return read_ensemble(folder, scenario, manifest)
+        return read_run(folder, scenario, manifest)
+    except DamagedError as error:
+        remedy = "name a directory that netkf run or netkf sweep left"
+        raise ScenarioError(where, f"cannot be opened: {error}", None, remedy) from None
+
+
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a directory; raises DamagedError."""
+    if not folder.is_dir():
+        raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
+    if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():
+        raise DamagedError("it holds a verdict, not runs: see verdict.txt and verdict.csv in it")
+    return read_form(folder, "manifest.json", MANIFEST)
+
+
+def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredSweep:
+    """Return a sweep; one that was interrupted at once has a table without rows."""
+    import pandas as pd
+
+    require(manifest["vary"], {}, "vary")
+    keys = tuple(manifest["vary"])
+    path = folder / "sweep.parquet"
+    table = _read_table(path, keys) if path.exists() else pd.DataFrame(columns=[*keys, *RESULTS])
+    require(manifest["status"], TEXT, "status")
+    return StoredSweep(folder, scenario, keys, table, manifest["status"], manifest)
+
+
+def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
+    """Return the table of a sweep: numbers, and texts in columns of keys and of the status."""
+    import pandas as pd
+
+    names = column_names(path)
+    for name in (*keys, "runs", *RESULTS, "status"):
+        if names.count(name) != 1:
+            raise DamagedError(f"{path.name} has no column {name}")
+    numeric = [name for name in names if is_numeric_column(path, name)]
+    if not {*RESULTS, "runs"} <= set(numeric):
+        raise DamagedError(f"{path.name} has texts in columns of numbers")
+    columns: dict[str, Any] = dict(read_numbers(path, numeric, missing=True))
+    columns |= {n: read_words(path, n).astype(str) for n in names if n not in numeric}
+    return pd.DataFrame({name: columns[name] for name in names})
