@@ -115,7 +115,7 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
     expected = np.full(P.shape[:2], np.nan)
     if sigma is None:
         return expected
-    usable = np.isfinite(P).all(axis=(-2, -1))
+    usable = np.asarray(np.isfinite(P).all(axis=(-2, -1)))
     usable[usable] = np.linalg.matrix_rank(P[usable]) == P.shape[-1]
     scaled = np.linalg.solve(P[usable], sigma[usable])
     expected[usable] = np.trace(scaled, axis1=-2, axis2=-1)
