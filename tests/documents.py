@@ -174,9 +174,9 @@ def copy(*words):
 
 
 def captured(call):
-    """What a call prints."""
+    """What a call prints, errors included, as on a terminal."""
     out = io.StringIO()
-    with contextlib.redirect_stdout(out):
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         call()
     return out.getvalue()
 

@@ -1,0 +1,29 @@
+"""The look of the drawings on the pages of the papers, and how they are written."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+HERE = Path(__file__).parent
+SCENARIOS = HERE.parent.parent / "scenarios"
+BLUE, ORANGE, GREEN, PINK, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#555555"
+LOOK = {
+    "font.size": 9,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "svg.hashsalt": "netkf",  # the same drawing is the same file
+    "figure.facecolor": "white",
+}
+
+
+def draw(name, function, size):
+    """Write NAME.svg, drawn by a function on an empty figure."""
+    with mpl.rc_context(LOOK):
+        figure = Figure(figsize=size, layout="constrained")
+        function(figure)
+        figure.savefig(HERE / f"{name}.svg", metadata={"Date": None})
