@@ -53,7 +53,7 @@ class LinearPlant(Plant):
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
         """The truth of one run; ``frames``: in frames, where the plant is unstable."""
-        start = self.start_mean + apply(noise_root(self.start_cov), random.standard_normal(self.n))
+        start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
         return LinearPath(self._steps, self.noise_root, start, random, slots)
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from netkf.core.fields import Component, covariance, field, vector
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import noise_root
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,3 +46,8 @@ class Plant(Component):
     def start_cov(self) -> FloatArray:
         """(n, n) covariance of x(0)."""
         return np.zeros((self.n, self.n)) if self.cov is None else self.cov
+
+    @cached_property
+    def start_root(self) -> FloatArray:
+        """The factor (n, n) of ``start_cov`` that standard normals are multiplied with."""
+        return noise_root(self.start_cov)

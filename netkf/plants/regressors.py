@@ -51,6 +51,11 @@ class RegressorSensor(Sensor):
         """The recursion of the regressor's state ``s``."""
         return Recursion(self.A)
 
+    @cached_property
+    def drive(self) -> FloatArray:
+        """The factor (m, q) that standard normals drive the regressor's state with."""
+        return product(self.B, noise_root(self.xi_cov))
+
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RegressorReadings:
@@ -68,8 +73,7 @@ class RegressorReadings(SlotReadings):
         driving: np.random.Generator,
     ) -> None:
         super().__init__(sensor.H, sensor.R, random)
-        drive = product(sensor.B, noise_root(sensor.xi_cov))
-        self._C, self._s = sensor.C, LinearPath(sensor.steps, drive, sensor.start, driving)
+        self._C, self._s = sensor.C, LinearPath(sensor.steps, sensor.drive, sensor.start, driving)
 
     def matrix(self, slot: int) -> FloatArray:
         """``phi_k'`` (1, n) of a slot not before the last one asked for."""

@@ -11,6 +11,8 @@ from netkf.linalg.portable import apply, gauss_legendre, norm, product
 
 UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
 DEPENDENT = 1e-9  # share of a row's norm below which what is left of it counts as rounding
+KNOWN = 32
+"""Sets of gaps whose laws are kept."""
 _NODES, _WEIGHTS = gauss_legendre(10)  # exact to rounding for gaps of that size
 
 
@@ -36,10 +38,21 @@ class Transitions:
             k += 1
         self._series = np.stack(powers)
         self._response = product(self._series, B)
+        # Runs that are sampled at the same times ask for the same gaps again.
+        self._known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """``Phi`` and ``L``, both (K, n, n), of K gaps in seconds, none below 0."""
         distinct, place = np.unique(gaps, return_inverse=True)
+        key = distinct.tobytes()
+        if key not in self._known:
+            if len(self._known) >= KNOWN:
+                self._known.clear()
+            self._known[key] = self._laws(distinct)
+        Phi, L = self._known[key]
+        return Phi[place], L[place]
+
+    def _laws(self, distinct: FloatArray) -> tuple[FloatArray, FloatArray]:
         doublings = self._doublings(distinct)
         units = np.ldexp(distinct, -doublings)
         Phi, L = self._unit_transition(units), noise_factors(self._unit_noise(units))[0]
@@ -48,7 +61,7 @@ class Transitions:
                 k = np.flatnonzero(doublings > level)
                 L[k] = noise_factors(np.concatenate([L[k], product(Phi[k], L[k])], axis=2))[0]
                 Phi[k] = product(Phi[k], Phi[k])
-        return Phi[place], L[place]
+        return Phi, L
 
     def transitions(self, gaps: FloatArray) -> FloatArray:
         """``Phi = e^{A g}`` (K, n, n) alone."""

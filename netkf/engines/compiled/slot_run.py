@@ -38,7 +38,7 @@ from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_se
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes
-from netkf.linalg.portable import noise_root, solve_lower
+from netkf.linalg.portable import solve_lower
 from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
 from netkf.rng.draws import StreamBatch
@@ -111,7 +111,7 @@ class SlotRuns:
         self._plant_states = StreamBatch(self._streams, "plant", [()]).states
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
         # A root of the covariance, which may be singular.
-        root, room = noise_root(plant.start_cov), np.zeros((setup.n, LANES))
+        root, room = plant.start_root, np.zeros((setup.n, LANES))
         draw_starts(MANY, self._plant_states, normal_ziggurat(), plant.start_mean, root, room, x)
         self._path = Path(plant.F, plant.noise_root, setup.frame, x, origin)
 

@@ -19,7 +19,7 @@ from netkf.engines.compiled.slot_messages import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, aligned, blocks_of
-from netkf.linalg.portable import cholesky, noise_root, product, solve_lower
+from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.channels import GilbertElliott, identical_per_link
 from netkf.network.graphs import Link
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
@@ -171,7 +171,7 @@ class SlotSetup:
         for d, sensor in enumerate(regressors):
             size = len(sensor.A)
             A, drive, start = np.zeros((k, k)), np.zeros((k, q)), np.zeros(k)
-            root = product(sensor.B, noise_root(sensor.xi_cov))
+            root = sensor.drive
             A[:size, :size], drive[:size, : root.shape[1]] = sensor.A, root
             C[d, :, :size], start[:size] = sensor.C, sensor.start
             # Columns of noise are not padded: each takes as many numbers as it does alone.
