@@ -10,6 +10,7 @@ from __future__ import annotations
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.diffusion_kalman import DiffusionKalman
 from netkf.algorithms.filter import (
     Estimate,
     Exchange,
@@ -23,7 +24,9 @@ from netkf.algorithms.filter import (
 from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.information_consensus import Hcmci, Icf
 from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.kalman_consensus import Kcf
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
@@ -109,6 +112,7 @@ __all__ = [
     "Delay",
     "Diffusion",
     "DiffusionFilter",
+    "DiffusionKalman",
     "Edges",
     "ErdosRenyi",
     "Estimate",
@@ -122,9 +126,12 @@ __all__ = [
     "Gossip",
     "Graph",
     "Grid",
+    "Hcmci",
     "Hybrid",
+    "Icf",
     "Increments",
     "Intermittent",
+    "Kcf",
     "LinearPlant",
     "LinearSensor",
     "LinkClock",

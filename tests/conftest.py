@@ -13,14 +13,8 @@ from netkf.scenario.reading import from_table
 
 ROOT = Path(__file__).parent.parent
 SCENARIOS = ROOT / "scenarios"
-SLOT_FILTERS = (
-    netkf.parts.Gossip,
-    netkf.parts.Intermittent,
-    netkf.parts.DiffusionFilter,
-    netkf.parts.PushSum,
-    netkf.parts.Local,
-)
-ONCE = {simulate_agenda, simulate_runs, *(kind.slot_kernel for kind in SLOT_FILTERS)}
+FILTERS = netkf.parts.kinds()["filter"].values()
+ONCE = {simulate_agenda, simulate_runs, *(kind.slot_kernel for kind in FILTERS)}
 
 
 def scenario_files():

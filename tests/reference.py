@@ -138,3 +138,94 @@ def switched_riccati(P, modes, F, Q, readings):
 def moments_update(P, x, moments, U, W, C):
     """The estimate once the moments of a reading are used, with gains ``U + P W``."""
     return x + (U + P @ W) @ (moments - C @ x)
+
+
+# Filters of the literature, one slot of all nodes: lists of x and P by node, predicted;
+# ``readings`` are (y, H, R) by node; ``heard[step]`` (N, N) is 1 where the message of node j
+# reached node i.
+
+
+def kalman_update(x, P, y, H, R):
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return x + gain @ (y - H @ x), P - gain @ H @ P
+
+
+def _consensus(values, weights, heard):
+    """Steps of ``v_i + sum_j w_ij (v_j - v_i)`` over those heard."""
+    for step in heard:
+        values = [
+            v + sum(weights[i, j] * step[i, j] * (u - v) for j, u in enumerate(values))
+            for i, v in enumerate(values)
+        ]
+    return values
+
+
+def _information(readings, n):
+    """H' R^-1 H and H' R^-1 y of each node, zeros without a reading."""
+    found = {
+        i: (H.T @ np.linalg.solve(R, H), H.T @ np.linalg.solve(R, y))
+        for i, (y, H, R) in readings.items()
+    }
+    return lambda i: found.get(i, (np.zeros((n, n)), np.zeros(n)))
+
+
+def hcmci(x, P, readings, weights, heard, consensus, omega):
+    """Battistelli, Chisci, Mugnai, Farina and Graziano 2015; CM and CI are the special cases."""
+    n, N = len(x[0]), len(x)
+    news = _information(readings, n)
+    prior = [np.linalg.inv(P[i]) for i in range(N)], [np.linalg.solve(P[i], x[i]) for i in range(N)]
+    novel = [news(i)[0] for i in range(N)], [news(i)[1] for i in range(N)]
+    if consensus == "information":
+        prior = tuple(
+            [a + b for a, b in zip(*both, strict=True)] for both in zip(prior, novel, strict=True)
+        )
+        novel, omega = prior, 0.0
+    if consensus != "measurements":
+        prior = tuple(_consensus(values, weights, heard) for values in prior)
+    novel = tuple(_consensus(values, weights, heard) for values in novel)
+    Omega, q = (
+        [a + omega * b for a, b in zip(*both, strict=True)]
+        for both in zip(prior, novel, strict=True)
+    )
+    cov = [np.linalg.inv(one) for one in Omega]
+    return [C @ one for C, one in zip(cov, q, strict=True)], cov
+
+
+def icf(x, P, readings, weights, heard):
+    """Kamal, Farrell and Roy-Chowdhury 2013, Algorithm 2."""
+    n, N = len(x[0]), len(x)
+    news = _information(readings, n)
+    V = [np.linalg.inv(P[i]) / N + news(i)[0] for i in range(N)]
+    v = [np.linalg.solve(P[i], x[i]) / N + news(i)[1] for i in range(N)]
+    V, v = (_consensus(values, weights, heard) for values in (V, v))
+    return [np.linalg.solve(*one) for one in zip(V, v, strict=True)], [
+        np.linalg.inv(N * one) for one in V
+    ]
+
+
+def kcf(x, P, readings, heard, epsilon, share=True):
+    """Olfati-Saber 2009, Algorithm 1; without sharing S and y are the node's own."""
+    n, N = len(x[0]), len(x)
+    news, found = _information(readings, n), []
+    for i in range(N):
+        around = [j for j in range(N) if heard[0][i, j]]
+        used = [i, *around] if share else [i]
+        S, y = sum(news(j)[0] for j in used), sum(news(j)[1] for j in used)
+        M = np.linalg.inv(np.linalg.inv(P[i]) + S)
+        gamma = epsilon / (np.sqrt(np.trace(P[i].T @ P[i])) + 1.0)
+        pull = sum((x[j] - x[i] for j in around), np.zeros(n))
+        found.append((x[i] + M @ (y - S @ x[i]) + gamma * P[i] @ pull, M))
+    return [one for one, _ in found], [M for _, M in found]
+
+
+def diffusion_kalman(x, P, readings, weights, heard):
+    """Cattivelli and Sayed 2010, Algorithm 1; ``heard`` is of the readings and of the estimates."""
+    psi, cov = [], []
+    for i in range(len(x)):
+        one, C = x[i], P[i]
+        for j in sorted(readings):
+            if j == i or heard[0][i, j]:
+                one, C = kalman_update(one, C, *readings[j])
+        psi.append(one)
+        cov.append(C)
+    return _consensus(psi, weights, heard[1:]), cov

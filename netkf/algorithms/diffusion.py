@@ -31,13 +31,11 @@ from netkf.algorithms.kernels.slots import (
 )
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
-from netkf.core.errors import ScenarioError
+from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import choice, either, field, nested, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, spread, store
-
-METROPOLIS = "metropolis"
 
 
 class DiffusionState(NamedTuple):
@@ -195,27 +193,8 @@ class DiffusionFilter(Filter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.weights, str):
-            return
-        if (self.weights < 0.0).any():
-            # Weights come from files: the message names the entry.
-            where = np.argwhere(self.weights < 0.0)[0].tolist()
-            raise ScenarioError(
-                "weights[{}][{}]".format(*where),
-                "must not be negative",
-                float(self.weights[tuple(where)]),
-                "give weights from 0 to 1",
-            )
-        # Column i holds what node i gives, itself included.
-        sums = self.weights.sum(axis=0)
-        wrong = np.flatnonzero(np.abs(sums - 1.0) > 1e-9)
-        if wrong.size:
-            raise ScenarioError(
-                "weights",
-                f"column {wrong[0]}, what node number {wrong[0]} gives, must sum to 1",
-                float(sums[wrong[0]]),
-                "write the weights that a node gives below each other",
-            )
+        if not isinstance(self.weights, str):
+            check_columns(self.weights)
 
     @property
     def pair_weights(self) -> FloatArray | None:

@@ -289,6 +289,10 @@ class Filter(Component):
         """Return how often exchange number ``phase`` of a slot is repeated, in equal times."""
         return 1
 
+    def exchange_steps(self, phase: int) -> int:
+        """Return ``steps(phase)``; a filter that has a setting called ``steps`` defines this."""
+        return self.steps(phase)
+
     def redraws_links(self, phase: int, step: int) -> bool:
         """Return True if links draw new outcomes in this step; else each keeps its last one. The
         first step always draws.

@@ -22,7 +22,7 @@ F = TypeVar("F", bound=type[Filter])
 
 _REGISTERED: dict[str, type[Filter]] = {}
 
-WEIGHING = ("share", "max_measurement_interval", "steps", "redraws_links")
+WEIGHING = ("share", "max_measurement_interval", "steps", "exchange_steps", "redraws_links")
 """Methods besides STEPS that theorems rely on; other weights of links are known to the theory."""
 
 LINK_WEIGHTS = ("weight", "pair_weights")

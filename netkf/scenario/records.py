@@ -68,9 +68,11 @@ def _exchanges(scenario: DerivedScenario) -> None:
         return
     phases = (algorithm.schedule or ()).count("exchange")
     for slot, phase, step in activation.recorded:
-        steps = algorithm.steps(phase) if phase < phases else 0
+        steps = algorithm.exchange_steps(phase) if phase < phases else 0
         if step >= steps:
-            limits = " and ".join(f"{algorithm.steps(k)} in phase {k}" for k in range(phases))
+            limits = " and ".join(
+                f"{algorithm.exchange_steps(k)} in phase {k}" for k in range(phases)
+            )
             raise ScenarioError(
                 "network.activation.path",
                 f"{activation.path.name}: the filter has no such step, only {limits}",

@@ -107,7 +107,7 @@ def _schedule(watched: Watched) -> None:
         demand(once, where, 'must have one "predict" and one "sense" at most', schedule)
         _check_predicts(watched, schedule)
     for phase in range(schedule.count("exchange")):
-        steps = watched.call("steps", phase)
+        steps = watched.call("exchange_steps", phase)
         whole = isinstance(steps, int) and steps >= 1
         demand(whole, f"{watched.name}.steps", "must be a whole number of at least 1", steps)
         fresh = watched.call("redraws_links", phase, 0)

@@ -45,7 +45,7 @@ class SlotTrial(Trial):
         for kind in part.schedule:
             if kind == "exchange":
                 if part.talks and slot >= part.first_slot:
-                    for step in range(min(part.steps(phase), MOST_STEPS)):
+                    for step in range(min(part.exchange_steps(phase), MOST_STEPS)):
                         self._exchange(Exchange(PERIOD * slot, phase, step, slot), lost)
                 phase += 1
             elif slot > 0 or part.predicts:  # a filtered one starts from before any reading

@@ -25,6 +25,10 @@ SOUND = {
         parts.DiffusionFilter(on_loss="keep-own"),
         parts.DiffusionFilter(weights=[[0.5, 0.5, 0.0], [0.25, 0.5, 0.25], [0.25, 0.0, 0.75]]),
     ],
+    "hcmci": [parts.Hcmci(consensus="information", steps=2)],
+    "icf": [parts.Icf()],
+    "kcf": [parts.Kcf(epsilon=0.2)],
+    "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [
         parts.PushSum(gamma=3, delta=4.0),
         parts.PushSum(gamma=1, delta=4.0, stop="paper", tolerance=0.1),

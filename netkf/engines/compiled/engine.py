@@ -17,6 +17,7 @@ from netkf.engines.compiled.batches import flow_batches
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
+from netkf.engines.compiled.state import COMBINATIONS
 from netkf.linalg import compiling
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -63,6 +64,11 @@ class CompiledEngine(Engine):
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
+        hosted = scenario.hosted
+        if not (hosted.slot_kernel if scenario.slotted else hosted.combination in COMBINATIONS):
+            time = "in slots" if scenario.slotted else "under clocks"
+            name = name_of("filter", scenario.filter.algorithm)
+            return f'engine "compiled" has no code for the filter {name!r} {time}; {remedy}'
         return None
 
     def announce(self, scenario: Scenario) -> None:

@@ -101,7 +101,7 @@ class SlotSetup:
                 # -1: a reading, which is no step of an exchange.
                 stages.append((-1, -1, 0.0))
             elif kind == "exchange":
-                steps = algorithm.steps(phase) if algorithm.talks else 0
+                steps = algorithm.exchange_steps(phase) if algorithm.talks else 0
                 for k in range(steps):
                     # Steps share the phase equally; ends are seconds after the slot begins.
                     stages.append((step, phase, (phase + (k + 1) / steps) * length))

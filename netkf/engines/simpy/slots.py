@@ -59,7 +59,7 @@ class Schedule:
         phases = self._algorithm.schedule or ()
         # Steps of each exchange; none if the filter does not talk.
         self._exchanges = [
-            self._algorithm.steps(k) if self._algorithm.talks else 0
+            self._algorithm.exchange_steps(k) if self._algorithm.talks else 0
             for k in range(phases.count("exchange"))
         ]
         # Exchanges without steps take no time.

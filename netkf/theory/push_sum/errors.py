@@ -22,15 +22,13 @@ from netkf.algorithms.push_sum import PushSum
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import HostObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.theory.numerics.updates import add_information_to_root
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
-
-ArrivalsByStep = dict[tuple[int, int, int], FloatArray]
-"""By slot, phase and step, (N, N): 1 where the message of node j reached node i in time."""
 
 
 def require_known_errors(scenario: Scenario, run: Run) -> None:
@@ -48,10 +46,7 @@ def require_known_errors(scenario: Scenario, run: Run) -> None:
         raise TheoryError("the exact errors are known for filters that have the plant's F")
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError("the exact errors are known for sensors whose H is fixed")
-    slots = np.round(run.times / plant.period).astype(int).tolist()
-    if slots and plant.over(slots[-1], scenario.horizon):
-        message = "the exchanges of the slot at the horizon are not in the trace: sample before it"
-        raise TheoryError(message)
+    require_traced_exchanges(scenario, run)
 
 
 class AveragingRule(ErrorRule):
@@ -62,7 +57,7 @@ class AveragingRule(ErrorRule):
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, PushSum)
         self._gamma, self._delta = int(algorithm.gamma or 1), float(algorithm.delta or math.nan)
-        self._arrivals = _arrivals_by_step(scenario, run, self._gamma)
+        self._arrivals = arrivals_by_step(scenario, run)
         self._N, n = len(scenario.nodes), errors.n
         self._nu = np.array([scenario.topology.degrees[node] + 1 for node in scenario.nodes])
         models = scenario.slot_models
@@ -112,23 +107,6 @@ class AveragingRule(ErrorRule):
             K = number[host] * root @ root.T @ np.linalg.solve(one.R, one.H).T
             errors.multiply(host, np.eye(n) - K @ one.H, root)
             errors.stack.add(host, columns[host], -K @ one.root)
-
-
-def _arrivals_by_step(scenario: Scenario, run: Run, gamma: int) -> ArrivalsByStep:
-    """Return the messages of a run that arrived in time, by slot, phase and averaging step."""
-    index, size, period = scenario.topology.index, len(scenario.nodes), scenario.slot_plant.period
-    rows = run.log[run.log["kind"] == CODES["deliver"]]
-    sent, length = rows["t"] - rows["age"], scenario.phase_length
-    slot = scenario.slot_plant.slots_of(sent)
-    # A message belongs to the averaging step in which it was sent.
-    since = sent - slot * period - rows["phase"] * length
-    step = np.where(rows["phase"] == 0, 0, np.round(since / (length / gamma))).astype(int)
-    up: ArrivalsByStep = {}
-    columns = (slot, rows["phase"], step, rows["node"], rows["peer"])
-    for t, phase, k, node, peer in zip(*(c.tolist() for c in columns), strict=True):
-        matrix = up.setdefault((t, phase, k), np.zeros((size, size)))
-        matrix[index[node], index[peer]] = 1.0
-    return up
 
 
 class Total(NamedTuple):

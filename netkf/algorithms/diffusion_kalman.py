@@ -1,0 +1,175 @@
+"""The diffusion Kalman filter: Cattivelli and Sayed, "Diffusion strategies for distributed Kalman
+filtering and smoothing", IEEE Trans. Automatic Control 55, 2010, Algorithm 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.neighbours import add_to_estimate, fuse_readings, move_towards
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    rebase,
+    show,
+)
+from netkf.algorithms.models import first_root, sample_update
+from netkf.algorithms.registry import built_in
+from netkf.algorithms.weights import METROPOLIS, check_columns
+from netkf.core.fields import choice, either, field, nested, square
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
+
+READINGS, ESTIMATES = 0, 1
+"""The two exchanges of a slot."""
+
+
+class DiffusionKalmanState(NamedTuple):
+    """Estimate ``xhat`` (n,), psi between the exchanges; ``root`` (n, n) of P; the model; the
+    node's own ``reading`` of this slot.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: Any
+    reading: Reading | None = None
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+
+@kernel
+def diffusion_kalman_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+) -> None:
+    """Carry diffusion Kalman filters through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.sensed[s]:
+                predict(nodes, room, b)
+                for h in range(len(nodes.rows)):
+                    fuse_readings(nodes, readings, plan, links, room, True, b, s, h)
+                # All differences before any estimate moves: the combination is simultaneous.
+                for h in range(len(nodes.rows)):
+                    move_towards(
+                        room.lanes, nodes.xhat, b, h, links, plan.up, s, 1, True, room.xhat
+                    )
+                for h in range(len(nodes.rows)):
+                    add_to_estimate(room.lanes, nodes.xhat, b, h, room.xhat)
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
+
+
+@kernel
+def move_one(x: FloatArray, links: SlotLinks, up: Any, moved: FloatArray) -> None:
+    """``move_towards`` of one node, the first of x (1, H, n, 1), with one lane."""
+    move_towards(ONE, x, 0, 0, links, up, 0, 0, True, moved)
+
+
+@built_in("diffusion-kalman")
+@dataclass(frozen=True, eq=False)
+class DiffusionKalman(Filter):
+    """Update with the readings of the neighbourhood, then combine the neighbours' estimates.
+
+    weights entry [l][i] is the weight c_{l,i} that node i gives to what node l sends, in the order
+            of node ids: columns sum to 1; or "metropolis", 1 / (1 + max degree) for each link and
+            the rest for oneself
+
+    The weight of an estimate that does not come stays with the node itself. P is that of the
+    readings a node has used; the combination leaves it as it is, so it is no bound on the error.
+    """
+
+    weights: str | FloatArray = field(
+        either(choice(METROPOLIS), square, nested(1)), default=METROPOLIS
+    )
+
+    paper: ClassVar[str] = "diffusion_kalman"
+    combination: ClassVar[str] = "readings, then estimates"
+    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange", "exchange")
+    clocks: ClassVar[tuple[str, ...]] = ()
+    first_slot: ClassVar[int] = 1
+    one_way: ClassVar[bool] = True
+    slot_kernel = staticmethod(diffusion_kalman_slots)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.weights, str):
+            check_columns(self.weights)
+
+    @property
+    def pair_weights(self) -> FloatArray | None:
+        """``weights`` where they are a matrix."""
+        return None if isinstance(self.weights, str) else self.weights
+
+    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
+        """Return False for the readings of nodes without a sensor."""
+        return has_sensor or phase == ESTIMATES
+
+    def init(
+        self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
+    ) -> DiffusionKalmanState:
+        """Return the state at time 0."""
+        return DiffusionKalmanState(mean, first_root(cov), model)
+
+    def update(self, state: DiffusionKalmanState, reading: Reading) -> DiffusionKalmanState:
+        """Use the node's own reading, and keep it to be sent."""
+        if not len(reading.y):
+            return state._replace(reading=None)
+        xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
+        return state._replace(xhat=xhat, root=root, reading=reading)
+
+    def emit(
+        self, state: DiffusionKalmanState, exchange: Exchange
+    ) -> tuple[DiffusionKalmanState, Any]:
+        """Return the reading, None from nodes that have none, and then psi."""
+        return state, state.xhat if exchange.phase == ESTIMATES else state.reading
+
+    def absorb(
+        self, state: DiffusionKalmanState, messages: Sequence[Message], exchange: Exchange
+    ) -> DiffusionKalmanState:
+        """Step 1, the incremental update, or step 2, the diffusion update, of Algorithm 1."""
+        if not messages:
+            return state
+        if exchange.phase == ESTIMATES:
+            return state._replace(xhat=combined(state.xhat, messages))
+        xhat, root = state.xhat, state.root
+        for message in messages:
+            one = message.payload
+            xhat, root = sample_update(xhat, root, one.y, one.H, one.R)
+        return state._replace(xhat=xhat, root=root)
+
+    shift = Filter.shift  # affine: the weights sum to one
+
+    def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
+        """Estimates move; a reading stays in the coordinates of its own time."""
+        return payload if isinstance(payload, Reading) else payload + offset
+
+
+def combined(psi: FloatArray, messages: Sequence[Message]) -> FloatArray:
+    """Return ``sum_l c_l psi_l`` (n,) with the weights of the messages and the rest for psi."""
+    # One receiver and its senders, as a star whose links are all up.
+    count, n = len(messages), len(psi)
+    x, places = np.stack([psi, *(m.payload for m in messages)])[None, :, :, None], np.arange(count)
+    weights = np.array([message.weight for message in messages], dtype=np.float64)
+    links = SlotLinks(np.array([0, count]), places + 1, places, weights)
+    moved = np.empty((1, n, 1))
+    move_one(x, links, np.ones((1, 1, 1, count, 1), dtype=np.uint8), moved)
+    return np.asarray(psi + moved.reshape(n))

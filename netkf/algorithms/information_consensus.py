@@ -1,0 +1,386 @@
+"""Consensus on information: HCMCI with its special cases, and the information-weighted filter.
+
+Nodes exchange pairs (Omega, q) = (P^-1, P^-1 xhat) of information and replace them by convex
+combinations of their own and their neighbours', ``steps`` times a slot. The filters differ in what
+they combine and in how often they count it:
+
+* CI, consensus on information: the pair after the node's reading (Battistelli and Chisci,
+  Automatica 50, 2014).
+* CM, consensus on measurements: the pair of the reading alone, counted ``novelty_weight`` times.
+* HCMCI: both, each by itself (Battistelli, Chisci, Mugnai, Farina and Graziano, "Consensus-based
+  linear and nonlinear filtering", IEEE Trans. Automatic Control 60, 2015).
+* ICF: the sum of the pair of the reading and 1/N of that of the prediction, counted N times (Kamal,
+  Farrell and Roy-Chowdhury, "Information weighted consensus filters and their application in
+  distributed camera networks", IEEE Trans. Automatic Control 58, 2013).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.filter import Estimate, Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.information import begin_part, mix_parts, read_off
+from netkf.algorithms.kernels.intersection import invert_lanes
+from netkf.algorithms.kernels.root_update import intersect_roots
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    rebase,
+    show,
+    slot_room,
+    whitened,
+)
+from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.registry import built_in
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import choice, field, integer, positive
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, ONE, aligned, load, store
+
+MOST_STEPS = 10_000
+INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
+
+
+class Recipe(NamedTuple):
+    """What K pairs of a node begin with and how its estimate is made of them in the end.
+
+    shares (K, 2): multiples of the information of the prediction and of the reading; counts
+    (K + 1,): multiples of each pair after the last step, and of the node's own prediction.
+    """
+
+    shares: FloatArray
+    counts: FloatArray
+
+
+def recipe(shares: Sequence[Sequence[float]], counts: Sequence[float]) -> Recipe:
+    """Return a recipe from plain numbers."""
+    return Recipe(np.array(shares, dtype=np.float64), np.array(counts, dtype=np.float64))
+
+
+class ConsensusState(NamedTuple):
+    """Estimate ``xhat`` (n,) and ``root`` (n, n) of its covariance, in a slot the prediction until
+    the last step; the model; how often pairs count; the roots of the node's pairs after its reading
+    (K, n, n + 1), see ``kernels.information``, None outside of a slot.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: Any
+    recipe: Recipe
+    parts: FloatArray | None = None
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+
+class Pairs(NamedTuple):
+    """A payload: roots of K pairs (K, n, n + 1) that count from ``xhat`` (n,)."""
+
+    xhat: FloatArray
+    parts: FloatArray
+
+
+class ConsensusArrays(NamedTuple):
+    """Steps and recipe, and the pairs of all nodes of a block, ``parts``
+    (2, K, H, n, n + 1, L).
+    """
+
+    steps: int
+    shares: FloatArray
+    counts: FloatArray
+    parts: FloatArray
+
+
+@kernel
+def consensus_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+    arrays: ConsensusArrays,
+) -> None:
+    """Carry filters by consensus on information through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.sensed[s]:
+                predict(nodes, room, b)
+                begin_all(nodes, readings, room, arrays, b, s)
+                for step in range(arrays.steps):
+                    for h in range(len(nodes.rows)):
+                        mix_parts(
+                            room.lanes, arrays.parts, step, h, links, plan.up, (b, s, step),
+                            room.xhat, room.total, room.whitened,
+                        )  # fmt: skip
+                for h in range(len(nodes.rows)):
+                    read_off(
+                        room.lanes, nodes.root, nodes.xhat, b, h, arrays.parts, arrays.steps % 2,
+                        arrays.counts, room.root, room.xhat, room.total, room.whitened,
+                    )  # fmt: skip
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
+
+
+@kernel
+def begin_all(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    room: SlotRoom,
+    arrays: ConsensusArrays,
+    b: int,
+    s: int,
+) -> None:
+    """Begin the pairs of all filters of a block from their predictions and readings."""
+    for h in range(len(nodes.rows)):
+        for i in range(nodes.xhat.shape[2]):
+            store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
+        invert_lanes(room.lanes, room.root, nodes.root, b, h)
+        for k in range(len(arrays.shares)):
+            begin_part(
+                room.lanes, arrays.parts, k, arrays.shares, room.root, readings.y, readings.H,
+                (b, s, h), nodes.rows[h], room.xhat, room.total, room.whitened,
+            )  # fmt: skip
+
+
+@kernel
+def begin_one(
+    nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, arrays: ConsensusArrays
+) -> None:
+    """``begin_all`` of one filter with one lane."""
+    begin_all(nodes, readings, room, arrays, 0, 0)
+
+
+@kernel
+def mix_one(parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any) -> None:
+    """A step of one node, the first of ``parts`` (2, K, H, n, n + 1, 1), with one lane."""
+    mix_parts(ONE, parts, 0, 0, links, up, (0, 0, 0), centre, work[0], work[1])
+
+
+@kernel
+def read_one(
+    root: FloatArray,
+    x: FloatArray,
+    parts: FloatArray,
+    counts: FloatArray,
+    inverse: FloatArray,
+    centre: FloatArray,
+    work: FloatArray,
+) -> None:
+    """``read_off`` of one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
+    invert_lanes(ONE, inverse, root, 0, 0)
+    read_off(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
+
+
+@dataclass(frozen=True, eq=False)
+class InformationConsensus(Filter):
+    """Consensus on pairs of information; a class says by ``recipe`` which.
+
+    The weights are Metropolis', ``1 / (1 + max degree)`` for each link; the weight of a message
+    that does not come stays with the node itself, so that weights always sum to one.
+    """
+
+    steps: int = field(integer(low=1, high=MOST_STEPS), default=1)  # type: ignore[assignment]
+
+    paper: ClassVar[str] = "information_consensus"
+    combination: ClassVar[str] = "intersection"
+    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
+    clocks: ClassVar[tuple[str, ...]] = ()
+    first_slot: ClassVar[int] = 1
+    inverts: ClassVar[bool] = True
+    slot_kernel = staticmethod(consensus_slots)
+
+    @abstractmethod
+    def recipe(self, nodes: int) -> Recipe:
+        """Return what is combined in a network of so many nodes."""
+
+    def exchange_steps(self, phase: int) -> int:
+        """Return ``steps``."""
+        return self.steps
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[ConsensusArrays]:
+        """Return steps, recipe and room for the pairs of all nodes."""
+        made = self.recipe(infos[0].nodes)
+        n, K = len(states[0].xhat), len(made.shares)
+        parts: FloatArray = aligned((2, K, len(states), n, n + 1, LANES))
+        return (ConsensusArrays(self.steps, *made, parts),)
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ConsensusState:
+        """The node knows how many nodes there are."""
+        return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))
+
+    def update(self, state: ConsensusState, reading: Any) -> ConsensusState:
+        """In slots begin the pairs; under clocks the Kalman update."""
+        if not isinstance(state.model, SlotModel):
+            updated: ConsensusState = super().update(state, reading)
+            return updated
+        return state._replace(parts=first_parts(state, reading))
+
+    def emit(self, state: ConsensusState, exchange: Exchange) -> tuple[ConsensusState, Any]:
+        """Return the pairs of the node, in slots those of this step."""
+        if exchange.slot < 0 or state.parts is None:
+            return state, Estimate(state.xhat, state.root)
+        return state, Pairs(state.xhat, state.parts)
+
+    def absorb(
+        self, state: ConsensusState, messages: Sequence[Message], exchange: Exchange
+    ) -> ConsensusState:
+        """Take a consensus step; after the last one of a slot make the estimate."""
+        if exchange.slot < 0:
+            return self._intersect(state, messages)
+        assert state.parts is not None
+        parts = mixed_parts(state.xhat, state.parts, messages)
+        if exchange.step < self.steps - 1:
+            return state._replace(parts=parts)
+        xhat, root = estimate_of(state, parts)
+        return state._replace(xhat=xhat, root=root, parts=None)
+
+    def _intersect(self, state: ConsensusState, messages: Sequence[Message]) -> ConsensusState:
+        """Under clocks: one step of consensus on the pairs of those heard, predicted to now."""
+        own = max(0.0, 1.0 - sum(message.weight for message in messages))
+        pairs = [(state.xhat, state.root)]
+        pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]
+        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
+        weights = np.array([own, *(message.weight for message in messages)])
+        xhat, root = intersect_roots(weights, means, roots)
+        return state._replace(xhat=xhat, root=root)
+
+    shift = Filter.shift  # affine: pairs count from the estimate
+    shift_payload = Filter.shift_payload
+
+
+@built_in("hcmci")
+@dataclass(frozen=True, eq=False)
+class Hcmci(InformationConsensus):
+    """Hybrid consensus on measurements and on information, with CM and CI as special cases.
+
+    steps           consensus steps a slot, L of the paper
+    consensus       "hybrid": the pairs of the prediction and of the reading, each by itself;
+                    "information" (CI): that of both together, P is never below the covariance of
+                    the error; "measurements" (CM): that of the reading alone
+    novelty_weight  how often the combined pair of the readings counts, omega of the paper; by
+                    default N, the number of nodes, which is right in the limit of many steps
+
+    Under clocks "information" alone: each message heard is one step of it.
+    """
+
+    consensus: str = field(choice(HYBRID, INFORMATION, MEASUREMENTS), default=HYBRID)
+    novelty_weight: float | None = field(positive, default=None)
+
+    clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")
+    one_way: ClassVar[bool] = True
+
+    def recipe(self, nodes: int) -> Recipe:
+        """Return the pairs of the paper's Algorithm, for the variant that was chosen."""
+        omega = float(nodes) if self.novelty_weight is None else self.novelty_weight
+        if self.consensus == INFORMATION:
+            return recipe([[1.0, 1.0]], [1.0, 0.0])
+        if self.consensus == MEASUREMENTS:
+            return recipe([[0.0, 1.0]], [omega, 1.0])
+        return recipe([[1.0, 0.0], [0.0, 1.0]], [1.0, omega, 0.0])
+
+    @property
+    def P_by_design(self) -> tuple[str, str]:  # type: ignore[override]
+        """CI keeps P above the covariance of its error."""
+        return ("larger", "larger") if self.consensus == INFORMATION else ("", "")
+
+    def check_scenario(self, scenario: Any) -> None:
+        """Raise ScenarioError where clocks or settings do not go with the variant."""
+        if not scenario.slotted and self.consensus != INFORMATION:
+            raise ScenarioError(
+                "filter.consensus",
+                "must be information in continuous time, where nodes do not read at one instant",
+                self.consensus,
+                'write consensus = "information", or use a plant in slots',
+            )
+        if self.consensus == INFORMATION and self.novelty_weight is not None:
+            raise ScenarioError(
+                "filter.novelty_weight",
+                "has no meaning for consensus on information, which counts a reading once",
+                self.novelty_weight,
+                'leave it out, or write consensus = "hybrid"',
+            )
+
+
+@built_in("icf")
+@dataclass(frozen=True, eq=False)
+class Icf(InformationConsensus):
+    """Information-weighted consensus filter, Kamal et al. 2013, Algorithm 2, in slots.
+
+    steps  steps of average consensus a slot, K of the paper
+
+    With the same weights of links it is HCMCI with novelty weight N, which sends twice as much.
+    """
+
+    def recipe(self, nodes: int) -> Recipe:
+        """Return ``V = P^-1 / N + H' R^-1 H``, of which N times the average is the new P^-1."""
+        return recipe([[1.0 / nodes, 1.0]], [float(nodes), 0.0])
+
+
+def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
+    """Return the roots (K, n, n + 1) of the pairs that a node begins a slot with."""
+    n, (y, H, R) = len(state.xhat), reading[:3]
+    if len(y):
+        # The kernel takes readings whose noise has variance 1.
+        y, H = whitened(y, H, R)
+    nodes = SlotNodes(
+        state.xhat.reshape(1, 1, n, 1),
+        np.ascontiguousarray(state.root).reshape(1, 1, n, n, 1),
+        state.model.F,
+        state.model.root_Q,
+        np.array([len(y)]),
+    )
+    readings = SlotReadings(
+        np.ascontiguousarray(y).reshape(1, 1, 1, -1, 1),
+        np.ascontiguousarray(H).reshape(1, 1, 1, -1, n, 1),
+        np.zeros((1, 1, n, 1)),
+        np.zeros(1, dtype=bool),
+    )
+    shares, counts = state.recipe
+    parts = np.zeros((2, len(shares), 1, n, n + 1, 1))
+    begin_one(nodes, readings, slot_room(1, n, ONE), ConsensusArrays(1, shares, counts, parts))
+    return parts[0, :, 0, :, :, 0]
+
+
+def mixed_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
+    """Return the roots (K, n, n + 1) of a node's pairs after a consensus step."""
+    # One receiver and its senders, as a star whose links are all up.
+    count, (K, n, _) = len(messages), parts.shape
+    stack = np.zeros((2, K, 1 + count, n, n + 1, 1))
+    centre = np.stack([xhat, *(message.payload.xhat for message in messages)])[..., None]
+    stack[0, :, 0, :, :, 0] = parts
+    for m, message in enumerate(messages):
+        stack[0, :, 1 + m, :, :, 0] = message.payload.parts
+    places = np.arange(count)
+    weights = np.array([message.weight for message in messages], dtype=np.float64)
+    links = SlotLinks(np.array([0, count]), places + 1, places, weights)
+    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
+    mix_one(stack, links, up, np.ascontiguousarray(centre), np.empty((2, n, n + 1, 1)))
+    return stack[1, :, 0, :, :, 0]
+
+
+def estimate_of(state: ConsensusState, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return estimate (n,) and root (n, n) from the pairs after the last step."""
+    K, n, _ = parts.shape
+    stack = np.zeros((2, K, 1, n, n + 1, 1))
+    stack[0, :, 0, :, :, 0] = parts
+    x, root = state.xhat.reshape(1, 1, n, 1).copy(), state.root.reshape(1, 1, n, n, 1).copy()
+    inverse, work = np.zeros((1, n, n, 1)), np.empty((2, n, n + 1, 1))
+    centre = state.xhat.reshape(1, n, 1).copy()
+    read_one(root, x, stack, state.recipe.counts, inverse, centre, work)
+    return x.reshape(n), np.tril(root.reshape(n, n))

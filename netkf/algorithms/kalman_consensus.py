@@ -1,0 +1,203 @@
+"""The Kalman-consensus filter: Olfati-Saber, "Kalman-consensus filter: optimality, stability, and
+performance", CDC 2009, Algorithm 1 (first proposed in CDC 2007, Algorithm 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.neighbours import (
+    add_to_estimate,
+    fuse_readings,
+    move_towards,
+    scale_by_covariance,
+)
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    rebase,
+    show,
+)
+from netkf.algorithms.models import first_root, sample_update
+from netkf.algorithms.registry import built_in
+from netkf.core.fields import boolean, field, number
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
+
+
+class KcfState(NamedTuple):
+    """Estimate ``xhat`` (n,), ``root`` (n, n) of P and the model; the prediction of this instant
+    with its root, ``prior`` and ``prior_root``, and the node's own ``reading`` of it.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: Any
+    prior: FloatArray
+    prior_root: FloatArray
+    reading: Reading | None = None
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+
+class Shared(NamedTuple):
+    """A payload: the sender's prediction ``xhat`` (n,) and its reading of this instant."""
+
+    xhat: FloatArray
+    reading: Reading | None
+
+
+class KcfArrays(NamedTuple):
+    """The settings of all filters."""
+
+    epsilon: float
+    share: bool
+
+
+@kernel
+def kcf_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+    arrays: KcfArrays,
+) -> None:
+    """Carry Kalman-consensus filters through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.sensed[s]:
+                predict(nodes, room, b)
+                # Consensus is on predictions and their covariances: before any reading is used.
+                for h in range(len(nodes.rows)):
+                    move_towards(
+                        room.lanes, nodes.xhat, b, h, links, plan.up, s, 0, False, room.xhat
+                    )
+                    scale_by_covariance(
+                        room.lanes, nodes.root, b, h, arrays.epsilon, room.xhat, room.row
+                    )
+                for h in range(len(nodes.rows)):
+                    fuse_readings(nodes, readings, plan, links, room, arrays.share, b, s, h)
+                    add_to_estimate(room.lanes, nodes.xhat, b, h, room.xhat)
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
+
+
+@kernel
+def term_of_one(
+    x: FloatArray,
+    links: SlotLinks,
+    up: Any,
+    root: FloatArray,
+    epsilon: float,
+    moved: FloatArray,
+    work: FloatArray,
+) -> None:
+    """The consensus term of one node, the first of x (1, H, n, 1), with one lane."""
+    move_towards(ONE, x, 0, 0, links, up, 0, 0, False, moved)
+    scale_by_covariance(ONE, root, 0, 0, epsilon, moved, work)
+
+
+@built_in("kcf")
+@dataclass(frozen=True, eq=False)
+class Kcf(Filter):
+    """Kalman update with the node's own and its neighbours' readings, plus a consensus term on
+    predictions, ``xhat = xbar + M (y - S xbar) + gamma P sum_j (xbar_j - xbar)`` with
+    ``M = (P^-1 + S)^-1`` and ``gamma = epsilon / (1 + |P|)``, Algorithm 1.
+
+    epsilon         the strength of the consensus term
+    share_readings  whether nodes send their readings beside their predictions (Algorithm 1); if
+                    not, the update is with the node's own alone
+
+    P counts the readings and leaves the consensus term out: it is no bound on the error. Under
+    clocks a reading is used by those who hear it without delay.
+    """
+
+    epsilon: float = field(number(low=0.0), default=0.1)
+    share_readings: bool = field(boolean, default=True)
+
+    paper: ClassVar[str] = "kalman_consensus"
+    combination: ClassVar[str] = "predictions"
+    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
+    clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
+    first_slot: ClassVar[int] = 1
+    one_way: ClassVar[bool] = True
+    needs_samples: ClassVar[bool] = True
+    slot_kernel = staticmethod(kcf_slots)
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[KcfArrays]:
+        """Return the settings."""
+        return (KcfArrays(self.epsilon, self.share_readings),)
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> KcfState:
+        """Return the state at time 0, a prediction."""
+        root = first_root(cov)
+        return KcfState(mean, root, model, mean, root)
+
+    def predict(self, state: KcfState, gap: float) -> KcfState:
+        """Predict; a reading of an earlier instant is not sent any more."""
+        xhat, root = state.model.predict(state.xhat, state.root, gap)
+        return KcfState(xhat, root, state.model, xhat, root)
+
+    def update(self, state: KcfState, reading: Reading) -> KcfState:
+        """Use the node's own reading, and keep it to be sent."""
+        if not len(reading.y):
+            return state
+        xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
+        return state._replace(xhat=xhat, root=root, reading=reading)
+
+    def emit(self, state: KcfState, exchange: Exchange) -> tuple[KcfState, Shared]:
+        """Return the message (u, U, xbar) of Algorithm 1, the reading in place of u and U."""
+        return state, Shared(state.prior, state.reading if self.share_readings else None)
+
+    def absorb(self, state: KcfState, messages: Sequence[Message], exchange: Exchange) -> KcfState:
+        """Use the readings heard, then add the consensus term."""
+        if not messages:
+            return state
+        xhat, root = state.xhat, state.root
+        for message in messages:
+            reading = message.payload.reading
+            # A late one belongs to another instant.
+            if reading is not None and (exchange.slot >= 0 or message.age <= 0.0):
+                xhat, root = sample_update(xhat, root, reading.y, reading.H, reading.R)
+        heard = [
+            state.model.extrapolate(message.payload.xhat, state.root, message.age)[0]
+            for message in messages
+        ]
+        term = consensus_term(state.prior, state.prior_root, heard, self.epsilon)
+        return state._replace(xhat=xhat + term, root=root)
+
+    def shift(self, state: KcfState, offset: FloatArray) -> KcfState:
+        """Affine: the consensus term is made of differences."""
+        return state._replace(xhat=state.xhat + offset, prior=state.prior + offset)
+
+
+def consensus_term(
+    prior: FloatArray, root: FloatArray, heard: Sequence[FloatArray], epsilon: float
+) -> FloatArray:
+    """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) for the predictions that were heard."""
+    # One receiver and its senders, as a star whose links are all up.
+    count, n = len(heard), len(prior)
+    x, places = np.stack([prior, *heard])[None, :, :, None], np.arange(count)
+    links = SlotLinks(np.array([0, count]), places + 1, places, np.ones(count))
+    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
+    moved, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)
+    term_of_one(x, links, up, S, epsilon, moved, np.empty((n, 1)))
+    return moved.reshape(n)

@@ -1,0 +1,198 @@
+"""Consensus on information in kernels: weighted sums of information pairs, carried as roots.
+
+A pair (Omega, q) of information about the state is a root (Z, z), n by n + 1, with ``Omega = Z' Z``
+and ``q = Omega c + Z' z``: Z is lower triangular, and z counts from a centre c (n,), the estimate
+of the node that holds the pair, so that differences of near states lose no digits. Omega may be
+singular, as that of a single reading is.
+
+Stacks ``parts`` (2, K, H, n, n + 1, L) hold K pairs of each of H nodes, before and after a step.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from netkf.algorithms.kernels.intersection import finish_lanes, merge_lanes
+from netkf.algorithms.kernels.slots import SlotLinks
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    Lanes,
+    any_lane,
+    load,
+    load_flags,
+    root_of,
+    select,
+    spread,
+    store,
+)
+
+
+@kernel(inlined=True)
+def take_inverse(lanes: Lanes, out: FloatArray, share: float, inverse: FloatArray, h: int) -> None:
+    """Write the root of ``share`` times ``P^-1`` of node ``h``, whose root S has the inverse
+    ``inverse[h]``, into ``out`` (n, n + 1, L); the centre is the node's estimate.
+    """
+    n, size = len(out), share**0.5
+    for i in range(n):
+        for j in range(i + 1):
+            store(lanes, out, i, j, size * load(lanes, inverse, h, i, j))
+        store(lanes, out, i, n, 0.0)
+
+
+@kernel(inlined=True)
+def add_reading(
+    lanes: Lanes,
+    total: FloatArray,
+    share: float,
+    y: FloatArray,
+    H: FloatArray,
+    place: tuple[int, int, int],
+    rows: int,
+    centre: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Add ``share`` times the information ``H' H`` and ``H' y`` of a whitened reading of so many
+    ``rows``, at ``place`` [b, s, h] of y and H, to ``total`` (n, n + 1, L); ``work`` is scratch.
+    """
+    b, s, h = place
+    n, size = len(total), share**0.5
+    # H that is fixed has one block and one slot.
+    d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
+    for k in range(rows):
+        # A row [H, y - H c] is the last one of a lower triangular root.
+        for i in range(n - 1):
+            for j in range(i + 1):
+                store(lanes, work, i, j, 0.0)
+            store(lanes, work, i, n, 0.0)
+        innovation = load(lanes, y, b, s, h, k)
+        for j in range(n):
+            entry = load(lanes, H, d, t, h, k, j)
+            innovation -= entry * load(lanes, centre, h, j)
+            store(lanes, work, n - 1, j, size * entry)
+        store(lanes, work, n - 1, n, size * innovation)
+        merge_lanes(lanes, total, work)
+
+
+@kernel(inlined=True)
+def weigh_part(
+    lanes: Lanes,
+    out: FloatArray,
+    weight: Any,
+    parts: FloatArray,
+    place: tuple[int, int, int],
+    centre: FloatArray,
+    h: int,
+) -> None:
+    """Write the root of ``weight`` times the pair at ``place`` [t, k, sender] of ``parts`` into
+    ``out`` (n, n + 1, L), counted from the centre of node ``h``.
+    """
+    t, k, sender = place
+    n, size = len(out), root_of(weight)
+    for i in range(n):
+        mean = load(lanes, parts, t, k, sender, i, n)
+        for j in range(i + 1):
+            entry = load(lanes, parts, t, k, sender, i, j)
+            # Z (x - c_h) = Z (x - c_j) + Z (c_j - c_h).
+            mean += entry * (load(lanes, centre, sender, j) - load(lanes, centre, h, j))
+            store(lanes, out, i, j, size * entry)
+        store(lanes, out, i, n, size * mean)
+
+
+@kernel(inlined=True)
+def keep_part(
+    lanes: Lanes, parts: FloatArray, place: tuple[int, int, int], total: FloatArray
+) -> None:
+    """Copy ``total`` (n, n + 1, L) to ``place`` [t, k, h] of ``parts``."""
+    t, k, h = place
+    n = len(total)
+    for i in range(n):
+        for j in range(i + 1):
+            store(lanes, parts, t, k, h, i, j, load(lanes, total, i, j))
+        store(lanes, parts, t, k, h, i, n, load(lanes, total, i, n))
+
+
+@kernel
+def begin_part(
+    lanes: Lanes,
+    parts: FloatArray,
+    k: int,
+    shares: FloatArray,
+    inverse: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    place: tuple[int, int, int],
+    rows: int,
+    centre: FloatArray,
+    total: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Begin part ``k`` of the node of ``place`` [b, s, h]: ``shares[k]`` (2,) times the information
+    of its prediction and of its reading.
+    """
+    take_inverse(lanes, total, shares[k, 0], inverse, place[2])
+    if shares[k, 1] > 0.0:
+        add_reading(lanes, total, shares[k, 1], y, H, place, rows, centre, work)
+    keep_part(lanes, parts, (0, k, place[2]), total)
+
+
+@kernel
+def mix_parts(
+    lanes: Lanes,
+    parts: FloatArray,
+    step: int,
+    h: int,
+    links: SlotLinks,
+    up: Any,
+    place: tuple[int, int, int],
+    centre: FloatArray,
+    total: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Take a consensus step of node ``h``: the convex combination of its pairs and those that it
+    hears, ``up`` at ``place`` [b, s, e]; the weight of what does not arrive stays with its own.
+    """
+    b, s, e = place
+    t = step % 2
+    heard = spread(lanes, 0.0)
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(lanes, up, b, s, e, links.way[m])
+        heard += select(arrived, links.weight[m], 0.0)
+    own = 1.0 - heard
+    own = select(own > 0.0, own, 0.0)
+    for k in range(parts.shape[1]):
+        weigh_part(lanes, total, own, parts, (t, k, h), centre, h)
+        for m in range(links.first[h], links.first[h + 1]):
+            arrived = load_flags(lanes, up, b, s, e, links.way[m])
+            # A weight of 0 adds no information.
+            if links.weight[m] > 0.0 and any_lane(arrived):
+                weight = select(arrived, links.weight[m], 0.0)
+                weigh_part(lanes, work, weight, parts, (t, k, links.sender[m]), centre, h)
+                merge_lanes(lanes, total, work)
+        keep_part(lanes, parts, (1 - t, k, h), total)
+
+
+@kernel
+def read_off(
+    lanes: Lanes,
+    root: FloatArray,
+    xhat: FloatArray,
+    b: int,
+    h: int,
+    parts: FloatArray,
+    t: int,
+    counts: FloatArray,
+    inverse: FloatArray,
+    centre: FloatArray,
+    total: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Write the estimate of filter ``h`` of a block and the root of its P from ``counts`` (K + 1,)
+    times its pairs after the steps, ``parts[t]``, and its prediction.
+    """
+    K = parts.shape[1]
+    take_inverse(lanes, total, float(counts[K]), inverse, h)
+    for k in range(K):
+        weigh_part(lanes, work, spread(lanes, counts[k]), parts, (t, k, h), centre, h)
+        merge_lanes(lanes, total, work)
+    finish_lanes(lanes, root, xhat, b, h, centre, total, work, False)

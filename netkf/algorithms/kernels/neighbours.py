@@ -1,0 +1,122 @@
+"""Neighbours in kernels: their readings, the consensus term of the KCF, convex combinations.
+
+Filter ``h`` of a block has place ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
+estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    use_reading,
+)
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    Lanes,
+    any_lane,
+    load,
+    load_flags,
+    root_of,
+    select,
+    spread,
+    store,
+)
+
+
+@kernel
+def move_towards(
+    lanes: Lanes,
+    x: FloatArray,
+    b: int,
+    h: int,
+    links: SlotLinks,
+    up: Any,
+    s: int,
+    e: int,
+    weighted: bool,
+    moved: FloatArray,
+) -> None:
+    """Write the sum of the differences of the estimates that filter ``h`` hears to its own into
+    ``moved[h]``, each times the weight of its link where ``weighted``.
+    """
+    for i in range(x.shape[2]):
+        own, total = load(lanes, x, b, h, i), spread(lanes, 0.0)
+        for m in range(links.first[h], links.first[h + 1]):
+            arrived = load_flags(lanes, up, b, s, e, links.way[m])
+            difference = load(lanes, x, b, links.sender[m], i) - own
+            factor = links.weight[m] if weighted else 1.0
+            total += select(arrived, factor * difference, 0.0)
+        store(lanes, moved, h, i, total)
+
+
+@kernel
+def scale_by_covariance(
+    lanes: Lanes,
+    root: FloatArray,
+    b: int,
+    h: int,
+    epsilon: float,
+    moved: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Multiply ``moved[h]`` by ``epsilon / (1 + |P|) P`` with the Frobenius norm of P = S S', the
+    consensus gain of the KCF; ``work`` (n, L) is scratch.
+    """
+    n, square = root.shape[2], spread(lanes, 0.0)
+    for i in range(n):
+        for j in range(i + 1):
+            total = spread(lanes, 0.0)
+            for m in range(j + 1):
+                total += load(lanes, root, b, h, i, m) * load(lanes, root, b, h, j, m)
+            # Entries off the diagonal stand for two.
+            square += total * total if i == j else 2.0 * total * total
+    gain = epsilon / (1.0 + root_of(square))
+    # S' d, then S times that: P itself is not kept.
+    for j in range(n):
+        total = spread(lanes, 0.0)
+        for i in range(j, n):
+            total += load(lanes, root, b, h, i, j) * load(lanes, moved, h, i)
+        store(lanes, work, j, total)
+    for i in range(n):
+        total = spread(lanes, 0.0)
+        for j in range(i + 1):
+            total += load(lanes, root, b, h, i, j) * load(lanes, work, j)
+        store(lanes, moved, h, i, gain * total)
+
+
+@kernel(inlined=True)
+def add_to_estimate(lanes: Lanes, x: FloatArray, b: int, h: int, moved: FloatArray) -> None:
+    """Add ``moved[h]`` (n, L) to the estimate of a filter."""
+    for i in range(x.shape[2]):
+        store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, moved, h, i))
+
+
+@kernel
+def fuse_readings(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    room: SlotRoom,
+    share: bool,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Update filter ``h`` of a block with its own reading and, where they ``share`` them, those
+    that arrive in the first step of the slot.
+    """
+    use_reading(nodes, readings, room, b, s, h, h, True)
+    if not share:
+        return
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(room.lanes, plan.up, b, s, 0, links.way[m])
+        if any_lane(arrived):
+            use_reading(nodes, readings, room, b, s, h, links.sender[m], arrived)

@@ -1,0 +1,35 @@
+"""The check of weights that a scenario gives for pairs of nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.linalg.arrays import FloatArray
+
+METROPOLIS = "metropolis"
+
+
+def check_columns(weights: FloatArray) -> None:
+    """Raise ScenarioError unless the weights (N, N) are not negative and each column, what one node
+    gives to all senders and to itself, sums to 1.
+    """
+    if (weights < 0.0).any():
+        # Weights come from files: the message names the entry.
+        where = np.argwhere(weights < 0.0)[0].tolist()
+        raise ScenarioError(
+            "weights[{}][{}]".format(*where),
+            "must not be negative",
+            float(weights[tuple(where)]),
+            "give weights from 0 to 1",
+        )
+    # Column i holds what node i gives, itself included.
+    sums = weights.sum(axis=0)
+    wrong = np.flatnonzero(np.abs(sums - 1.0) > 1e-9)
+    if wrong.size:
+        raise ScenarioError(
+            "weights",
+            f"column {wrong[0]}, what node number {wrong[0]} gives, must sum to 1",
+            float(sums[wrong[0]]),
+            "write the weights that a node gives below each other",
+        )

@@ -1,0 +1,44 @@
+"""Messages of a run in slots that arrived in time, by slot, exchange and step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+ArrivalsByStep = dict[tuple[int, int, int], FloatArray]
+"""By slot, phase and step, (N, N): 1 where the message of node j reached node i in time."""
+
+
+def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
+    """Return the messages of a run that arrived in time, by slot, phase and step of the phase."""
+    index, size, period = scenario.topology.index, len(scenario.nodes), scenario.slot_plant.period
+    rows = run.log[run.log["kind"] == CODES["deliver"]]
+    sent, length = rows["t"] - rows["age"], scenario.phase_length
+    slot = scenario.slot_plant.slots_of(sent)
+    # A message belongs to the step in which it was sent.
+    since = sent - slot * period - rows["phase"] * length
+    phases = (scenario.hosted.schedule or ()).count("exchange")
+    steps = np.array([scenario.hosted.exchange_steps(phase) for phase in range(phases)])
+    step = np.round(since * steps[rows["phase"]] / length).astype(int)
+    up: ArrivalsByStep = {}
+    columns = (slot, rows["phase"], step, rows["node"], rows["peer"])
+    for t, phase, k, node, peer in zip(*(c.tolist() for c in columns), strict=True):
+        matrix = up.setdefault((t, phase, k), np.zeros((size, size)))
+        matrix[index[node], index[peer]] = 1.0
+    return up
+
+
+def require_traced_exchanges(scenario: Scenario, run: Run) -> None:
+    """Raise TheoryError if a filtered estimate is sampled at the horizon: the exchanges of the slot
+    that begins there are not in the trace.
+    """
+    plant = scenario.slot_plant
+    slots = np.round(run.times / plant.period).astype(int).tolist()
+    if slots and plant.over(slots[-1], scenario.horizon):
+        message = "the exchanges of the slot at the horizon are not in the trace: sample before it"
+        raise TheoryError(message)

@@ -1,0 +1,1 @@
+"""Theory of the diffusion Kalman filter: exact errors."""

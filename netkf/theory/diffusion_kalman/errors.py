@@ -1,0 +1,61 @@
+"""Exact errors of the diffusion Kalman filter along the messages of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+
+from netkf.algorithms.diffusion_kalman import READINGS
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors, Term
+from netkf.trace.run import Run
+
+
+class DiffusionKalmanRule(ErrorRule):
+    """Incremental update with the readings of the neighbourhood, then the convex combination of
+    estimates, which leaves P as it is.
+    """
+
+    def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        super().__init__(scenario, errors)
+        self._seen: HostObservations = {}
+        self._columns: dict[int, slice] = {}
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Update by the nodes' own readings, and keep them for their neighbours."""
+        self._seen, self._columns = observations, self.errors.reading_noises(observations)
+        for host, observation in observations.items():
+            self.errors.update(host, observation, self._columns[host])
+
+    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
+        """Use the readings that arrived, or combine the estimates."""
+        if phase == READINGS:
+            for message in messages:
+                seen, columns = self._seen[message.sender], self._columns[message.sender]
+                self.errors.update(message.receiver, seen, columns)
+            return
+        nodes, eye = self.scenario.nodes, np.eye(self.errors.n)
+        weights: dict[int, dict[int, float]] = {}
+        for message in messages:
+            weight = self.scenario.weight(nodes[message.receiver], nodes[message.sender])
+            weights.setdefault(message.receiver, {})[message.sender] = weight
+        changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
+        for host, heard in weights.items():
+            # The weight of what did not come stays with the node.
+            terms: list[Term] = [(host, (1.0 - sum(heard.values())) * eye)]
+            terms += [(sender, weight * eye) for sender, weight in heard.items()]
+            changes[host] = self.errors.roots[host], terms
+        self.errors.combine(changes)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    require_traced_exchanges(scenario, run)
+    return DiffusionKalmanRule(scenario, errors)

@@ -1,0 +1,49 @@
+"""Assumptions under which P of consensus on information is no smaller than the covariance of the
+error.
+
+With weights that sum to one, ``sum_j a_ij P_j^-1`` of consistent pairs is consistent whatever their
+correlation (Julier and Uhlmann, ACC 1997). Readings have independent noises, and count rightly as
+long as none counts more than once: with A the weights of all steps together and omega the novelty
+weight, omega a_ij <= 1 (derived; at omega = N that needs all a_ij = 1/N).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import AssumptionRow, true_model_row
+from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.information_consensus.errors import effective_weights, step_weights
+
+SOURCE = "Battistelli and Chisci 2014"
+ONCE = "no reading counts more than once"
+TOLERANCE = 1e-12
+
+
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows about the model, the weights of readings and the first covariances."""
+    return [
+        true_model_row(scenario, SOURCE, "same F, Q and R"),
+        (ONCE, "derived", *_judge_counts(scenario)),
+        *start_rows(scenario, SOURCE),
+    ]
+
+
+def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
+    """Return verdict and evidence on the largest number of times that a node counts a reading."""
+    weights, channel = step_weights(scenario), scenario.network.channel
+    steps = scenario.hosted.exchange_steps(0)
+    # A node that hears nothing counts its own reading in full, whatever the weights.
+    _, silent = effective_weights(scenario, [])
+    whole = channel.delay.fixed == 0.0 and all(
+        channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
+        for link in scenario.topology.directions
+    )
+    if not whole:
+        most = float(silent.max())
+        words = "its own, in slots in which it hears nothing"
+        return most <= 1.0 + TOLERANCE, f"a node counts a reading up to {most:.4g} times: {words}"
+    _, counts = effective_weights(scenario, [weights] * steps)
+    most = float(np.max(counts))
+    return most <= 1.0 + TOLERANCE, f"a node counts a reading up to {most:.4g} times"

@@ -1,0 +1,102 @@
+"""Exact errors of consensus on information along the messages of a run.
+
+In slots the steps of a slot multiply to one matrix A of weights (N, N), rows of which sum to one.
+With it a node ends at the information ``sum_j a_ij P_j^-1 + sum_j b_ij G_j`` of predictions and
+readings, where ``a`` and ``b`` are A times how often the filter counts each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+
+from netkf.algorithms.information_consensus import InformationConsensus
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors, Term
+from netkf.theory.hybrid.errors import ResetRule
+from netkf.theory.numerics.prediction import triangular_root
+from netkf.trace.run import Run
+
+
+def step_weights(scenario: Scenario) -> FloatArray:
+    """Return the weights (N, N) that nodes (rows) give to the messages of others (columns)."""
+    index = scenario.topology.index
+    weights = np.zeros((len(index), len(index)))
+    for sender, receiver in scenario.topology.directions:
+        weights[index[receiver], index[sender]] = scenario.weight(receiver, sender)
+    return weights
+
+
+def effective_weights(
+    scenario: Scenario, weights: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return how often the pairs of predictions and of readings count after the steps of a slot,
+    (N, N) each, from the ``weights`` (N, N) of the messages that arrived in each step.
+    """
+    algorithm, N = scenario.hosted, len(scenario.nodes)
+    assert isinstance(algorithm, InformationConsensus)
+    mixing = np.eye(N)
+    for heard in weights:
+        # The weight of what did not come stays with the node.
+        mixing = (heard + np.diag(np.maximum(1.0 - heard.sum(axis=1), 0.0))) @ mixing
+    shares, counts = algorithm.recipe(N)
+    times = counts[:-1] @ shares
+    return times[0] * mixing + counts[-1] * np.eye(N), times[1] * mixing
+
+
+class ConsensusRule(ErrorRule):
+    """Consensus on the pairs of predictions and of readings, in slots."""
+
+    def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
+        super().__init__(scenario, errors)
+        self._arrivals, self._weights = arrivals_by_step(scenario, run), step_weights(scenario)
+        self._steps = scenario.hosted.exchange_steps(0)
+        self._observations: HostObservations = {}
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Keep the readings of the slot, which are combined before they are used."""
+        self._observations = observations
+
+    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
+        """Combine the pairs in the steps of the slot, and make the estimates of them."""
+        nothing = np.zeros_like(self._weights)
+        heard = [
+            self._weights * self._arrivals.get((slot, phase, step), nothing)
+            for step in range(self._steps)
+        ]
+        of_predictions, of_readings = effective_weights(self.scenario, heard)
+        errors, seen = self.errors, self._observations
+        columns, hosts = errors.reading_noises(seen), range(errors.hosts)
+        inverses = [np.linalg.inv(errors.roots[j]) for j in hosts]
+        # R^-1/2 H of each reading, whose square is its information.
+        white = {j: np.linalg.solve(np.linalg.cholesky(o.R), o.H) for j, o in seen.items()}
+        changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
+        for i in hosts:
+            a, b = of_predictions[i], of_readings[i]
+            rows = [np.sqrt(a[j]) * V for j, V in enumerate(inverses)]
+            rows += [np.sqrt(b[j]) * V for j, V in white.items()]
+            root = triangular_root(np.linalg.inv(np.linalg.qr(np.concatenate(rows), mode="r")))
+            terms = [(j, a[j] * root @ root.T @ V.T @ V) for j, V in enumerate(inverses)]
+            changes[i] = root, terms
+        errors.combine(changes)
+        for i in hosts:
+            for j, one in seen.items():
+                # e+ = P (sum_j a_ij P_j^-1 e_j - sum_j b_ij H_j' R_j^-1 v_j)
+                root, information = errors.roots[i], np.linalg.solve(one.R, one.H).T
+                gain = of_readings[i, j] * root @ root.T @ information
+                errors.stack.add(i, columns[j], -gain @ one.root)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    if not scenario.slotted:
+        return ResetRule(scenario, errors)
+    require_traced_exchanges(scenario, run)
+    return ConsensusRule(scenario, errors, run)

@@ -1,0 +1,1 @@
+"""Theory of the Kalman-consensus filter: exact errors."""

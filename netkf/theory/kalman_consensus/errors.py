@@ -1,0 +1,110 @@
+"""Exact errors of the Kalman-consensus filter along the messages of a run.
+
+With predictions ``xbar`` and their errors ``ebar`` the update by readings is that of a Kalman
+filter, and the consensus term adds ``gamma P sum_j (ebar_j - ebar_i)`` to the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+
+from netkf.algorithms.kalman_consensus import Kcf
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.trace.run import Run
+
+
+class KcfRule(ErrorRule):
+    """Readings of the neighbourhood and consensus on predictions, in slots and under clocks.
+
+    The prediction of an instant is kept beside the estimate once a reading has changed the latter.
+    """
+
+    def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        super().__init__(scenario, errors)
+        algorithm = scenario.filter.algorithm
+        assert isinstance(algorithm, Kcf)
+        self._epsilon, self._share = algorithm.epsilon, algorithm.share_readings
+        self._seen: HostObservations = {}
+        self._columns: dict[int, slice] = {}
+
+    def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
+        """Forget the predictions and readings of an earlier instant."""
+        if gap > 0.0:
+            self._forget()
+
+    def _forget(self) -> None:
+        self.errors.drop(
+            [name for name in map(_prior, range(self.errors.hosts)) if self._has(name)]
+        )
+        self._seen, self._columns = {}, {}
+
+    def _has(self, name: Hashable) -> bool:
+        return name in self.errors.roots
+
+    def _prediction(self, host: int) -> Hashable:
+        """Return the name of the node's prediction of this instant."""
+        return _prior(host) if self._has(_prior(host)) else host
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Update by the nodes' own readings, and keep their predictions."""
+        self._forget()
+        for host in observations:
+            self.errors.copy(host, _prior(host), host)
+        self._seen, self._columns = observations, self.errors.reading_noises(observations)
+        for host, observation in observations.items():
+            self.errors.update(host, observation, self._columns[host])
+
+    def send(self, messages: Sequence[SentMessage]) -> None:
+        """Copy the sender's prediction for each message that takes time."""
+        for message in messages:
+            if message.late:
+                self.errors.copy(self._prediction(message.sender), message, None)
+
+    def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
+        """Add the consensus terms, and use the readings that took no time."""
+        inboxes: dict[int, dict[int, SentMessage]] = {}
+        # Messages of one sender can overtake each other: the last one sent counts.
+        for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
+            inboxes.setdefault(message.receiver, {})[message.sender] = message
+        # All terms before any estimate changes, since predictions may be estimates.
+        terms = {host: self._term(host, list(inbox.values())) for host, inbox in inboxes.items()}
+        for host, inbox in inboxes.items():
+            for message in inbox.values():
+                if self._share and not message.late and message.sender in self._seen:
+                    seen, columns = self._seen[message.sender], self._columns[message.sender]
+                    self.errors.update(host, seen, columns)
+            form = self.errors.stack.form(host)
+            form[:, : terms[host].shape[1]] += terms[host]
+            self.errors.stack.put(host, form)
+        self.errors.drop([message for message in messages if message.late])
+
+    def _term(self, host: int, inbox: list[SentMessage]) -> FloatArray:
+        """Return the form of ``gamma P sum_j (ebar_j - ebar)``."""
+        own, stack = self._prediction(host), self.errors.stack
+        root = self.errors.roots[own]
+        P = root @ root.T
+        total = np.zeros_like(stack.form(own))
+        for message in inbox:
+            source = message if message.late else self._prediction(message.sender)
+            total += stack.form(source) - stack.form(own)
+        return np.asarray(self._epsilon / (1.0 + np.linalg.norm(P)) * P @ total)
+
+
+def _prior(host: int) -> Hashable:
+    return ("prediction", host)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    if scenario.slotted:
+        require_traced_exchanges(scenario, run)
+    return KcfRule(scenario, errors)
