@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,15 +60,22 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Return the exit status: 1 if a promise is broken."""
+    from netkf.runs.directory_lock import only_writer
+
+    # Promises are checked at times of their own, so that the file's may not fit the horizon.
+    scenario = load_scenario(options, {"probe": [0.0]})
+    with only_writer(options.out):
+        return _check(scenario, options)
+
+
+def _check(scenario: Scenario, options: argparse.Namespace) -> int:
     from netkf.checks.check import check
     from netkf.checks.looks import MOST_RUNS
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 
-    # Promises are checked at times of their own, so that the file's may not fit the horizon.
-    scenario = load_scenario(options, {"probe": [0.0]})
     earlier = _prepare(scenario, options)
-    with ProgressLine() as line:
+    with _explain_interrupt(options, earlier), ProgressLine() as line:
         verdict = check(
             scenario,
             options.runs,
@@ -89,6 +98,19 @@ def _run(options: argparse.Namespace) -> int:
         if options.out is not None:
             print(f"written to {options.out}")
     return 0 if verdict else FAILED
+
+
+@contextlib.contextmanager
+def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> Iterator[None]:
+    """Say in the interrupt of the body that runs are kept with their verdict only."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if options.out is None:
+            raise
+        kept = f"{options.out} has the verdict on {earlier.runs:,} runs" if earlier else ""
+        words = f"new runs are kept with their verdict only; {kept or 'nothing was written'}"
+        raise KeyboardInterrupt(words) from None
 
 
 def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:

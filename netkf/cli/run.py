@@ -66,7 +66,10 @@ def _run(options: argparse.Namespace) -> int:
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
-    return _run_many(scenario, options) if many else _run_once(scenario, options)
+    from netkf.runs.directory_lock import only_writer
+
+    with only_writer(options.out):
+        return _run_many(scenario, options) if many else _run_once(scenario, options)
 
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:

@@ -47,11 +47,12 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from netkf.runs.directory_lock import only_writer
     from netkf.studies.parameter_grid import parse_grid
     from netkf.studies.sweep import sweep_to_directory
 
     grid, scenario = parse_grid(options.vary), load_scenario(options)
-    with ProgressLine() as line:
+    with only_writer(options.out), ProgressLine() as line:
         completed = sweep_to_directory(
             scenario,
             grid,

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from netkf.core.errors import EngineError
 from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.runs.failures import explain_failure
+from netkf.runs.provenance import versions
 from netkf.scenario.imports import forget_other
 from netkf.scenario.plugins import in_words, plugged_in
 from netkf.scenario.scenario import Scenario
@@ -24,11 +25,14 @@ BlockTask = Callable[[Scenario, int, range], Any]
 
 
 class PackedScenario(NamedTuple):
-    """A scenario as it travels: its pickle, the digest of that, and where its modules are."""
+    """A scenario as it travels: its pickle, the digest of that, where its modules are, and the
+    versions that the worker must have, none if it is of this installation anyway.
+    """
 
     digest: str
     payload: bytes
     modules: tuple[tuple[str, str], ...]
+    versions: tuple[tuple[str, str], ...] = ()
 
 
 class Job(NamedTuple):
@@ -112,7 +116,19 @@ def unpacked(travelling: PackedScenario) -> Scenario:
     return scenario
 
 
+def _check_versions(wanted: tuple[tuple[str, str], ...]) -> None:
+    """Raise EngineError if results of this worker could have other bits, or none at all."""
+    found = versions()
+    other = [(name, found.get(name, "none"), own) for name, own in wanted if found.get(name) != own]
+    if other:
+        listed = ", ".join(f"{name} {there} instead of {here}" for name, there, here in other)
+        words = f"a worker of the scheduler has other versions than this computer: {listed}"
+        raise EngineError(f"{words}; install the same there, or use --workers")
+
+
 def _unpickled(travelling: PackedScenario) -> Scenario:
+    if travelling.versions:
+        _check_versions(travelling.versions)
     for name, folder in travelling.modules:
         forget_other(name, Path(folder))
         if folder not in sys.path:

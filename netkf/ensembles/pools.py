@@ -16,6 +16,7 @@ from netkf.ensembles.ask_scheduler import scheduler_answers
 from netkf.ensembles.blocks import Job, PackedScenario, packed, work
 from netkf.ensembles.workers import WorkerProcesses
 from netkf.linalg.compiling import seconds_spent
+from netkf.runs.provenance import versions
 from netkf.scenario.scenario import Scenario
 
 AHEAD = 1024
@@ -162,9 +163,12 @@ class Elsewhere(Pool):
         """Hand out a block with the packed scenario."""
         if isinstance(job.scenario, Scenario):
             if self._packed is None or self._packed[0] is not job.scenario:
-                self._packed = job.scenario, packed(job.scenario)
+                self._packed = job.scenario, self._pack(job.scenario)
             job = job._replace(scenario=self._packed[1])
         return self._send(job)
+
+    def _pack(self, scenario: Scenario) -> PackedScenario:
+        return packed(scenario)
 
     @abstractmethod
     def _send(self, job: Job) -> Future[Any]:
@@ -208,6 +212,10 @@ class Cluster(Elsewhere):
         self._executor = self._client.get_executor(retries=3)
         self._address = address
         self.width = max(1, sum(self._client.nthreads().values()))
+
+    def _pack(self, scenario: Scenario) -> PackedScenario:
+        # Workers may join at any time, so each looks at its own versions.
+        return packed(scenario)._replace(versions=tuple(versions().items()))
 
     def _send(self, job: Job) -> Future[Any]:
         future: Future[Any] = self._executor.submit(work, job)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Link = tuple[int, int]
 MAX_TRIES = 1000
-MAX_NODES, MAX_LINKS = 1_000_000, 2_000_000
+MAX_NODES, MAX_LINKS = 200_000, 1_000_000
 MAX_DRAWN = 400_000  # nodes and links of all graphs that are drawn until one is connected
 
 

@@ -115,14 +115,10 @@ def new_directory(wanted: Path | None, name: str) -> Path:
     if wanted is None:
         safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)[:100].strip(".")
         tries = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
-        wanted = next(path for path in tries if not path.exists())
-    try:
-        wanted.mkdir(parents=True, exist_ok=True)
-        taken = any(wanted.iterdir())
-    except (OSError, ValueError) as error:
-        words = f"cannot be made ({getattr(error, 'strerror', None) or error})"
-        raise ScenarioError("--out", words, str(wanted), "choose another") from None
-    if taken:
+        # Another command that starts now may choose the same name.
+        return next(path for path in tries if make_directory(path, anew=True))
+    make_directory(wanted)
+    if any(wanted.iterdir()):
         raise ScenarioError(
             "--out",
             "must be a new or empty directory",
@@ -130,6 +126,25 @@ def new_directory(wanted: Path | None, name: str) -> Path:
             "choose another, or remove it first",
         )
     return wanted
+
+
+def make_directory(path: Path, anew: bool = False) -> bool:
+    """Make a directory unless it is there and can be read; return False if ``anew`` and it is.
+
+    Raises ScenarioError if it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=not anew)
+        next(path.iterdir(), None)
+    except FileExistsError as error:
+        if anew:
+            return False
+        reason = error.strerror
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+    else:
+        return True
+    raise ScenarioError("--out", f"cannot be made ({reason})", str(path), "choose another")
 
 
 BLOCKS = "blocks"

@@ -31,6 +31,7 @@ from netkf.theory.hybrid.steady import steady_by_node
 CLOSE_TO_S = 0.1  # of the Frobenius norm of S
 MAX_RATED = 60  # nodes for which rates are looked for in seconds
 MAX_UNKNOWNS = 60_000  # of the steady bound, which takes some ten seconds
+MAX_COUPLED = 120_000  # unknowns times links of a node: dense networks take longer
 MARKS = {True: "holds", False: "FAILS", None: "unknown"}
 LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
     "limit_covariance": limit_covariance,
@@ -99,9 +100,13 @@ def _steady(scenario: Scenario) -> dict[str, Any]:
     """Return the steady bound; without messages some nodes may have one and others not."""
     n = scenario.plant.n
     unknowns = len(scenario.nodes) * n * (n + 1) // 2
-    if unknowns > MAX_UNKNOWNS:
+    degree = len(scenario.topology.directions) / len(scenario.nodes)
+    large = f"more than {MAX_UNKNOWNS:,}" if unknowns > MAX_UNKNOWNS else ""
+    if not large and unknowns * degree > MAX_COUPLED:
+        large = f"and its nodes have {degree:,.3g} neighbours each"
+    if large:
         reason = (
-            f"left out, because it has {unknowns:,} unknowns, more than {MAX_UNKNOWNS:,}; "
+            f"left out, because it has {unknowns:,} unknowns, {large}; "
             "netkf.theory.steady_covariance_bound computes it however long it takes"
         )
         return {"value": None, "trace": None, "reason": reason}

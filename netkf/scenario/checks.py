@@ -21,6 +21,8 @@ from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.shapes import demand_shape
 
 MAX_SAMPLES = 10_000_000
+MAX_ENTRIES = 100_000_000
+"""Entries of all sampled covariances of a run, of which it may hold a gigabyte."""
 MAX_STEPS = 100_000_000
 MAX_TICKS = 1e9
 MAX_CONSTANTS = 1e15  # as integers they can be counted
@@ -68,6 +70,7 @@ def _check_times(scenario: DerivedScenario) -> None:
                 probe,
                 "lengthen the period",
             )
+        _check_entries(scenario, horizon / probe)
         return
     outside = probe[(probe < 0.0) | (probe > horizon)]
     if outside.size:
@@ -79,6 +82,19 @@ def _check_times(scenario: DerivedScenario) -> None:
         )
     if (np.diff(probe) <= 0.0).any():
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
+    _check_entries(scenario, len(probe))
+
+
+def _check_entries(scenario: DerivedScenario, samples: float) -> None:
+    """Raise ScenarioError if so many samples of all nodes do not fit into the memory."""
+    nodes, n = len(scenario.nodes), scenario.plant.n
+    if samples * nodes * n * n > MAX_ENTRIES:
+        raise ScenarioError(
+            "probe",
+            f"must ask for at most {MAX_ENTRIES:,} entries of covariances",
+            f"{samples:,.0f} samples of {nodes:,} nodes with {n} x {n} entries",
+            "lengthen the period, or take fewer nodes",
+        )
 
 
 def _check_plant(scenario: DerivedScenario) -> None:

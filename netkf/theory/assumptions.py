@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -101,21 +102,27 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
     if any(sensor.varying for sensor in scenario.sensors):
         return None, "H differs from reading to reading"
     A, n = scenario.truth.A, scenario.plant.n
+    # Thousands of nodes may have the sensors of one [[sensors]] entry.
+    counts = Counter(_entries(scenario, node) for node in scenario.nodes)
+    alike = {entries: _information(scenario, entries) for entries in counts}
     # (A, H) is observable if and only if (A, sum H' R^-1 H) is: both hide the same modes.
     information = np.zeros((n, n))
     for node in scenario.sensing:
-        information += _node_information(scenario, node)
+        information += alike[_entries(scenario, node)]
     hidden = unobservable_mode(A, information)
     if hidden is not None:
         evidence = f"the mode with eigenvalue {hidden:.6g} is not seen"
         return judge_plant(scenario, False, evidence)
-    alone = [
-        node
-        for node in scenario.nodes
-        if unobservable_mode(A, _node_information(scenario, node)) is None
-    ]
-    evidence = f"every mode is seen; {len(alone)} of {len(scenario.nodes)} nodes see all alone"
+    alone = sum(
+        count for entries, count in counts.items() if unobservable_mode(A, alike[entries]) is None
+    )
+    evidence = f"every mode is seen; {alone} of {len(scenario.nodes)} nodes see all alone"
     return judge_plant(scenario, True, evidence)
+
+
+def _entries(scenario: Scenario, node: int) -> tuple[int, ...]:
+    """Return the numbers of the [[sensors]] entries of a node."""
+    return tuple(place.entry for place in scenario.placed.get(node, ()))
 
 
 def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -132,11 +139,11 @@ def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
     return [(name, source, True, "the bound on the mean of P then has them")]
 
 
-def _node_information(scenario: Scenario, node: int) -> np.ndarray:
-    """Return ``sum H' R^-1 H`` (n, n) over a node's sensors; a sampled one counts by one sample."""
+def _information(scenario: Scenario, entries: tuple[int, ...]) -> np.ndarray:
+    """Return ``sum H' R^-1 H`` (n, n) over sensors; a sampled one counts by one sample."""
     information = np.zeros((scenario.plant.n, scenario.plant.n))
-    for place in scenario.placed.get(node, ()):
-        H, R = scenario.sensors[place.entry].H, scenario.noise(place.entry, believed=False)
+    for entry in entries:
+        H, R = scenario.sensors[entry].H, scenario.noise(entry, believed=False)
         information += H.T @ np.linalg.solve(R, H)
     return information
 

@@ -11,6 +11,8 @@ import time
 import pytest
 
 import netkf
+from netkf.core.errors import EngineError
+from netkf.ensembles import pools
 from netkf.ensembles.pools import Cluster
 from tests.ensembles.test_ensembles import assert_same_bits
 
@@ -56,6 +58,15 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bits(ring, cluster):
     assert 16 <= killed[0] < 60
     assert workers[1].poll() is None
     assert_same_bits(ensemble, netkf.monte_carlo(short, 60, workers=1))
+
+
+def test_workers_with_other_versions_are_refused_in_one_line(ring, cluster, monkeypatch):
+    short = ring.replace({"horizon": 1.0})
+    here = {**pools.versions(), "numpy": "0.1"}
+    monkeypatch.setattr(pools, "versions", lambda: here)
+    with pytest.raises(EngineError, match=r"numpy [\d.]+ instead of 0\.1; install") as refused:
+        netkf.monte_carlo(short, 4, scheduler=cluster[0])
+    assert str(refused.value).isprintable()
 
 
 def test_a_scheduler_that_is_not_there_is_told_in_one_line(ring, monkeypatch):

@@ -61,6 +61,8 @@ LIMITS = [
     (RING, {"horizon": 1e300}, "horizon", "from 1e-09 to 1e"),
     (RING, {"probe": 5e-324}, "probe", "from 1e-09 to 1e"),
     (RING, {"probe": 1e-9}, "probe", "at most 10,000,000 samples"),
+    (RING, {"probe": 1e-6, "horizon": 10.0}, "probe", "entries of covariances"),
+    (RING, {"network.graph.nodes": 100_000, "probe": 0.01}, "probe", "entries of covariances"),
     (RING, {"plant.sensing_period": 5e-324}, "plant.sensing_period", "100,000,000 steps"),
     (RING, {"plant.A": [[0.0, 1e20], [-1.0, 0.1]], "sensors": CLOCKED}, "plant.A", "1e+15 time"),
     (RING, {"plant.A": [[1e8, 0.0], [0.0, 1e8]], "sensors": CLOCKED}, "plant.A", "grow"),
@@ -76,6 +78,7 @@ LIMITS = [
 ]
 GRAPHS = [
     {"kind": "cycle", "nodes": 10**9},
+    {"kind": "cycle", "nodes": 1_000_000},
     {"kind": "complete", "nodes": 1_000_000},
     {"kind": "complete", "nodes": 4000},
     {"kind": "geometric", "nodes": 1_000_000, "radius": 0.5},

@@ -4,9 +4,10 @@
 
 Every trial starts a command in a session of its own and sends SIGINT or SIGTERM to it or to its
 whole process group, twice in a few trials, or kills one of its workers. It fails unless the command
-ends within LIMIT seconds with status 130 and one line that says so (or is done: status 0), no
-process of the session is left, and ``--resume`` gives the same files to the bit as a run that was
-left alone. One process at a time, Linux only; a trial takes about 10 s.
+ends within LIMIT seconds with status 130 and one line that says so (or is done, with the status and
+the lines of one that was left alone), no process of the session is left, and ``--resume`` gives the
+same files to the bit as a run that was left alone. One process at a time, Linux only; a trial takes
+about 10 s.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 RING = str(ROOT / "scenarios" / "poisson_ring.toml")
@@ -49,6 +51,31 @@ SIGNALS = {
     "SIGTERM to the group": lambda pid: os.killpg(pid, signal.SIGTERM),
     "SIGINT to the group": lambda pid: os.killpg(pid, signal.SIGINT),
 }
+
+
+class Reference(NamedTuple):
+    """How a command ends that is left alone: its seconds, its status, the lines that it prints on
+    standard error, and its directory if it can be resumed.
+    """
+
+    seconds: float
+    status: int
+    lines: list[str]
+    kept: Path | None
+
+
+def leave_alone(name: str, folder: Path) -> Reference:
+    """Run a command to its end."""
+    out, began = folder / name if takes_out(name) else None, time.monotonic()
+    process = begin(COMMANDS[name], out)
+    _, printed = process.communicate()
+    kept = out if name.startswith("run") else None
+    return Reference(time.monotonic() - began, process.returncode, error_lines(printed), kept)
+
+
+def error_lines(printed: str) -> list[str]:
+    """Return the lines that are no notes."""
+    return [line for line in printed.splitlines() if not line.startswith("note: ")]
 
 
 def begin(command: list[str], out: Path | None) -> subprocess.Popen[str]:
@@ -117,11 +144,11 @@ def strike(process: subprocess.Popen[str], draw: random.Random) -> str:
     return name
 
 
-def trial(name: str, whole: float, kept: Path | None, draw: random.Random) -> list[str]:
+def trial(name: str, alone: Reference, draw: random.Random) -> list[str]:
     """Interrupt a command once; return what was wrong."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out" if takes_out(name) else None
-        process, after = begin(COMMANDS[name], out), draw.uniform(EARLIEST, whole)
+        process, after = begin(COMMANDS[name], out), draw.uniform(EARLIEST, alone.seconds)
         time.sleep(after)
         done = strike(process, draw) if process.poll() is None else "nothing"
         killed = done == "killed a worker"
@@ -134,20 +161,22 @@ def trial(name: str, whole: float, kept: Path | None, draw: random.Random) -> li
             process.communicate()
             return [f"{done} after {after:.2f} s: did not end"]
         seconds = time.monotonic() - began
-        wrong = look(process, printed, seconds, killed)
-        if kept is not None and out is not None:
-            wrong += resume(name, out, kept)
+        wrong = look(process, printed, seconds, killed, alone)
+        if alone.kept is not None and out is not None:
+            wrong += resume(name, out, alone.kept)
     print(f"  {name}: {done} after {after:.2f} s: status {process.returncode}, {seconds:.2f} s")
     return [f"{done} after {after:.2f} s: {problem}" for problem in wrong]
 
 
-def look(process: subprocess.Popen[str], printed: str, seconds: float, killed: bool) -> list[str]:
+def look(
+    process: subprocess.Popen[str], printed: str, seconds: float, killed: bool, alone: Reference
+) -> list[str]:
     """Return what was wrong with how a command ended."""
-    wrong, lines = [], [line for line in printed.splitlines() if not line.startswith("note: ")]
+    wrong, lines = [], error_lines(printed)
     if process.returncode == 130 and not killed:
         if len(lines) != 1 or not lines[0].startswith("netkf: interrupted"):
             wrong.append(f"printed {printed!r}")
-    elif process.returncode != 0 or lines:
+    elif (process.returncode, lines) != (alone.status, alone.lines):
         wrong.append(f"status {process.returncode}, printed {printed!r}")
     if seconds > LIMIT and not killed:
         wrong.append(f"took {seconds:.1f} s")
@@ -188,16 +217,12 @@ def main() -> int:
     names = [name for name in COMMANDS if options.only in name]
     draw, failed = random.Random(options.seed), 0
     with tempfile.TemporaryDirectory() as folder:
-        known: dict[str, tuple[float, Path | None]] = {}
+        known: dict[str, Reference] = {}
         for k in range(options.trials):
             name = names[k % len(names)]
             if name not in known:
-                out = Path(folder) / str(k) if takes_out(name) else None
-                began = time.monotonic()
-                begin(COMMANDS[name], out).communicate()
-                kept = out if name.startswith("run") else None
-                known[name] = time.monotonic() - began, kept
-            wrong = trial(name, *known[name], draw)
+                known[name] = leave_alone(name, Path(folder))
+            wrong = trial(name, known[name], draw)
             failed += bool(wrong)
             for problem in wrong:
                 print(f"FAILED {name}: {problem}", flush=True)

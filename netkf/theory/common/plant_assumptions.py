@@ -37,8 +37,9 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
     """Return one row: each P_i(0) is at least the second moment of the node's first error."""
     plant, worst = scenario.plant, np.inf
-    for node in scenario.nodes:
-        mean, cov = scenario.start(node)
+    starts = (scenario.start(node) for node in scenario.nodes)
+    # Most networks have one start for all nodes.
+    for mean, cov in {(id(mean), id(cov)): (mean, cov) for mean, cov in starts}.values():
         # E[(x - xhat)(x - xhat)'] = cov of x(0) + the square of the difference of the means
         offset = plant.start_mean - mean
         gap = cov - plant.start_cov - np.outer(offset, offset)

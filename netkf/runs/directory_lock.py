@@ -1,0 +1,86 @@
+"""One command at a time writes into a directory."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from hashlib import sha256
+from pathlib import Path
+
+from netkf.core.errors import ScenarioError
+from netkf.runs.files import make_directory
+
+
+@contextlib.contextmanager
+def only_writer(directory: Path | None) -> Iterator[None]:
+    """Make a directory and lock it for the body; the operating system unlocks it if this process
+    dies. It is removed again if it was made here and is empty at the end. Nothing for None.
+
+    Raises ScenarioError if another command has locked it, or if it cannot be made. A note says so
+    where a file system has no locks.
+    """
+    if directory is None:
+        yield
+        return
+    made = not directory.exists()
+    make_directory(directory)
+    try:
+        with _locked(directory):
+            yield
+    finally:
+        if made:
+            with contextlib.suppress(OSError):  # it has files now
+                directory.rmdir()
+
+
+@contextlib.contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    opened = None
+    try:
+        opened = _open(directory)
+        _lock(opened)
+    except (BlockingIOError, PermissionError) as error:
+        if opened is not None:
+            os.close(opened)
+            rule = "is in use: another netkf command writes there"
+            remedy = "wait for its end, or choose another"
+            raise ScenarioError("--out", rule, str(directory), remedy) from None
+        _print_note(directory, error)
+    except OSError as error:
+        _print_note(directory, error)
+    try:
+        yield
+    finally:
+        if opened is not None:
+            with contextlib.suppress(OSError):
+                os.close(opened)
+
+
+def _print_note(directory: Path, error: OSError) -> None:
+    words = f"note: {directory} cannot be locked ({error.strerror}): one command at a time on it"
+    print(words, file=sys.stderr)
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _open(directory: Path) -> int:
+        """Open a file that stands for the directory, which Windows does not open."""
+        name = sha256(str(directory.resolve()).casefold().encode()).hexdigest()[:32]
+        return os.open(Path(tempfile.gettempdir()) / f"netkf-{name}.lock", os.O_RDWR | os.O_CREAT)
+
+    def _lock(opened: int) -> None:
+        msvcrt.locking(opened, msvcrt.LK_NBLCK, 1)
+
+else:
+    import fcntl
+
+    def _open(directory: Path) -> int:
+        """Open the directory itself, so that no file of a lock is left."""
+        return os.open(directory, os.O_RDONLY)
+
+    def _lock(opened: int) -> None:
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
