@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import argparse
 
 BAD_USAGE = 2
-COMMANDS = ("run", "check", "theory", "sweep", "size", "consistency", "compare")
+COMMANDS = ("run", "check", "theory", "sweep", "size", "consistency", "compare", "report")
 """Modules of this package, each with a COMMAND."""
 
 

@@ -1,0 +1,126 @@
+// Curves with uPlot: one look, a line at the time of the clock, a click that sets it.
+const Curves = (() => {
+  const HEIGHT = 240;
+  const DASHES = { solid: [], dashed: [7, 4], dotted: [2, 3] };
+
+  // series: { label, x, y, low, high, colour, dash, width }, all over the same x where there is a
+  // band. `timed` curves follow the clock.
+  function figure(app, { title, note, unit, xlabel, series, lines, band, timed }) {
+    const box = Format.element("div", { class: "plot" });
+    const whole = Format.element("figure", { class: "curve" },
+      Format.element("figcaption", {}, Format.element("strong", {}, title), " ", note || ""), box,
+      legend(series, lines, band));
+    let plot = null;
+    function build() {
+      if (plot) plot.destroy();
+      box.replaceChildren();
+      const width = Math.max(260, box.clientWidth);
+      plot = new uPlot(options(width), data(series), box);
+      box.querySelectorAll("canvas").forEach((canvas) => canvas.setAttribute("aria-hidden", "true"));
+      if (timed) plot.over.addEventListener("click", () => app.setTime(plot.posToVal(plot.cursor.left, "x")));
+    }
+
+    function options(width) {
+      const axis = { stroke: Theme.colours.ink, grid: { stroke: Theme.colours.faint, width: 1 }, ticks: { stroke: Theme.colours.faint }, font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif" };
+      return {
+        width, height: HEIGHT, padding: [12, 12, 0, 0], legend: { show: false },
+        cursor: { drag: { x: false, y: false }, y: false },
+        scales: { x: { time: false }, y: { range: (u, low, high) => yRange(low, high, lines, band) } },
+        axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34 }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(tick) }],
+        series: [{}, ...expanded(series)],
+        bands: bandsOf(series),
+        hooks: { drawClear: [(u) => drawBand(u, band)], draw: [(u) => overlay(u, lines, timed ? app.time : null)] },
+      };
+    }
+    return { whole, build, redraw: () => plot && plot.redraw(false) };
+  }
+
+  function tick(value) {
+    return Number.isFinite(value) ? String(Number(value.toPrecision(6))) : "";
+  }
+
+  function yRange(low, high, lines, band) {
+    const all = [low, high, ...(lines || []).map((line) => line.y), ...(band || [])].filter(Number.isFinite);
+    if (!all.length) return [0, 1];
+    const top = Math.max(...all), bottom = Math.min(0, ...all);
+    return [bottom, top > bottom ? top + 0.06 * (top - bottom) : bottom + 1];
+  }
+
+  function colour(name) {
+    return Theme.colours[name] || name;
+  }
+
+  function expanded(series) {
+    return series.flatMap((s) => {
+      const line = { label: s.label, stroke: () => colour(s.colour), width: s.width || 1.5, dash: DASHES[s.dash || "solid"], points: { show: Boolean(s.points), size: 7 }, spanGaps: false };
+      const edge = { ...line, width: 0, stroke: "transparent", points: { show: false } };
+      return s.low ? [line, edge, edge] : [line];
+    });
+  }
+
+  function bandsOf(series) {
+    const found = [];
+    let at = 1;
+    for (const s of series) {
+      if (s.low) found.push({ series: [at + 2, at + 1], fill: () => faded(colour(s.colour)) });
+      at += s.low ? 3 : 1;
+    }
+    return found;
+  }
+
+  function faded(name) {
+    return /^#[0-9a-f]{6}$/i.test(name) ? name + "38" : name;
+  }
+
+  function data(series) {
+    const tables = series.map((s) => {
+      const columns = s.low ? [s.y, s.low, s.high] : [s.y];
+      return [s.x, ...columns].map((column) => Array.from(column, (v) => (Number.isFinite(v) ? v : null)));
+    });
+    return tables.length ? uPlot.join(tables) : [[]];
+  }
+
+  function drawBand(u, band) {
+    if (!band) return;
+    const { ctx, bbox } = u, top = u.valToPos(band[1], "y", true), bottom = u.valToPos(band[0], "y", true);
+    ctx.save();
+    ctx.fillStyle = faded(Theme.colours.green);
+    ctx.fillRect(bbox.left, top, bbox.width, bottom - top);
+    ctx.restore();
+  }
+
+  function overlay(u, lines, time) {
+    const { ctx, bbox } = u;
+    ctx.save();
+    for (const line of lines || []) {
+      const y = u.valToPos(line.y, "y", true);
+      ctx.strokeStyle = colour(line.colour);
+      ctx.lineWidth = 1.5 * devicePixelRatio;
+      ctx.setLineDash((DASHES[line.dash] || []).map((part) => part * devicePixelRatio));
+      ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke();
+    }
+    if (time !== null) {
+      const x = u.valToPos(time, "x", true);
+      ctx.setLineDash([]);
+      ctx.strokeStyle = Theme.colours.ink;
+      ctx.lineWidth = devicePixelRatio;
+      ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke();
+    }
+    ctx.restore();
+  }
+
+  function legend(series, lines, band) {
+    const list = Format.element("ul", { class: "series" });
+    for (const s of [...series, ...(lines || [])]) {
+      const sample = Format.element("svg", { width: 34, height: 10, "aria-hidden": "true" },
+        Format.element("line", { x1: 0, x2: 34, y1: 5, y2: 5, class: "swatch " + s.colour, "stroke-width": Math.max(2, s.width || 1.5),
+          "stroke-dasharray": DASHES[s.dash || "solid"].join(" ") || null }));
+      list.append(Format.element("li", {}, sample, " " + s.label + (s.y && s.y.length === undefined ? " " + Format.number(s.y) : "")));
+    }
+    if (band) list.append(Format.element("li", {}, Format.element("span", { class: "key band", "aria-hidden": "true" }),
+      " 95 % where P is exact: " + Format.number(band[0]) + " .. " + Format.number(band[1])));
+    return list;
+  }
+
+  return { figure };
+})();

@@ -1,0 +1,171 @@
+// The figures of a page: which curves there are. How they look is in curves.js.
+const Figures = (() => {
+  const COLOURS = ["blue", "red"];
+  const root = (values) => Array.from(values, (v) => Math.sqrt(v));
+
+  function letter(runs, r) {
+    return runs.length > 1 ? "AB"[r] + ": " : "";
+  }
+
+  function column(run, values, i) {
+    return Array.from({ length: run.samples.count }, (_, k) => values[k * run.N + i]);
+  }
+
+  // Over the nodes at each sample: root of the mean square, smallest and largest root.
+  function overNodes(run, values) {
+    const all = { rms: [], low: [], high: [] };
+    for (let k = 0; k < run.samples.count; k++) {
+      const row = Array.from(values.subarray(k * run.N, (k + 1) * run.N));
+      all.rms.push(Math.sqrt(row.reduce((a, b) => a + b, 0) / run.N));
+      all.low.push(Math.sqrt(Math.min(...row)));
+      all.high.push(Math.sqrt(Math.max(...row)));
+    }
+    return all;
+  }
+
+  function traces(run) {
+    if (!run.traces) {
+      run.traces = new Float64Array(run.samples.count * run.N);
+      for (let k = 0; k < run.samples.count; k++) {
+        for (let i = 0; i < run.N; i++) run.traces[k * run.N + i] = State.sampleOf(run, k, i).trace;
+      }
+    }
+    return run.traces;
+  }
+
+  function errors(app, runs) {
+    const series = [], lines = [];
+    runs.forEach((run, r) => {
+      const i = app.nodeOf(run), name = letter(runs, r), x = run.samples.t, colour = COLOURS[r];
+      if (run.truth) {
+        const all = overNodes(run, run.samples.sq_error);
+        series.push({ label: name + "all nodes, root mean square; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
+        if (i >= 0) series.push({ label: name + "error of node " + run.nodes[i], x, y: root(column(run, run.samples.sq_error, i)), colour, width: 2.5 });
+      } else {
+        const all = overNodes(run, traces(run));
+        series.push({ label: name + "square root of trace P, all nodes; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
+      }
+      if (i >= 0) series.push({ label: name + "square root of trace P of node " + run.nodes[i], x, y: root(column(run, traces(run), i)), colour: r ? "orange" : "green", width: 2, dash: "dashed" });
+      if (i >= 0 && run.samples.bound) series.push({ label: name + "square root of the bound H(12) on the mean of trace P", x, y: root(column(run, run.samples.bound, i)), colour: "ink", width: 2, dash: r ? "dashed" : "solid" });
+    });
+    for (const [label, value] of Object.entries(runs[0].limits)) lines.push({ label: label + ", square root:", y: Math.sqrt(value), colour: "purple", dash: lines.length ? "dotted" : "dashed" });
+    const truth = runs.some((run) => run.truth);
+    return { title: truth ? "Error and bound" : "Uncertainty", unit: truth ? "|x - xhat|" : "root of trace P", timed: true, series, lines,
+      note: truth ? "One run: the bound is about the mean over runs." : "Without truth there is no error." };
+  }
+
+  function nees(app, runs) {
+    const series = [];
+    runs.forEach((run, r) => {
+      const i = app.nodeOf(run);
+      if (!run.truth || i < 0) return;
+      series.push({ label: letter(runs, r) + "NEES of node " + run.nodes[i], x: run.samples.t, y: column(run, run.samples.nees, i), colour: COLOURS[r], width: 1.8, dash: r ? "dashed" : "solid" });
+    });
+    if (!series.some((s) => s.y.some(Number.isFinite))) return null;
+    return { title: "Does P fit the error?", unit: "NEES", timed: true, series, band: runs[0].samples.nees_interval,
+      lines: [{ label: "expected where P is exact:", y: runs[0].n, colour: "green", dash: "dashed" }], note: "Squared error in units of P." };
+  }
+
+  function ages(app, runs) {
+    const series = [];
+    runs.forEach((run, r) => {
+      const i = app.nodeOf(run), x = run.samples.t;
+      const mean = Array.from({ length: run.samples.count }, (_, k) => {
+        const row = Array.from(run.samples.age.subarray(k * run.N, (k + 1) * run.N)).filter(Number.isFinite);
+        return row.length ? row.reduce((a, b) => a + b, 0) / row.length : NaN;
+      });
+      series.push({ label: letter(runs, r) + "mean of all nodes", x, y: mean, colour: COLOURS[r], width: 1, dash: "dotted" });
+      if (i >= 0) series.push({ label: letter(runs, r) + "node " + run.nodes[i], x, y: column(run, run.samples.age, i), colour: COLOURS[r], width: 2 });
+    });
+    if (!series.some((s) => s.y.some(Number.isFinite))) return null;
+    return { title: "Age of information", unit: "seconds", timed: true, series,
+      note: "Time since the newest message heard was sent, averaged over the links into a node." };
+  }
+
+  function traffic(app, runs) {
+    const names = { delivered: ["blue", "solid"], lost: ["red", "dashed"], late: ["orange", "dotted"], "under way": ["purple", "dotted"] };
+    const series = [];
+    runs.forEach((run, r) => {
+      for (const [kind, [colour, dash]] of Object.entries(names)) {
+        const y = run.traffic[kind], wide = run.horizon / y.length;
+        if (!y.some(Boolean)) continue;
+        series.push({ label: letter(runs, r) + kind, x: y.map((_, k) => (k + 0.5) * wide), y, colour, dash, width: r ? 1 : 2 });
+      }
+    });
+    if (!series.length) return null;
+    const wide = Format.number(runs[0].horizon / runs[0].traffic.lost.length);
+    return { title: "Traffic", unit: "messages per " + wide + " s", timed: true, series, note: "All messages, by when they were sent." };
+  }
+
+  function averages(app, summaries) {
+    const series = [];
+    summaries.forEach((rows, r) => {
+      if (!rows) return;
+      const x = rows.map((row) => row.node), name = summaries.length > 1 ? "AB"[r] + ": " : "";
+      const of = (key) => rows.map((row) => row[key]);
+      const wide = (key, side) => rows.map((row) => (row[key + "_se"] ? row[key] + side * 2 * row[key + "_se"] : row[key]));
+      if (of("rms_error").some(Number.isFinite)) {
+        const band = rows.some((row) => row.rms_error_se) ? { low: wide("rms_error", -1), high: wide("rms_error", 1) } : {};
+        series.push({ label: name + "RMS error" + (band.low ? ", shaded: two standard errors" : ""), x, y: of("rms_error"), ...band, colour: COLOURS[r], points: true });
+      }
+      series.push({ label: name + "square root of mean trace P", x, y: root(of("mean_trace")), colour: r ? "orange" : "green", dash: "dashed", points: true });
+      if (of("bound").some(Number.isFinite)) series.push({ label: name + "square root of its bound", x, y: root(of("bound").map((v) => v ?? NaN)), colour: "ink", dash: "dotted", points: true });
+    });
+    return series.length ? { title: "Averages per node", unit: "root mean square", xlabel: "node", series, note: "Over time; the numbers stand in the table." } : null;
+  }
+
+  function ensemble(app, ensembles) {
+    const series = [];
+    ensembles.forEach((found, r) => {
+      const entry = found && found.nodes[String(app.nodeId)];
+      if (!entry) return;
+      const name = ensembles.length > 1 ? "AB"[r] + ": " : "", x = found.times;
+      const add = (label, [y, low, high], colour, dash) => series.push({ label: name + label, x, y, low, high, colour, dash, width: 2 });
+      if (entry.square[0].some(Number.isFinite)) add("mean squared error of node " + app.nodeId, entry.square, COLOURS[r], "solid");
+      add("mean trace P of node " + app.nodeId, entry.trace, r ? "orange" : "green", "dashed");
+      if (entry.bound) series.push({ label: name + "bound H(12)", x, y: entry.bound, colour: "ink", dash: "dotted", width: 2 });
+    });
+    return series.length ? { title: "Mean over the runs", unit: "squared units", timed: true, series, note: "Shaded: at least two standard errors on each side." } : null;
+  }
+
+  function ensembleNees(app, ensembles) {
+    const series = [];
+    ensembles.forEach((found, r) => {
+      const entry = found && found.nodes[String(app.nodeId)];
+      if (!entry || !entry.nees[0].some(Number.isFinite)) return;
+      const [y, low, high] = entry.nees;
+      series.push({ label: (ensembles.length > 1 ? "AB"[r] + ": " : "") + "mean NEES of node " + app.nodeId, x: found.times, y, low, high, colour: COLOURS[r], width: 2 });
+    });
+    const known = ensembles.find(Boolean);
+    return series.length ? { title: "Does P fit the error, on average?", unit: "mean NEES", timed: true, series, band: known.nees_interval, note: "Shaded in the colour of a curve: two standard errors." } : null;
+  }
+
+  function difference(app, found) {
+    const entry = found && found.nodes[String(app.nodeId)];
+    if (!entry) return null;
+    const [y, low, high] = entry, x = found.times;
+    const sure = y.map((v, k) => (low[k] > 0 || high[k] < 0 ? v : NaN));
+    const series = [{ label: "B - A, mean squared error of node " + app.nodeId + "; shaded: interval", x, y, low, high, colour: "blue" }];
+    if (sure.some(Number.isFinite)) series.push({ label: "certain: the interval leaves out 0", x, y: sure, colour: "red", points: true, width: 3 });
+    return { title: "Where they differ for certain", unit: "squared units", timed: true, series, lines: [{ label: "no difference", y: 0, colour: "ink", dash: "dotted" }],
+      note: "All intervals, of all nodes and times, hold together with probability " + found.confidence + "." };
+  }
+
+  function sweep(app, found) {
+    if (!found) return null;
+    const colours = ["blue", "red", "green", "orange", "purple", "ink"], dashes = ["solid", "dashed", "dotted"];
+    const series = found.series.map((s, k) => ({ label: s.label, x: s.x, y: s.y[0], low: s.y[1], high: s.y[2], colour: colours[k % 6], dash: dashes[Math.floor(k / 6) % 3], points: true, width: 2 }));
+    return { title: "Worst node over the sweep", unit: "RMS error", xlabel: found.key, series, note: "Shaded: two standard errors." };
+  }
+
+  function all(app, page) {
+    const live = page.runs.length > 0;
+    return [
+      difference(app, page.difference), ensemble(app, page.ensembles), ensembleNees(app, page.ensembles),
+      live && errors(app, page.runs), live && nees(app, page.runs), live && ages(app, page.runs),
+      live && traffic(app, page.runs), averages(app, page.summaries), sweep(app, page.sweep),
+    ].filter(Boolean);
+  }
+
+  return { all };
+})();

@@ -1,0 +1,178 @@
+// The sequence chart: a lifeline for each chosen node, time downwards, an arrow for each message.
+const Sequence = (() => {
+  const HEIGHT = 480, TOP = 34, LEFT = 70, RIGHT = 26, BOTTOM = 14;
+  const MAX_ARROWS = 220, MAX_NEAR = 7;
+  const make = Format.element;
+
+  // The chosen node and those it has heard most recently.
+  function near(run, node, t) {
+    const heard = run.messages.into[node].map((link) => ({
+      sender: link.sender, at: Why.heard(run, link, t).sent,
+    }));
+    heard.sort((a, b) => b.at - a.at);
+    return [node, ...heard.slice(0, MAX_NEAR).map((h) => h.sender)].sort((a, b) => a - b);
+  }
+
+  function rows(run, chosen, start, end) {
+    const m = run.messages, inside = new Set(chosen), found = [];
+    for (let k = State.firstSent(m, start - m.longest); k < m.bySent.length; k++) {
+      const row = m.bySent[k];
+      if (m.sent[row] > end) break;
+      if (!inside.has(m.sender[row]) || !inside.has(m.receiver[row])) continue;
+      if (m.sent[row] >= start || (Number.isFinite(m.ended[row]) && m.ended[row] >= start)) found.push(row);
+    }
+    return found;
+  }
+
+  // Half of the width until no more than MAX_ARROWS messages are left around t.
+  function narrow(run, chosen, t, width) {
+    for (;;) {
+      const start = Math.max(0, t - 0.75 * width), end = start + width;
+      const found = rows(run, chosen, start, end);
+      if (found.length <= MAX_ARROWS || width < 1e-9 * run.horizon) return { found, start, end, width };
+      width /= 2;
+    }
+  }
+
+  // Instants of several transmissions, such as slots, are spread a little: y then orders what time
+  // alone does not tell apart.
+  function heights(run, found, start, end) {
+    const m = run.messages, scale = (HEIGHT - TOP - BOTTOM) / (end - start), groups = new Map();
+    for (const row of found) {
+      const at = m.sent[row], key = m.phase[row] + " " + (run.broadcasts ? m.sender[row] : row);
+      if (!groups.has(at)) groups.set(at, new Map());
+      const ranks = groups.get(at);
+      if (!ranks.has(key)) ranks.set(key, ranks.size);
+    }
+    const instants = [...groups.keys()].sort((a, b) => a - b);
+    const room = new Map(instants.map((at, k) => {
+      const next = k + 1 < instants.length ? instants[k + 1] : end + (end - start) * 0.05;
+      return [at, Math.min(0.85 * (next - at) * scale, 12 * groups.get(at).size)];
+    }));
+    const y = (time) => TOP + (time - start) * scale;
+    const sent = (row) => {
+      const ranks = groups.get(m.sent[row]);
+      const key = m.phase[row] + " " + (run.broadcasts ? m.sender[row] : row);
+      return y(m.sent[row]) + (ranks.size > 1 ? (room.get(m.sent[row]) * ranks.get(key)) / ranks.size : 0);
+    };
+    const ended = (row) => (m.ended[row] === m.sent[row] ? sent(row) : y(Math.min(m.ended[row], end * 1.01)));
+    return { y, sent, ended };
+  }
+
+  function draw(box, note, run, app) {
+    const chosen = app.lifelines === "near" ? near(run, app.nodeOf(run), app.time) : app.picks.slice();
+    const { found, start, end, width } = narrow(run, chosen, app.time, app.window);
+    const wide = Math.max(box.clientWidth - 2, LEFT + RIGHT + 44 * chosen.length);
+    const step = (wide - LEFT - RIGHT) / Math.max(1, chosen.length - 1 || 1);
+    const x = new Map(chosen.map((i, k) => [i, chosen.length > 1 ? LEFT + 14 + (k * (step * (chosen.length - 1) - 28)) / (chosen.length - 1) : wide / 2]));
+    x.gap = chosen.length > 1 ? Math.abs(x.get(chosen[1]) - x.get(chosen[0])) : 0;
+    const at = heights(run, found, start, end);
+    const svg = make("svg", {
+      width: wide, height: HEIGHT, role: "img", class: "sequence",
+      "aria-label": describe(run, chosen, found, start, end),
+    });
+    drawFrame(svg, at, start, end, wide);
+    drawLifelines(svg, run, app, chosen, x, at, start, end);
+    for (const row of app.filtered(run, found)) svg.append(arrow(run, row, x, at));
+    drawClock(svg, at, app.time, wide, end);
+    svg.addEventListener("click", (event) => {
+      const y = event.clientY - svg.getBoundingClientRect().top;
+      if (y > TOP) app.setTime(start + ((y - TOP) / (HEIGHT - TOP - BOTTOM)) * (end - start));
+    });
+    box.replaceChildren(svg);
+    note.textContent = words(run, found, start, end, width, app);
+  }
+
+  function describe(run, chosen, found, start, end) {
+    const names = chosen.map((i) => run.nodes[i]).join(", ");
+    return "Sequence chart of nodes " + names + " from " + Format.time(start) + " to " +
+      Format.time(end) + " seconds, " + found.length + " messages; the table of messages has them in words";
+  }
+
+  function words(run, found, start, end, width, app) {
+    let said = Format.count(found.length) + " messages from " + Format.time(start) + " to " + Format.time(end) + " s";
+    if (width < app.window) said += "; the window is narrowed so that they can be told apart";
+    const m = run.messages;
+    if (m.step > 1 && (start < m.start || end > m.end)) {
+      said += "; outside of " + Format.time(m.start) + " to " + Format.time(m.end) +
+        " s the page holds only every " + m.step + "th message of a link";
+    }
+    return said + ". Ticks on a lifeline are readings of its sensor.";
+  }
+
+  function drawFrame(svg, at, start, end, wide) {
+    for (const tick of Estimates.ticks([start, end], 8)) {
+      const y = at.y(tick);
+      svg.append(make("line", { x1: LEFT - 6, x2: wide, y1: y, y2: y, class: "grid" }),
+        make("text", { x: LEFT - 10, y: y + 4, "text-anchor": "end" }, Format.time(tick)));
+    }
+    svg.append(make("text", { x: 4, y: 14 }, "seconds"));
+  }
+
+  function drawLifelines(svg, run, app, chosen, x, at, start, end) {
+    for (const i of chosen) {
+      const line = i === app.nodeOf(run) ? "lifeline chosen" : "lifeline";
+      const name = make("text", { x: x.get(i), y: 16, "text-anchor": "middle", class: i === app.nodeOf(run) ? "chosen" : "" },
+        (run.sensing[i] ? "\u25a0 " : "\u25cf ") + run.nodes[i]);
+      name.addEventListener("click", (event) => { event.stopPropagation(); app.setNode(i); });
+      svg.append(name, make("line", { x1: x.get(i), x2: x.get(i), y1: TOP - 8, y2: HEIGHT - BOTTOM, class: line }));
+    }
+    for (const [events, name] of [[run.senses, "reading"], [run.marks, "mark"]]) {
+      for (let k = State.above(events.t, start) - 1; k < events.t.length; k++) {
+        if (k < 0 || events.t[k] < start) continue;
+        if (events.t[k] > end) break;
+        if (!x.has(events.node[k])) continue;
+        const px = x.get(events.node[k]), y = at.y(events.t[k]);
+        const words = name === "reading" ? "reading" : events.names[events.kind[k]];
+        const tick = make("line", { x1: px - 6, x2: px + 6, y1: y, y2: y, class: name },
+          make("title", {}, words + " of node " + run.nodes[events.node[k]] + " at " + Format.time(events.t[k]) + " s"));
+        svg.append(tick);
+        if (name === "mark" && words !== "swap") svg.append(make("text", { x: px + 8, y: y + 4 }, words));
+      }
+    }
+  }
+
+  function arrow(run, row, x, at) {
+    const m = run.messages, outcome = m.outcome[row], lost = outcome === State.LOST;
+    const x1 = x.get(m.sender[row]), y1 = at.sent(row), whole = x.get(m.receiver[row]);
+    // A lost message stops short of its receiver, between two lifelines.
+    const x2 = lost ? whole - Math.sign(whole - x1) * 0.4 * x.gap : whole, y2 = lost ? y1 : at.ended(row);
+    const group = make("g", { class: "message " + State.OUTCOMES[outcome].replace(" ", "-") },
+      make("title", {}, sentence(run, row)),
+      make("line", { x1, y1, x2, y2 }), make("circle", { cx: x1, cy: y1, r: 2.5 }));
+    if (lost) {
+      group.append(make("path", { d: `M${x2 - 4} ${y2 - 4}L${x2 + 4} ${y2 + 4}M${x2 - 4} ${y2 + 4}L${x2 + 4} ${y2 - 4}` }));
+    } else if (outcome === State.LATE) {
+      group.append(make("polygon", { points: `${x2},${y2 - 6} ${x2 + 6},${y2 + 5} ${x2 - 6},${y2 + 5}` }),
+        make("text", { x: x2 + 9, y: y2 + 4 }, Format.number(m.age[row]) + " s"));
+    } else if (Number.isFinite(m.ended[row])) {
+      const angle = Math.atan2(y2 - y1, x2 - x1);
+      const side = (turn) => `${x2 - 8 * Math.cos(angle + turn)},${y2 - 8 * Math.sin(angle + turn)}`;
+      group.append(make("polygon", { points: `${x2},${y2} ${side(0.4)} ${side(-0.4)}` }));
+    }
+    return group;
+  }
+
+  function sentence(run, row) {
+    const m = run.messages, outcome = State.OUTCOMES[m.outcome[row]];
+    const age = m.outcome[row] === State.DELIVERED || m.outcome[row] === State.LATE
+      ? ", age " + Format.number(m.age[row]) + " s" : "";
+    return "message " + m.number[row] + " from node " + run.nodes[m.sender[row]] + " to node " +
+      run.nodes[m.receiver[row]] + ", sent at " + Format.time(m.sent[row]) + " s, " + outcome + age;
+  }
+
+  function drawClock(svg, at, t, wide, end) {
+    if (t > end) return;
+    svg.append(make("line", { x1: LEFT - 6, x2: wide, y1: at.y(t), y2: at.y(t), class: "now" }));
+  }
+
+  // A window that shows enough messages to see what happened around t.
+  function usualWindow(run, node, t) {
+    const chosen = near(run, node, t), least = Math.min(16, run.messages.count);
+    let width = run.horizon / 4096;
+    while (width < run.horizon && rows(run, chosen, t - 0.75 * width, t + 0.25 * width).length < least) width *= 1.5;
+    return Math.min(width, run.horizon) || 1;
+  }
+
+  return { draw, sentence, usualWindow };
+})();

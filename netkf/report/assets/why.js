@@ -1,0 +1,173 @@
+// Why a node knew what it knew at a time: a search backwards through the messages of the page.
+const Why = (() => {
+  const MAX_LISTED = 40;
+
+  // What a node had heard over one link by time t: the newest delivered message by when it was
+  // sent, and those sent after it.
+  function heard(run, link, t) {
+    const m = run.messages;
+    let newest = -1;
+    for (let row = link.from; row < link.to; row++) {
+      if (!known(run, m.sent[row], t)) break;
+      if (m.outcome[row] === State.DELIVERED && known(run, m.ended[row], t)) newest = row;
+    }
+    const since = newest < 0 ? -Infinity : m.sent[newest], missing = [];
+    for (let row = newest < 0 ? link.from : newest + 1; row < link.to && known(run, m.sent[row], t); row++) {
+      missing.push(row);
+    }
+    return { sender: link.sender, newest, sent: since, missing };
+  }
+
+  // True if the sample that is shown at t knows of what happened at `time`: samples of slots are
+  // either predictions, with which the slot begins, or know of the whole slot.
+  function known(run, time, t) {
+    if (run.knowledge === "before") return time < t;
+    if (run.knowledge === "slot") return time < (Math.floor(t / run.period + 1e-6) + 1) * run.period * (1 - 1e-12);
+    return time <= t;
+  }
+
+  // The latest moment of each node of which anything can have reached `node` by t. Messages are
+  // taken from the last arrival to the first, so a node's moment is final before any message into
+  // it is looked at. At one instant senders send before anybody receives, so a relay must have
+  // heard strictly before it sends.
+  function reach(run, node, t) {
+    const m = run.messages, moments = new Array(run.N).fill(null);
+    moments[node] = { t, row: -1 };
+    for (const row of arrivals(run)) {
+      const to = moments[m.receiver[row]];
+      if (to === null || m.sender[row] === node) continue;
+      if (!(m.receiver[row] === node ? known(run, m.ended[row], t) : m.ended[row] < to.t)) continue;
+      const from = moments[m.sender[row]];
+      if (from === null || m.sent[row] > from.t) moments[m.sender[row]] = { t: m.sent[row], row };
+    }
+    return moments;
+  }
+
+  function arrivals(run) {
+    const m = run.messages;
+    if (!m.byArrival) {
+      const rows = Array.from(m.sent.keys()).filter((row) => m.outcome[row] === State.DELIVERED);
+      m.byArrival = Uint32Array.from(rows);
+      m.byArrival.sort((a, b) => m.ended[b] - m.ended[a] || m.sent[b] - m.sent[a]);
+    }
+    return m.byArrival;
+  }
+
+  // For each sensing node its newest reading that can have reached the node, and by which way.
+  function readings(run, node, t) {
+    const moments = reach(run, node, t), found = [];
+    for (let i = 0; i < run.N; i++) {
+      if (!run.sensing[i]) continue;
+      const times = run.readings[i], moment = moments[i];
+      let k = moment === null ? -1 : State.above(times, moment.t + (i === node ? run.period : 0)) - 1;
+      while (i === node && k >= 0 && !known(run, times[k], t)) k--;
+      found.push({ node: i, at: k < 0 ? NaN : times[k], way: k < 0 ? [] : way(run, moments, i) });
+    }
+    return found;
+  }
+
+  function way(run, moments, from) {
+    const passed = [from];
+    for (let i = from; moments[i].row >= 0 && passed.length <= run.N; ) {
+      i = run.messages.receiver[moments[i].row];
+      passed.push(i);
+    }
+    return passed;
+  }
+
+  function explain(run, node, t) {
+    const links = run.messages.into[node].map((link) => heard(run, link, t));
+    links.sort((a, b) => a.sent - b.sent);
+    return { links, readings: readings(run, node, t), complete: complete(run, links, t) };
+  }
+
+  // A page that holds only some messages outside of a span answers for the inside of it.
+  function complete(run, links, t) {
+    const m = run.messages;
+    if (m.step === 1) return true;
+    return t >= m.start && t <= m.end && links.every((link) => link.sent >= m.start);
+  }
+
+  function show(box, title, run, app) {
+    const node = app.nodeOf(run), t = app.time, k = State.sampleAt(run, t);
+    title.textContent = "Why: node " + run.nodes[node] + " at " + Format.time(t) + " s";
+    const found = explain(run, node, t), parts = [lead(run, node, k, found, t)];
+    if (!found.complete) parts.push(Format.element("p", { class: "note" }, thinned(run)));
+    if (found.links.length) parts.push(linkTable(run, found.links, t));
+    if (found.readings.length) parts.push(readingTable(run, node, found.readings, t));
+    parts.push(lostList(run, found.links));
+    parts.push(Format.element("p", {}, "What it would have been had these messages come, replayed: ",
+      Format.element("code", {}, "netkf why " + quoted(run.label) + " --node " + run.nodes[node] + " --at " + Format.time(t))));
+    box.replaceChildren(...parts);
+  }
+
+  function quoted(label) {
+    return /^[\w./-]+$/.test(label) ? label : "'" + label.replace(/'/g, "'\\''") + "'";
+  }
+
+  function thinned(run) {
+    const m = run.messages;
+    return "The page holds all messages from " + Format.time(m.start) + " to " + Format.time(m.end) +
+      " s only, and this answer reaches outside of it: it may lack messages. The command below knows all.";
+  }
+
+  function lead(run, node, k, found, t) {
+    const parts = [];
+    if (k >= 0) {
+      const s = State.sampleOf(run, k, node);
+      parts.push("Sampled at " + Format.time(run.samples.t[k]) + " s:");
+      if (run.truth) parts.push("error " + Format.number(s.error) + ",");
+      parts.push("square root of trace P " + Format.number(Math.sqrt(s.trace)) + ".");
+      if (Number.isFinite(s.nees)) parts.push("NEES " + Format.number(s.nees) + ", expected " + run.n + " where P is exact.");
+    }
+    const lost = found.links.reduce((sum, link) => sum + bad(run, link).length, 0);
+    const oldest = found.links[0];
+    if (oldest) {
+      parts.push(oldest.newest < 0 ? "It had never heard node " + run.nodes[oldest.sender] + "."
+        : "Oldest link: node " + run.nodes[oldest.sender] + ", heard as of " + Format.number(Math.max(0, t - oldest.sent)) + " s before.");
+      parts.push(lost + (lost === 1 ? " message" : " messages") + " to it lost or late since it last heard each sender.");
+    } else parts.push("No message was ever sent to it.");
+    return Format.element("p", { class: "state" }, parts.join(" "));
+  }
+
+  function bad(run, link) {
+    return link.missing.filter((row) => [State.LOST, State.LATE].includes(run.messages.outcome[row]));
+  }
+
+  function linkTable(run, links, t) {
+    const m = run.messages;
+    const rows = links.map((link) => {
+      const kinds = link.missing.map((row) => m.outcome[row]);
+      const of = (outcome) => kinds.filter((kind) => kind === outcome).length;
+      const none = link.newest < 0;
+      return ["node " + run.nodes[link.sender], none ? "never" : Format.time(link.sent),
+        none ? "-" : Format.time(m.ended[link.newest]), none ? "-" : Format.number(Math.max(0, t - link.sent)),
+        of(State.LOST), of(State.LATE), kinds.length - of(State.LOST) - of(State.LATE)];
+    });
+    return Format.table("What it had heard, oldest first (seconds)",
+      ["from", "newest sent at", "arrived at", "age", "lost since", "late since", "on the way"], rows);
+  }
+
+  function readingTable(run, node, readings, t) {
+    const came = readings.filter((reading) => Number.isFinite(reading.at));
+    const none = readings.filter((reading) => !Number.isFinite(reading.at)).map((reading) => run.nodes[reading.node]);
+    const rows = came.map((reading) => ["node " + run.nodes[reading.node], Format.time(reading.at),
+      Format.number(Math.max(0, t - reading.at)),
+      reading.node === node ? "its own sensor" : reading.way.map((i) => run.nodes[i]).join(" \u2192 ")]);
+    const parts = rows.length ? [Format.table("Newest readings that can have reached it (seconds)",
+      ["sensor of", "read at", "age", "way"], rows)] : [];
+    if (none.length) parts.push(Format.element("p", {}, "No reading of node " + none.join(", ") + " can have reached it yet."));
+    return Format.element("div", {}, ...parts);
+  }
+
+  function lostList(run, links) {
+    const rows = links.flatMap((link) => bad(run, link)).sort((a, b) => run.messages.sent[b] - run.messages.sent[a]);
+    const items = rows.slice(0, MAX_LISTED).map((row) => Format.element("li", {}, Sequence.sentence(run, row)));
+    if (rows.length > MAX_LISTED) items.push(Format.element("li", {}, "and " + (rows.length - MAX_LISTED) + " more"));
+    if (!rows.length) return Format.element("p", {}, "No lost or late message stands between it and those it hears.");
+    return Format.element("details", {}, Format.element("summary", {}, rows.length + " lost or late messages in between"),
+      Format.element("ul", {}, ...items));
+  }
+
+  return { heard, reach, readings, explain, show };
+})();

@@ -1,0 +1,292 @@
+"""Sentences computed from the data: which node was worst, when, why, and if the bound holds."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.report.directories import Source, Trace
+from netkf.report.messages import DELIVERED, LATE, LOST, information_age
+from netkf.runs.summary import averaged_samples
+from netkf.runs.tables import format_number
+from netkf.trace.schema import CODES
+
+UNUSUAL = 0.9
+"""Share of a node's samples whose age of information an unusual one exceeds."""
+MAX_LISTED = 4
+"""Links that a sentence lists."""
+LARGE_NEES = 2.0
+"""Squared errors, in units of what P says, that are called larger than P says."""
+
+
+class Worst(NamedTuple):
+    """The node that was worst over time and its worst sample.
+
+    value, peak : with truth the RMS error over time and the error at ``time``; without it the
+    square roots of the mean trace of P and of the trace at ``time``
+    """
+
+    node: int
+    time: float
+    value: float
+    peak: float
+    by_error: bool
+
+
+def worst_node(source: Source) -> Worst | None:
+    """Return the worst node of the trace of a source: the one with the largest RMS error over time,
+    or, without ground truth, with the largest mean trace of P. None without a finite number.
+    """
+    trace = source.trace
+    if trace is None or not len(trace.times) or not trace.nodes:
+        return None
+    by_error = trace.truth_known
+    traces = np.trace(trace.P, axis1=2, axis2=3)
+    square = trace.sq_error if by_error else traces
+    used = _averaged(source, trace)
+    chosen = used.errors if by_error else used.covariances
+    if not len(chosen):
+        return None
+    with np.errstate(all="ignore"):
+        means = square[chosen].mean(axis=0)
+    if not np.isfinite(means).any():
+        return None
+    k = int(np.nanargmax(np.where(np.isfinite(means), means, -np.inf)))
+    at = int(chosen[np.argmax(square[chosen, k])])
+    return Worst(
+        trace.nodes[k],
+        float(trace.times[at]),
+        math.sqrt(max(0.0, float(means[k]))),
+        math.sqrt(max(0.0, float(square[at, k]))),
+        by_error,
+    )
+
+
+def _averaged(source: Source, trace: Trace) -> Any:
+    """Return the indices of the samples that the summary averages over."""
+    found = (source.summary or {}).get("rounding_from")
+    blurred = math.inf if found is None else float(found)
+    return averaged_samples(trace.times, blurred, trace.kinds["diverged"] > 0)
+
+
+def findings(source: Source, messages: np.ndarray) -> list[str]:
+    """Return sentences about a source with these MESSAGE rows, the most important first."""
+    if source.kind == "sweep":
+        return [*_ending(source), *_of_sweep(source)]
+    if source.kind == "verdict":
+        return _of_verdict(source)
+    found = [*_ending(source)]
+    if source.kind == "ensemble" and source.summary is not None:
+        found += [*_of_ensemble(source), *_of_bound(source)]
+    elif source.trace is not None:
+        found += [*_of_trace(source, source.trace, messages), *_of_bound(source)]
+    else:
+        found.append(
+            "There is no table of states, so nothing moves here: run again with --trace full"
+        )
+    if source.verdict is not None:
+        found += _of_verdict(source)
+    return found
+
+
+def _ending(source: Source) -> list[str]:
+    """Return sentences on a run that did not end as planned, or on one that never began."""
+    found, trace = [], source.trace
+    if source.status == "interrupted":
+        done = source.manifest["runs"]
+        many = f"{done['done']:,} of {done['wanted']:,} runs are done"
+        reached = f"at {_time(_last(trace))}" if trace is not None else "before its first sample"
+        what = many if done["wanted"] > 1 else f"the run stopped {reached}"
+        found.append(f"Interrupted: {what}. Everything here is about what was finished")
+    elif source.status == "failed":
+        found.append(f"Failed: {source.manifest.get('error', 'no reason was written')}")
+    if trace is not None and trace.kinds["diverged"]:
+        rows = trace.log[trace.log["kind"] == CODES["diverged"]]
+        nodes = ", ".join(map(str, rows["node"][:MAX_LISTED].tolist()))
+        more = ", ..." if len(rows) > MAX_LISTED else ""
+        when = _time(float(rows["t"][0])) if len(rows) else "an unknown time"
+        found.append(
+            f"Diverged: at {when} the estimate or the covariance of node {nodes}{more} was no "
+            "longer usable, and the run ended there"
+        )
+    if trace is not None and not len(trace.times):
+        found.append("The run is empty: it has no sample, so there is no error to show")
+    if trace is not None and len(trace.nodes) == 1:
+        found.append("There is one node, so nothing is sent")
+    return found
+
+
+def _last(trace: Trace | None) -> float:
+    return float(trace.times[-1]) if trace is not None and len(trace.times) else 0.0
+
+
+def _of_trace(source: Source, trace: Trace, messages: np.ndarray) -> list[str]:
+    worst = worst_node(source)
+    if worst is None:
+        return []
+    count = len(trace.nodes)
+    if not worst.by_error:
+        return [
+            "There is no ground truth, so nobody knows which node was most wrong. Least certain by "
+            f"its own covariance was node {worst.node}: square root of mean trace P "
+            f"{format_number(worst.value)}, the largest of {count} nodes; it peaked at "
+            f"{_time(worst.time)} with {format_number(worst.peak)}",
+            *_why(source, trace, messages, worst),
+        ]
+    overall = (source.summary or {}).get("overall", {}).get("rms_error")
+    rank = f", the largest of {count} nodes (all nodes {format_number(overall)})"
+    return [
+        f"Node {worst.node} was worst: RMS error {format_number(worst.value)} over time"
+        f"{rank if count > 1 else ''}. Its error was largest at {_time(worst.time)}: "
+        f"{format_number(worst.peak)}",
+        *_why(source, trace, messages, worst),
+    ]
+
+
+def _why(source: Source, trace: Trace, messages: np.ndarray, worst: Worst) -> list[str]:
+    """Return what the worst node had heard by its worst instant, and what its P said."""
+    into = messages[messages["receiver"] == worst.node]
+    found = []
+    if len(into):
+        cut = float(source.cuts(np.array([worst.time]))[0])
+        found.append(_heard(into, worst, cut) + _unusual(source, trace, into, worst))
+    k, at = trace.nodes.index(worst.node), int(np.searchsorted(trace.times, worst.time))
+    nees, n = float(trace.nees[at, k]), trace.x.shape[1]
+    if worst.by_error and math.isfinite(nees):
+        large = nees > LARGE_NEES * n
+        judged = "far more than its P says" if large else "no more than its P allows"
+        found.append(
+            f"The error then was {judged}: NEES {format_number(nees)}, expected {n} where P is exact"
+        )
+    return found
+
+
+def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:
+    """Return when the node had last heard whom by ``cut`` seconds, and what was lost since."""
+    links, missing = [], 0
+    for sender in np.unique(into["sender"]).tolist():
+        link = into[(into["sender"] == sender) & (into["sent"] <= cut)]
+        arrived = link[(link["outcome"] == DELIVERED) & (link["ended"] <= cut)]
+        since = float(arrived["sent"].max()) if len(arrived) else -math.inf
+        after = link[(link["sent"] > since) & np.isin(link["outcome"], (LOST, LATE))]
+        missing += len(after)
+        links.append((max(0.0, worst.time - since), sender))
+    heard = sorted((link for link in links if math.isfinite(link[0])), reverse=True)
+    parts = [f"node {sender} ({format_number(age)} s before)" for age, sender in heard[:MAX_LISTED]]
+    listed = "it had last heard " + ", ".join(parts) if parts else "it had heard nobody"
+    if len(heard) > MAX_LISTED:
+        listed += f" (the {MAX_LISTED} oldest of {len(heard)} links)"
+    silent = len(links) - len(heard)
+    if parts and silent:
+        listed += f" and had not heard {silent} other node{'s' if silent > 1 else ''} yet"
+    lost = f"{missing:,} message{'s' if missing != 1 else ''} to it had been lost or late since"
+    return f"Why: {listed}; {lost}"
+
+
+def _unusual(source: Source, trace: Trace, into: np.ndarray, worst: Worst) -> str:
+    """Return if the age of what the node had heard was unusual at its worst instant."""
+    cuts = source.cuts(trace.times)
+    ages: FloatArray = information_age(into, (worst.node,), trace.times, cuts)[:, 0]
+    now = ages[int(np.searchsorted(trace.times, worst.time))]
+    later = ages[trace.times > 0.0]
+    if len(later) < 10 or not now < worst.time:  # too few to compare with, or nothing heard yet
+        return ""
+    share = float((later < now).mean())
+    mean = format_number(float(later.mean()))
+    if share >= UNUSUAL:
+        return (
+            f". That is unusually old: {format_number(float(now))} s on average over its links, "
+            f"older than at {share:.0%} of its samples (mean {mean} s)"
+        )
+    return (
+        f". That is not unusual: {format_number(float(now))} s on average over its links, mean over "
+        f"the run {mean} s. Losses alone do not explain this"
+    )
+
+
+def _of_ensemble(source: Source) -> list[str]:
+    summary = source.summary or {}
+    known = [row for row in summary.get("nodes", []) if row["rms_error"] is not None]
+    if not known:
+        return ["No node has a finite RMS error"]
+    worst = max(known, key=lambda row: float(row["rms_error"]))
+    error = worst.get("rms_error_se")
+    interval = f" +- {error:.1g}" if error is not None else ""
+    overall = format_number(summary["overall"]["rms_error"])
+    return [
+        f"Over {source.runs:,} runs node {worst['node']} was worst: RMS error "
+        f"{format_number(worst['rms_error'])}{interval}, the largest of {len(known)} nodes (all "
+        f"nodes {overall})"
+    ]
+
+
+def _of_bound(source: Source) -> list[str]:
+    """Return how the traces of P lie beside the bound: one run does not decide about a mean."""
+    summary = source.summary
+    if summary is None:
+        return []
+    rows = [row for row in summary["nodes"] if row["bound"] and row["mean_trace"] is not None]
+    if not rows:
+        return [f"No bound: {summary['bound']}"]
+    top = max(rows, key=lambda row: float(row["mean_trace"]) / float(row["bound"]))
+    ratio = float(top["mean_trace"]) / float(top["bound"])
+    numbers = (
+        f"mean trace P {format_number(top['mean_trace'])}{_se(top)} against "
+        f"{format_number(top['bound'])} at node {top['node']}, ratio {format_number(ratio)}"
+    )
+    if source.runs > 1:
+        sure = float(top.get("mean_trace_se") or 0.0)
+        above = float(top["mean_trace"]) - 2.0 * sure > float(top["bound"])
+        held = "is exceeded by more than two standard errors" if above else "holds"
+        return [f"The bound {summary['bound'].split(',')[0]} {held}; closest: {numbers}"]
+    side = "below" if ratio <= 1.0 else "above"
+    return [
+        f"The bound {summary['bound'].split(',')[0]} is about the mean over runs. In this one run "
+        f"P was {side} it: largest {numbers}. netkf check decides if it holds"
+    ]
+
+
+def _se(row: dict[str, Any]) -> str:
+    error = row.get("mean_trace_se")
+    return f" +- {error:.1g}" if error is not None else ""
+
+
+def _of_verdict(source: Source) -> list[str]:
+    verdict = source.verdict or {}
+    rows = verdict.get("rows", [])
+    broken = [row for row in rows if row["verdict"] == "broken"]
+    counts = {name: sum(row["verdict"] == name for row in rows) for name in _verdicts(rows)}
+    listed = ", ".join(f"{count} {name}" for name, count in counts.items())
+    head = f"{len(broken)} promises are broken" if len(broken) > 1 else "1 promise is broken"
+    found = [
+        f"{head if broken else 'No promise is broken'} in {verdict.get('runs', 0):,} runs "
+        f"({listed}); all intervals hold together with probability "
+        f"{format_number(verdict.get('confidence'))}"
+    ]
+    return found + [f"Broken: {row['promise']} [{row['source']}]" for row in broken]
+
+
+def _verdicts(rows: list[dict[str, Any]]) -> list[str]:
+    return sorted({str(row["verdict"]) for row in rows})
+
+
+def _of_sweep(source: Source) -> list[str]:
+    table, varied = source.sweep, list(source.manifest.get("vary", {}))
+    if table is None or not len(table) or "worst_rms" not in table:
+        return ["The sweep has no finished point yet"]
+    column = table["worst_rms"].to_numpy(dtype=np.float64)
+    if not np.isfinite(column).any():
+        return [f"{len(table):,} points; none has a finite error"]
+    best = table.iloc[int(np.nanargmin(column))]
+    where = ", ".join(f"{key} = {best[key]}" for key in varied if key in table)
+    return [
+        f"Of {len(table):,} points the worst node did best at {where}: RMS error "
+        f"{format_number(float(best['worst_rms']))}; largest {format_number(float(np.nanmax(column)))}"
+    ]
+
+
+def _time(seconds: float) -> str:
+    return f"t = {seconds:.6g} s"

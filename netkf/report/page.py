@@ -1,0 +1,326 @@
+"""``netkf report``: one self-contained HTML page of one or two directories."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.version import __version__
+from netkf.report import tables
+from netkf.report.claims import findings
+from netkf.report.data import Budget, run_data, thinning_rules
+from netkf.report.directories import Source, read_source
+from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
+from netkf.report.messages import MESSAGE, join_messages
+from netkf.report.packing import Packer
+from netkf.runs.documents import DamagedError
+from netkf.runs.files import write_text
+from netkf.studies.compare import ENDED, Comparison, compare, damage_named
+
+MAX_BYTES = 4_800_000
+"""Size of a page above which its data are thinned further."""
+BUDGET = Budget(messages=100_000, values=400_000)
+MAX_NODES = 2_000
+"""Nodes up to which there are live views."""
+SCRIPTS = (
+    "format.js",
+    "decode.js",
+    "state.js",
+    "theme.js",
+    "network.js",
+    "estimates.js",
+    "sequence.js",
+    "why.js",
+    "curves.js",
+    "figures.js",
+    "clock.js",
+    "main.js",
+)
+POLICY = (
+    "default-src 'none'; script-src {script}; style-src {style}; img-src data:; "
+    "base-uri 'none'; form-action 'none'"
+)
+LEAST_BUDGET = 500
+
+
+class _Entry(NamedTuple):
+    """A source with its MESSAGE rows."""
+
+    source: Source
+    messages: np.ndarray
+
+    @property
+    def moves(self) -> bool:
+        """True if there is something to show in the live views."""
+        trace = self.source.trace
+        return trace is not None and len(trace.times) > 0 and len(trace.nodes) <= MAX_NODES
+
+
+def write_report(
+    directories: Sequence[str | Path],
+    out: Path | None = None,
+    replica: int | None = None,
+    trust: bool = False,
+) -> Path:
+    """Write the page of one directory, or of two side by side, and return its path.
+
+    The path is ``out``, by default ``report.html`` in the first directory. A second directory may
+    hold the verdict of ``netkf check`` on the first. Raises ScenarioError for a directory that is
+    not one of netkf's, WriteError if the page cannot be written.
+    """
+    path = Path(directories[0]) / "report.html" if out is None else out
+    write_text(path, make_page(directories, replica, trust, path))
+    return path
+
+
+def make_page(
+    directories: Sequence[str | Path],
+    replica: int | None = None,
+    trust: bool = False,
+    out: Path | None = None,
+) -> str:
+    """Return the page of one or two directories as HTML; see ``write_report``."""
+    if not 1 <= len(directories) <= 2:
+        raise ScenarioError("report", "takes one or two directories", len(directories))
+    entries = [_entry(Path(directory), replica, trust) for directory in directories]
+    entries = _merge_verdict(entries)
+    command = _command(directories, replica, trust, out)
+    comparison = _compare(entries, directories)
+    budget = Budget(*(part // len(entries) for part in BUDGET))
+    while True:
+        page = _assemble(entries, comparison, command, budget)
+        if len(page.encode("utf-8")) <= MAX_BYTES or budget.messages < LEAST_BUDGET:
+            return page
+        budget = budget.halved()
+
+
+def _entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
+    source = read_source(directory, replica, trust)
+    none = np.empty(0, dtype=MESSAGE)
+    if source.trace is None:
+        return _Entry(source, none)
+    with damage_named(directory):
+        try:
+            return _Entry(source, join_messages(source.trace.log))
+        except ValueError as error:
+            raise DamagedError(f"events.parquet: {error}") from None
+
+
+def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
+    """Return the entries, a verdict as part of the run beside it."""
+    kinds = [entry.source.kind for entry in entries]
+    if len(entries) == 2 and kinds[1] == "verdict" and kinds[0] in ("run", "ensemble"):
+        first, verdict = entries
+        source = replace(first.source, verdict=verdict.source.verdict)
+        return [_Entry(source, first.messages)]
+    if len(entries) == 2 and not {*kinds} <= {"run", "ensemble"}:
+        rule = "compares runs and ensembles; a verdict can stand behind a run"
+        raise ScenarioError("report", rule, " and ".join(kinds), "give one directory for each page")
+    return entries
+
+
+def _command(
+    directories: Sequence[str | Path], replica: int | None, trust: bool, out: Path | None
+) -> str:
+    words = ["netkf", "report", *map(str, directories)]
+    words += ["--replica", str(replica)] if replica is not None else []
+    words += ["--trust"] if trust else []
+    words += ["--out", str(out)] if out is not None else []
+    return shlex.join(words)
+
+
+def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Comparison | str | None:
+    """Return the comparison of two entries, or why there is none."""
+    if len(entries) < 2:
+        return None
+    ended = all(entry.source.status in ENDED and entry.source.summary for entry in entries)
+    return compare(directories) if ended else "A run did not finish, so nothing is compared"
+
+
+def _assemble(
+    entries: list[_Entry], comparison: Comparison | str | None, command: str, budget: Budget
+) -> str:
+    """Return the page with at most as much data as the budget allows."""
+    packer = Packer()
+    moving = [entry for entry in entries if entry.moves]
+    runs = [
+        run_data(entry.source, entry.source.trace, entry.messages, budget, packer)
+        for entry in moving
+        if entry.source.trace is not None
+    ]
+    rules = [
+        rule
+        for entry, data in zip(moving, runs, strict=True)
+        for rule in thinning_rules(entry.source, data)
+    ]
+    packed, sizes = packer.text()
+    data = {
+        "runs": runs,
+        "sizes": sizes,
+        "ensembles": [tables.ensemble_curves(entry.source) for entry in entries],
+        "summaries": [tables.averages(entry.source) for entry in entries],
+        "difference": tables.difference_curves(*(entry.source for entry in entries))
+        if len(entries) == 2
+        else None,
+        "labels": [entry.source.label for entry in entries],
+        "sweep": tables.sweep_curves(entries[0].source),
+    }
+    body = _header(entries) + _main(entries, comparison, command, rules, bool(runs))
+    title = " and ".join(dict.fromkeys(entry.source.name for entry in entries))
+    script, style = _script(), _style()
+    policy = POLICY.format(script=content_hash(script), style=content_hash(style))
+    return _asset("page.html").format(
+        policy=text(policy),
+        title=text(title),
+        version=text(__version__),
+        style=style,
+        body=body,
+        data=script_json(data),
+        packed=packed,
+        script=script,
+    )
+
+
+def _header(entries: list[_Entry]) -> str:
+    """Return the head of the page: names, claims, and what the data say."""
+    parts = []
+    for letter, (source, messages) in zip("AB", entries, strict=False):
+        mark = f"{letter}: " if len(entries) > 1 else ""
+        level = "h2" if len(entries) > 1 else "h1"
+        title = f"{mark}{source.name}"
+        status = "" if source.status == "complete" else f" ({source.status})"
+        parts.append(f"<{level}>{text(title + status)}</{level}>")
+        if source.claim:
+            parts.append(paragraph(f"Claim of the scenario: {source.claim}", "claim"))
+        parts.append(bullets((line + "." for line in findings(source, messages)), "findings"))
+        if source.problem:
+            parts.append(paragraph(f"No bounds and no positions: {source.problem}", "note"))
+    heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
+    return f'<header class="top">{heading}{"".join(parts)}</header>'
+
+
+def _main(
+    entries: list[_Entry],
+    comparison: Comparison | str | None,
+    command: str,
+    rules: list[str],
+    live: bool,
+) -> str:
+    sources = [entry.source for entry in entries]
+    parts = [_asset("live.html") if live else _nothing_moves(sources)]
+    if comparison is not None:
+        parts.append(section("comparison", "What differs", _differences(comparison)))
+    parts.append(section("figures", "Figures", '<div id="curves" class="curves"></div>'))
+    parts.append(section("verdicts", "Verdicts and averages", "".join(map(_results, sources))))
+    parts.append(section("scenario", "Scenario", "".join(map(_scenario, sources))))
+    parts.append(section("origin", "Versions and command", _origin(sources, command, rules)))
+    return "<main>" + "".join(parts) + "</main>"
+
+
+def _differences(comparison: Comparison | str) -> str:
+    if isinstance(comparison, str):
+        return paragraph(comparison)
+    return tables.comparison_section(comparison)
+
+
+def _nothing_moves(sources: list[Source]) -> str:
+    if sources[0].kind in ("sweep", "verdict"):
+        reason = (
+            f"A {sources[0].kind} keeps no trace of single runs. To see one move: netkf run "
+            "SCENARIO --trace full --out DIR, then netkf report DIR."
+        )
+    elif all(source.trace is None for source in sources):
+        reason = "No run was recorded here, so nothing moves: run again with --trace full."
+    elif all(source.trace is None or not len(source.trace.times) for source in sources):
+        reason = "The run has no sample, so there is nothing to show in motion."
+    else:
+        reason = f"Networks of more than {MAX_NODES:,} nodes are not shown in motion."
+    return section("live", "The network in motion", paragraph(reason, "note"))
+
+
+def _results(source: Source) -> str:
+    parts = []
+    if source.verdict is not None:
+        parts.append(tables.verdict_table(source))
+    if source.kind == "sweep":
+        parts.append(tables.sweep_table(source))
+    elif source.kind != "verdict":
+        parts.append(tables.summary_section(source))
+        if source.verdict is None:
+            parts.append(
+                paragraph(
+                    "No verdict stands here. netkf check SCENARIO --out VERDICT holds the promises "
+                    "of the paper against many runs; netkf report DIR VERDICT shows both.",
+                    "note",
+                )
+            )
+    return "".join(parts)
+
+
+def _scenario(source: Source) -> str:
+    if not source.scenario_text:
+        return paragraph("The directory has no scenario.toml")
+    label = f"scenario.toml of {source.label}"
+    return (
+        f"<h3>{text(label)}</h3>"
+        f'<pre tabindex="0" role="group" aria-label="{text(label)}">{text(source.scenario_text)}</pre>'
+    )
+
+
+def _origin(sources: list[Source], command: str, rules: list[str]) -> str:
+    parts = [
+        paragraph("This page was made by:"),
+        f'<pre tabindex="0" role="group" aria-label="command">{text(command)}</pre>',
+    ]
+    for source in sources:
+        runs = f" --runs {source.runs}" if source.kind == "ensemble" else ""
+        verb = {"sweep": "sweep", "verdict": "check"}.get(source.kind, "run")
+        again = f"netkf {verb} {shlex.quote(source.label + '/scenario.toml')}{runs}"
+        if verb == "sweep":
+            again += "".join(
+                f" --vary {shlex.quote(key + '=' + ','.join(map(str, values)))}"
+                for key, values in source.manifest.get("vary", {}).items()
+            )
+        parts.append(paragraph("The results can be computed again by:"))
+        parts.append(f'<pre tabindex="0" role="group" aria-label="command">{text(again)}</pre>')
+        parts.append(tables.versions_table(source))
+        if source.trace is not None:
+            kinds = {kind: count for kind, count in source.trace.kinds.items() if count}
+            counts = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
+            parts.append(
+                paragraph(
+                    f"Events of replica {source.trace.replica}: {sum(kinds.values()):,} ({counts})"
+                )
+            )
+    whole = "Nothing was left out: the page holds every sample and every message of these runs."
+    parts.append(bullets([f"Left out: {rule}." for rule in rules]) if rules else paragraph(whole))
+    return "".join(parts)
+
+
+@cache
+def _asset(name: str) -> str:
+    """Return the text of a file of this package."""
+    return (resources.files("netkf.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+@cache
+def _script() -> str:
+    """Return all scripts as one: uPlot, then the page's own modules in a scope of their own."""
+    # The licence of uPlot asks for its text in every copy.
+    licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
+    own = "\n".join(_asset(name) for name in SCRIPTS)
+    return f"{licence}{_asset('uPlot.iife.min.js')}\n(function () {{\n\"use strict\";\n{own}\n}})();\n"
+
+
+@cache
+def _style() -> str:
+    return _asset("uPlot.min.css") + "\n" + _asset("page.css")
+
