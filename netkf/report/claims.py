@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.report.directories import Source, Trace
+from netkf.report.directories import Source
 from netkf.report.messages import DELIVERED, LATE, LOST, information_age
-from netkf.runs.summary import averaged_samples
+from netkf.runs.stored import StoredRun
+from netkf.runs.summary import SampleIndices, averaged_samples
 from netkf.runs.tables import format_number
 from netkf.trace.schema import CODES
 
@@ -40,13 +41,13 @@ def worst_node(source: Source) -> Worst | None:
     """Return the worst node of the trace of a source: the one with the largest RMS error over time,
     or, without ground truth, with the largest mean trace of P. None without a finite number.
     """
-    trace = source.trace
-    if trace is None or not len(trace.times) or not trace.nodes:
+    run = source.run
+    if run is None or not len(run.times) or not run.nodes:
         return None
-    by_error = trace.truth_known
-    traces = np.trace(trace.P, axis1=2, axis2=3)
-    square = trace.sq_error if by_error else traces
-    used = _averaged(source, trace)
+    by_error = run.truth_known
+    traces = np.trace(run.P, axis1=2, axis2=3)
+    square = run.sq_error if by_error else traces
+    used = _averaged(source, run)
     chosen = used.errors if by_error else used.covariances
     if not len(chosen):
         return None
@@ -57,19 +58,19 @@ def worst_node(source: Source) -> Worst | None:
     k = int(np.nanargmax(np.where(np.isfinite(means), means, -np.inf)))
     at = int(chosen[np.argmax(square[chosen, k])])
     return Worst(
-        trace.nodes[k],
-        float(trace.times[at]),
+        run.nodes[k],
+        float(run.times[at]),
         math.sqrt(max(0.0, float(means[k]))),
         math.sqrt(max(0.0, float(square[at, k]))),
         by_error,
     )
 
 
-def _averaged(source: Source, trace: Trace) -> Any:
+def _averaged(source: Source, run: StoredRun) -> SampleIndices:
     """Return the indices of the samples that the summary averages over."""
-    found = (source.summary or {}).get("rounding_from")
+    found = source.summary.get("rounding_from")
     blurred = math.inf if found is None else float(found)
-    return averaged_samples(trace.times, blurred, trace.kinds["diverged"] > 0)
+    return averaged_samples(run.times, blurred, run.count("diverged") > 0)
 
 
 def findings(source: Source, messages: np.ndarray) -> list[str]:
@@ -79,14 +80,12 @@ def findings(source: Source, messages: np.ndarray) -> list[str]:
     if source.kind == "verdict":
         return _of_verdict(source)
     found = [*_ending(source)]
-    if source.kind == "ensemble" and source.summary is not None:
+    if source.kind == "ensemble":
         found += [*_of_ensemble(source), *_of_bound(source)]
-    elif source.trace is not None:
-        found += [*_of_trace(source, source.trace, messages), *_of_bound(source)]
-    else:
-        found.append(
-            "There is no table of states, so nothing moves here: run again with --trace full"
-        )
+    elif source.run is not None and len(source.run.times):
+        found += [*_of_trace(source, source.run, messages), *_of_bound(source)]
+    elif source.status == "complete":
+        found.append("No samples were recorded, so nothing moves here: run again with --trace full")
     if source.verdict is not None:
         found += _of_verdict(source)
     return found
@@ -94,17 +93,18 @@ def findings(source: Source, messages: np.ndarray) -> list[str]:
 
 def _ending(source: Source) -> list[str]:
     """Return sentences on a run that did not end as planned, or on one that never began."""
-    found, trace = [], source.trace
+    found, run = [], source.run
     if source.status == "interrupted":
         done = source.manifest["runs"]
         many = f"{done['done']:,} of {done['wanted']:,} runs are done"
-        reached = f"at {_time(_last(trace))}" if trace is not None else "before its first sample"
+        sampled = run is not None and len(run.times) > 0
+        reached = f"after its sample at {_time(_last(run))}" if sampled else "before it was sampled"
         what = many if done["wanted"] > 1 else f"the run stopped {reached}"
         found.append(f"Interrupted: {what}. Everything here is about what was finished")
     elif source.status == "failed":
         found.append(f"Failed: {source.manifest.get('error', 'no reason was written')}")
-    if trace is not None and trace.kinds["diverged"]:
-        rows = trace.log[trace.log["kind"] == CODES["diverged"]]
+    if run is not None and run.count("diverged"):
+        rows = run.log[run.log["kind"] == CODES["diverged"]]
         nodes = ", ".join(map(str, rows["node"][:MAX_LISTED].tolist()))
         more = ", ..." if len(rows) > MAX_LISTED else ""
         when = _time(float(rows["t"][0])) if len(rows) else "an unknown time"
@@ -112,54 +112,53 @@ def _ending(source: Source) -> list[str]:
             f"Diverged: at {when} the estimate or the covariance of node {nodes}{more} was no "
             "longer usable, and the run ended there"
         )
-    if trace is not None and not len(trace.times):
-        found.append("The run is empty: it has no sample, so there is no error to show")
-    if trace is not None and len(trace.nodes) == 1:
+    if run is not None and len(run.nodes) == 1:
         found.append("There is one node, so nothing is sent")
     return found
 
 
-def _last(trace: Trace | None) -> float:
-    return float(trace.times[-1]) if trace is not None and len(trace.times) else 0.0
+def _last(run: StoredRun | None) -> float:
+    return float(run.times[-1]) if run is not None and len(run.times) else 0.0
 
 
-def _of_trace(source: Source, trace: Trace, messages: np.ndarray) -> list[str]:
+def _of_trace(source: Source, run: StoredRun, messages: np.ndarray) -> list[str]:
     worst = worst_node(source)
     if worst is None:
         return []
-    count = len(trace.nodes)
+    count = len(run.nodes)
     if not worst.by_error:
         return [
             "There is no ground truth, so nobody knows which node was most wrong. Least certain by "
             f"its own covariance was node {worst.node}: square root of mean trace P "
             f"{format_number(worst.value)}, the largest of {count} nodes; it peaked at "
             f"{_time(worst.time)} with {format_number(worst.peak)}",
-            *_why(source, trace, messages, worst),
+            *_why(source, run, messages, worst),
         ]
-    overall = (source.summary or {}).get("overall", {}).get("rms_error")
+    overall = source.summary.get("overall", {}).get("rms_error")
     rank = f", the largest of {count} nodes (all nodes {format_number(overall)})"
     return [
         f"Node {worst.node} was worst: RMS error {format_number(worst.value)} over time"
         f"{rank if count > 1 else ''}. Its error was largest at {_time(worst.time)}: "
         f"{format_number(worst.peak)}",
-        *_why(source, trace, messages, worst),
+        *_why(source, run, messages, worst),
     ]
 
 
-def _why(source: Source, trace: Trace, messages: np.ndarray, worst: Worst) -> list[str]:
+def _why(source: Source, run: StoredRun, messages: np.ndarray, worst: Worst) -> list[str]:
     """Return what the worst node had heard by its worst instant, and what its P said."""
     into = messages[messages["receiver"] == worst.node]
     found = []
     if len(into):
         cut = float(source.cuts(np.array([worst.time]))[0])
-        found.append(_heard(into, worst, cut) + _unusual(source, trace, into, worst))
-    k, at = trace.nodes.index(worst.node), int(np.searchsorted(trace.times, worst.time))
-    nees, n = float(trace.nees[at, k]), trace.x.shape[1]
+        found.append(_heard(into, worst, cut) + _unusual(source, run, into, worst))
+    k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
+    nees, n = float(run.nees[at, k]), run.x.shape[1]
     if worst.by_error and math.isfinite(nees):
         large = nees > LARGE_NEES * n
         judged = "far more than its P says" if large else "no more than its P allows"
         found.append(
-            f"The error then was {judged}: NEES {format_number(nees)}, expected {n} where P is exact"
+            f"The error then was {judged}: NEES {format_number(nees)}, expected {n} where P is "
+            "exact"
         )
     return found
 
@@ -186,12 +185,12 @@ def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:
     return f"Why: {listed}; {lost}"
 
 
-def _unusual(source: Source, trace: Trace, into: np.ndarray, worst: Worst) -> str:
+def _unusual(source: Source, run: StoredRun, into: np.ndarray, worst: Worst) -> str:
     """Return if the age of what the node had heard was unusual at its worst instant."""
-    cuts = source.cuts(trace.times)
-    ages: FloatArray = information_age(into, (worst.node,), trace.times, cuts)[:, 0]
-    now = ages[int(np.searchsorted(trace.times, worst.time))]
-    later = ages[trace.times > 0.0]
+    cuts = source.cuts(run.times)
+    ages: FloatArray = information_age(into, (worst.node,), run.times, cuts)[:, 0]
+    now = ages[int(np.searchsorted(run.times, worst.time))]
+    later = ages[run.times > 0.0]
     if len(later) < 10 or not now < worst.time:  # too few to compare with, or nothing heard yet
         return ""
     share = float((later < now).mean())
@@ -202,16 +201,21 @@ def _unusual(source: Source, trace: Trace, into: np.ndarray, worst: Worst) -> st
             f"older than at {share:.0%} of its samples (mean {mean} s)"
         )
     return (
-        f". That is not unusual: {format_number(float(now))} s on average over its links, mean over "
-        f"the run {mean} s. Losses alone do not explain this"
+        f". That is not unusual: {format_number(float(now))} s on average over its links, mean "
+        f"over the run {mean} s. Losses alone do not explain this"
     )
 
 
 def _of_ensemble(source: Source) -> list[str]:
-    summary = source.summary or {}
+    summary = source.summary
     known = [row for row in summary.get("nodes", []) if row["rms_error"] is not None]
     if not known:
-        return ["No node has a finite RMS error"]
+        unknown = not source.scenario.plant.truth_known
+        return [
+            "There is no ground truth: errors are unavailable"
+            if unknown
+            else "No node has a finite RMS error"
+        ]
     worst = max(known, key=lambda row: float(row["rms_error"]))
     error = worst.get("rms_error_se")
     interval = f" +- {error:.1g}" if error is not None else ""
@@ -226,11 +230,11 @@ def _of_ensemble(source: Source) -> list[str]:
 def _of_bound(source: Source) -> list[str]:
     """Return how the traces of P lie beside the bound: one run does not decide about a mean."""
     summary = source.summary
-    if summary is None:
+    if not summary:
         return []
     rows = [row for row in summary["nodes"] if row["bound"] and row["mean_trace"] is not None]
     if not rows:
-        return [f"No bound: {summary['bound']}"]
+        return [f"No bound: {summary.get('bound', 'unknown')}"]
     top = max(rows, key=lambda row: float(row["mean_trace"]) / float(row["bound"]))
     ratio = float(top["mean_trace"]) / float(top["bound"])
     numbers = (
@@ -274,17 +278,19 @@ def _verdicts(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _of_sweep(source: Source) -> list[str]:
-    table, varied = source.sweep, list(source.manifest.get("vary", {}))
-    if table is None or not len(table) or "worst_rms" not in table:
+    assert source.sweep is not None
+    table, varied = source.sweep.table, source.sweep.keys
+    if not len(table):
         return ["The sweep has no finished point yet"]
     column = table["worst_rms"].to_numpy(dtype=np.float64)
     if not np.isfinite(column).any():
         return [f"{len(table):,} points; none has a finite error"]
     best = table.iloc[int(np.nanargmin(column))]
-    where = ", ".join(f"{key} = {best[key]}" for key in varied if key in table)
+    where = ", ".join(f"{key} = {best[key]}" for key in varied)
     return [
         f"Of {len(table):,} points the worst node did best at {where}: RMS error "
-        f"{format_number(float(best['worst_rms']))}; largest {format_number(float(np.nanmax(column)))}"
+        f"{format_number(float(best['worst_rms']))}; the largest is "
+        f"{format_number(float(np.nanmax(column)))}"
     ]
 
 

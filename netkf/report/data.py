@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import networkx
 import numpy as np
 import scipy.special
 
-from netkf.linalg.arrays import FloatArray
 from netkf.report.claims import Worst, worst_node
-from netkf.report.directories import Source, Trace
+from netkf.report.directories import Source
 from netkf.report.messages import (
     Kept,
     information_age,
@@ -19,6 +19,7 @@ from netkf.report.messages import (
     traffic,
 )
 from netkf.report.packing import Packer
+from netkf.runs.stored import StoredRun
 from netkf.runs.summary import nees_bounds
 from netkf.trace.schema import CODES
 
@@ -45,51 +46,49 @@ class Budget(NamedTuple):
 
 
 def run_data(
-    source: Source, trace: Trace, messages: np.ndarray, budget: Budget, packer: Packer
+    source: Source, run: StoredRun, messages: np.ndarray, budget: Budget, packer: Packer
 ) -> dict[str, Any]:
     """Return what the views show of the trace of a source with these MESSAGE rows; columns go to
     ``packer``.
     """
     worst = worst_node(source)
-    times = sample_indices(trace, budget.values)
-    end = source.scenario.horizon if source.scenario is not None else _last_time(trace)
-    instant = worst.time if worst is not None else end
+    times = sample_indices(run, budget.values)
+    horizon = float(source.scenario.horizon)
+    instant = worst.time if worst is not None else horizon
     kept = keep_messages(messages, budget.messages, instant)
-    horizon = float(end)
     return {
         "label": source.label,
-        "name": source.name,
+        "name": source.scenario.name,
         "status": source.status,
-        "replica": trace.replica,
+        "replica": run.replica,
         "horizon": horizon,
-        "truth": trace.truth_known,
-        "broadcasts": _broadcasts(trace),
-        "n": trace.x.shape[1],
-        "nodes": list(trace.nodes),
-        "sensors": _sensors(source, trace),
-        "positions": positions(source, trace),
+        "truth": run.truth_known,
+        "broadcasts": _broadcasts(run),
+        "n": run.x.shape[1],
+        "nodes": list(run.nodes),
+        "sensors": [node for node in run.nodes if node in source.scenario.placed],
+        "positions": positions(source, run),
         "knowledge": source.knowledge,
-        "period": _period(source),
-        "axes": _axes(source, trace.x.shape[1]),
-        "links": _links(source, messages),
+        "period": source.period,
+        "axes": _axes(source, run.x.shape[1]),
+        "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
         "worst": _worst_data(worst),
         "scale": _scales(),
-        "samples": _sample_columns(source, trace, times, messages, packer),
-        "messages": _message_columns(kept, trace, packer),
-        "senses": _event_columns(trace, ("sense",), budget.messages // 2, packer),
-        "marks": _event_columns(trace, MARKS, MAX_MARKS, packer),
+        "samples": _sample_columns(source, run, times, messages, packer),
+        "messages": _message_columns(kept, run, packer),
+        "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
+        "marks": _event_columns(run, MARKS, MAX_MARKS, packer),
         "traffic": traffic(messages, horizon, BINS),
         "totals": {
-            "events": sum(trace.kinds.values()),
-            "kinds": {kind: count for kind, count in trace.kinds.items() if count},
+            "events": len(run.log),
             "messages": len(messages),
-            "samples": len(trace.times),
+            "samples": len(run.times),
         },
         "limits": _limits(source),
     }
 
 
-def thinning_rules(source: Source, data: dict[str, Any]) -> list[str]:
+def thinning_rules(data: dict[str, Any]) -> list[str]:
     """Return sentences that say what the page leaves out of a run; none if it has everything."""
     rules = []
     messages, totals = data["messages"], data["totals"]
@@ -114,65 +113,54 @@ def thinning_rules(source: Source, data: dict[str, Any]) -> list[str]:
     return rules
 
 
-def sample_indices(trace: Trace, values: int) -> np.ndarray:
+def sample_indices(run: StoredRun, values: int) -> np.ndarray:
     """Return the indices of the samples to keep, so that there are at most about ``values``
     numbers: every k-th, the last one, and the worst instant of each node.
     """
-    n, count = trace.x.shape[1], len(trace.nodes)
+    n, count = run.x.shape[1], len(run.nodes)
     each = count * (n + n * (n + 1) // 2 + 4) + n + 1
     most = max(2, values // max(1, each))
-    total = len(trace.times)
+    total = len(run.times)
     if total <= most:
         return np.arange(total)
     step = -(-total // max(1, most - 1))
     chosen = {*range(0, total, step), total - 1}
-    if trace.truth_known:
-        error = np.where(np.isfinite(trace.sq_error), trace.sq_error, -1.0)
+    if run.truth_known:
+        error = np.where(np.isfinite(run.sq_error), run.sq_error, -1.0)
         chosen |= set(error.argmax(axis=0).tolist())
     return np.array(sorted(chosen))
 
 
-def positions(source: Source, trace: Trace) -> list[list[float]]:
+def positions(source: Source, run: StoredRun) -> list[list[float]]:
     """Return a place (x, y) between 0 and 1 for each node, y downwards: the scenario's positions to
     scale, or a layout by the links.
     """
-    given = source.scenario.topology.positions if source.scenario is not None else None
-    if given is None or any(node not in given for node in trace.nodes):
-        given = _layout(source, trace)
-    places = np.array([given[node] for node in trace.nodes], dtype=float).reshape(-1, 2)
+    given: Mapping[int, Any] | None = source.scenario.topology.positions
+    if given is None or any(node not in given for node in run.nodes):
+        given = _layout(source, run)
+    places = np.array([given[node] for node in run.nodes], dtype=float).reshape(-1, 2)
     if not len(places) or not np.isfinite(places).all():
-        return [[0.5, 0.5] for _ in trace.nodes]
+        return [[0.5, 0.5] for _ in run.nodes]
     low, high = places.min(axis=0), places.max(axis=0)
     size = max(float((high - low).max()), 1e-12)
     places = (places - 0.5 * (low + high)) / size
     return [[round(0.5 + x, 5), round(0.5 - y, 5)] for x, y in places.tolist()]
 
 
-def _layout(source: Source, trace: Trace) -> dict[int, tuple[float, float]]:
-    graph = networkx.Graph()
-    graph.add_nodes_from(trace.nodes)
-    if source.scenario is not None:
-        graph.add_edges_from(source.scenario.topology.links)
-    else:
-        sends = trace.log[trace.log["kind"] == CODES["send"]]
-        pairs = np.unique(np.stack([sends["node"], sends["peer"]], axis=1), axis=0)
-        graph.add_edges_from(pairs.tolist())
+def _layout(source: Source, run: StoredRun) -> dict[int, Any]:
+    graph: networkx.Graph[int] = networkx.Graph()
+    graph.add_nodes_from(run.nodes)
+    graph.add_edges_from(source.scenario.topology.links)
     few = len(graph) <= MAX_KAMADA_KAWAI and networkx.is_connected(graph) if graph else False
     if few:
-        return dict(networkx.kamada_kawai_layout(graph))
-    return dict(networkx.spring_layout(graph, seed=1, iterations=30))
-
-
-def _period(source: Source) -> float:
-    """Return the seconds of a slot, 0 under clocks."""
-    scenario = source.scenario
-    return float(scenario.plant.period) if scenario is not None and scenario.slotted else 0.0
+        return networkx.kamada_kawai_layout(graph)
+    return networkx.spring_layout(graph, seed=1, iterations=30)
 
 
 def _axes(source: Source, n: int) -> list[int]:
     """Return the two components of the state to show first: those that sensors see, if two are."""
     seen: list[int] = []
-    for sensor in source.scenario.sensors if source.scenario is not None else ():
+    for sensor in source.scenario.sensors:
         H = getattr(sensor, "H", None)
         if H is not None:
             seen += np.flatnonzero(np.any(np.asarray(H) != 0.0, axis=0)).tolist()
@@ -180,34 +168,10 @@ def _axes(source: Source, n: int) -> list[int]:
     return [int(k) for k in first]
 
 
-def _links(source: Source, messages: np.ndarray) -> list[list[int]]:
-    """Return directed links [sender, receiver], at most MAX_LINKS of them."""
-    # The topology lists what may be used; without a scenario there is only what was used.
-    if source.scenario is not None:
-        pairs = [(int(i), int(j)) for i, j in source.scenario.topology.directions]
-    else:
-        pairs = [(int(i), int(j)) for i, j in np.unique(messages[["sender", "receiver"]]).tolist()]
-    return [list(pair) for pair in pairs[:MAX_LINKS]]
-
-
-def _sensors(source: Source, trace: Trace) -> list[int]:
-    """Return the nodes that take readings."""
-    if source.scenario is not None:
-        return [node for node in trace.nodes if node in source.scenario.placed]
-    return np.unique(trace.log["node"][trace.log["kind"] == CODES["sense"]]).tolist()
-
-
-def _broadcasts(trace: Trace) -> bool:
+def _broadcasts(run: StoredRun) -> bool:
     """Return True if the messages of one node at one instant are one transmission."""
-    in_slots = bool((trace.log["phase"][trace.log["kind"] == CODES["send"]] >= 0).any())
-    return in_slots or trace.kinds["transmit"] > 0
-
-
-def _last_time(trace: Trace) -> float:
-    ends = [float(trace.times[-1])] if len(trace.times) else [0.0]
-    if len(trace.log):
-        ends.append(float(trace.log["t"][-1]))
-    return max(ends)
+    in_slots = bool((run.log["phase"][run.log["kind"] == CODES["send"]] >= 0).any())
+    return in_slots or run.count("transmit") > 0
 
 
 def _worst_data(worst: Worst | None) -> dict[str, Any] | None:
@@ -224,37 +188,33 @@ def _scales() -> dict[str, float]:
 
 def _limits(source: Source) -> dict[str, Any]:
     """Return the horizontal lines of curves: limits of the bound and the interval of NEES."""
-    found: dict[str, Any] = {}
-    if source.promised is not None:
-        for name, value in (
-            (source.promised.limit_label, source.promised.limit),
-            ("centralised filter", source.promised.central),
-        ):
-            if math.isfinite(value):
-                found[name] = value
-    return found
+    promised = source.promised
+    if promised is None:
+        return {}
+    known = {promised.limit_label: promised.limit, "centralised filter": promised.central}
+    return {name: value for name, value in known.items() if math.isfinite(value)}
 
 
 def _sample_columns(
-    source: Source, trace: Trace, chosen: np.ndarray, messages: np.ndarray, packer: Packer
+    source: Source, run: StoredRun, chosen: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
-    n = trace.x.shape[1]
+    n = run.x.shape[1]
     i, j = np.triu_indices(n)
-    total = len(trace.times)
-    times = trace.times[chosen]
-    ages = information_age(messages, trace.nodes, times, source.cuts(times))
+    total = len(run.times)
+    times = run.times[chosen]
+    ages = information_age(messages, run.nodes, times, source.cuts(times))
     columns = {
         "t": packer.add(times, "f8"),
-        "xhat": packer.add(trace.xhat[chosen], "f8"),
-        "P": packer.add(trace.P[chosen][..., i, j], "f8"),
+        "xhat": packer.add(run.xhat[chosen], "f8"),
+        "P": packer.add(run.P[chosen][..., i, j], "f8"),
         "age": packer.add(ages, "f8"),
     }
-    if trace.truth_known:
-        columns["x"] = packer.add(trace.x[chosen], "f8")
-        columns["sq_error"] = packer.add(trace.sq_error[chosen], "f8")
-        columns["nees"] = packer.add(trace.nees[chosen], "f8")
+    if run.truth_known:
+        columns["x"] = packer.add(run.x[chosen], "f8")
+        columns["sq_error"] = packer.add(run.sq_error[chosen], "f8")
+        columns["nees"] = packer.add(run.nees[chosen], "f8")
     bound = source.promised.bound if source.promised is not None else None
-    if bound is not None and bound.shape == (total, len(trace.nodes)):
+    if bound is not None and bound.shape == (total, len(run.nodes)):
         columns["bound"] = packer.add(bound[chosen], "f8")
     low, high = nees_bounds(n)
     step = 1 if len(chosen) == total else int(chosen[1] - chosen[0]) if len(chosen) > 1 else 1
@@ -262,9 +222,9 @@ def _sample_columns(
     return {"columns": columns, "count": len(chosen), "step": step, "nees_interval": [low, high]}
 
 
-def _message_columns(kept: Kept, trace: Trace, packer: Packer) -> dict[str, Any]:
+def _message_columns(kept: Kept, run: StoredRun, packer: Packer) -> dict[str, Any]:
     messages = kept.messages
-    nodes = np.array(trace.nodes)
+    nodes = np.array(run.nodes)
     ended = np.where(np.isnan(messages["ended"]), np.inf, messages["ended"])
     columns = {
         "sent": packer.add(messages["sent"], "f8"),
@@ -288,16 +248,16 @@ def _message_columns(kept: Kept, trace: Trace, packer: Packer) -> dict[str, Any]
 
 
 def _event_columns(
-    trace: Trace, kinds: tuple[str, ...], most: int, packer: Packer
+    run: StoredRun, kinds: tuple[str, ...], most: int, packer: Packer
 ) -> dict[str, Any]:
     """Return the events of some kinds, every k-th if there are more than ``most``."""
     codes = [CODES[kind] for kind in kinds]
-    rows = trace.log[np.isin(trace.log["kind"], codes)]
+    rows = run.log[np.isin(run.log["kind"], codes)]
     step = max(1, -(-len(rows) // max(1, most)))
     kept = rows[::step]
     columns = {
         "t": packer.add(kept["t"], "f8"),
-        "node": packer.add(np.searchsorted(np.array(trace.nodes), kept["node"]), "u2"),
+        "node": packer.add(np.searchsorted(np.array(run.nodes), kept["node"]), "u2"),
         "kind": packer.add(kept["kind"], "u1"),
     }
     names = {CODES[kind]: kind for kind in kinds}

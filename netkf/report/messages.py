@@ -112,9 +112,7 @@ def information_age(
     """
     total = np.zeros((len(times), len(nodes)))
     links = np.zeros(len(nodes))
-    ends = np.flatnonzero(
-        (np.diff(messages["sender"]) != 0) | (np.diff(messages["receiver"]) != 0)
-    )
+    ends = np.flatnonzero((np.diff(messages["sender"]) != 0) | (np.diff(messages["receiver"]) != 0))
     for link in np.split(messages, ends + 1) if len(messages) else []:
         column = int(np.searchsorted(nodes, link["receiver"][0]))
         arrived = link[link["outcome"] == DELIVERED]

@@ -23,7 +23,9 @@ from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
 from netkf.runs.documents import DamagedError
 from netkf.runs.files import write_text
+from netkf.runs.stored import StoredRun
 from netkf.studies.compare import ENDED, Comparison, compare, damage_named
+from netkf.trace.schema import KINDS
 
 MAX_BYTES = 4_800_000
 """Size of a page above which its data are thinned further."""
@@ -60,8 +62,8 @@ class _Entry(NamedTuple):
     @property
     def moves(self) -> bool:
         """True if there is something to show in the live views."""
-        trace = self.source.trace
-        return trace is not None and len(trace.times) > 0 and len(trace.nodes) <= MAX_NODES
+        run = self.source.run
+        return run is not None and len(run.times) > 0 and len(run.nodes) <= MAX_NODES
 
 
 def write_report(
@@ -105,11 +107,11 @@ def make_page(
 def _entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
     source = read_source(directory, replica, trust)
     none = np.empty(0, dtype=MESSAGE)
-    if source.trace is None:
+    if source.run is None:
         return _Entry(source, none)
     with damage_named(directory):
         try:
-            return _Entry(source, join_messages(source.trace.log))
+            return _Entry(source, join_messages(source.run.log))
         except ValueError as error:
             raise DamagedError(f"events.parquet: {error}") from None
 
@@ -152,15 +154,11 @@ def _assemble(
     packer = Packer()
     moving = [entry for entry in entries if entry.moves]
     runs = [
-        run_data(entry.source, entry.source.trace, entry.messages, budget, packer)
+        run_data(entry.source, entry.source.run, entry.messages, budget, packer)
         for entry in moving
-        if entry.source.trace is not None
+        if entry.source.run is not None
     ]
-    rules = [
-        rule
-        for entry, data in zip(moving, runs, strict=True)
-        for rule in thinning_rules(entry.source, data)
-    ]
+    rules = [rule for data in runs for rule in thinning_rules(data)]
     packed, sizes = packer.text()
     data = {
         "runs": runs,
@@ -174,7 +172,7 @@ def _assemble(
         "sweep": tables.sweep_curves(entries[0].source),
     }
     body = _header(entries) + _main(entries, comparison, command, rules, bool(runs))
-    title = " and ".join(dict.fromkeys(entry.source.name for entry in entries))
+    title = " and ".join(dict.fromkeys(entry.source.scenario.name for entry in entries))
     script, style = _script(), _style()
     policy = POLICY.format(script=content_hash(script), style=content_hash(style))
     return _asset("page.html").format(
@@ -195,14 +193,12 @@ def _header(entries: list[_Entry]) -> str:
     for letter, (source, messages) in zip("AB", entries, strict=False):
         mark = f"{letter}: " if len(entries) > 1 else ""
         level = "h2" if len(entries) > 1 else "h1"
-        title = f"{mark}{source.name}"
+        title = f"{mark}{source.scenario.name}"
         status = "" if source.status == "complete" else f" ({source.status})"
         parts.append(f"<{level}>{text(title + status)}</{level}>")
-        if source.claim:
-            parts.append(paragraph(f"Claim of the scenario: {source.claim}", "claim"))
+        if source.scenario.claim:
+            parts.append(paragraph(f"Claim of the scenario: {source.scenario.claim}", "claim"))
         parts.append(bullets((line + "." for line in findings(source, messages)), "findings"))
-        if source.problem:
-            parts.append(paragraph(f"No bounds and no positions: {source.problem}", "note"))
     heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
     return f'<header class="top">{heading}{"".join(parts)}</header>'
 
@@ -237,9 +233,9 @@ def _nothing_moves(sources: list[Source]) -> str:
             f"A {sources[0].kind} keeps no trace of single runs. To see one move: netkf run "
             "SCENARIO --trace full --out DIR, then netkf report DIR."
         )
-    elif all(source.trace is None for source in sources):
+    elif all(source.run is None for source in sources):
         reason = "No run was recorded here, so nothing moves: run again with --trace full."
-    elif all(source.trace is None or not len(source.trace.times) for source in sources):
+    elif all(source.run is None or not len(source.run.times) for source in sources):
         reason = "The run has no sample, so there is nothing to show in motion."
     else:
         reason = f"Networks of more than {MAX_NODES:,} nodes are not shown in motion."
@@ -266,13 +262,19 @@ def _results(source: Source) -> str:
 
 
 def _scenario(source: Source) -> str:
-    if not source.scenario_text:
-        return paragraph("The directory has no scenario.toml")
     label = f"scenario.toml of {source.label}"
     return (
         f"<h3>{text(label)}</h3>"
-        f'<pre tabindex="0" role="group" aria-label="{text(label)}">{text(source.scenario_text)}</pre>'
+        f'<pre tabindex="0" role="group" aria-label="{text(label)}">'
+        f"{text(source.scenario_text)}</pre>"
     )
+
+
+def _event_counts(run: StoredRun) -> str:
+    """Return how many events of each kind a run has."""
+    counts = [f"{run.count(kind):,} {kind}" for kind in KINDS if run.count(kind)]
+    listed = f" ({', '.join(counts)})" if counts else ""
+    return f"Events of replica {run.replica}: {len(run.log):,}{listed}"
 
 
 def _origin(sources: list[Source], command: str, rules: list[str]) -> str:
@@ -292,14 +294,8 @@ def _origin(sources: list[Source], command: str, rules: list[str]) -> str:
         parts.append(paragraph("The results can be computed again by:"))
         parts.append(f'<pre tabindex="0" role="group" aria-label="command">{text(again)}</pre>')
         parts.append(tables.versions_table(source))
-        if source.trace is not None:
-            kinds = {kind: count for kind, count in source.trace.kinds.items() if count}
-            counts = ", ".join(f"{count:,} {kind}" for kind, count in kinds.items())
-            parts.append(
-                paragraph(
-                    f"Events of replica {source.trace.replica}: {sum(kinds.values()):,} ({counts})"
-                )
-            )
+        if source.run is not None:
+            parts.append(paragraph(_event_counts(source.run)))
     whole = "Nothing was left out: the page holds every sample and every message of these runs."
     parts.append(bullets([f"Left out: {rule}." for rule in rules]) if rules else paragraph(whole))
     return "".join(parts)
@@ -317,10 +313,11 @@ def _script() -> str:
     # The licence of uPlot asks for its text in every copy.
     licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
     own = "\n".join(_asset(name) for name in SCRIPTS)
-    return f"{licence}{_asset('uPlot.iife.min.js')}\n(function () {{\n\"use strict\";\n{own}\n}})();\n"
+    return (
+        f'{licence}{_asset("uPlot.iife.min.js")}\n(function () {{\n"use strict";\n{own}\n}})();\n'
+    )
 
 
 @cache
 def _style() -> str:
     return _asset("uPlot.min.css") + "\n" + _asset("page.css")
-

@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.special import stdtrit
 
+from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import Source
 from netkf.report.markup import bullets, paragraph, table
 from netkf.runs.summary import CONFIDENCE, nees_bounds
@@ -51,8 +51,8 @@ def _rank(row: dict[str, Any]) -> int:
 def summary_section(source: Source) -> str:
     """Return the table that ends ``netkf run``, with its notes."""
     summary = source.summary
-    if summary is None:
-        return paragraph("This directory has no summary: the run ended before it was written")
+    if not summary:
+        return paragraph("There is no summary: the runs ended before it was written")
     rows = [[str(row["node"]), *_cells(row)] for row in summary["nodes"]]
     shown = rows[:MAX_ROWS]
     if len(rows) > MAX_ROWS:
@@ -76,13 +76,11 @@ def summary_section(source: Source) -> str:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
-    return [
-        format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS
-    ]
+    return [format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS]
 
 
 def _bound_notes(source: Source) -> list[str]:
-    summary = source.summary or {}
+    summary = source.summary
     found = [] if any(row["bound"] for row in summary["nodes"]) else [f"bound: {summary['bound']}"]
     if source.promised is not None:
         label = source.promised.limit_label
@@ -104,7 +102,9 @@ def comparison_section(comparison: Comparison) -> str:
         one, other = entries[0], entries[1]
         where = quantity if node < 0 else f"{quantity} of node {node}"
         rows.append([where, _value(one), _value(other), *_difference(other)])
-    names = [f"{letter}: {label}" for letter, label in zip("AB", comparison.directories, strict=True)]
+    names = [
+        f"{letter}: {label}" for letter, label in zip("AB", comparison.directories, strict=True)
+    ]
     header = ["quantity", *names, "B - A", "interval", "certain?"]
     count = sum(entries[1].real is True for _, _, entries in comparison.rows)
     certain = (
@@ -133,12 +133,15 @@ def _difference(entry: Entry) -> list[str]:
 
 def sweep_table(source: Source) -> str:
     """Return the points of a sweep."""
-    if source.sweep is None or not len(source.sweep):
+    assert source.sweep is not None
+    found = source.sweep.table
+    if not len(found):
         return paragraph("No point of the sweep is finished yet")
-    names = [str(name) for name in source.sweep.columns if not str(name).endswith("_se")]
-    rows = []
-    for record in source.sweep.to_dict("records")[:MAX_ROWS]:
-        rows.append([_cell(record[name], record.get(f"{name}_se")) for name in names])
+    names = [str(name) for name in found.columns if not str(name).endswith("_se")]
+    rows = [
+        [_cell(record[name], record.get(f"{name}_se")) for name in names]
+        for record in found.to_dict("records")[:MAX_ROWS]
+    ]
     return table("Points of the sweep, +- one standard error", names, rows)
 
 
@@ -154,41 +157,33 @@ def versions_table(source: Source) -> str:
     """Return the versions that the results depend on, and what else the manifest says."""
     manifest = source.manifest
     rows = [(name, value) for name, value in manifest.get("versions", {}).items()]
-    for key in ("seed", "replica", "engine", "status", "events", "fingerprint"):
-        if key in manifest:
-            rows.append((key, manifest[key]))
+    keys = ("seed", "replica", "engine", "status", "events", "fingerprint")
+    rows += [(key, manifest[key]) for key in keys if key in manifest]
     return table("Versions and identity of the run", ("what", "value"), rows, "words")
 
 
 def ensemble_curves(source: Source) -> dict[str, Any] | None:
     """Return curves of an ensemble with their intervals for the page: for each node the mean of
-    trace P, the mean squared error and the mean NEES, as lists over times; None without a table.
+    trace P, the mean squared error and the mean NEES, as lists over times; None for single runs.
 
     The standard error of a trace is at most the sum of those of its diagonal, which is used.
     """
     found = source.ensemble
-    if found is None or not len(found):
+    if found is None:
         return None
-    names = list(found.columns)
-    times = sorted(set(found["t"].tolist()))
-    bound = source.promised.bound if source.promised is not None else None
-    curves: dict[str, Any] = {"nodes": {}, "times": times}
-    for k, (node, rows) in enumerate(found.groupby("node")):
-        if len(rows) != len(times):
-            return None
-        entry: dict[str, Any] = {}
-        if bound is not None and bound.shape[0] == len(times):
-            entry["bound"] = finite(bound[:, k])
-        for letter, name in (("P", "trace"), ("E", "square")):
-            diagonal = [c for c in names if _is_diagonal(c, letter)]
-            mean = rows[diagonal].sum(axis=1, skipna=False).to_numpy()
-            error = rows[[f"{c}_se" for c in diagonal]].sum(axis=1, skipna=False).to_numpy()
-            entry[name] = _with_interval(mean, error)
-        entry["nees"] = _with_interval(rows["nees"].to_numpy(), rows["nees_se"].to_numpy())
-        curves["nodes"][str(node)] = entry
-    if source.scenario is not None:
-        curves["nees_interval"] = list(nees_bounds(source.scenario.plant.n, source.runs))
-    return curves
+    trace, trace_se = _trace(found.mean_P), _trace(found.se_P)
+    square, square_se = _trace(found.mean_error), _trace(found.se_error)
+    nodes: dict[str, Any] = {}
+    for k, node in enumerate(found.nodes):
+        nodes[str(node)] = {
+            "trace": _with_interval(trace[:, k], trace_se[:, k]),
+            "square": _with_interval(square[:, k], square_se[:, k]),
+            "nees": _with_interval(found.mean_nees[:, k], found.se_nees[:, k]),
+        }
+        if found.bound is not None:
+            nodes[str(node)]["bound"] = finite(found.bound[:, k])
+    interval = list(nees_bounds(source.scenario.plant.n, max(1, source.runs)))
+    return {"times": found.times.tolist(), "nodes": nodes, "nees_interval": interval}
 
 
 def difference_curves(one: Source, other: Source) -> dict[str, Any] | None:
@@ -198,53 +193,34 @@ def difference_curves(one: Source, other: Source) -> dict[str, Any] | None:
     The intervals are Welch's, and hold together for all nodes and times (Bonferroni). The standard
     error of a sum is at most the sum of the standard errors, which is used.
     """
-    pair = [source.ensemble for source in (one, other)]
-    if any(table is None or not len(table) for table in pair):
+    first, second = one.ensemble, other.ensemble
+    if first is None or second is None or first.nodes != second.nodes:
         return None
-    first, second = (_squares(table) for table in pair if table is not None)
-    if not first.index.equals(second.index):
-        return None
-    gap = (second["mean"] - first["mean"]).to_numpy()
-    error = np.hypot(first["se"], second["se"]).to_numpy()
     freedom = min(one.runs, other.runs) - 1
-    level = (1.0 - CONFIDENCE) / (2.0 * max(1, len(gap)))
-    wide = stdtrit(freedom, 1.0 - level) * error if freedom > 0 else np.full(len(gap), np.nan)
-    curves: dict[str, Any] = {"confidence": CONFIDENCE, "nodes": {}}
-    nodes = first.index.get_level_values("node").to_numpy()
-    curves["times"] = sorted(set(first.index.get_level_values("t").tolist()))
-    for node in np.unique(nodes).tolist():
-        rows = nodes == node
-        columns = (gap[rows], (gap - wide)[rows], (gap + wide)[rows])
-        curves["nodes"][str(node)] = [finite(column) for column in columns]
-    return curves
-
-
-def _squares(found: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean squared errors with their standard errors, by node and time."""
-    diagonal = [str(name) for name in found.columns if _is_diagonal(str(name), "E")]
-    columns = {
-        "node": found["node"],
-        "t": found["t"],
-        "mean": found[diagonal].sum(axis=1, skipna=False),
-        "se": found[[f"{name}_se" for name in diagonal]].sum(axis=1, skipna=False),
+    if not np.array_equal(first.times, second.times) or freedom < 1:
+        return None
+    gap = _trace(second.mean_error) - _trace(first.mean_error)
+    error = np.hypot(_trace(first.se_error), _trace(second.se_error))
+    level = (1.0 - CONFIDENCE) / (2.0 * gap.size)
+    wide = float(stdtrit(freedom, 1.0 - level)) * error
+    nodes = {
+        str(node): [finite(part[:, k]) for part in (gap, gap - wide, gap + wide)]
+        for k, node in enumerate(first.nodes)
     }
-    return pd.DataFrame(columns).set_index(["node", "t"]).sort_index()
+    return {"confidence": CONFIDENCE, "times": first.times.tolist(), "nodes": nodes}
+
+
+def _trace(matrices: FloatArray) -> FloatArray:
+    """Return the traces (T, N) of matrices (T, N, n, n)."""
+    return np.asarray(np.trace(matrices, axis1=2, axis2=3))
 
 
 def averages(source: Source) -> list[dict[str, Any]] | None:
     """Return the averages of each node as in summary.json, None without a summary."""
-    if source.summary is None or source.kind in ("sweep", "verdict"):
+    if not source.summary:
         return None
     names = ["node", *COLUMNS, *(f"{name}_se" for name in COLUMNS)]
     return [{name: row[name] for name in names if name in row} for row in source.summary["nodes"]]
-
-
-def _is_diagonal(name: str, letter: str) -> bool:
-    digits = name[1:]
-    half = digits.split("_") if "_" in digits else [digits[: len(digits) // 2]] * 2
-    if not name.startswith(letter) or not all(part.isdecimal() for part in half):
-        return False
-    return half[0] == half[1] and (("_" in digits) or digits == half[0] * 2)
 
 
 def _with_interval(mean: Any, error: Any) -> list[list[float | None]]:
@@ -260,20 +236,18 @@ def finite(values: Any) -> list[float | None]:
 
 def sweep_curves(source: Source) -> dict[str, Any] | None:
     """Return the results of a sweep over its first varied key if that has numbers, else None."""
-    found, keys = source.sweep, list(source.manifest.get("vary", {}))
-    if found is None or not len(found) or not keys or keys[0] not in found:
+    if source.sweep is None or not len(source.sweep.table):
         return None
+    found, keys = source.sweep.table, list(source.sweep.keys)
     if not np.issubdtype(found[keys[0]].to_numpy().dtype, np.number):
         return None
     series = []
     groups = found.groupby(keys[1:], sort=False) if len(keys) > 1 else [((), found)]
-    for where, rows in groups:
-        rows = rows.sort_values(keys[0])
-        values = where if isinstance(where, tuple) else (where,)
+    for where, points in groups:
+        rows = points.sort_values(keys[0])
+        values = tuple(where)
         label = ", ".join(f"{k} = {v}" for k, v in zip(keys[1:], values, strict=True))
         mean, error = rows["worst_rms"].to_numpy(), rows["worst_rms_se"].to_numpy()
-        points = rows[keys[0]].astype(float).tolist()
-        series.append(
-            {"label": label or "worst node", "x": points, "y": _with_interval(mean, error)}
-        )
+        x = rows[keys[0]].astype(float).tolist()
+        series.append({"label": label or "worst node", "x": x, "y": _with_interval(mean, error)})
     return {"key": keys[0], "series": series}
