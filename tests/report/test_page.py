@@ -1,0 +1,305 @@
+"""Pages without a browser: nothing from outside, every number the run's, every text escaped."""
+
+import base64
+import hashlib
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+import netkf
+from netkf.cli.main import main
+from netkf.core.errors import ScenarioError
+from netkf.report import page as pages
+from netkf.report.claims import findings, worst_node
+from netkf.report.data import Budget
+from netkf.report.directories import read_source
+from netkf.report.markup import script_json
+from netkf.report.messages import MESSAGE, information_age, join_messages, keep_messages
+from netkf.report.page import make_page
+from netkf.report.tables import difference_curves
+from netkf.runs.run import run_to_directory
+from netkf.runs.tables import summary_table
+from tests.conftest import SCENARIOS
+from tests.report.conftest import EVIL, write_verdict
+from tests.report.decoding import Page
+from tests.report.oracle import plain_messages
+
+
+def findings_of(directory):
+    source = read_source(directory)
+    return findings(source, join_messages(source.run.log))
+
+
+@pytest.mark.parametrize("name", ["ring", "delayed", "slots", "library"])
+def test_a_page_holds_every_number_of_its_run(name, request):
+    directory = request.getfixturevalue(name)
+    page, run = Page(make_page([directory])), netkf.open(directory)
+    data = page.data["runs"][0]
+    columns = {key: page.column(c) for key, c in data["samples"]["columns"].items()}
+    i, j = np.triu_indices(run.x.shape[1])
+    np.testing.assert_array_equal(columns["t"], run.times)
+    np.testing.assert_array_equal(columns["xhat"], run.xhat)
+    np.testing.assert_array_equal(columns["P"], run.P[..., i, j])
+    if run.truth_known:
+        np.testing.assert_array_equal(columns["x"], run.x)
+        np.testing.assert_array_equal(columns["sq_error"], run.sq_error)
+    assert data["totals"]["events"] == len(run.log)
+    parts = {key: page.column(c) for key, c in data["messages"]["columns"].items()}
+    numbers = np.cumsum(parts["number"].astype(np.uint64)) % 2**32
+    nodes = np.array(run.nodes)
+    ended = np.where(parts["travel"] == 0.0, parts["sent"], parts["travel"])
+    outcomes = ("delivered", "lost", "late", "under way")
+    found = {
+        (int(nodes[a]), int(nodes[b]), int(k)): (sent, outcomes[o], end)
+        for a, b, k, sent, o, end in zip(
+            parts["sender"],
+            parts["receiver"],
+            numbers,
+            parts["sent"],
+            parts["outcome"],
+            ended,
+            strict=True,
+        )
+    }
+    expected = plain_messages(run.events)
+    assert found == {key: (sent, o, end) for key, (sent, o, end, _) in expected.items()}
+    assert "Nothing was left out" in page.shown
+
+
+def test_nothing_comes_from_outside(ring, ensembles):
+    for directories in ([ring], ensembles):
+        page = Page(make_page(directories))
+        for tag, attrs in page.elements:
+            assert not {"src", "action", "style", "onclick", "onload"} & set(attrs), tag
+            assert attrs.get("href", "#").startswith(("#", "data:,"))
+        script = next(text for tag, attrs, text in page.raw if tag == "script" and not attrs)
+        (style,) = [text for tag, _, text in page.raw if tag == "style"]
+        assert not re.search(r"url\(|@import|fetch\(|XMLHttp|innerHTML|eval\(", script + style)
+        policy = next(a["content"] for t, a in page.elements if t == "meta" and "http-equiv" in a)
+        for kind, text in (("script", script), ("style", style)):
+            digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+            assert f"{kind}-src 'sha256-{digest}'" in policy
+        assert policy.startswith("default-src 'none'")
+        assert "unsafe" not in policy
+
+
+def test_texts_of_files_are_escaped(tmp_path):
+    changes = {"horizon": 1.0, "claim": EVIL, "name": f"name {EVIL}"}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    directory = run_to_directory(scenario, tmp_path / "a<b>&'quoted\"").directory
+    write_verdict(directory, EVIL + "\u202e")
+    text = make_page([directory])
+    page = Page(text)
+    assert [tag for tag, _ in page.elements].count("script") == 3
+    assert not {"img", "b"} & {tag for tag, _ in page.elements}
+    assert not any(name.startswith("on") for _, attrs in page.elements for name in attrs)
+    assert text.count("<script") == 3
+    assert "\u202e" not in text  # changes the direction of what follows
+    assert page.data["runs"][0]["name"] == scenario.name
+
+
+@pytest.mark.parametrize("value", ["</script>", "<!--", "]]>", "\u2028", "a&lt;b"])
+def test_data_cannot_end_their_element(value):
+    text = script_json({value: value})
+    assert not set("<>&\u2028\u2029") & set(text)
+    assert json.loads(text) == {value: value}
+
+
+def test_tables_show_the_numbers_of_the_command_line(ring, ensembles):
+    for directory in (ring, ensembles[0]):
+        source = read_source(directory)
+        shown = Page(make_page([directory])).shown
+        for line in summary_table(source.summary).splitlines()[2 : 2 + len(source.run.nodes)]:
+            assert " ".join(line.split()) in shown
+
+
+def test_the_claim_names_the_worst_node_of_the_tables(ring, slots, library):
+    for directory in (ring, slots):
+        source = read_source(directory)
+        worst, rows = worst_node(source), source.summary["nodes"]
+        top = max(rows, key=lambda row: row["rms_error"])
+        assert worst.node == top["node"]
+        assert worst.value == pytest.approx(top["rms_error"], rel=1e-12)
+        states = netkf.open(directory).states
+        at = states[(states["node"] == worst.node) & (states["t"] > 0)].nlargest(1, "sq_error")
+        assert (worst.time, worst.peak**2) == (at["t"].item(), pytest.approx(at["sq_error"].item()))
+        assert (
+            f"Node {worst.node} was worst: RMS error {top['rms_error']:.4g}"
+            in findings_of(directory)[0]
+        )
+    assert "There is no ground truth" in findings_of(library)[0]
+
+
+def test_why_counts_what_was_lost_since_the_worst_node_last_heard(ring):
+    worst = worst_node(read_source(ring))
+    messages = plain_messages(netkf.open(ring).events)
+    lost = 0
+    for sender in {key[0] for key in messages if key[1] == worst.node}:
+        link = [m for key, m in messages.items() if key[:2] == (sender, worst.node)]
+        heard = max(m[0] for m in link if m[1] == "delivered" and m[2] <= worst.time)
+        lost += sum(m[1] == "lost" and heard < m[0] <= worst.time for m in link)
+        assert f"node {sender} ({worst.time - heard:.4g} s before)" in findings_of(ring)[1]
+    assert f"; {lost:,} message" in findings_of(ring)[1]
+
+
+def test_ages_of_information_are_means_over_links(delayed):
+    run = netkf.open(delayed)
+    messages, links = plain_messages(run.events), {}
+    for (sender, receiver, _), (sent, outcome, ended, _) in messages.items():
+        links.setdefault((sender, receiver), []).append((sent, outcome, ended))
+    found = information_age(join_messages(run.log), run.nodes, run.times, run.times)
+    for k in (1, len(run.times) // 2, len(run.times) - 1):
+        t = run.times[k]
+        for i, node in enumerate(run.nodes):
+            ages = [
+                t - max([0.0, *(s for s, o, e in link if o == "delivered" and e <= t)])
+                for (_, receiver), link in links.items()
+                if receiver == node
+            ]
+            assert found[k, i] == pytest.approx(np.mean(ages))
+
+
+def test_thinned_pages_keep_what_they_say(ring, monkeypatch):
+    monkeypatch.setattr(pages, "BUDGET", Budget(messages=120, values=700))
+    page, run = Page(make_page([ring])), netkf.open(ring)
+    data = page.data["runs"][0]
+    kept, samples = data["messages"], data["samples"]
+    assert 20 < kept["count"] <= 240 < data["totals"]["messages"] == run.count("send")
+    parts = {name: page.column(c) for name, c in kept["columns"].items()}
+    numbers = np.cumsum(parts["number"].astype(np.uint64)) % 2**32
+    inside = (parts["sent"] >= kept["start"]) & (parts["sent"] <= kept["end"])
+    sent = run.log["t"][run.log["kind"] == 2]
+    assert inside.sum() == ((sent >= kept["start"]) & (sent <= kept["end"])).sum() > 0
+    assert (numbers[~inside] % kept["step"] == 0).all()
+    worst = worst_node(read_source(ring))
+    times = page.column(samples["columns"]["t"])
+    assert worst.time in times
+    assert run.times[-1] in times
+    assert f"of {run.count('send'):,} messages the page holds {kept['count']:,}" in page.shown
+    assert sum(map(sum, data["traffic"].values())) == run.count("send")  # of all messages
+
+
+def test_no_message_is_left_out_below_the_limit_and_few_beyond():
+    messages = np.zeros(1000, dtype=MESSAGE)
+    messages["sent"] = np.arange(1000.0)
+    messages["number"] = np.arange(1000)
+    assert keep_messages(messages, 1000, 500.0).step == 1
+    for instant in (0.0, 500.0, 999.0):
+        kept = keep_messages(messages, 100, instant)
+        assert kept.start <= instant <= kept.end
+        assert len(kept.messages) <= 110
+
+
+def test_a_page_of_fifty_nodes_and_100_000_events_is_small_and_complete(tmp_path):
+    changes = {
+        "network.graph": {"kind": "regular", "nodes": 50, "degree": 4, "seed": 1},
+        "network.channel.delay": {"kind": "exponential", "mean": 0.05},
+        "network.activation.rate": 2.8,
+        "filter.epsilon": 0.2,
+        "horizon": 57.0,
+    }
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    directory = run_to_directory(scenario, tmp_path / "large").directory
+    assert 95_000 < len(netkf.open(directory).log) < 110_000
+    text = make_page([directory])
+    assert len(text.encode()) < 5_000_000
+    assert Page(text).data["runs"][0]["messages"]["step"] == 1
+
+
+def test_larger_pages_are_thinned_until_they_fit(ring, monkeypatch):
+    whole = len(make_page([ring]))
+    monkeypatch.setattr(pages, "MAX_BYTES", whole - 5_000)
+    monkeypatch.setattr(pages, "LEAST_BUDGET", 10)
+    text = make_page([ring])
+    assert len(text.encode()) <= whole - 5_000
+    assert "Left out: of" in text
+
+
+def test_two_runs_show_their_differences(ensembles):
+    page = Page(make_page(ensembles))
+    comparison = netkf.compare(ensembles)
+    certain = [row for row in comparison.rows if row.entries[1].real]
+    assert certain
+    assert f"{len(certain)} differences are certain" in page.shown
+    assert page.shown.count("\u25c6 certain") == len(certain)
+    value = comparison.rows[0].entries[1]
+    assert f"{value.low:.4g} .. {value.high:.4g}" in page.shown
+    assert len(page.data["runs"]) == 2
+
+
+def test_intervals_of_differences_over_time(ensembles):
+    one, other = (read_source(directory) for directory in ensembles)
+    found = difference_curves(one, other)
+    tables = [netkf.open(d).table.set_index(["node", "t"]) for d in ensembles]
+    count = len(tables[0])
+    for node in (0, 3):
+        a, b = (table.loc[node].iloc[5] for table in tables)
+        gap = (b["E00"] + b["E11"]) - (a["E00"] + a["E11"])
+        error = np.hypot(a["E00_se"] + a["E11_se"], b["E00_se"] + b["E11_se"])
+        wide = scipy.stats.t(11).ppf(1 - 0.05 / (2 * count)) * error
+        shown = [column[5] for column in found["nodes"][str(node)]]
+        np.testing.assert_allclose(shown, [gap, gap - wide, gap + wide])
+
+
+def test_every_kind_of_directory_has_a_page(ring, ensembles, sweep, tmp_path):
+    verdict = tmp_path / "verdict"
+    verdict.mkdir()
+    (verdict / "scenario.toml").write_bytes((ring / "scenario.toml").read_bytes())
+    write_verdict(verdict, "P fits the error")
+    shown = Page(make_page([verdict])).shown
+    assert "1 promise is broken in 50 runs (1 broken, 1 holds)" in shown
+    assert "A verdict keeps no trace" in shown
+    both = Page(make_page([ring, verdict]))
+    assert "BROKEN P fits the error" in both.shown
+    assert len(both.data["runs"]) == 1
+    shown = Page(make_page([sweep])).shown
+    table = pd.read_parquet(sweep / "sweep.parquet")
+    assert f"RMS error {table['worst_rms'].min():.4g}" in shown
+    assert "--trace full" in shown
+    page = Page(make_page([ensembles[0]]))
+    np.testing.assert_array_equal(
+        page.data["ensembles"][0]["times"], netkf.open(ensembles[0]).times
+    )
+    assert "Over 12 runs node" in page.shown
+
+
+def test_an_interrupted_a_diverged_and_a_lonely_run_say_so(ring, build, tmp_path):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml")
+    with pytest.raises(KeyboardInterrupt):
+        run_to_directory(scenario, tmp_path / "stopped", progress=interrupt)
+    assert "poisson-ring (interrupted)" in Page(make_page([tmp_path / "stopped"])).shown
+    plant = {"kind": "diffusion", "A": [[60.0]], "B": [[1.0]], "cov": [[1.0]]}
+    wild = build(plant=plant, horizon=20.0, filter={"kind": "local", "cov": [[1.0]]})
+    done = run_to_directory(wild, tmp_path / "wild")
+    assert done.status == "diverged"
+    assert "Diverged: at t = " in Page(make_page([done.directory])).shown
+    graph = {"graph": {"kind": "complete", "nodes": 1}}
+    alone = build(network=graph, filter={"kind": "local", "cov": [[1.0]]})
+    shown = Page(make_page([run_to_directory(alone, tmp_path / "one").directory])).shown
+    assert "There is one node, so nothing is sent" in shown
+    run_to_directory(scenario, tmp_path / "empty", trace="none")
+    page = Page(make_page([tmp_path / "empty"]))
+    assert "No samples were recorded" in page.shown
+    assert page.data["runs"] == []
+
+
+def test_the_command(ring, tmp_path, capsys):
+    assert main(["report", str(ring), "--out", str(tmp_path / "page.html")]) == 0
+    assert capsys.readouterr().out == f"written to {tmp_path / 'page.html'}\n"
+    assert "poisson-ring" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    for arguments in (["report", str(tmp_path)], ["report", str(ring), "--replica", "7"]):
+        assert main(arguments) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert main(["report", str(ring), str(ring), str(ring)]) == 2
+
+
+def test_sweeps_are_not_compared(ring, sweep):
+    with pytest.raises(ScenarioError, match="compares runs and ensembles"):
+        make_page([ring, sweep])
