@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from netkf.scenario.reading import load
     from netkf.scenario.scenario import Scenario
     from netkf.studies.compare import compare
+    from netkf.studies.compare_filters import compare_filters
     from netkf.studies.consistency import consistency
     from netkf.studies.opening import open as open
     from netkf.studies.size import size
@@ -32,6 +33,7 @@ _WHERE = {
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
     "compare": "netkf.studies.compare",
+    "compare_filters": "netkf.studies.compare_filters",
     "consistency": "netkf.studies.consistency",
     "first_difference": "netkf.trace.run",
     "load": "netkf.scenario.reading",
@@ -62,6 +64,7 @@ __all__ = [
     "TheoryError",
     "check",
     "compare",
+    "compare_filters",
     "consistency",
     "first_difference",
     "load",

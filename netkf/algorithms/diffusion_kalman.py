@@ -123,6 +123,10 @@ class DiffusionKalman(Filter):
         """Return False for the readings of nodes without a sensor."""
         return has_sensor or phase == ESTIMATES
 
+    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+        """A message is y, H and R, or psi."""
+        return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
+
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> DiffusionKalmanState:

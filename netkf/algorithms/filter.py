@@ -305,6 +305,13 @@ class Filter(Component):
         """
         return True
 
+    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+        """Return how many numbers a message holds that a node sends in exchange number ``phase`` of
+        a slot (-1 under clocks): n states, so many ``rows`` of readings of its own. Of a symmetric
+        matrix one triangle counts; by default a message is an estimate with its covariance.
+        """
+        return n + n * (n + 1) // 2
+
     def slot_stopping(self) -> tuple[int, bool]:
         """The exchange in which nodes may stop for good (-1: none), and whether they are silent in
         it from then on; for compiled filters.

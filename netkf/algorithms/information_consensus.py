@@ -220,6 +220,11 @@ class InformationConsensus(Filter):
         parts: FloatArray = aligned((2, K, len(states), n, n + 1, LANES))
         return (ConsensusArrays(self.steps, *made, parts),)
 
+    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+        """In slots a message is K pairs (Omega, q)."""
+        pairs = 1 if phase < 0 else len(self.recipe(2).shares)
+        return pairs * (n + n * (n + 1) // 2)
+
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ConsensusState:
         """The node knows how many nodes there are."""
         return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))

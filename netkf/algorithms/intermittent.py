@@ -138,6 +138,10 @@ class Intermittent(Filter):
         """Nodes send their readings."""
         return has_sensor
 
+    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+        """A message is y, H and R."""
+        return rows * (1 + n) + rows * (rows + 1) // 2
+
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> IntermittentState:

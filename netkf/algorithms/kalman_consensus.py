@@ -146,6 +146,10 @@ class Kcf(Filter):
         """Return the settings."""
         return (KcfArrays(self.epsilon, self.share_readings),)
 
+    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+        """A message is (u, U, xbar), or xbar alone."""
+        return 2 * n + n * (n + 1) // 2 if rows and self.share_readings else n
+
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> KcfState:
         """Return the state at time 0, a prediction."""
         root = first_root(cov)

@@ -410,6 +410,12 @@ class PushSum(Filter):
         # Exchange MASS carries nothing if the gains are known beforehand.
         return phase == AVERAGE or not self.asymptotic
 
+    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+        """A message is w, n~ and C~, or z; under clocks a weight, information and its vector."""
+        if phase == AVERAGE:
+            return n
+        return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
+
     def slot_stopping(self) -> tuple[int, bool]:
         """Nodes stop when they have exchanged mass; by the paper's rule they send none then."""
         # Without exchanges of mass there is nothing to stop.

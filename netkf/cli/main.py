@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     import argparse
 
 BAD_USAGE = 2
-COMMANDS = ("run", "check", "theory", "sweep", "size", "consistency", "compare", "report")
+COMMANDS = (
+    *("run", "check", "theory", "sweep", "size", "consistency", "compare", "compare_filters"),
+    "report",
+)
 """Modules of this package, each with a COMMAND."""
 
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 RUN = "netkf.runs.plots", "run_picture"
 ENSEMBLE = "netkf.ensembles.picture", "ensemble_picture"
 SWEEP = "netkf.studies.picture", "sweep_picture"
+FILTERS = "netkf.studies.filter_picture", "filter_picture"
 VERDICT = "netkf.checks.picture", "verdict_picture"
 
 

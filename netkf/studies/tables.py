@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.printable import shorten
 from netkf.runs.tables import format_number, shorten_rows, standard_error, table
 from netkf.studies.compare import Comparison, Entry
+from netkf.studies.compare_filters import QUANTITIES, FilterComparison
 from netkf.studies.consistency import Consistency
+from netkf.studies.filter_values import Quantity
 from netkf.studies.search import Sizing
 
 if TYPE_CHECKING:
@@ -120,6 +123,47 @@ def consistency_text(found: Consistency) -> str:
             *(f"note: {note}" for note in found.notes),
         ]
     )
+
+
+def filters_text(found: FilterComparison) -> str:
+    """Return one row per filter, reasons of those that cannot run, and a legend of the columns."""
+    header = ["filter", "RMS error", "difference", "worst instant", "difference", "NEES / n"]
+    header += ["difference", "consistency", "transmissions", "kB"]
+    ran = [row for row in found.rows if row.ran]
+    rows = [
+        [
+            shorten(row.filter),
+            *(cell for name in QUANTITIES for cell in _quantity_cells(row.quantities[name])),
+            row.consistency,
+            f"{row.transmissions:,}",
+            f"{row.bytes / 1000.0:,.6g}",
+        ]
+        for row in ran
+    ]
+    lines = [table(header, rows, left=1), ""]
+    noted = [row for row in found.rows if row.status != "complete"]
+    lines += [f"{shorten(row.filter)}: {row.status}" for row in noted]
+    runs = f"{found.runs:,} run{'s' if found.runs > 1 else ''} of each on the same draws"
+    lines.append(f"{runs}; +-: one standard error; differences from {shorten(ran[0].filter)}, run")
+    lines.append(f"by run; * for certain, all marks together at confidence {found.confidence:g}")
+    lines.append("worst instant: largest error of any node at any sample; traffic of replica 0")
+    ahead = [shorten(row.filter) for row in ran if row.predicts]
+    if ahead and len(ahead) < len(ran):
+        lines.append(
+            f"note: samples of {', '.join(ahead)} are predictions, the others are filtered"
+        )
+    return "\n".join(lines)
+
+
+def _quantity_cells(found: Quantity) -> tuple[str, str]:
+    """Return the value with its standard error, and the difference with half its interval."""
+    difference = "-"
+    if math.isfinite(found.difference):
+        width = 0.5 * (found.high - found.low)
+        difference = f"{found.difference:+.4g}"
+        difference += f" +- {width:.2g}" if math.isfinite(width) else ""
+        difference += "*" if found.real else ""
+    return _with_error(found.value, found.se), difference
 
 
 def comparison_text(found: Comparison) -> str:

@@ -1,0 +1,87 @@
+"""``netkf compare-filters``: several filters on one truth and one network."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from netkf.cli import pictures
+from netkf.cli.options import (
+    Command,
+    add_engine,
+    add_json,
+    add_no_plot,
+    add_pool,
+    add_seed,
+    load_scenario,
+    parse_count,
+    print_json,
+    print_title,
+)
+from netkf.cli.progress import ProgressLine
+
+
+def _declare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--filters",
+        required=True,
+        metavar="F1,F2,...",
+        help='kinds of filters, or tables such as {kind="hcmci",steps=3}; the first is compared '
+        "with the others",
+    )
+    parser.add_argument(
+        "--runs", type=parse_count, default=100, help="runs of each filter (default: 100)"
+    )
+    parser.add_argument(
+        "--confidence",
+        type=float,
+        default=0.95,
+        help="probability that all marks are right (default: 0.95)",
+    )
+    parser.add_argument("--out", type=Path, help="directory for tables and a picture")
+    add_no_plot(parser)
+    add_seed(parser)
+    add_engine(parser)
+    add_pool(parser)
+    add_json(parser)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from netkf.scenario.values import typed_values
+    from netkf.studies.compare_filters import compare_filters, write_comparison
+    from netkf.studies.tables import filters_text
+
+    filters = typed_values("--filters", "filters", options.filters)
+    scenario = load_scenario(options)
+    with ProgressLine() as line:
+        comparison = compare_filters(
+            scenario,
+            filters,
+            options.runs,
+            confidence=options.confidence,
+            engine=options.engine,
+            workers=options.workers,
+            scheduler=options.scheduler,
+            progress=line.counter("filters"),
+        )
+    written = None
+    if options.out is not None:
+        written = write_comparison(scenario, comparison, options.out)
+        if not options.no_plot:
+            pictures.draw_picture(pictures.FILTERS, scenario, written)
+    if options.json:
+        print_json(comparison.document())
+        return 0
+    print_title(scenario)
+    print(f"\n{filters_text(comparison)}")
+    if written is not None:
+        print(f"written to {written.directory}")
+    return 0
+
+
+COMMAND = Command(
+    "compare-filters",
+    "compare filters on one truth and one network, with intervals of their differences",
+    _declare,
+    _run,
+)

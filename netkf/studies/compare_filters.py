@@ -1,0 +1,294 @@
+"""``netkf.compare_filters``: filters on one truth, one network and the same draws."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from netkf.algorithms.filter import Filter
+from netkf.core.errors import EngineError, ScenarioError, nearest
+from netkf.core.fields import integer, number
+from netkf.ensembles.pools import Pool
+from netkf.ensembles.replicas import replicate_blocks
+from netkf.runs.documents import write_sealed
+from netkf.runs.failures import explain_failures
+from netkf.runs.files import check_sources, new_directory, write_scenario, write_text
+from netkf.runs.parquet_files import write_table
+from netkf.runs.provenance import versions
+from netkf.runs.simulate import choose_engine
+from netkf.scenario.registry import KINDS, name_of
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.writing import as_table
+from netkf.studies.filter_values import (
+    FilterValues,
+    Quantity,
+    Traffic,
+    block_values,
+    count_traffic,
+    estimate_quantities,
+    join_values,
+    judge_consistency,
+)
+from netkf.studies.pools import PoolOptions, shared_pool
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LOAD = "load it first: netkf.compare_filters(netkf.load(path), ...)"
+CARRIED = ("mean", "cov", "model")
+"""Keys of ``[filter]`` that every compared filter takes over from the scenario."""
+QUANTITIES = ("rms_error", "worst_instant", "nees_ratio")
+Progress = Callable[[int, int], None]
+Choice = str | Mapping[str, Any] | Filter
+"""A filter: its kind, its table in a scenario file, or an object."""
+
+
+class Candidate(NamedTuple):
+    """A filter to compare: its ``label``, and its scenario or why it cannot run there."""
+
+    label: str
+    scenario: Scenario | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ComparedFilter:
+    """One filter of a comparison.
+
+    quantities    : rms_error, worst_instant (mean over runs of the largest error of any node at any
+                    sample) and nees_ratio (NEES / n), empty if it cannot run
+    consistency   : "consistent", "too sure" or "too careful", by NEES / n
+    transmissions, bytes : of replica 0, a broadcast counts once; nan if it cannot run
+    status        : "complete", how many runs diverged, or why it cannot run there
+    predicts      : True if its samples in slots are predictions, not filtered
+    """
+
+    filter: str
+    quantities: Mapping[str, Quantity]
+    consistency: str
+    transmissions: float
+    bytes: float
+    status: str
+    predicts: bool = False
+
+    @property
+    def ran(self) -> bool:
+        """True if it can run there."""
+        return bool(self.quantities)
+
+    def document(self) -> dict[str, Any]:
+        """Return plain values, one level deep."""
+        row: dict[str, Any] = {"filter": self.filter}
+        for name in QUANTITIES:
+            quantity = self.quantities.get(name, Quantity(math.nan, math.nan))
+            row[name] = quantity.value
+            for part in ("se", "difference", "low", "high", "real"):
+                row[f"{name}_{part}"] = getattr(quantity, part)
+        row |= {"consistency": self.consistency, "transmissions": self.transmissions}
+        row |= {"bytes": self.bytes, "predicts": self.predicts}
+        return row | {"status": self.status}
+
+
+@dataclass(frozen=True)
+class FilterComparison:
+    """Filters side by side; all intervals of differences from the first that can run hold together
+    with probability ``confidence``.
+    """
+
+    scenario: str
+    runs: int
+    seed: int
+    confidence: float
+    rows: tuple[ComparedFilter, ...]
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """One row per filter."""
+        import pandas as pd
+
+        return pd.DataFrame([row.document() for row in self.rows])
+
+    @property
+    def first(self) -> str:
+        """The filter from which differences are taken."""
+        return next(row.filter for row in self.rows if row.ran)
+
+    def document(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        rows = [row.document() for row in self.rows]
+        names = ("scenario", "runs", "seed", "confidence")
+        return {**{name: getattr(self, name) for name in names}, "first": self.first, "rows": rows}
+
+
+def compare_filters(
+    scenario: Scenario,
+    filters: Sequence[Choice],
+    runs: int = 100,
+    seed: int | None = None,
+    confidence: float = 0.95,
+    *,
+    engine: str = "auto",
+    workers: int | None = None,
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> FilterComparison:
+    """Simulate a scenario with each of several filters, on the same truth, readings and draws of
+    the network, and compare errors, consistency and traffic run by run.
+
+    A filter is a kind (``"hcmci"``), a table (``{"kind": "hcmci", "steps": 3}``) or an object of
+    netkf.parts; the start and the model of the scenario's own filter hold for all of them, and its
+    settings for its own kind. A filter that cannot run there says why in its row. Raises
+    ScenarioError if none can, or if there is no such kind.
+    """
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError("", "compare_filters takes a netkf.Scenario", scenario, LOAD)
+    sure = number(above=0.0, below=1.0)("confidence", confidence)
+    count = integer(low=1)("runs", runs)
+    root = scenario.seed if seed is None else integer(low=0)("seed", seed)
+    candidates = _candidates(scenario, filters, engine)
+    values: dict[str, FilterValues] = {}
+    traffic: dict[str, Traffic] = {}
+    with shared_pool(count, PoolOptions(workers, executor, scheduler)) as pool:
+        for k, candidate in enumerate(candidates):
+            if candidate.scenario is not None:
+                values[candidate.label] = _simulate(candidate.scenario, count, root, engine, pool)
+                chosen = choose_engine(engine, candidate.scenario)
+                traffic[candidate.label] = count_traffic(candidate.scenario, root, chosen)
+            if progress is not None:
+                progress(k + 1, len(candidates))
+    first = next(iter(values))
+    level = (1.0 - sure) / (len(QUANTITIES) * max(1, len(values) - 1))
+    rows = []
+    for label, made, reason in candidates:
+        if made is None:
+            rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
+            continue
+        base = values[first] if label != first else None
+        row = _row(label, values[label], base, traffic[label], scenario.plant.n, level)
+        rows.append(dataclasses.replace(row, predicts=made.slotted and made.hosted.predicts))
+    return FilterComparison(scenario.name, count, root, sure, tuple(rows))
+
+
+def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:
+    with explain_failures(scenario):
+        task = partial(block_values, engine=choose_engine(engine, scenario))
+        found: FilterValues = replicate_blocks(task, join_values, scenario, runs, seed, pool=pool)
+    return found
+
+
+def _row(
+    label: str,
+    values: FilterValues,
+    first: FilterValues | None,
+    traffic: Traffic,
+    n: int,
+    level: float,
+) -> ComparedFilter:
+    diverged = int(values.diverged.sum())
+    return ComparedFilter(
+        label,
+        estimate_quantities(values, first, n, level),
+        judge_consistency(values, n, level),
+        *traffic,
+        f"{diverged} of {len(values.diverged)} runs diverged" if diverged else "complete",
+    )
+
+
+def _candidates(
+    scenario: Scenario, filters: Sequence[Choice], engine: str
+) -> tuple[Candidate, ...]:
+    """Return the filters with their scenarios; raises ScenarioError if none can run."""
+    if isinstance(filters, (str, Mapping, Filter)) or not filters:
+        rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
+        raise ScenarioError("filters", rule, filters, remedy)
+    found = [_candidate(scenario, choice, engine) for choice in filters]
+    labels = [candidate.label for candidate in found]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise ScenarioError("filters", "must differ from each other", label, "remove one")
+    if all(candidate.scenario is None for candidate in found):
+        problem = f"none of them can run there; {found[0].label}: {found[0].reason}"
+        raise ScenarioError("filters", problem, None, "choose others, or change the scenario")
+    return tuple(found)
+
+
+def _candidate(scenario: Scenario, choice: Choice, engine: str) -> Candidate:
+    if isinstance(choice, Filter):
+        filtering = dataclasses.replace(scenario.filter, algorithm=choice)
+        make = partial(dataclasses.replace, scenario, filter=filtering)
+        label = _label(name_of("filter", choice), {})
+    else:
+        table = _filter_table(scenario, choice)
+        given = {} if isinstance(choice, str) else {k: v for k, v in choice.items() if k != "kind"}
+        label, make = (
+            _label(str(table["kind"]), given),
+            partial(scenario.replace, {"filter": table}),
+        )
+    try:
+        made = make()
+        choose_engine(engine, made)
+    except (ScenarioError, EngineError) as error:
+        return Candidate(label, None, f"cannot run here: {error}")
+    return Candidate(label, made)
+
+
+def _label(kind: str, settings: Mapping[str, Any]) -> str:
+    return " ".join([kind, *(f"{key}={value}" for key, value in settings.items())])
+
+
+def _filter_table(scenario: Scenario, choice: str | Mapping[str, Any]) -> dict[str, Any]:
+    """Return the table [filter] of a choice; raises ScenarioError for a kind that is unknown."""
+    own = as_table(scenario)["filter"]
+    table = {"kind": choice} if isinstance(choice, str) else dict(choice)
+    kind = table.get("kind")
+    known = sorted(KINDS["filter"])
+    if not isinstance(kind, str) or (":" not in kind and kind not in known):
+        hint = nearest(kind, known) if isinstance(kind, str) else ""
+        raise ScenarioError(
+            "filters", "is no filter", kind, f"{hint}filters are {', '.join(known)}"
+        )
+    carried = {key: value for key, value in own.items() if key in CARRIED}
+    if isinstance(choice, str) and kind == own["kind"]:
+        return dict(own)
+    return {**carried, **table}
+
+
+@dataclass(frozen=True, eq=False)
+class CompletedComparison:
+    """A comparison that was written to ``directory``."""
+
+    directory: Path
+    comparison: FilterComparison
+
+
+def write_comparison(
+    scenario: Scenario, comparison: FilterComparison, out: Path | None = None
+) -> CompletedComparison:
+    """Write filters.parquet, filters.csv, scenario.toml and manifest.json into a new directory.
+
+    Raises ScenarioError if ``out`` cannot be created or is not empty.
+    """
+    check_sources(scenario)
+    directory = new_directory(out, f"{scenario.name}-filters")
+    write_scenario(directory, scenario)
+    table = comparison.table
+    write_table(directory / "filters.parquet", {str(k): column for k, column in table.items()})
+    write_text(directory / "filters.csv", table.to_csv(index=False))
+    manifest = {
+        "name": scenario.name,
+        "versions": versions(),
+        "seed": comparison.seed,
+        "filters": [row.filter for row in comparison.rows],
+        "confidence": comparison.confidence,
+        "runs": {"wanted": comparison.runs, "done": comparison.runs},
+        "status": "complete",
+    }
+    write_sealed(directory / "manifest.json", manifest)
+    return CompletedComparison(directory, comparison)

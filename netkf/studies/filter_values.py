@@ -1,0 +1,173 @@
+"""Values of the runs of one filter, and paired differences of two filters on the same runs."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+
+from netkf.engines.base import Engine
+from netkf.ensembles.statistics import run_values
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.simulate import simulate
+from netkf.scenario.scenario import Scenario
+from netkf.trace.batch import RunBatch
+from netkf.trace.schema import CODES
+
+BYTES = 8
+"""Of a number in a message."""
+ROUNDING = 1e-9
+"""Relative difference below which two filters are the same."""
+
+
+class FilterValues(NamedTuple):
+    """Values of R runs, averages over the samples after time 0 (R,) each.
+
+    square   : squared error, mean of all nodes
+    worst    : largest error of any node at any sample
+    nees     : e' P^-1 e, mean of all nodes
+    diverged : True if the run ended early
+    """
+
+    square: FloatArray
+    worst: FloatArray
+    nees: FloatArray
+    diverged: np.ndarray
+
+
+def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> FilterValues:
+    """Simulate consecutive replicas and return their values; a task of ``replicate_blocks``."""
+    batches = engine.run_many(scenario, seed, replicas)
+    return join_values(*(_batch_values(scenario, batch) for batch in batches))
+
+
+def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
+    values = run_values(batch, scenario)
+    whole = values.averages[:, -1]
+    worst = [
+        _largest_error(batch, r, float(end)) for r, end in enumerate(values.rounding_from.tolist())
+    ]
+    return FilterValues(whole[:, 0], np.array(worst), whole[:, 2], values.diverged > 0)
+
+
+def _largest_error(batch: RunBatch, r: int, blurred_from: float) -> float:
+    """Return the largest |e| of a run after time 0, where rounding does not blur it."""
+    length = int(batch.lengths[r])
+    times = batch.times[:length]
+    # The last sample of a run that diverges is the broken one.
+    used = (times > 0.0) & ~(times >= blurred_from)
+    if batch.diverged[r]:
+        used[-1:] = False
+    sizes = np.linalg.norm(batch.error[r, :length][used], axis=-1)
+    return float(sizes.max()) if sizes.size else math.nan
+
+
+def join_values(*parts: FilterValues) -> FilterValues:
+    """Return the values of several batches as one."""
+    return FilterValues(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+class Traffic(NamedTuple):
+    """What all nodes send in a run: ``transmissions``, a broadcast once, and their ``bytes``."""
+
+    transmissions: int
+    bytes: int
+
+
+def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
+    """Return the traffic of replica 0, with 8 bytes for each number of a message."""
+    log, slotted = simulate(scenario, seed, 0, engine).log, scenario.slotted
+    sent = log[log["kind"] == CODES["send"]]
+    if slotted:
+        # All messages of a node in one step of an exchange are one transmission.
+        sent = np.unique(sent[["t", "phase", "node"]])
+    elif (log["kind"] == CODES["transmit"]).any():
+        sent = log[log["kind"] == CODES["transmit"]]
+    rows = {
+        node: sum(len(scenario.sensors[place.entry].H) for place in placed)
+        for node, placed in scenario.placed.items()
+    }
+    phases = sent["phase"].tolist() if slotted else [-1] * len(sent)
+    numbers = sum(
+        scenario.hosted.payload_numbers(scenario.plant.n, rows.get(node, 0), phase)
+        for node, phase in zip(sent["node"].tolist(), phases, strict=True)
+    )
+    return Traffic(len(sent), BYTES * numbers)
+
+
+class Quantity(NamedTuple):
+    """A mean over runs with its standard error, and its difference from that of the first filter
+    with an interval; ``real`` if that leaves 0 out. nan and False where there is none.
+    """
+
+    value: float
+    se: float
+    difference: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    real: bool = False
+
+
+def estimate_quantities(
+    values: FilterValues, first: FilterValues | None, n: int, level: float
+) -> dict[str, Quantity]:
+    """Return ``rms_error``, ``worst_instant`` and ``nees_ratio`` (NEES / n) of a filter, with the
+    paired differences from the ``first`` one; each interval misses with probability ``level``.
+    """
+    found = {}
+    base = _influences(first, n) if first is not None else {}
+    for name, (value, influence) in _influences(values, n).items():
+        runs = len(influence)
+        quantity = Quantity(value, _standard_error(influence))
+        if name in base and not (values.diverged.any() or first is None or first.diverged.any()):
+            other, paired = base[name][0], influence - base[name][1]
+            width = _width(paired, level)
+            gap = value - other
+            # Filters that are one algorithm differ by rounding.
+            real = runs > 1 and abs(gap) > max(width, ROUNDING * abs(value))
+            quantity = quantity._replace(
+                difference=gap, low=gap - width, high=gap + width, real=bool(real)
+            )
+        found[name] = quantity
+    return found
+
+
+def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArray]]:
+    """Return each quantity with one number a run (R,) of which its deviation is the mean."""
+    rms = math.sqrt(float(values.square.mean()))
+    # The root of a mean moves by half of what its argument does, over the root.
+    square = values.square / (2.0 * rms) if rms > 0.0 else values.square
+    nees = values.nees / n
+    return {
+        "rms_error": (rms, square),
+        "worst_instant": (float(values.worst.mean()), values.worst),
+        "nees_ratio": (float(nees.mean()), nees),
+    }
+
+
+def _standard_error(values: FloatArray) -> float:
+    return float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+
+
+def _width(values: FloatArray, level: float) -> float:
+    """Return half the width of Student's interval for the mean of values (R,)."""
+    if len(values) < 2:
+        return math.nan
+    return float(scipy.special.stdtrit(len(values) - 1, 1.0 - level / 2.0)) * _standard_error(
+        values
+    )
+
+
+def judge_consistency(values: FilterValues, n: int, level: float) -> str:
+    """Return "too sure", "too careful" or "consistent" by the interval of NEES / n, "-" where NEES
+    is unknown or one run shows nothing.
+    """
+    ratios = values.nees / n
+    mean, width = float(ratios.mean()), _width(ratios, level)
+    if not math.isfinite(width) or not math.isfinite(mean):
+        return "-"
+    return (
+        "too sure" if mean - width > 1.0 else "too careful" if mean + width < 1.0 else "consistent"
+    )
