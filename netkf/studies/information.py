@@ -1,0 +1,370 @@
+"""How information travelled through a run: a backward search over its messages.
+
+The log of a run says when each node took readings, when each message was sent and when its receiver
+used it. From a node at an instant the search goes back along the messages and finds, of every other
+node, the last moment whose knowledge can have reached it. All of it works on arrays, in one pass
+over the messages from the newest to the oldest.
+
+What a message carries depends on the filter. A filter that combines estimates passes on all that
+its sender knows; one that sends readings passes on the reading of that instant; one that swaps
+states replaces what its receiver knew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.derived import DerivedScenario
+from netkf.trace.schema import CODES
+
+IntArray = np.ndarray
+NEVER = -1
+OUTCOMES = ("used", "lost", "late", "refused", "under way", "unused")
+"""What became of a message until the end of a log. Late ones came after the inbox of their slot had
+closed, refused ones were too old for the filter, unused ones gave way to another message of that
+instant.
+"""
+USED, LOST, LATE, REFUSED, UNDER_WAY, UNUSED = range(len(OUTCOMES))
+
+
+class MessageKey(NamedTuple):
+    """The identity of a message: its directed link and its number on that link."""
+
+    sender: int
+    receiver: int
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
+class Messages:
+    """The M messages of a log, ordered by directed link and number.
+
+    ``sender``, ``receiver`` and ``number`` (M,) name them; ``sent`` and ``arrived`` (M,) are times
+    in seconds (nan: not arrived), ``outcome`` (M,) is an index of OUTCOMES. ``sent_row`` and
+    ``used_row`` (M,) are the rows of the log at which the message was sent and at which its
+    receiver used what had arrived (NEVER if it did not arrive in time).
+    """
+
+    sender: IntArray
+    receiver: IntArray
+    number: IntArray
+    sent: FloatArray
+    arrived: FloatArray
+    outcome: IntArray
+    sent_row: IntArray
+    used_row: IntArray
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.sender)
+
+    def key(self, m: int) -> MessageKey:
+        """Return the identity of message ``m``."""
+        return MessageKey(int(self.sender[m]), int(self.receiver[m]), int(self.number[m]))
+
+    @cached_property
+    def index(self) -> dict[MessageKey, int]:
+        """The index of each message by its identity."""
+        return {self.key(m): m for m in range(len(self))}
+
+
+def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
+    """Return the messages of an EVENT log, which must begin with the run.
+
+    With ``swaps`` a receiver uses one message of an instant only, that of the sender with the
+    largest id.
+    """
+    kind = log["kind"]
+    rows = np.flatnonzero(kind == CODES["send"])
+    rows = rows[np.lexsort((log["message"][rows], log["peer"][rows], log["node"][rows]))]
+    sender, receiver, number = (log[name][rows] for name in ("node", "peer", "message"))
+    first = np.ones(len(rows), dtype=bool)
+    first[1:] = (sender[1:] != sender[:-1]) | (receiver[1:] != receiver[:-1])
+    links = _Links(sender[first], receiver[first], np.flatnonzero(first))
+    outcome = np.full(len(rows), UNDER_WAY)
+    arrived, used = np.full(len(rows), np.nan), np.full(len(rows), NEVER)
+    lost = np.flatnonzero(kind == CODES["lost"])
+    outcome[links.places(log["node"][lost], log["peer"][lost], log["message"][lost])] = LOST
+    late = np.flatnonzero(kind == CODES["late"])
+    at = links.places(log["peer"][late], log["node"][late], log["message"][late])
+    outcome[at], arrived[at] = (LATE if slotted else REFUSED), log["t"][late]
+    came = np.flatnonzero(kind == CODES["deliver"])
+    at = links.places(log["peer"][came], log["node"][came], log["message"][came])
+    arrived[at], used[at] = log["t"][came], _next_use(log, came)
+    outcome[at] = np.where(used[at] == NEVER, UNDER_WAY, USED)
+    if swaps:
+        chosen = np.flatnonzero(outcome == USED)
+        outcome[chosen[~_last_of_instant(used[chosen], sender[chosen], rows[chosen])]] = UNUSED
+    return Messages(sender, receiver, number, log["t"][rows], arrived, outcome, rows, used)
+
+
+class _Links(NamedTuple):
+    """Directed links in the order of ``sender`` and ``receiver``; ``start`` is the place of the
+    first message of each.
+    """
+
+    sender: IntArray
+    receiver: IntArray
+    start: IntArray
+
+    def places(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
+        """Return the places of messages among those of all links."""
+        if not len(self.start):
+            return np.empty(0, dtype=np.int64)
+        ids = np.unique(np.concatenate([self.sender, self.receiver]))
+        keys = np.searchsorted(ids, self.sender) * len(ids) + np.searchsorted(ids, self.receiver)
+        wanted = np.searchsorted(ids, sender) * len(ids) + np.searchsorted(ids, receiver)
+        return np.asarray(self.start[np.searchsorted(keys, wanted)] + number)
+
+
+def _next_use(log: IntArray, rows: IntArray) -> IntArray:
+    """Return the row at which the node of each of the ``rows`` next uses what has arrived."""
+    uses = np.flatnonzero((log["kind"] == CODES["absorb"]) | (log["kind"] == CODES["swap"]))
+    ids, length = np.unique(log["node"]), len(log) + 1
+    keys = np.searchsorted(ids, log["node"][uses]) * length + uses
+    order = np.argsort(keys)
+    node = np.searchsorted(ids, log["node"][rows])
+    place = np.searchsorted(keys[order], node * length + rows)
+    found = np.append(uses[order], NEVER)[place]
+    return np.where((found >= 0) & (log["node"][found] == log["node"][rows]), found, NEVER)
+
+
+def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
+    """(K,) bool: messages that count where a receiver takes one of those of an instant."""
+    order = np.lexsort((sent_row, sender, used))
+    last = np.ones(len(used), dtype=bool)
+    last[:-1] = used[order][1:] != used[order][:-1]
+    counts = np.empty(len(used), dtype=bool)
+    counts[order] = last
+    return counts
+
+
+def at_once(messages: Messages, log: IntArray) -> Messages:
+    """Return the messages as if those that were not used had been used at the instant of sending,
+    for a search that knows nothing of when they would have arrived.
+    """
+    last = np.searchsorted(log["t"], messages.sent, side="right") - 1
+    used = np.where(messages.outcome == USED, messages.used_row, last)
+    return replace(messages, used_row=used)
+
+
+def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
+    """Return the rows of an EVENT log that the state shown at ``at`` seconds contains."""
+    return np.asarray(log[: _end(scenario, log["t"], at)])
+
+
+def _end(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
+    if not scenario.slotted:
+        return int(np.searchsorted(times, at, side="right"))
+    plant = scenario.slot_plant
+    slot = round(at / plant.period)
+    # A prediction is shown before anything of its slot happens, a filtered state after all of it.
+    end = plant.slot_time(slot if scenario.hosted.predicts else slot + 1)
+    return int(np.searchsorted(times, end, side="left"))
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """The flow of information in a log: segments, and the messages that join them.
+
+    A segment is a stretch of rows of one node over which what it knows accumulates. It is the whole
+    run for filters that combine, from one swap to the next for filters that swap, and one instant
+    for the readings that a message carries. ``node`` and ``start`` (G,) are the node of each
+    segment and its first row. Of each message, ``origin`` (M,) is the segment that its sender is
+    in, ``target`` (M,) the one of its receiver, and ``cost`` (M,) is 1 if it was not used in the
+    run and 0 if it was. ``last`` is the segment of each node at the end of the log, by node. If
+    ``pooled``, one filter has the readings of all nodes.
+    """
+
+    messages: Messages
+    rows: int
+    node: IntArray
+    start: IntArray
+    origin: IntArray
+    target: IntArray
+    cost: IntArray
+    last: dict[int, int]
+    pooled: bool = False
+
+
+def find_flow(
+    scenario: DerivedScenario, log: IntArray, messages: Messages, used: IntArray | None = None
+) -> Flow:
+    """Return the flow of information in a log with these messages.
+
+    ``used`` (M,) bool says which of them were used in the run that is asked about, by default those
+    that were used in this log; the others cost 1 each.
+    """
+    used = messages.outcome == USED if used is None else used
+    nodes = np.array(scenario.nodes)
+    own = np.searchsorted(nodes, messages.receiver)
+    combination, count = scenario.hosted.combination, len(messages)
+    if combination == "readings":
+        # What a message carries is the reading of its instant, and nobody passes it on.
+        start = np.searchsorted(log["t"], messages.sent, side="left")
+        node = np.concatenate([nodes, messages.sender])
+        begin = np.concatenate([np.zeros(len(nodes), dtype=np.int64), start])
+        origin = len(nodes) + np.arange(count)
+        last = dict(zip(scenario.nodes, range(len(nodes)), strict=True))
+        return Flow(messages, len(log), node, begin, origin, own, 1 - used, last)
+    if combination == "swap":
+        return _swaps(nodes, len(log), messages, np.asarray(used))
+    origin = np.searchsorted(nodes, messages.sender)
+    start, last = np.zeros(len(nodes), dtype=np.int64), {n: k for k, n in enumerate(scenario.nodes)}
+    pooled = scenario.hosted.pooled
+    return Flow(messages, len(log), nodes, start, origin, own, 1 - used, last, pooled)
+
+
+def _swaps(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
+    """Segments that begin with each swap."""
+    swapped = np.flatnonzero(used)
+    node = np.concatenate([nodes, messages.receiver[swapped]])
+    start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])
+    order = np.lexsort((start, node))
+    node, start = node[order], start[order]
+    places, length = np.searchsorted(nodes, node), rows + 1
+    keys = places * length + start
+
+    def segment(who: IntArray, row: IntArray) -> IntArray:
+        wanted = np.searchsorted(nodes, who) * length + row
+        return np.searchsorted(keys, wanted, side="right") - 1
+
+    origin = segment(messages.sender, messages.sent_row)
+    # A swap that happened begins a segment at its own row, one that did not falls into another.
+    target = segment(messages.receiver, np.maximum(messages.used_row, 0))
+    last = segment(nodes, np.full(len(nodes), rows))
+    ends = dict(zip(nodes.tolist(), last.tolist(), strict=True))
+    return Flow(messages, rows, node, start, origin, target, 1 - used, ends)
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """The result of a backward search from one node at the end of a log.
+
+    ``deadline`` (B + 1, G): what is known in a segment before this row reaches the node if at most
+    b of the messages that cost something had come; NEVER if nothing does. ``via`` (B + 1, G) is the
+    first message on the way, NEVER at the node itself.
+    """
+
+    flow: Flow
+    deadline: IntArray
+    via: IntArray
+
+    def messages_from(self, segment: int, budget: int) -> list[int]:
+        """Return the messages on the way from a segment to the node, in the order of sending."""
+        found: list[int] = []
+        while self.via[budget, segment] != NEVER:
+            message = int(self.via[budget, segment])
+            found.append(message)
+            budget -= int(self.flow.cost[message])
+            segment = int(self.flow.target[message])
+        return found
+
+    def needed(self, message: int) -> int | None:
+        """Return how many messages that cost something must come, this one included, for what it
+        carries to reach the node; None if more than the budget of the search.
+        """
+        used, cost = self.flow.messages.used_row[message], int(self.flow.cost[message])
+        for budget in range(len(self.deadline) - cost):
+            if NEVER < used < self.deadline[budget, self.flow.target[message]]:
+                return budget + cost
+        return None
+
+
+def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
+    """Search back from ``node`` at the end of the log, along the messages that were used and at
+    most ``budget`` others.
+    """
+    segments = len(flow.node)
+    deadline = [[NEVER] * segments for _ in range(budget + 1)]
+    via = [[NEVER] * segments for _ in range(budget + 1)]
+    for layer in deadline:
+        for known in flow.last.values() if flow.pooled else (flow.last[node],):
+            layer[known] = flow.rows
+    usable = np.flatnonzero((flow.messages.used_row != NEVER) & (flow.cost <= budget))
+    order = usable[np.argsort(-flow.messages.used_row[usable], kind="stable")]
+    columns = (flow.messages.used_row, flow.messages.sent_row, flow.origin, flow.target, flow.cost)
+    rows = zip(order.tolist(), *(column[order].tolist() for column in columns), strict=True)
+    # From the last use to the first: a message that moves a deadline beyond a row was sent after
+    # that row, and used later still, so it has been looked at.
+    for message, used, sent, origin, target, cost in rows:
+        for b in range(cost, budget + 1):
+            if used < deadline[b - cost][target] and sent > deadline[b][origin]:
+                deadline[b][origin], via[b][origin] = sent, message
+    return Reach(flow, np.array(deadline), np.array(via))
+
+
+class Readings:
+    """The times at which the nodes of a log took readings, by row."""
+
+    def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
+        self._scenario, self._times, self._at = scenario, log["t"], at
+        sensed = np.flatnonzero(log["kind"] == CODES["sense"])
+        self._rows = {node: sensed[log["node"][sensed] == node] for node in scenario.sensing}
+
+    def newest(self, node: int, start: int, end: int) -> float:
+        """Return the time in seconds of the newest reading of a node in the rows from ``start`` to
+        before ``end``, nan without one.
+        """
+        if node not in self._rows:
+            return np.nan
+        if node in self._scenario.increment_sensors:
+            # Continuous readings are used up to the very moment at which the node is asked.
+            return float(self._times[end]) if end < len(self._times) else self._at
+        rows = self._rows[node]
+        k = int(np.searchsorted(rows, end)) - 1
+        return self.taken(int(rows[k])) if k >= 0 and rows[k] >= start else np.nan
+
+    def taken(self, row: int) -> float:
+        """Return the time at which the reading used at a row was taken."""
+        time = float(self._times[row])
+        if not self._scenario.slotted:
+            return time
+        plant = self._scenario.slot_plant
+        return plant.slot_time(int(plant.slots_of(np.array([time]))[0]))
+
+
+class Newest(NamedTuple):
+    """The newest information of a node that reached another: the ``reading`` time and the last
+    moment ``known``, seconds, nan without one, and the segment it came from (NEVER without one).
+    """
+
+    reading: float
+    known: float
+    segment: int
+
+
+def newest_information(
+    reach: Reach, log: IntArray, readings: Readings, budget: int
+) -> dict[int, Newest]:
+    """Return by node the newest information that reached the node of a search within a budget."""
+    flow, found = reach.flow, dict[int, Newest]()
+    deadline = reach.deadline[budget]
+    for segment in np.flatnonzero(deadline != NEVER).tolist():
+        node, end = int(flow.node[segment]), int(deadline[segment])
+        reading = readings.newest(node, int(flow.start[segment]), end)
+        known = float(log["t"][end]) if end < len(log) else np.nan
+        best = found.get(node)
+        if best is None or _order(reading, known) > _order(best.reading, best.known):
+            found[node] = Newest(reading, known, segment)
+    return found
+
+
+def _order(reading: float, known: float) -> tuple[float, float]:
+    return (
+        -np.inf if np.isnan(reading) else reading,
+        -np.inf if np.isnan(known) else known,
+    )
+
+
+def route(reach: Reach, segment: int, budget: int) -> tuple[int, ...]:
+    """Return the nodes on the way from a segment to the node of the search."""
+    passed: Iterable[int] = reach.messages_from(segment, budget)
+    hops = [int(reach.flow.messages.receiver[m]) for m in passed]
+    return (int(reach.flow.node[segment]), *hops)

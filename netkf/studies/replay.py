@@ -1,0 +1,260 @@
+"""What a node would have known had chosen messages come: replays of a run up to one instant.
+
+The scenario, the seed and all draws are those of the run. Only the outcome of chosen messages is
+another: they are delivered, after the delay that they drew, and those that came too late take no
+time. The truth and the readings do not depend on the network, so they are the same (with continuous
+readings, a message that newly arrives between two grid times may split the reading of that interval
+at another moment; its parts are then drawn anew, given the same whole).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.fields import field, instance
+from netkf.linalg.arrays import FloatArray
+from netkf.network.channels import Channel, Delay, Loss, NoDelay
+from netkf.network.graphs import Link, Topology
+from netkf.runs.simulate import simulate
+from netkf.scenario.scenario import Scenario
+from netkf.studies.information import (
+    LATE,
+    REFUSED,
+    UNDER_WAY,
+    IntArray,
+    MessageKey,
+    match_messages,
+    rows_until,
+)
+
+Chosen = frozenset[MessageKey]
+
+
+class Deliveries:
+    """The messages that come in the next replay whatever the channel says: ``chosen``, or all where
+    that is None; those in ``hurried`` take no time.
+    """
+
+    def __init__(self) -> None:
+        self.chosen: Chosen | None = frozenset()
+        self.hurried: Chosen = frozenset()
+
+
+@dataclass(frozen=True, eq=False)
+class DeliveringLoss(Loss):
+    """The losses of ``given``, but for the messages of ``deliveries``."""
+
+    given: Loss = field(instance(Loss))
+    # It changes from replay to replay, so that one scenario serves all of them: what follows from a
+    # scenario is computed once.
+    deliveries: Deliveries = field(instance(Deliveries))
+
+    @property
+    def deterministic(self) -> bool:
+        """That of the given losses, so that the same numbers are drawn."""
+        return self.given.deterministic
+
+    @property
+    def stateful(self) -> bool:
+        """That of the given losses, so that the same numbers are drawn."""
+        return self.given.stateful
+
+    def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
+        """Return that of the given losses."""
+        return self.given.next_state(bad, random)
+
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
+        """Return 1 for chosen messages, else what the given losses say."""
+        chosen = self.deliveries.chosen
+        if chosen is None or (*link, message) in chosen:
+            return 1.0
+        return self.given.delivery_probability(link, message, bad, table_probability)
+
+    def mean_delivery(self, link: Link, table_probability: float) -> float:
+        """Return nan: this is one outcome, not a law."""
+        return math.nan
+
+    @property
+    def independent(self) -> bool:
+        """False: this is one outcome, not a law."""
+        return False
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError if the given losses do not fit the graph."""
+        self.given.check(topology)
+
+
+@dataclass(frozen=True, eq=False)
+class HurryingDelay(Delay):
+    """The delays of ``given``, but for the hurried messages of ``deliveries``."""
+
+    given: Delay = field(instance(Delay))
+    deliveries: Deliveries = field(instance(Deliveries))
+
+    def draw(self, random: np.random.Generator) -> float:
+        """Return the draw of the given delays."""
+        return self.given.draw(random)
+
+    @property
+    def fixed(self) -> float | None:
+        """That of the given delays."""
+        return self.given.fixed
+
+    @property
+    def longest(self) -> float:
+        """That of the given delays."""
+        return self.given.longest
+
+    @property
+    def is_random(self) -> bool:
+        """That of the given delays, so that the same numbers are drawn."""
+        return self.given.is_random
+
+    def message_delay(self, link: Link, message: int, drawn: float) -> float:
+        """Return 0 for hurried messages, else what the given delays say.
+
+        A message whose record says nothing but that it was lost takes no time if it comes.
+        """
+        chosen, key = self.deliveries.chosen, (*link, message)
+        if key in self.deliveries.hurried:
+            return 0.0
+        seconds = self.given.message_delay(link, message, drawn)
+        comes = chosen is None or key in chosen
+        return 0.0 if comes and math.isnan(seconds) else seconds
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError if the given delays do not fit the graph."""
+        self.given.check(topology)
+
+
+class Outcome(NamedTuple):
+    """The state of a node at an instant: its estimate ``xhat`` (n,), covariance ``P`` (n, n), nan
+    where the filter gives none, and ``error`` (n,) = x - xhat, nan without a known truth.
+    """
+
+    xhat: FloatArray
+    P: FloatArray
+    error: FloatArray
+
+    @property
+    def trace(self) -> float:
+        """The trace of P."""
+        return float(np.trace(self.P))
+
+    @property
+    def distance(self) -> float:
+        """The length of the error."""
+        return float(np.sqrt(self.error @ self.error))
+
+
+class Replayer:
+    """Replays a run up to the state of ``node`` at ``at`` seconds, which stops there.
+
+    ``count`` is the number of replays so far.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, replica: int, node: int, at: float) -> None:
+        self.scenario, self._seed, self._replica = scenario, seed, replica
+        self._node, self.at, self.count = scenario.nodes.index(node), at, 0
+        self._deliveries = Deliveries()
+        self._short, self._whole = (
+            _delivering(_shortened(scenario, at, whole), self._deliveries)
+            for whole in (False, True)
+        )
+        self._known: dict[tuple[Chosen | None, bool], Outcome] = {}
+
+    @cached_property
+    def log(self) -> IntArray:
+        """The EVENT rows of the run as it was, up to the state that is asked about."""
+        return self._replay(frozenset(), whole=False)
+
+    @cached_property
+    def hurried(self) -> Chosen:
+        """The messages of the run that had not been used by then though they were not lost: late
+        ones, refused ones, and those under way.
+        """
+        scenario = self.scenario
+        swaps = scenario.hosted.combination == "swap"
+        messages = match_messages(self.log, swaps, scenario.slotted)
+        found = np.flatnonzero(np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY)))
+        return frozenset(messages.key(m) for m in found.tolist())
+
+    @cached_property
+    def full_log(self) -> IntArray:
+        """The EVENT rows of the run if every message had come."""
+        return self._replay(None, whole=False)
+
+    def outcome(self, chosen: Iterable[MessageKey] | None = (), error: bool = False) -> Outcome:
+        """Return the state had the ``chosen`` messages come; None stands for all messages.
+
+        ``error`` asks for the error too, which may take the whole run; it is nan otherwise.
+        """
+        wanted = None if chosen is None else frozenset(chosen)
+        whole = error and bool(self.scenario.sampled_sensors)
+        if (wanted, whole) not in self._known:
+            if wanted is None and not whole:
+                _ = self.full_log
+            elif wanted == frozenset() and not whole:
+                _ = self.log
+            else:
+                self._replay(wanted, whole)
+        return self._known[wanted, whole]
+
+    def _replay(self, chosen: Chosen | None, whole: bool) -> IntArray:
+        self.count += 1
+        hurried: Chosen = frozenset()
+        if chosen is None or chosen:
+            hurried = self.hurried if chosen is None else chosen & self.hurried
+        self._deliveries.chosen, self._deliveries.hurried = chosen, hurried
+        scenario = self._whole if whole else self._short
+        run = simulate(scenario, self._seed, self._replica)
+        k = self._node
+        outcome = Outcome(run.xhat[-1, k], run.P[-1, k], run.error[-1, k])
+        if run.times[-1] != self.at:  # it diverged before
+            outcome = Outcome(*(np.full_like(part, np.nan) for part in outcome))
+        self._known[chosen, whole] = outcome
+        return rows_until(self.scenario, run.log, self.at)
+
+
+def _delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
+    """Return the scenario in which the messages of ``deliveries`` come."""
+    network = scenario.network
+    given = network.channel
+    loss, delay = DeliveringLoss(given.loss, deliveries), given.delay
+    # Without delays nothing is ever late, and the engines are faster.
+    if not isinstance(delay, NoDelay):
+        delay = HurryingDelay(delay, deliveries)
+    channel = Channel(loss=loss, delay=delay, symmetric=given.symmetric)
+    return _with(scenario, network=dataclasses.replace(network, channel=channel))
+
+
+def _shortened(scenario: Scenario, at: float, whole: bool) -> Scenario:
+    """Return the scenario with the state at ``at`` seconds as its last sample; unless ``whole`` it
+    ends there.
+
+    Earlier samples stay: with continuous readings they decide where the readings of an interval are
+    split. The true state between two samples of sensors depends on the later one too, so errors may
+    need the ``whole`` run.
+    """
+    times = scenario.times
+    probe = np.append(times[times < at], at)
+    beyond = scenario.slot_plant.period if scenario.slotted else max(1e-9, 1e-12 * at)
+    end = scenario.horizon if whole else min(scenario.horizon, at + beyond)
+    return _with(scenario, probe=probe, horizon=end)
+
+
+def _with(scenario: Scenario, **changes: object) -> Scenario:
+    """Return the scenario with some fields changed and the same topology."""
+    changed = dataclasses.replace(scenario, **changes)
+    # A graph that is drawn or read from a file is neither drawn nor read again.
+    object.__setattr__(changed, "topology", scenario.topology)
+    return changed

@@ -1,0 +1,297 @@
+"""An explanation in words, as tables, and as a JSON document."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from netkf.core.printable import shorten
+from netkf.runs.files import finite
+from netkf.runs.tables import format_number, shorten_rows, table
+from netkf.studies.information import MessageKey
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from netkf.studies.message_sets import SmallestSet
+    from netkf.studies.why import Source, WhatIf, Why
+
+MAX_ROWS, MAX_LISTED = 20, 4
+
+
+def source_table(found: Why) -> pd.DataFrame:
+    """Return a row for each source of an explanation: ages in seconds, nan if unknown."""
+    import pandas as pd
+
+    more = len(found.sources[0].with_more) if found.sources else 0
+    rows = [
+        {
+            "node": s.node,
+            "sensor": s.sensor,
+            "neighbour": s.neighbour,
+            "heard": s.heard,
+            "arrived": s.arrived,
+            "unheard": s.unheard,
+            "known_age": found.at - s.known,
+            "reading": s.reading,
+            "reading_age": found.at - s.reading,
+            "route": " -> ".join(map(str, s.route)),
+            **{f"age_with_{k}_more": found.at - s.with_more[k - 1] for k in range(1, more + 1)},
+            "age_without_losses": found.at - s.without_losses,
+            "missing": "; ".join(map(str, s.missing)),
+        }
+        for s in found.sources
+    ]
+    return pd.DataFrame(rows)
+
+
+def why_document(found: Why) -> dict[str, Any]:
+    """Return plain JSON values; what is unknown is None."""
+    smallest = found.smallest
+    document: dict[str, Any] = {
+        "scenario": found.scenario,
+        "node": found.node,
+        "at": found.at,
+        "seed": found.seed,
+        "replica": found.replica,
+        "trace": found.trace,
+        "error": found.error,
+        "sentences": sentences(found),
+        "sources": [
+            {**vars(s), "missing": [_message(found, m.key) for m in s.missing]}
+            for s in found.sources
+        ],
+        "what_ifs": [
+            {
+                "label": w.label,
+                "messages": _messages(found, w.messages),
+                "trace": w.trace,
+                "error": w.error,
+            }
+            for w in found.what_ifs
+        ],
+        "smallest": None,
+        "notes": found.notes,
+    }
+    if smallest is not None:
+        messages = _messages(found, smallest.messages)
+        document["smallest"] = {
+            **vars(smallest),
+            "messages": messages,
+            "best": _messages(found, smallest.best),
+            "proven": smallest.proven,
+        }
+    plain: dict[str, Any] = finite(document)
+    return plain
+
+
+def _messages(found: Why, keys: Sequence[MessageKey] | None) -> list[dict[str, Any]] | None:
+    return None if keys is None else [_message(found, key) for key in keys]
+
+
+def _message(found: Why, key: MessageKey) -> dict[str, Any]:
+    missing = found.missing[key]
+    return {
+        "sender": key.sender,
+        "receiver": key.receiver,
+        "message": key.number,
+        "outcome": missing.outcome,
+        "sent": missing.sent,
+        "arrived": missing.arrived,
+    }
+
+
+def why_text(found: Why) -> str:
+    """Return the answer for a terminal: sentences, the table of sources, the table of replays."""
+    lines = [*sentences(found), "", _sources(found), "", _replays(found)]
+    lines += [f"note: {note}" for note in found.notes]
+    return "\n".join(lines)
+
+
+def sentences(found: Why) -> list[str]:
+    """Return the answer in sentences, one line each."""
+    return [*_state(found), *_heard(found), *_readings(found), *_smallest(found)]
+
+
+def _state(found: Why) -> Iterator[str]:
+    where = f"{shorten(found.scenario, 60)}, seed {found.seed}, replica {found.replica}"
+    words = f"Node {found.node} at {found.at:g} s ({where})"
+    if math.isfinite(found.trace):
+        rms = math.sqrt(max(found.trace, 0.0))
+        words += f": trace P is {found.trace:.4g}, which claims an RMS error of {rms:.3g}"
+    else:
+        words += ": the filter gives no covariance"
+    error = f"; its error is {found.error:.3g}" if math.isfinite(found.error) else ""
+    yield f"{words}{error}."
+
+
+def _heard(found: Why) -> Iterator[str]:
+    """Whom the node heard directly."""
+    neighbours = [s for s in found.sources if s.neighbour]
+    if not neighbours:
+        yield f"Nobody can send to node {found.node}."
+        return
+    heard = sorted((s for s in neighbours if not math.isnan(s.heard)), key=lambda s: -s.heard)
+    silent = [s.node for s in neighbours if math.isnan(s.heard)]
+    parts = [f"node {s.node} {_ago(found, s.heard)}" for s in heard[:MAX_LISTED]]
+    if parts:
+        rest = f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
+        yield f"It last heard {_and(parts)}{rest} (times of sending)."
+    if silent:
+        yield f"It had never heard node {_and(list(map(str, silent[:MAX_LISTED])))}."
+    unheard = sum(s.unheard for s in neighbours)
+    if unheard:
+        which = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
+        noun = "message" if unheard == 1 else "messages"
+        verb = "was" if unheard == 1 else "were"
+        yield (
+            f"{unheard} {noun} sent to it since then {verb} lost, late or not used: "
+            f"{_and(which[:MAX_LISTED])}{', ...' if len(which) > MAX_LISTED else ''}."
+        )
+
+
+def _readings(found: Why) -> Iterator[str]:
+    """The newest readings, and what kept newer ones away."""
+    sensors = [s for s in found.sources if s.sensor and s.node != found.node]
+    known = sorted((s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading)
+    never = [str(s.node) for s in sensors if math.isnan(s.reading)]
+    if known:
+        oldest = known[:MAX_LISTED]
+        words = [
+            f"{found.at - s.reading:.4g} s old from node {s.node} ({_route(s)})" for s in oldest
+        ]
+        which = "The oldest of its" if len(known) > MAX_LISTED else "Its"
+        yield f"{which} newest readings are {_and(words)}."
+    if never:
+        yield f"No reading of node {_and(never[:MAX_LISTED])} can have reached it."
+    kept_away = [s for s in known + [s for s in sensors if math.isnan(s.reading)] if s.missing]
+    for source in kept_away[:MAX_LISTED]:
+        newest = source.with_more[len(source.missing) - 1]
+        messages = _and([str(m) for m in source.missing])
+        age = f"{found.at - newest:.4g} s old"
+        yield f"A newer reading of node {source.node}, {age}, would have come with {messages}."
+    if sensors and not kept_away:
+        yield "No newer reading was kept away by up to three messages that did not come."
+
+
+def _smallest(found: Why) -> Iterator[str]:
+    smallest, whole = found.smallest, found.what_ifs[-1]
+    if smallest is None:
+        return
+    change = _change(whole.trace, found.trace)
+    yield f"Had no message been missing, trace P would be {whole.trace:.4g} ({change})."
+    if smallest.messages == ():
+        limit = f"{smallest.limit:.4g}"
+        yield f"No message had to come: trace P is at most {limit} as it is."
+        return
+    tried = _tried(smallest)
+    if smallest.messages is not None:
+        named = _and([str(found.missing[key]) for key in smallest.messages])
+        one = len(smallest.messages) == 1
+        what = "One message would" if one else f"{len(smallest.messages)} messages together would"
+        fewer = "" if one else ("; fewer would not" if smallest.proven else "; perhaps fewer would")
+        yield (
+            f"{what} have brought trace P to {smallest.trace:.4g} (wanted: at most "
+            f"{smallest.limit:.4g}): {named}{fewer} ({tried})."
+        )
+        return
+    limit = f"{smallest.limit:.4g}"
+    if smallest.proven:
+        yield f"No {smallest.most} messages or fewer would have brought it to {limit} ({tried})."
+    else:
+        yield (
+            f"No set of up to {smallest.most} messages brought it to {limit}, of those that were "
+            f"tried ({tried}; --replays tries more)."
+        )
+    if smallest.best:
+        named = _and([str(found.missing[key]) for key in smallest.best])
+        change = _change(smallest.best_trace, found.trace)
+        yield f"The best that was tried brings it to {smallest.best_trace:.4g} ({change}): {named}."
+
+
+def _tried(smallest: SmallestSet) -> str:
+    words = f"{smallest.candidates} messages could have mattered"
+    if smallest.considered < smallest.candidates:
+        if not smallest.considered:
+            return f"{words}; all of them together change next to nothing"
+        since = f"{smallest.considered} of them sent from {smallest.since:.6g} s on"
+        words += f", {since}; all before would have changed next to nothing"
+    return f"{words}; {smallest.replays} replays"
+
+
+def _sources(found: Why) -> str:
+    """The table of sources: sensors and neighbours first."""
+    chosen = [s for s in found.sources if s.sensor or s.neighbour or s.node == found.node]
+    others = len(found.sources) - len(chosen)
+    more = len(chosen[0].with_more) if chosen else 0
+    header = ["from", "last heard", "missed since", "newest reading", "age"]
+    header += [f"+{k}" for k in range(1, more + 1)] + ["none lost", "way"]
+    rows = [
+        [
+            f"{s.node}{'' if s.sensor else ' (no sensor)'}",
+            _time(s.heard),
+            str(s.unheard) if s.neighbour else "-",
+            _time(s.reading),
+            *(format_number(found.at - t) for t in (s.reading, *s.with_more, s.without_losses)),
+            _route(s),
+        ]
+        for s in chosen
+    ]
+    text = table(header, shorten_rows(rows, MAX_ROWS), left=1)
+    rest = f"\n{others} other nodes have no sensor and no link to it." if others else ""
+    explained = (
+        f"times in seconds; +1 .. +{more}: age of the newest reading with so many more messages"
+    )
+    return f"{text}\n{explained}{rest}"
+
+
+def _replays(found: Why) -> str:
+    truth = any(math.isfinite(w.error) for w in found.what_ifs)
+    header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
+    rows = [
+        [
+            w.label,
+            _count(w),
+            format_number(w.trace),
+            "" if k == 0 else _change(w.trace, found.trace),
+            *([format_number(w.error)] if truth else []),
+        ]
+        for k, w in enumerate(found.what_ifs)
+    ]
+    return table(header, shorten_rows(rows, MAX_ROWS), left=1)
+
+
+def _count(what_if: WhatIf) -> str:
+    return "all" if what_if.messages is None else str(len(what_if.messages))
+
+
+def _change(trace: float, base: float) -> str:
+    if not (math.isfinite(trace) and base > 0.0):
+        return "-"
+    return f"{100.0 * (trace / base - 1.0):+.1f} %"
+
+
+def _time(seconds: float) -> str:
+    return "-" if math.isnan(seconds) else f"{seconds:.6g}"
+
+
+def _ago(found: Why, seconds: float) -> str:
+    return f"at {seconds:.6g} s ({found.at - seconds:.4g} s before)"
+
+
+def _route(source: Source) -> str:
+    if not source.route:
+        return "-"
+    if len(source.route) == 1:
+        return "its own"
+    shown = (
+        source.route if len(source.route) <= 6 else (*source.route[:3], "..", *source.route[-2:])
+    )
+    return " -> ".join(map(str, shown))
+
+
+def _and(parts: Sequence[str]) -> str:
+    if len(parts) < 2:
+        return "".join(parts)
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -1,0 +1,384 @@
+"""``netkf.why`` against searches and replays that are made in another way."""
+
+import itertools
+import json
+import math
+
+import networkx as nx
+import numpy as np
+import pytest
+
+import netkf
+from netkf.core.errors import ScenarioError
+from netkf.scenario.reading import from_table
+from netkf.studies.information import (
+    Readings,
+    find_flow,
+    match_messages,
+    newest_information,
+    rows_until,
+    search_back,
+)
+from netkf.studies.message_sets import Candidate, smallest_set
+from netkf.studies.replay import MessageKey, Replayer
+from netkf.studies.why import why
+
+FLOW = {"kind": "diffusion", "A": [[-0.3]], "B": [[1.0]], "cov": [[1.0]]}
+SLOTS = {"kind": "linear", "F": [[0.95]], "Q": [[0.3]], "period": 0.5, "cov": [[1.0]]}
+EDGES = {"kind": "edges", "edges": [[0, 1], [1, 2], [2, 3], [3, 4], [1, 3]]}
+SENSORS = [{"nodes": [0, 4], "H": [[1.0]], "R": [[0.2]]}]
+SAMPLED = [{**SENSORS[0], "sampling": {"kind": "poisson", "rate": 2.0}}]
+HALF = {"kind": "bernoulli", "delivery": 0.5}
+
+
+def tables(plant, activation, kind, sensors=SENSORS, delay=None):
+    channel = {"loss": HALF, "symmetric": False, **({"delay": delay} if delay else {})}
+    return {
+        "plant": plant,
+        "sensors": sensors,
+        "network": {"graph": EDGES, "activation": activation, "channel": channel},
+        "filter": kind,
+    }
+
+
+LATE = {"kind": "uniform", "low": 0.0, "high": 0.5}
+CASES = {
+    "hybrid": tables(FLOW, {"kind": "poisson", "rate": 2.0}, {"kind": "hybrid", "epsilon": 0.3}),
+    "intersection": tables(
+        FLOW,
+        {"kind": "poisson", "at": "nodes", "rate": 2.0},
+        {"kind": "covariance-intersection", "epsilon": 0.3},
+        SAMPLED,
+        {"kind": "exponential", "mean": 0.3},
+    ),
+    "refused": tables(
+        FLOW, {"kind": "readings"}, {"kind": "intermittent", "window": 0.2}, SAMPLED, LATE
+    ),
+    "swaps": tables(
+        FLOW,
+        {"kind": "poisson", "rate": 2.0},
+        {"kind": "gossip"},
+        SAMPLED,
+        {"kind": "exponential", "mean": 0.1},
+    ),
+    "gossip": tables(SLOTS, {"kind": "matching", "protocol": "maximal"}, {"kind": "gossip"}),
+    "late": tables(SLOTS, {"kind": "broadcast"}, {"kind": "intermittent"}, delay=LATE),
+    "diffusion": tables(SLOTS, {"kind": "broadcast"}, {"kind": "diffusion"}),
+    "push-sum": tables(
+        SLOTS, {"kind": "broadcast"}, {"kind": "push-sum", "gamma": 2, "delta": 4.0}
+    ),
+}
+
+
+def make(name, folder, horizon=12.0):
+    head = {"format": 1, "name": name, "horizon": horizon, "probe": 0.5, "seed": 3}
+    return from_table({**head, **CASES[name]}, folder)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """The scenario and the run of each case."""
+    folder = tmp_path_factory.mktemp("why")
+    found = {name: make(name, folder) for name in CASES}
+    return {name: (scenario, netkf.simulate(scenario)) for name, scenario in found.items()}
+
+
+class EventGraph:
+    """The events of a run as a graph: an edge for each step along which information can pass.
+
+    Vertices are (node, row). A message that was not used in the run weighs 1, everything else 0.
+    """
+
+    def __init__(self, scenario, events, used):
+        self.graph = nx.DiGraph()
+        self.scenario, self.kind = scenario, scenario.hosted.combination
+        self.now = {node: (node, -1) for node in scenario.nodes}
+        self.graph.add_nodes_from(self.now.values())
+        self.cargo, self.waiting = {}, {node: [] for node in scenario.nodes}
+        self.time, self.sensed, self.last = {}, {}, []
+        for row in events.itertuples():
+            self.add(row, used)
+            self.last.append(dict(self.now))
+
+    def add(self, row, used):
+        here = (row.node, row.Index)
+        if row.kind in ("sense", "send", "absorb", "swap"):
+            self.time[here] = row.t
+        if row.kind == "sense":
+            self.sensed[here] = row.t
+            self.step(here)
+        elif row.kind == "send":
+            key = (row.node, row.peer, row.message)
+            if self.kind == "readings":
+                self.cargo[key] = self.now[row.node]  # the reading just taken, and no more
+            else:
+                self.step(here)
+                self.cargo[key] = here
+        elif row.kind == "deliver":
+            self.waiting[row.node].append((row.peer, row.node, row.message))
+        elif row.kind in ("absorb", "swap"):
+            came, self.waiting[row.node] = self.waiting[row.node], []
+            if self.kind == "swap":
+                replaced = [key for key in came if key in used]
+                sender = max((key[0] for key in replaced), default=None)
+                newest = max((key for key in replaced if key[0] == sender), default=None)
+                came = [key for key in came if key == newest or key not in used]
+            self.step(here, keep=not (self.kind == "swap" and any(key in used for key in came)))
+            for key in came:
+                self.graph.add_edge(self.cargo[key], here, weight=int(key not in used))
+
+    def step(self, here, keep=True):
+        self.graph.add_node(here)
+        if keep:
+            self.graph.add_edge(self.now[here[0]], here, weight=0)
+        self.now[here[0]] = here
+
+    def newest(self, node, row, most=0):
+        """The newest reading of each node that reached one after a row, by messages that came and
+        at most so many others.
+        """
+        target = self.last[row][node] if row >= 0 else (node, -1)
+        if self.kind == "readings":
+            sources = self.one_hop(target, most)
+        else:
+            backwards = self.graph.reverse(copy=False)
+            lengths = nx.single_source_dijkstra_path_length(backwards, target, cutoff=most)
+            sources = set(lengths)
+        found = {}
+        for vertex in sources:
+            if vertex in self.sensed:
+                when = self.taken(self.sensed[vertex])
+                found[vertex[0]] = max(found.get(vertex[0], -math.inf), when)
+        return found, sources
+
+    def one_hop(self, target, most):
+        """What the node used itself: its own readings and those that came to it."""
+        own = {v for v in self.graph if v[0] == target[0] and v[1] <= target[1]}
+        into = [(a, b, w) for a, b, w in self.graph.in_edges(own, data="weight") if a[0] != b[0]]
+        return own | {a for a, _, weight in into if weight <= most}
+
+    def taken(self, t):
+        if not self.scenario.slotted:
+            return t
+        return math.floor(t / 0.5 + 1e-9) * 0.5
+
+
+def used_messages(scenario, events):
+    """The messages that a receiver used, told from the events alone."""
+    used, waiting = set(), {node: [] for node in scenario.nodes}
+    for row in events.itertuples():
+        if row.kind == "deliver":
+            waiting[row.node].append((row.peer, row.node, row.message))
+        elif row.kind in ("absorb", "swap"):
+            came, waiting[row.node] = waiting[row.node], []
+            used |= {max(came)} if scenario.hosted.combination == "swap" else set(came)
+    return used
+
+
+def rows_before(scenario, events, at):
+    """The number of rows that a state shown at a time contains."""
+    if not scenario.slotted:
+        return int((events.t <= at).sum())
+    return int((events.t < (at if scenario.hosted.predicts else at + 0.5) - 1e-9).sum())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_newest_readings_are_those_of_a_search_in_a_graph_of_events(runs, name):
+    scenario, run = runs[name]
+    graph = EventGraph(scenario, run.events, used_messages(scenario, run.events))
+    random, reached = np.random.default_rng(7), 0
+    for _ in range(25):  # 200 in all cases together
+        node = int(random.choice(scenario.nodes))
+        at = float(random.uniform(0.0, 12.0))
+        at = math.floor(at / 0.5) * 0.5 if scenario.slotted else at
+        count = rows_before(scenario, run.events, at)
+        log = rows_until(scenario, run.log, at)
+        assert len(log) == count
+        messages = match_messages(log, scenario.hosted.combination == "swap", scenario.slotted)
+        reach = search_back(find_flow(scenario, log, messages), node)
+        found = newest_information(reach, log, Readings(scenario, log, at), 0)
+        ours = {n: f.reading for n, f in found.items() if not math.isnan(f.reading)}
+        expected, sources = graph.newest(node, count - 1)
+        if name == "hybrid":  # continuous readings reach up to the moment of sending
+            expected = {
+                n: max(graph.time.get(v, 0.0) for v in sources if v[0] == n)
+                for n in (0, 4)
+                if any(v[0] == n and v[1] >= 0 for v in sources)
+            }
+            expected |= {node: at} if node in (0, 4) else {}
+        assert ours == pytest.approx(expected)
+        reached += len(ours.keys() - {node})
+    assert reached > 5
+
+
+@pytest.mark.parametrize("name", ["intersection", "late", "gossip", "push-sum"])
+def test_ages_with_more_messages_are_shortest_paths_in_the_graph_of_all_events(runs, name):
+    scenario, run = runs[name]
+    at = 9.0
+    used = used_messages(scenario, run.events[: rows_before(scenario, run.events, at)])
+    gained = 0
+    for node in (0, 2, 3):
+        found = why(run, node, at, scenario=scenario, replays=1)
+        events = replayed(scenario, run, node, at)
+        graph = EventGraph(scenario, events, used)
+        for most in range(4):
+            expected, _ = graph.newest(node, len(events) - 1, most)
+            for source in found.sources:
+                reading = (source.reading, *source.with_more)[most]
+                assert reading == pytest.approx(expected.get(source.node, math.nan), nan_ok=True)
+                gained += reading > source.reading
+        for source in found.sources:
+            if source.missing:
+                assert source.with_more[len(source.missing) - 1] > source.reading or math.isnan(
+                    source.reading
+                )
+    assert gained
+
+
+def replayed(scenario, run, node, at):
+    """The events of the run in which all messages came, up to a time."""
+    import pandas as pd
+
+    from netkf.trace.run import event_columns
+
+    replayer = Replayer(scenario, run.seed, run.replica, node, at)
+    return pd.DataFrame(event_columns(replayer.full_log, 0, 0))
+
+
+def recorded(scenario, run, chosen, folder, hurried=()):
+    """The run again from tables written by hand: the losses of its events but for the chosen ones,
+    and where some are hurried the delays of its events too.
+    """
+    events, changes = run.events, {}
+    lost = [(r.node, r.peer, r.message) for r in events[events.kind == "lost"].itertuples()]
+    rows = [(*key, 0) for key in lost if key not in chosen]
+    write(folder / "lost.csv", "sender,receiver,message,delivered", rows)
+    changes["network.channel.loss"] = {"kind": "recorded", "path": "lost.csv"}
+    if hurried:
+        came = events[events.kind.isin(["deliver", "late"])]
+        seconds = {(r.peer, r.node, r.message): r.age for r in came.itertuples()}
+        sent = [(r.node, r.peer, r.message) for r in events[events.kind == "send"].itertuples()]
+        delays = [(*key, 0.0 if key in hurried else seconds.get(key, 1e3)) for key in sent]
+        write(folder / "delays.csv", "sender,receiver,message,seconds", delays)
+        changes["network.channel.delay"] = {"kind": "recorded", "path": "delays.csv"}
+    object.__setattr__(scenario, "_folder", folder)
+    return netkf.simulate(scenario.replace(changes), engine="simpy")
+
+
+def write(path, header, rows):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows), ""]))
+
+
+@pytest.mark.parametrize(
+    ("name", "node", "at"),
+    [("hybrid", 2, 8.0), ("intersection", 3, 9.5), ("gossip", 1, 7.0), ("push-sum", 2, 6.5)],
+)
+def test_what_ifs_are_those_of_a_run_from_recorded_losses(runs, name, node, at, tmp_path):
+    scenario, run = runs[name]
+    found = why(run, node, at, scenario=scenario, replays=30)
+    k = run.times.tolist().index(at)
+    assert found.trace == pytest.approx(np.trace(run.P[k, node]), rel=1e-9)
+    assert found.error == pytest.approx(np.linalg.norm(run.error[k, node]), rel=1e-9)
+    checked = 0
+    for what_if in found.what_ifs[1:-1]:
+        if any(found.missing[key].outcome != "lost" for key in what_if.messages):
+            continue
+        again = recorded(scenario, run, set(what_if.messages), tmp_path)
+        assert what_if.trace == pytest.approx(np.trace(again.P[k, node]), rel=1e-9)
+        assert what_if.error == pytest.approx(np.linalg.norm(again.error[k, node]), rel=1e-7)
+        checked += abs(what_if.trace - found.trace) > 1e-6
+    assert checked
+    none_lost = netkf.simulate(scenario.replace({"network.channel.loss": {"kind": "none"}}))
+    if name != "intersection":  # there some messages are under way
+        assert found.what_ifs[-1].trace == pytest.approx(np.trace(none_lost.P[k, node]), rel=1e-9)
+
+
+@pytest.mark.parametrize(("name", "outcome"), [("refused", "refused"), ("late", "late")])
+def test_a_message_that_came_too_late_is_replayed_without_delay(runs, name, outcome, tmp_path):
+    scenario, run = runs[name]
+    node, at = 1, 9.0
+    k = run.times.tolist().index(at)
+    found = why(run, node, at, scenario=scenario, replays=1)
+    mine = [m for m in found.missing.values() if m.outcome == outcome and m.key.receiver == node]
+    key = max(mine, key=lambda m: m.sent).key
+    outcome = Replayer(scenario, run.seed, 0, node, at).outcome([key])
+    again = recorded(scenario, run, set(), tmp_path, hurried={tuple(key)})
+    assert outcome.trace == pytest.approx(np.trace(again.P[k, node]), rel=1e-9)
+    assert abs(outcome.trace - found.trace) > 1e-9
+
+
+def test_the_smallest_set_is_that_of_all_sets(tmp_path):
+    scenario = make("diffusion", tmp_path, horizon=2.5)
+    run, node, at = netkf.simulate(scenario), 2, 2.0
+    replayer = Replayer(scenario, run.seed, 0, node, at)
+    lost = run.events[(run.events.kind == "lost") & (run.events.t < at)]
+    keys = [MessageKey(r.node, r.peer, r.message) for r in lost.itertuples()]
+    times = dict(zip(keys, lost.t, strict=True))
+    assert len(keys) >= 10
+    k = run.times.tolist().index(at)
+
+    def trace(chosen):
+        return np.trace(recorded(scenario, run, set(chosen), tmp_path).P[k, node])
+
+    values = {
+        chosen: replayer.outcome(chosen).trace
+        for size in range(4)
+        for chosen in itertools.combinations(keys, size)
+    }
+    some = list(values)[:: len(values) // 12]
+    assert [values[c] for c in some] == pytest.approx([trace(c) for c in some], rel=1e-9)
+    best = [min(v for c, v in values.items() if len(c) == size) for size in range(4)]
+    assert best[0] > best[1] > best[2] > best[3]
+    candidates = [Candidate(key, times[key], 1) for key in keys]
+    for size, limit in [(1, best[1]), (2, 0.5 * (best[1] + best[2])), (3, best[3] + 1e-12)]:
+        found = smallest_set(replayer, candidates, limit, 3, 10**6)
+        assert len(found.messages) == size
+        assert found.trace == values[tuple(sorted(found.messages, key=keys.index))] <= limit
+        assert found.proven
+    none = smallest_set(replayer, candidates, best[3] - 1e-9, 3, 10**6)
+    assert none.messages is None
+    assert none.proven
+    few = smallest_set(replayer, candidates, best[3] - 1e-9, 3, 0)
+    assert few.messages is None
+    assert not few.proven
+
+
+def test_the_answer_is_said_in_sentences_a_table_and_json(runs):
+    scenario, run = runs["gossip"]
+    found = why(run, 1, 7.0, scenario=scenario, below=100.0)
+    assert found.smallest.messages == ()
+    found = why(run, 1, 7.0, scenario=scenario, replays=50)
+    text, document = str(found), found.to_dict()
+    assert f"trace P is {found.trace:.4g}" in text
+    assert "It last heard node" in text
+    assert document == json.loads(json.dumps(document))
+    assert document["what_ifs"][0]["trace"] == found.trace
+    assert list(found.table["node"]) == [s.node for s in found.sources] == [0, 2, 3, 4]
+    assert found.table["reading_age"].iloc[0] == 7.0 - found.sources[0].reading
+    assert "node 1 at 7 s" in repr(found)
+
+
+def test_what_cannot_be_answered_is_refused_in_one_line(runs):
+    scenario, run = runs["gossip"]
+    asked = {"scenario": scenario}
+    with pytest.raises(ScenarioError, match="node: must be a node of the scenario; got 9"):
+        why(run, 9, 3.0, **asked)
+    with pytest.raises(ScenarioError, match="at: must be a finite number"):
+        why(run, 1, 12.5, **asked)
+    with pytest.raises(ScenarioError, match="--trace full"):
+        why(without_events(run), 1, 3.0, **asked)
+    other = netkf.simulate(scenario, seed=4)
+    with pytest.raises(ScenarioError, match="other events than its replay"):
+        why(with_seed(other, 3), 1, 3.0, **asked)
+
+
+def without_events(run):
+    from dataclasses import replace
+
+    return replace(run, log=run.log[:0])
+
+
+def with_seed(run, seed):
+    from dataclasses import replace
+
+    return replace(run, seed=seed)
