@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from netkf.studies.opening import open as open
     from netkf.studies.size import size
     from netkf.studies.sweep import sweep
+    from netkf.studies.why import why
     from netkf.trace.run import Run, first_difference
 
 _WHERE = {
@@ -47,6 +48,7 @@ _WHERE = {
     "sweep": "netkf.studies.sweep",
     "testing": "netkf.testing",
     "theory": "netkf.theory",
+    "why": "netkf.studies.why",
 }
 
 _MODULES = ("parts", "testing", "theory")
@@ -76,6 +78,7 @@ __all__ = [
     "sweep",
     "testing",
     "theory",
+    "why",
 ]
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 BAD_USAGE = 2
 COMMANDS = (
     *("run", "check", "theory", "sweep", "size", "consistency", "compare", "compare_filters"),
-    "report",
+    *("report", "why"),
 )
 """Modules of this package, each with a COMMAND."""
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -67,11 +66,6 @@ class Messages:
     def key(self, m: int) -> MessageKey:
         """Return the identity of message ``m``."""
         return MessageKey(int(self.sender[m]), int(self.receiver[m]), int(self.number[m]))
-
-    @cached_property
-    def index(self) -> dict[MessageKey, int]:
-        """The index of each message by its identity."""
-        return {self.key(m): m for m in range(len(self))}
 
 
 def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
@@ -233,7 +227,7 @@ def _swaps(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Fl
 
     def segment(who: IntArray, row: IntArray) -> IntArray:
         wanted = np.searchsorted(nodes, who) * length + row
-        return np.searchsorted(keys, wanted, side="right") - 1
+        return np.asarray(np.searchsorted(keys, wanted, side="right") - 1)
 
     origin = segment(messages.sender, messages.sent_row)
     # A swap that happened begins a segment at its own row, one that did not falls into another.

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -153,7 +153,7 @@ class Outcome(NamedTuple):
     @property
     def distance(self) -> float:
         """The length of the error."""
-        return float(np.sqrt(self.error @ self.error))
+        return float(np.linalg.norm(self.error))
 
 
 class Replayer:
@@ -252,7 +252,7 @@ def _shortened(scenario: Scenario, at: float, whole: bool) -> Scenario:
     return _with(scenario, probe=probe, horizon=end)
 
 
-def _with(scenario: Scenario, **changes: object) -> Scenario:
+def _with(scenario: Scenario, **changes: Any) -> Scenario:
     """Return the scenario with some fields changed and the same topology."""
     changed = dataclasses.replace(scenario, **changes)
     # A graph that is drawn or read from a file is neither drawn nor read again.

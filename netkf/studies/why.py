@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,9 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
+from netkf.ensembles.stored import StoredEnsemble
 from netkf.scenario.scenario import Scenario
+from netkf.studies.explanation import Explanation, Missing, Source, WhatIf
 from netkf.studies.information import (
     OUTCOMES,
     USED,
@@ -34,7 +36,9 @@ from netkf.studies.information import (
     search_back,
 )
 from netkf.studies.message_sets import Candidate, SmallestSet, smallest_set
+from netkf.studies.opening import open as open_directory
 from netkf.studies.replay import Replayer
+from netkf.studies.why_text import source_table, why_document, why_text
 from netkf.trace.run import Run
 
 if TYPE_CHECKING:
@@ -47,103 +51,16 @@ one of the run in which every message came.
 """
 
 
-@dataclass(frozen=True)
-class Missing:
-    """A message that was sent but not used: its ``outcome`` (of OUTCOMES), and when it was ``sent``
-    and ``arrived`` (seconds, nan if it did not).
-    """
-
-    key: MessageKey
-    outcome: str
-    sent: float
-    arrived: float
-
-    def __str__(self) -> str:
-        sender, receiver, count = self.key
-        return f"{sender} -> {receiver} number {count} ({self.outcome}, sent at {self.sent:.6g} s)"
-
-
-@dataclass(frozen=True)
-class Source:
-    """What had reached the node from one other, ``node``. Times are in seconds, nan if unknown.
-
-    neighbour       it can send to the node directly
-    heard, arrived  when the last message from it that was used was sent, and arrived
-    unheard         messages from it that were sent since then and not used
-    known           the last moment whose knowledge can have reached the node, over any way
-    reading         its newest reading whose information can have reached the node
-    route           the nodes on the way of that, this one first
-    with_more       its newest reading that could have come with at most 1, 2, .. more messages
-    without_losses  its newest reading that could have come if every message had
-    missing         the fewest messages that had to come for a newer reading, of up to MOST
-    """
-
-    node: int
-    sensor: bool
-    neighbour: bool
-    heard: float
-    arrived: float
-    unheard: int
-    known: float
-    reading: float
-    route: tuple[int, ...]
-    with_more: tuple[float, ...]
-    without_losses: float
-    missing: tuple[Missing, ...]
-
-
-@dataclass(frozen=True)
-class WhatIf:
-    """A replay in which ``messages`` came, or all where that is None: the trace of P at the node,
-    and the length of its error (nan without a known truth).
-    """
-
-    label: str
-    messages: tuple[MessageKey, ...] | None
-    trace: float
-    error: float
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class Why:
-    """Why ``node`` knew at ``at`` seconds what it knew, in one run of a scenario.
-
-    ``trace`` is that of its covariance P and ``error`` the length of its error. ``sources`` tells
-    what had reached it from whom, ``what_ifs`` what P would have been in replays, the run as it was
-    first, and ``smallest`` which messages would have sufficed (None if the filter gives no P).
-    """
-
-    scenario: str
-    node: int
-    at: float
-    seed: int
-    replica: int
-    sources: tuple[Source, ...]
-    what_ifs: tuple[WhatIf, ...]
-    smallest: SmallestSet | None
-    missing: dict[MessageKey, Missing] = field(repr=False)
-    notes: tuple[str, ...] = ()
-
-    @property
-    def trace(self) -> float:
-        """The trace of P at the node."""
-        return self.what_ifs[0].trace
-
-    @property
-    def error(self) -> float:
-        """The length of x - xhat at the node, nan without a known truth."""
-        return self.what_ifs[0].error
+class Why(Explanation):
+    """The answer of ``netkf.why``: an explanation with its texts and tables."""
 
     @cached_property
     def table(self) -> pd.DataFrame:
         """A row for each other node, and the node itself if it has a sensor: ages in seconds."""
-        from netkf.studies.why_text import source_table
-
         return source_table(self)
 
     def __str__(self) -> str:
-        from netkf.studies.why_text import why_text
-
         return why_text(self)
 
     def __repr__(self) -> str:
@@ -154,8 +71,6 @@ class Why:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        from netkf.studies.why_text import why_document
-
         return why_document(self)
 
 
@@ -176,20 +91,21 @@ def why(
     come, by replays of the run.
 
     ``run`` is a run in memory or the directory of one; of an ensemble with all traces ``replica``
-    names one. ``below`` is the trace of P that the smallest set of messages has to reach; by
-    default that of the run without losses, but for 5 %. The set has at most ``most`` messages, and
-    at most ``replays`` replays look for it. ``trust`` imports classes of modules in the directory.
+    (default 0) names one. ``scenario`` is only needed for a run that does not know its own.
+    ``below`` is the trace of P that the smallest set of messages has to reach; by default that of
+    the run without losses, but for 5 %. The set has at most ``most`` messages, and at most
+    ``replays`` replays look for it. ``trust`` imports classes of modules in the directory.
 
     Raises ScenarioError for a node, time or run that is not there, and for a run without events.
     """
     run, known = _given(run, scenario, replica, trust)
-    at = _instant(known, node, at)
+    at = _instant(run, known, node, at)
     most = integer(low=1, high=MOST)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
     replayer = Replayer(known, run.seed, run.replica, node, at)
     _same_events(rows_until(known, run.log, at), replayer.log)
     before = replayer.outcome(error=True)
-    if not np.isfinite(before.xhat).all():
+    if not np.isfinite(before.xhat).all() or np.isinf(before.P).any():
         raise ScenarioError(
             "at", "lies after the run had diverged", at, "ask about an earlier time"
         )
@@ -217,14 +133,13 @@ def _given(
     run: Run | str | Path, scenario: Scenario | None, replica: int | None, trust: bool
 ) -> tuple[Run, Scenario]:
     """Return a run with all its events, and its scenario; raises ScenarioError."""
-    where = "run"
+    where = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
-        where = shorten(run)
-        run = _opened(Path(run), replica, trust)
-    elif replica is not None and replica != run.replica:
+        run = _opened(run, replica, trust)
+    if replica is not None and replica != run.replica:
         rule = f"is another one than that of the run, {run.replica}"
         raise ScenarioError("replica", rule, replica, "leave it out")
-    known = scenario if scenario is not None else getattr(run, "scenario", None)
+    known = run.scenario if scenario is None else scenario
     if known is None:
         raise ScenarioError("scenario", "is not known", None, "give the scenario of the run")
     if run.nodes != known.nodes:
@@ -235,18 +150,27 @@ def _given(
     return run, known
 
 
-def _opened(directory: Path, replica: int | None, trust: bool) -> Run:
-    """Return a run that is read back from its directory."""
-    raise NotImplementedError(directory, replica, trust)
+def _opened(directory: str | Path, replica: int | None, trust: bool) -> Run:
+    """Return a run that is read back from its directory; raises ScenarioError."""
+    found = open_directory(directory, trust=trust)
+    if isinstance(found, Run):
+        return found
+    if isinstance(found, StoredEnsemble):
+        return found.replica(replica or 0)
+    rule = "holds a sweep, which keeps no events"
+    raise ScenarioError(shorten(directory), rule, None, "run one of its points with netkf run")
 
 
-def _instant(scenario: Scenario, node: int, at: float) -> float:
+def _instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
     """Return the time that is asked about, in slots the start of its slot."""
     if node not in scenario.topology.index:
         listed = ", ".join(map(str, scenario.nodes[:8]))
         listed += ", ..." if len(scenario.nodes) > 8 else ""
         raise ScenarioError("node", "must be a node of the scenario", node, f"nodes: {listed}")
     time: float = number(low=0.0, high=scenario.horizon)("at", at)
+    if run.status not in ("complete", "diverged") and not time <= max(run.times, default=-1.0):
+        rule = f"lies beyond what was kept of a run that ended as {run.status}"
+        raise ScenarioError("at", rule, time, "finish it with netkf run --resume")
     if not scenario.slotted:
         return time
     plant = scenario.slot_plant

@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.printable import shorten
 from netkf.runs.files import finite
 from netkf.runs.tables import format_number, shorten_rows, table
+from netkf.studies.explanation import Explanation, Source, WhatIf
 from netkf.studies.information import MessageKey
+from netkf.studies.message_sets import SmallestSet
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from netkf.studies.message_sets import SmallestSet
-    from netkf.studies.why import Source, WhatIf, Why
-
 MAX_ROWS, MAX_LISTED = 20, 4
 
 
-def source_table(found: Why) -> pd.DataFrame:
+def source_table(found: Explanation) -> pd.DataFrame:
     """Return a row for each source of an explanation: ages in seconds, nan if unknown."""
     import pandas as pd
 
@@ -46,7 +45,7 @@ def source_table(found: Why) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def why_document(found: Why) -> dict[str, Any]:
+def why_document(found: Explanation) -> dict[str, Any]:
     """Return plain JSON values; what is unknown is None."""
     smallest = found.smallest
     document: dict[str, Any] = {
@@ -86,11 +85,11 @@ def why_document(found: Why) -> dict[str, Any]:
     return plain
 
 
-def _messages(found: Why, keys: Sequence[MessageKey] | None) -> list[dict[str, Any]] | None:
+def _messages(found: Explanation, keys: Sequence[MessageKey] | None) -> list[dict[str, Any]] | None:
     return None if keys is None else [_message(found, key) for key in keys]
 
 
-def _message(found: Why, key: MessageKey) -> dict[str, Any]:
+def _message(found: Explanation, key: MessageKey) -> dict[str, Any]:
     missing = found.missing[key]
     return {
         "sender": key.sender,
@@ -102,19 +101,19 @@ def _message(found: Why, key: MessageKey) -> dict[str, Any]:
     }
 
 
-def why_text(found: Why) -> str:
+def why_text(found: Explanation) -> str:
     """Return the answer for a terminal: sentences, the table of sources, the table of replays."""
     lines = [*sentences(found), "", _sources(found), "", _replays(found)]
     lines += [f"note: {note}" for note in found.notes]
     return "\n".join(lines)
 
 
-def sentences(found: Why) -> list[str]:
+def sentences(found: Explanation) -> list[str]:
     """Return the answer in sentences, one line each."""
     return [*_state(found), *_heard(found), *_readings(found), *_smallest(found)]
 
 
-def _state(found: Why) -> Iterator[str]:
+def _state(found: Explanation) -> Iterator[str]:
     where = f"{shorten(found.scenario, 60)}, seed {found.seed}, replica {found.replica}"
     words = f"Node {found.node} at {found.at:g} s ({where})"
     if math.isfinite(found.trace):
@@ -126,7 +125,7 @@ def _state(found: Why) -> Iterator[str]:
     yield f"{words}{error}."
 
 
-def _heard(found: Why) -> Iterator[str]:
+def _heard(found: Explanation) -> Iterator[str]:
     """Whom the node heard directly."""
     neighbours = [s for s in found.sources if s.neighbour]
     if not neighbours:
@@ -151,7 +150,7 @@ def _heard(found: Why) -> Iterator[str]:
         )
 
 
-def _readings(found: Why) -> Iterator[str]:
+def _readings(found: Explanation) -> Iterator[str]:
     """The newest readings, and what kept newer ones away."""
     sensors = [s for s in found.sources if s.sensor and s.node != found.node]
     known = sorted((s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading)
@@ -175,7 +174,7 @@ def _readings(found: Why) -> Iterator[str]:
         yield "No newer reading was kept away by up to three messages that did not come."
 
 
-def _smallest(found: Why) -> Iterator[str]:
+def _smallest(found: Explanation) -> Iterator[str]:
     smallest, whole = found.smallest, found.what_ifs[-1]
     if smallest is None:
         return
@@ -220,7 +219,7 @@ def _tried(smallest: SmallestSet) -> str:
     return f"{words}; {smallest.replays} replays"
 
 
-def _sources(found: Why) -> str:
+def _sources(found: Explanation) -> str:
     """The table of sources: sensors and neighbours first."""
     chosen = [s for s in found.sources if s.sensor or s.neighbour or s.node == found.node]
     others = len(found.sources) - len(chosen)
@@ -246,7 +245,7 @@ def _sources(found: Why) -> str:
     return f"{text}\n{explained}{rest}"
 
 
-def _replays(found: Why) -> str:
+def _replays(found: Explanation) -> str:
     truth = any(math.isfinite(w.error) for w in found.what_ifs)
     header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
     rows = [
@@ -276,7 +275,7 @@ def _time(seconds: float) -> str:
     return "-" if math.isnan(seconds) else f"{seconds:.6g}"
 
 
-def _ago(found: Why, seconds: float) -> str:
+def _ago(found: Explanation, seconds: float) -> str:
     return f"at {seconds:.6g} s ({found.at - seconds:.4g} s before)"
 
 
