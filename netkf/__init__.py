@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
 from netkf.core.version import __version__ as __version__
 
+TYPE_CHECKING = False
+"""Type checkers read it as True. ``typing`` itself takes half of the time in which a command of
+netkf does not handle signals yet.
+"""
 if TYPE_CHECKING:
+    from typing import Any
+
     from netkf import parts, testing, theory
     from netkf.checks.check import check
     from netkf.ensembles.monte_carlo import Ensemble, monte_carlo

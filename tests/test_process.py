@@ -112,12 +112,26 @@ def test_a_command_that_does_not_end_is_ended():
     assert (stuck.returncode, printed.count("\n")) == (130, 1)
 
 
+def test_signals_are_handled_before_anything_large_is_imported():
+    """-S: what is installed beside netkf may import it at the start of Python."""
+    large = ("typing", "re", "argparse", "dataclasses", "inspect", "logging", "numpy")
+    code = f"import sys, netkf.cli.main; print([name for name in {large} if name in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(SCENARIOS.parent)},
+    )
+    assert done.stdout == "[]\n"
+
+
 SERVER = """
 import sys
 from netkf.cli.process import end_process
 from netkf.ensembles import process_start
 process_start.PRELOADED = ["slow_to_import"]
-process_start.start_early()
+process_start.start_server()
 end_process(3)
 """
 

@@ -9,7 +9,6 @@ import os
 import sys
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
 
 from netkf.cli.process import (
     INTERRUPTED,
@@ -22,8 +21,10 @@ from netkf.cli.process import (
 from netkf.core.errors import NetkfError
 from netkf.core.printable import one_line
 
+TYPE_CHECKING = False  # as in netkf/__init__.py
 if TYPE_CHECKING:
     import argparse
+    from typing import Any
 
 BAD_USAGE = 2
 COMMANDS = (
@@ -50,11 +51,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run_command(arguments, interruption)
 
 
-class _Ending(NamedTuple):
+class _Ending:
     """The exit status of a command and its line on standard error, if any."""
 
-    status: int
-    line: str = ""
+    def __init__(self, status: int, line: str = "") -> None:
+        self.status, self.line = status, line
 
 
 def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:

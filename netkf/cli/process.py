@@ -11,10 +11,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from types import FrameType, TracebackType
-from typing import Any, NoReturn, TextIO
 
 from netkf.core.printable import printable
+
+TYPE_CHECKING = False  # as in netkf/__init__.py
+if TYPE_CHECKING:
+    from types import FrameType
+    from typing import Any, NoReturn, TextIO
 
 INTERRUPTED = 130
 END_SECONDS = 8.0
@@ -50,12 +53,7 @@ class Interruption:
                 self._before[number] = signal.signal(number, self._receive)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._armed = False
         for number, handler in self._before.items():
             signal.signal(number, handler)

@@ -59,9 +59,9 @@ def _run(options: argparse.Namespace) -> int:
         raise ScenarioError("--replica", "is for a single run", options.replica, remedy)
     if many and (options.workers or 1) > 1:
         # Worker processes import netkf while this one reads the scenario.
-        from netkf.ensembles.process_start import start_early
+        from netkf.ensembles.process_start import start_server
 
-        start_early()
+        start_server()
     scenario = load_scenario(options)
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"

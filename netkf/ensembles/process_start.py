@@ -32,13 +32,9 @@ def context() -> Any:
     return made
 
 
-def start_early() -> None:
-    """Let the process that workers are forked from load what they need, while this one goes on."""
-    start_server()
-
-
 def start_server() -> None:
-    """Start the process that workers are forked from, if there is one and it does not run yet.
+    """Start the process that workers are forked from, if there is one and it does not run yet. It
+    loads what they need while this process goes on.
 
     It and the workers never see Ctrl-C or SIGTERM, which reach all processes of a terminal or a
     job: this process alone decides what they mean, and kills the workers.
