@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
+from netkf.core.printable import cut, shorten
+
 
 class NetkfError(Exception):
     """Base class of every error that netkf raises on purpose."""
@@ -57,14 +59,8 @@ class ScenarioError(NetkfError, ValueError):
     def __str__(self) -> str:
         got = "" if self.value is None else f"; got {quote(self.value)}"
         remedy = f"; {self.remedy}" if self.remedy else ""
-        key = _printable(self.key)
-        where = ": ".join(part for part in (_printable(self.file, 1000), key) if part)
+        where = ": ".join(filter(None, (shorten(self.file, 1000), shorten(self.key, 120))))
         return f"{where}: {self.rule}{got}{remedy}" if where else f"{self.rule}{got}{remedy}"
-
-
-def _printable(key: str, longest: int = 120) -> str:
-    shown = key if key.isprintable() else key.encode("unicode_escape").decode()
-    return shown if len(shown) <= longest else f"{shown[: longest // 2]} ... {shown[-20:]}"
 
 
 LONGEST_WORD = 100
@@ -88,5 +84,4 @@ def quote(value: object, longest: int = 80) -> str:
         text = " ".join(repr(tolist() if callable(tolist) else value).split())
     except (ValueError, RecursionError):  # an integer of thousands of digits, tables within tables
         text = f"a large {type(value).__name__}"
-    half = (longest - 5) // 2
-    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+    return cut(text, longest)

@@ -86,28 +86,25 @@ def runs_to_directory(
     pool = make_pool(runs, workers, executor, scheduler)
     try:
         keeper = _begin(scenario, runs, out, resume, trace, engine_used.name, pool.width)
-    except BaseException:
+        if keeper is None:
+            return None
+        try:
+            keeper.begin(note)
+            engine_used.announce(scenario)
+            task = partial(block_statistics, engine=engine_used, traces=keeper.traces)
+            whole = keeper.simulate(task, pool, progress)
+            written = _write(keeper, whole)
+            finished = FinishedEnsemble(*written, keeper.simulated, time.perf_counter() - began)
+            if finish is not None:
+                finish(finished)
+            keeper.end(finished.status, whole)
+        except BaseException as error:
+            reason = keeper.stop(error)
+            if reason is error:
+                raise
+            raise reason from error
+    finally:
         pool.close(at_once=True)
-        raise
-    if keeper is None:
-        pool.close(at_once=True)
-        return None
-    try:
-        keeper.begin(note)
-        engine_used.announce(scenario)
-        task = partial(block_statistics, engine=engine_used, traces=keeper.traces)
-        whole = keeper.simulate(task, pool, progress)
-        written = _write(keeper, whole)
-        finished = FinishedEnsemble(*written, keeper.simulated, time.perf_counter() - began)
-        if finish is not None:
-            finish(finished)
-        keeper.end(finished.status, whole)
-    except BaseException as error:
-        pool.close(at_once=True)
-        reason = keeper.stop(error)
-        if reason is error:
-            raise
-        raise reason from error
     keeper.blocks.remove()
     return finished
 

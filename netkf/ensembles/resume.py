@@ -11,6 +11,7 @@ from netkf.core.errors import ScenarioError
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity, is_block_size
 from netkf.runs.documents import (
     COUNT,
+    ENDED,
     TEXT,
     DamagedError,
     check_files,
@@ -25,7 +26,6 @@ from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolved, to_toml
 
-ENDED = ("complete", "diverged")
 MANIFEST = {
     "name": TEXT,
     "status": TEXT,

@@ -21,10 +21,10 @@ from netkf.report.directories import Source, read_source
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
 from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
-from netkf.runs.documents import DamagedError
+from netkf.runs.documents import ENDED, DamagedError
 from netkf.runs.files import write_text
 from netkf.runs.stored import StoredRun
-from netkf.studies.compare import ENDED, Comparison, compare, damage_named
+from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.trace.schema import KINDS
 
 MAX_BYTES = 4_800_000

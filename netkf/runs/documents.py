@@ -6,10 +6,11 @@ can compute it too.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from netkf.runs.files import file_digest, finite, write_json
 
 SEAL = "sha256"
 """Key of the digest of all other entries."""
+ENDED = ("complete", "diverged")
+"""Values of ``status`` in the manifest of a run that has come to its end."""
 MAX_COUNT = 1 << 62
 MAX_BYTES = 1 << 28
 """Largest document that is read: the summary of some 500,000 nodes."""
@@ -45,19 +48,29 @@ def _digest(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def read_document(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; raises DamagedError for everything else."""
+@contextlib.contextmanager
+def reading(path: Path, name: str = "") -> Iterator[None]:
+    """Raise DamagedError in place of what the body raises while it reads a file, whatever is in it,
+    and for anything but a regular file. ``name`` begins the message.
+    """
+    where = f"{name} " if name else ""
     try:
         # Anything but a regular file, such as a pipe, may never end.
         if not path.is_file():
-            raise DamagedError("is missing" if not path.exists() else "is no regular file")
+            raise DamagedError(f"{where}is {'no regular file' if path.exists() else 'missing'}")
+        yield
+    except DamagedError:
+        raise
+    except Exception as error:
+        raise DamagedError(f"{where}cannot be read ({type(error).__name__})") from None
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file; raises DamagedError for everything else."""
+    with reading(path):
         if path.stat().st_size > MAX_BYTES:
             raise DamagedError(f"is larger than {MAX_BYTES >> 20} MiB")
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
-    except DamagedError:
-        raise
-    except (OSError, ValueError, RecursionError, MemoryError) as error:
-        raise DamagedError(f"cannot be read ({type(error).__name__})") from None
     if not isinstance(document, dict):
         raise DamagedError("is no JSON object")
     return document

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.documents import DamagedError
+from netkf.runs.documents import DamagedError, reading
 from netkf.runs.files import publish, writing
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Sink
@@ -41,7 +40,7 @@ def read_numbers(
     Raises DamagedError for any other file, for one with more than MAX_READ_ROWS rows, and for
     empty cells that are not allowed.
     """
-    with _readable(path), pq.ParquetFile(path) as file:
+    with reading(path, path.name), pq.ParquetFile(path) as file:
         names, types = file.schema_arrow.names, file.schema_arrow.types
         known = dict(zip(names, types, strict=True))
         wrong = [name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])]
@@ -58,7 +57,7 @@ def read_words(path: Path, column: str, run: int | None = None) -> pd.Series[str
     """Return a column of texts of a Parquet file, of one ``run`` if it is given; raises
     DamagedError for any other file.
     """
-    with _readable(path), pq.ParquetFile(path) as file:
+    with reading(path, path.name), pq.ParquetFile(path) as file:
         names = file.schema_arrow.names
         if names.count(column) != 1:
             raise DamagedError(f"{path.name} has no column {column}")
@@ -78,28 +77,15 @@ def _read(file: Any, path: Path, columns: Sequence[str], run: int | None) -> Any
     return pq.read_table(path, columns=list(columns), filters=[("run", "==", run)])
 
 
-@contextlib.contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Raise DamagedError in place of what pyarrow raises about a file that is not as it should."""
-    if not path.is_file():
-        raise DamagedError(f"{path.name} is no regular file")
-    try:
-        yield
-    except DamagedError:
-        raise
-    except (OSError, ValueError, TypeError, MemoryError, OverflowError, pa.ArrowException) as error:
-        raise DamagedError(f"{path.name} cannot be read ({type(error).__name__})") from None
-
-
 def column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file; raises DamagedError."""
-    with _readable(path):
+    with reading(path, path.name):
         return list(pq.read_schema(path).names)
 
 
 def is_numeric_column(path: Path, name: str) -> bool:
     """Return True if a column of a Parquet file holds numbers; raises DamagedError."""
-    with _readable(path):
+    with reading(path, path.name):
         return _is_numeric(pq.read_schema(path).field(name).type)
 
 
@@ -207,12 +193,7 @@ class TraceTables:
     def __enter__(self) -> TraceTables:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Finish the files, or remove them after an exception."""
         try:
             if error is None:

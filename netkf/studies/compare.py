@@ -20,6 +20,7 @@ from netkf.core.fields import number
 from netkf.core.printable import shorten
 from netkf.runs.documents import (
     COUNT,
+    ENDED,
     NUMBER,
     SEAL,
     TEXT,
@@ -36,7 +37,6 @@ from netkf.studies.metrics import mean_over_runs
 AVERAGES = ("rms_error", "mean_trace", "mean_nees")
 MESSAGES = ("sent", "delivered", "lost")
 TRACES = ("bound", "limit", "central")
-ENDED = ("complete", "diverged")
 DIAGONAL = re.compile(r"P(\d+)_?\1$")
 """Columns of the diagonal of P: P11, or P1_1 where there are more than ten states."""
 ROW: dict[str, Any] = dict.fromkeys((*AVERAGES, "bound"), NUMBER)

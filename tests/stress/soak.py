@@ -34,9 +34,9 @@ def draw_command(draw: random.Random) -> list[str]:
     """Return a command line on a scenario that is right, with a short horizon."""
     name = draw.choice(SCENARIOS)
     short = [f"{name}.toml", "--set", f"horizon={SHORT.get(name, draw.choice([1.0, 2.0, 4.0]))}"]
-    short += ["--set", f"network.channel.loss.delivery={draw.uniform(0.3, 1.0):.3f}"]
     if name not in SHORT:
-        short += ["--set", "probe=0.5"]
+        loss = f"{{kind = 'bernoulli', delivery = {draw.uniform(0.3, 1.0):.3f}}}"
+        short += ["--set", "probe=0.5", "--set", f"network.channel.loss={loss}"]
     seed = ["--seed", str(draw.randrange(1000))]
     alone = ["--workers", "1"]
     commands = {
