@@ -246,6 +246,34 @@ def test_wide_starts_and_precise_sensors_keep_their_digits(tmp_path):
     np.testing.assert_allclose(xhat[1:], x[1:], rtol=1e-8)
 
 
+def test_the_optimism_of_the_kcf_shows_and_breaks_no_promise(tmp_path):
+    """A strong pull towards blind neighbours, which P leaves out."""
+    scenario = scenario_of({"kind": "kcf", "epsilon": 2.0}, tmp_path, 1)
+    found = netkf.consistency(scenario, 10, confidence=0.999, workers=1)
+    assert found
+    assert max(row.expected for row in found.rows) > 1.3 * 2
+    verdicts = [row.verdict for row in found.rows]
+    assert "as it should be: P is too small" in verdicts
+    assert not any(verdict.endswith("is not known") for verdict in verdicts)
+    verdict = netkf.check(scenario.replace({"horizon": 12.0}), 10, confidence=0.999, workers=1)
+    assert verdict
+    promises = set(verdict.table["promise"])
+    assert "P follows the equations along the events of each run" in promises
+    assert "P is at least the covariance of the error, given the events" not in promises
+
+
+def test_check_promises_consistency_where_no_reading_counts_twice(tmp_path):
+    bound = "P is at least the covariance of the error, given the events"
+    for settings, expected in (({"consensus": "information"}, "holds"), ({}, "not promised")):
+        algorithm = {"kind": "hcmci", "steps": 2, **settings}
+        scenario = scenario_of(algorithm, tmp_path, horizon=12.0)
+        table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+        assert table.loc[bound, "verdict"] == expected
+        assert (
+            table.loc["P follows the equations along the events of each run", "verdict"] == "holds"
+        )
+
+
 # Under clocks.
 
 ROTATION = {"kind": "diffusion", "A": [[-0.1, 0.8], [-0.8, -0.1]], "B": [[0.4, 0.0], [0.1, 0.3]]}
