@@ -11,12 +11,12 @@ import numpy as np
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing, find_unknown
 from netkf.checks.exact import (
-    MAX_REPLAYED,
     check_bias,
     check_error_covariance,
     check_expected_nees,
     check_upper_bound,
     few_errors,
+    most_replayed,
     summarise_exactly,
     with_promised_filter,
 )
@@ -72,7 +72,8 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
     """Compare exact mean squares at the end, with and without neighbours, on the same truth."""
-    Sigma, Sigma_alone = samples.runs.Sigma[:MAX_REPLAYED, -1], samples.runs.alone[:MAX_REPLAYED]
+    most = most_replayed(samples.scenario)
+    Sigma, Sigma_alone = samples.runs.Sigma[:most, -1], samples.runs.alone[:most]
     together = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
     alone = np.trace(Sigma_alone, axis1=-2, axis2=-1).mean(axis=0)
     margin = 1.0 - float(together.max() / alone.max())
@@ -87,7 +88,7 @@ def _errors_bounded(samples: RunSamples, level: float) -> Finding:
     """Compare the growth of the law of squared errors in the second half of the horizon with that
     of Gaussian errors that have the exact covariances.
     """
-    e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[:MAX_REPLAYED, -2:]
+    e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[: most_replayed(samples.scenario), -2:]
     if np.isnan(e).all():
         return find_nothing(LAW_TOLERANCE)
     square = e[..., :, None] * e[..., None, :]
@@ -186,7 +187,7 @@ class DiffusionChecks(PaperChecks):
         """Return the summary of a run whose samples are at ``check_times``."""
         sampled = sampled_indices(scenario)
         alone = np.full(run.P[0, sampled].shape, np.nan)
-        if run.replica < MAX_REPLAYED and few_errors(scenario).holds:
+        if run.replica < most_replayed(scenario) and few_errors(scenario).holds:
             silent = _without_cooperation(scenario)
             last = error_covariance(silent, simulate(silent, run.seed, run.replica))[-1]
             alone = last[sampled]

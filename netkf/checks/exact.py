@@ -36,11 +36,14 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.errors import diagonal_blocks, error_law
 from netkf.theory.common.replay import ErrorLaw
+from netkf.theory.common.stacked_errors import integration_steps
 from netkf.trace.nees import errors
 from netkf.trace.run import BLUR, Run, blurred
 
-MAX_REPLAYED = 1000
-"""Replicas whose exact covariances are computed; the others show their errors only."""
+MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 50_000
+"""Replicas whose exact covariances are computed, fewer (but at least 20) where their errors are
+integrated in many short steps; the others show their errors only. A step takes some milliseconds.
+"""
 MAX_ERRORS = 64
 """Errors of all nodes together for which the exact covariance (64, 64) is cheap."""
 LEAST_VARIANCE_INTEGRATED, LEAST_VARIANCE = 0.02, 1e-8
@@ -61,13 +64,20 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     e = np.where(blurred(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
     P, e, nees = run.P[:, sampled], e[:, sampled], nees[:, sampled]
-    if run.replica < MAX_REPLAYED and few_errors(scenario).holds:
+    if run.replica < most_replayed(scenario) and few_errors(scenario).holds:
         try:
             law = error_law(with_promised_filter(scenario), run)
         except TheoryError:  # an assumption says so, and rows that need them are not promised
             return _unreplayed(P, e, nees)
         return _replayed_summary(scenario, run, law, e, nees)
     return _unreplayed(P, e, nees)
+
+
+@lru_cache(maxsize=8)
+def most_replayed(scenario: Scenario) -> int:
+    """Return the number of replicas whose exact covariances are computed."""
+    affordable = MAX_REPLAYED_STEPS // max(integration_steps(scenario), 1)
+    return min(MAX_REPLAYED, max(MIN_REPLAYED, affordable))
 
 
 def _unreplayed(P: FloatArray, e: FloatArray, nees: FloatArray) -> ReplicaSummary:
@@ -219,12 +229,13 @@ def promised_filter(algorithm: Any) -> Any:
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     """Check that P - Sigma has no negative eigenvalue; Sigma is the exact covariance of errors."""
-    P, Sigma = samples.runs.P[:MAX_REPLAYED], samples.runs.Sigma[:MAX_REPLAYED]
+    most = most_replayed(samples.scenario)
+    P, Sigma = samples.runs.P[:most], samples.runs.Sigma[:most]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
     below = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
     message = f"least eigenvalue of P - Sigma relative to its trace in {below.size:,} covariances"
-    terms = samples.largest_terms(samples.runs.replayed[:MAX_REPLAYED])
+    terms = samples.largest_terms(samples.runs.replayed[:most])
     return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
 
 
@@ -233,8 +244,9 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     and for all nodes together.
     """
     runs, scenario = samples.runs, samples.scenario
-    Sigma, whole, n = runs.Sigma[:MAX_REPLAYED], runs.whole[:MAX_REPLAYED], scenario.plant.n
-    e = runs.e[:MAX_REPLAYED] - runs.mean[:MAX_REPLAYED]
+    n, most = scenario.plant.n, most_replayed(scenario)
+    Sigma, whole = runs.Sigma[:most], runs.whole[:most]
+    e = runs.e[:most] - runs.mean[:most]
     if np.isnan(e).all():
         return find_nothing(NEES_TOLERANCE)
     # Each error is whitened by itself; directions without any variance are left out of the freedom.
@@ -251,7 +263,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     labels = [*samples.point_labels, *(f"{time}, all nodes" for time in samples.time_labels)]
     # A part of the level for each point, as much for all of them together, which see far less.
     found = compare_chi_square(ratios, freedom.tolist(), labels, level / 2.0, "e' Sigma^-1 e")
-    pooled = _compare_pooled(runs.joint[:MAX_REPLAYED], level / 2.0)
+    pooled = _compare_pooled(runs.joint[:most], level / 2.0)
     found = pool(found, pooled, EVERYTHING)
     return found._replace(message=found.message + samples.blurred_note)
 
@@ -271,7 +283,7 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     The distance is that of the bias from 0 in standard deviations of an error that is typical, the
     inverse of the information that one run has on it.
     """
-    bias = samples.runs.bias[:MAX_REPLAYED]
+    bias = samples.runs.bias[: most_replayed(samples.scenario)]
     bias = bias[np.isfinite(bias).all(axis=(1, 2))]
     n = bias.shape[1]
     if not len(bias) or not np.abs(bias).any():
@@ -304,18 +316,19 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     less that mean.
     """
     runs, n = samples.runs, samples.scenario.plant.n
-    P, Sigma = runs.replayed[:MAX_REPLAYED], runs.Sigma[:MAX_REPLAYED]
-    inverse, m = np.linalg.pinv(P), runs.mean[:MAX_REPLAYED]
+    most = most_replayed(samples.scenario)
+    P, Sigma = runs.replayed[:most], runs.Sigma[:most]
+    inverse, m = np.linalg.pinv(P), runs.mean[:most]
     weights = np.linalg.eigvals(inverse @ Sigma).real
     weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)
     mean = weights.sum(axis=(0, 2))
-    nees = runs.nees[:MAX_REPLAYED]
+    nees = runs.nees[:most]
     if np.nan_to_num(m).any():
-        e = runs.e[:MAX_REPLAYED] - m
+        e = runs.e[:most] - m
         nees = np.einsum("rkna,rknab,rknb->rkn", e, inverse, e)
     nees = nees.reshape(len(P), -1)
     known = np.flatnonzero(np.isfinite(nees).all(axis=0) & (mean > 0.0))
-    if np.isnan(runs.e[:MAX_REPLAYED]).all():
+    if np.isnan(runs.e[:most]).all():
         return find_nothing(NEES_TOLERANCE)
     if not len(known):
         return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)

@@ -166,7 +166,7 @@ def test_broken_filters_in_continuous_time_are_caught(kind, tmp_path):
     if kind == "Stale":
         changes["horizon"], changes["probe"] = 2.0, 0.5
         changes["network.channel.delay"] = {"kind": "constant", "seconds": 0.3}
-    found = check(scenario_of(RING, tmp_path, **changes), runs=25, workers=1)
+    found = check(scenario_of(RING, tmp_path, **changes), runs=12, workers=1)
     broken = [row.source for row in found.rows if row.verdict == BROKEN]
     assert any(FLOW[kind] in source for source in broken)
 
@@ -174,16 +174,17 @@ def test_broken_filters_in_continuous_time_are_caught(kind, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "source", "runs"),
     [
-        ("LosesMass", "P (67), (3)-(5) corrected", 20),
-        ("SendsTooMuch", "P (67), (3)-(5) corrected", 20),
-        ("NeverAverages", "P Theorem 6, Lemma 10, Figs. 4, 5, derived", 60),
-        ("Overshoots", "P (7)-(9), derived", 40),
-        ("ForgetsN", "P (7)-(9), derived", 40),
+        ("LosesMass", "P (67), (3)-(5) corrected", 10),
+        ("SendsTooMuch", "P (67), (3)-(5) corrected", 10),
+        ("NeverAverages", "P Theorem 6, Lemma 10, Figs. 4, 5, derived", 40),
+        ("Overshoots", "P (7)-(9), derived", 20),
+        ("ForgetsN", "P (7)-(9), derived", 20),
     ],
 )
 def test_broken_push_sum_is_caught(kind, source, runs, tmp_path):
     filtering = {**PUSH_SUM["filter"], "kind": f"tests.checks.broken:{kind}"}
-    found = rows_of(check(scenario_of(PUSH_SUM, tmp_path, filter=filtering), runs=runs, workers=1))
+    scenario = scenario_of(PUSH_SUM, tmp_path, filter=filtering, horizon=40.0)
+    found = rows_of(check(scenario, runs=runs, workers=1))
     assert found[source].verdict == BROKEN
 
 
@@ -197,7 +198,7 @@ def test_broken_push_sum_is_caught(kind, source, runs, tmp_path):
 )
 def test_broken_diffusion_is_caught(kind, source, tmp_path):
     filtering = {"kind": f"tests.checks.broken:{kind}"}
-    found = rows_of(check(scenario_of(DIFFUSION, tmp_path, filter=filtering), runs=40, workers=1))
+    found = rows_of(check(scenario_of(DIFFUSION, tmp_path, filter=filtering), runs=20, workers=1))
     assert found[source].verdict == BROKEN
 
 
@@ -244,7 +245,7 @@ def test_broken_gossip_is_caught(kind, caught, not_seen, tmp_path):
     scenario = scenario_of(
         GOSSIP, tmp_path, filter={"kind": f"tests.checks.broken:{kind}"}, horizon=16.0
     )
-    found = check(scenario, runs=300, workers=1)
+    found = check(scenario, runs=200, workers=1)
     assert not found
     broken = {row.source for row in found.rows if row.verdict == BROKEN}
     assert caught <= broken
@@ -262,9 +263,9 @@ def test_a_wrong_mean_matching_is_caught(tmp_path):
 def test_arrivals_of_the_wrong_probability_are_caught(tmp_path):
     loss = {"kind": "tests.checks.broken:Lossier", "delivery": 0.7}
     many = scenario_of(INTERMITTENT, tmp_path, **{"network.channel.loss": loss})
-    assert rows_of(check(many, runs=300))["R (12)"].verdict == BROKEN
+    assert rows_of(check(many, runs=300, workers=1))["R (12)"].verdict == BROKEN
     scalar = scenario_of(SCALAR, tmp_path, **{"network.channel.loss": loss})
-    found = rows_of(check(scalar, runs=800))
+    found = rows_of(check(scalar, runs=800, workers=1))
     assert found["R (12)"].verdict == BROKEN
     assert found["R Proposition 24, derived"].verdict == BROKEN
     assert found["R (15)-(18)"].verdict == "holds"
@@ -275,7 +276,7 @@ def test_arrivals_of_the_wrong_probability_are_caught(tmp_path):
 )
 def test_broken_intermittent_filters_are_caught(kind, source, tmp_path):
     scenario = scenario_of(INTERMITTENT, tmp_path, filter={"kind": f"tests.checks.broken:{kind}"})
-    assert rows_of(check(scenario, runs=100))[source].verdict == BROKEN
+    assert rows_of(check(scenario, runs=30, workers=1))[source].verdict == BROKEN
 
 
 def test_correct_filters_hold_with_enough_runs(tmp_path):
@@ -290,12 +291,12 @@ def test_correct_filters_hold_with_enough_runs(tmp_path):
 
 def test_what_is_not_promised_says_why():
     scenario = netkf.load(SCENARIOS / "gossip_periodic.toml").replace({"horizon": 20.0})
-    found = rows_of(check(scenario, runs=20))
+    found = rows_of(check(scenario, runs=20, workers=1))
     row = found["G Theorem 8"]
     assert row.verdict == NOT_PROMISED
     assert "it has period 2" in row.assumptions
     copies = netkf.load(SCENARIOS / "gossip_copies.toml").replace({"horizon": 20.0})
-    row = rows_of(check(copies, runs=20))["G Proposition 6"]
+    row = rows_of(check(copies, runs=20, workers=1))["G Proposition 6"]
     assert "every exchange is a swap" in row.assumptions
 
 

@@ -282,6 +282,19 @@ class ErrorPropagator:
             errors.stack.add(STATE, shared, response)
 
 
+def integration_steps(scenario: Scenario) -> int:
+    """Return the least number of steps in which the errors of a run are propagated, 0 if no sensor
+    senses increments.
+    """
+    if scenario.slotted:
+        return 0
+    flows = _increment_flows(scenario, len(scenario.nodes))
+    if flows is None:
+        return 0
+    unit = min(flow.unit for flow in (*flows.hosts, flows.messages))
+    return math.ceil(scenario.horizon / unit)
+
+
 def _increment_flows(scenario: Scenario, hosts: int) -> IncrementFlows | None:
     """Return the flows of a scenario, or None if no sensor senses increments."""
     observations = increment_observations(scenario)
