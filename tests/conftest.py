@@ -1,5 +1,6 @@
 """Shared by all tests: where the scenarios are and how to build one from plain values."""
 
+import math
 import signal
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 import netkf
 from netkf.engines.compiled.agenda import simulate_agenda
 from netkf.engines.compiled.batch_loop import simulate_runs
+from netkf.ensembles import pools
 from netkf.linalg import compiling
 from netkf.scenario.reading import from_table
 
@@ -30,6 +32,17 @@ def pytest_configure():
 def _nothing_to_announce():
     """Whether code is kept from before must not decide what a test sees on stderr."""
     compiling._said.update(ONCE)
+
+
+SAVING = pools.SAVING
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_processes_unless_asked():
+    """Tests run side by side on all cores: worker processes, which take seconds to start, would
+    only wait for each other. Tests about them ask for workers, or set the limit themselves.
+    """
+    pools.SAVING = math.inf
 
 
 @pytest.fixture

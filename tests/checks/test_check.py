@@ -178,12 +178,14 @@ def test_broken_filters_in_continuous_time_are_caught(kind, tmp_path):
         ("SendsTooMuch", "P (67), (3)-(5) corrected", 10),
         ("NeverAverages", "P Theorem 6, Lemma 10, Figs. 4, 5, derived", 40),
         ("Overshoots", "P (7)-(9), derived", 20),
-        ("ForgetsN", "P (7)-(9), derived", 20),
+        ("ForgetsN", "P (7)-(9), derived", 40),
     ],
 )
 def test_broken_push_sum_is_caught(kind, source, runs, tmp_path):
     filtering = {**PUSH_SUM["filter"], "kind": f"tests.checks.broken:{kind}"}
-    scenario = scenario_of(PUSH_SUM, tmp_path, filter=filtering, horizon=40.0)
+    scenario = scenario_of(PUSH_SUM, tmp_path, filter=filtering)
+    # A gain that is too small shows once the start is forgotten.
+    scenario = scenario if kind == "ForgetsN" else scenario.replace({"horizon": 40.0})
     found = rows_of(check(scenario, runs=runs, workers=1))
     assert found[source].verdict == BROKEN
 

@@ -12,7 +12,7 @@ from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
 from netkf.checks.rounding import compare_identities
 from netkf.cli.main import main
-from netkf.core.errors import TheoryError
+from netkf.core.errors import ScenarioError, TheoryError
 from netkf.parts import Filter, Hybrid, number, setting
 from netkf.scenario.reading import from_table
 from netkf.theory.intermittent.scalar_law import scalar_law
@@ -263,3 +263,11 @@ def test_directions_without_any_error_are_not_judged(table, driven, tmp_path):
 def test_scenarios_drawn_at_random_are_not_accused(scenario_number, tmp_path):
     """One for each filter; the same for hundreds in ``python -m tests.checks.calibration``."""
     assert not accusations(draw_scenario(scenario_number, tmp_path), 12, 0, levels=(0.01,))
+
+
+@pytest.mark.parametrize(("table", "slots"), [(GOSSIP, 2.0), (DIFFUSION, 3.0), (PUSH_SUM, 3.0)])
+def test_a_few_slots_are_enough_to_be_judged(table, slots, tmp_path):
+    """Limits that they do not reach are undecided; less than two slots to look at are refused."""
+    assert not broken_rows(scenario_of(table, tmp_path, horizon=slots), runs=12)
+    with pytest.raises(ScenarioError, match="must have a slot to look at before its last one"):
+        check(scenario_of(table, tmp_path, horizon=1.0), runs=12)

@@ -22,7 +22,7 @@ from netkf.ensembles.directory import runs_to_directory
 from netkf.ensembles.merge_tree import MergeTree, aligned_pieces
 from netkf.ensembles.moments import merge_moments, moments_of
 from netkf.ensembles.replicas import replicate
-from tests.conftest import SCENARIOS
+from tests.conftest import SAVING, SCENARIOS
 
 FIELDS = (
     "runs mean_P se_P mean_error se_error mean_nees se_nees average se_average".split()  # noqa: SIM905
@@ -378,6 +378,7 @@ class NoProcesses:
 def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
     monkeypatch.setattr(pools, "Processes", NoProcesses)
     monkeypatch.setattr(pools, "cores", lambda: 2)
+    monkeypatch.setattr(pools, "SAVING", SAVING)
     short = ring.replace({"horizon": 2.0})
     here = netkf.monte_carlo(short, 20)
     assert here.runs.max() == 20
