@@ -24,11 +24,12 @@ import re
 import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+
+import pytest
 
 from netkf.cli.main import main
 from tests.conftest import ROOT
@@ -132,10 +133,8 @@ class Follower:
         if program == "python":
             return self.captured_status(lambda: script(*words))
         if program == "pytest":
-            line = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *words]
-            done = subprocess.run(line, capture_output=True, text=True, check=False)
-            self.status = done.returncode
-            return done.stdout + done.stderr
+            options = ["-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(self.folder)]
+            return self.captured_status(lambda: int(pytest.main([*options, *words])))
         if program == "echo" and words == ["$?"]:
             return f"{self.status}\n"
         if program == "mkdir":

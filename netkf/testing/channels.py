@@ -287,8 +287,10 @@ def _check_draws(watched: Watched) -> None:
     demand(
         not same, where, "must draw from the generator given", "equal delays from two generators"
     )
-    # Ranks, so that long tails do not hide a relation.
-    unit = (np.argsort(np.argsort(drawn)) + 0.5) / len(drawn) - 0.5
+    from scipy.stats import rankdata
+
+    # Ranks, so that long tails do not hide a relation; equal delays have equal ranks.
+    unit = (rankdata(drawn) - 0.5) / len(drawn) - 0.5
     found = largest_deviation((unit[1:] * unit[:-1])[:, None]) if varies else None
     if found is not None:
         words = f"a correlation of ranks of {12.0 * found.mean:.3g} (+- {12.0 * found.error:.2g})"

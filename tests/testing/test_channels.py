@@ -1,5 +1,7 @@
 """check_channel and check_clock: our own parts pass, and each breach is named."""
 
+from dataclasses import dataclass
+
 import pytest
 
 from netkf import parts
@@ -63,6 +65,18 @@ def clocks(tables):
         "recorded": [parts.RecordedClock(tables["ticks"])],
         "readings": [parts.OnReadings()],
     }
+
+
+@dataclass(frozen=True, eq=False)
+class Tries(parts.Delay):
+    """Geometric: most delays are equal."""
+
+    def draw(self, random):
+        return 0.1 * min(random.geometric(0.7), 4)
+
+
+def test_delays_of_few_values_keep_the_contract():
+    assert check_channel(Tries()) is None
 
 
 def test_our_own_channels_keep_the_contract(tables):
