@@ -1,5 +1,6 @@
 """Healthy scenarios that look suspicious: none of them may be accused, whatever the level."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 import netkf
 from netkf.algorithms.kernels.root_update import intersect_roots
-from netkf.checks import statistics
+from netkf.checks import exact, statistics
 from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
 from netkf.checks.rounding import compare_identities
@@ -15,6 +16,7 @@ from netkf.cli.main import main
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.parts import Filter, Hybrid, number, setting
 from netkf.scenario.reading import from_table
+from netkf.theory.common.stacked_errors import integration_steps
 from netkf.theory.intermittent.scalar_law import scalar_law
 from tests.checks.calibration import accusations
 from tests.checks.healthy import draw_scenario
@@ -271,3 +273,19 @@ def test_a_few_slots_are_enough_to_be_judged(table, slots, tmp_path):
     assert not broken_rows(scenario_of(table, tmp_path, horizon=slots), runs=12)
     with pytest.raises(ScenarioError, match="must have a slot to look at before its last one"):
         check(scenario_of(table, tmp_path, horizon=1.0), runs=12)
+
+
+def test_runs_without_an_exact_covariance_are_judged_too(tmp_path, monkeypatch):
+    """Where errors are integrated in many steps, fewer runs have one; rows use what there is."""
+    monkeypatch.setattr(exact, "MAX_REPLAYED_STEPS", 1)
+    monkeypatch.setattr(exact, "MIN_REPLAYED", 4)
+    for kind in ("hybrid", "covariance-intersection"):
+        scenario = scenario_of(RING, tmp_path, filter={"kind": kind, "epsilon": 0.3})
+        assert exact.most_replayed(scenario) == 4
+        found = check(scenario, runs=12, workers=1)
+        assert found
+        covariances = [row for row in found.rows if "e' Sigma^-1 e" in row.evidence]
+        assert covariances
+        assert all(math.isfinite(row.margin) for row in covariances)
+    precise = scenario_of(RING, tmp_path, sensors=[{**RING["sensors"][0], "R": [[1e-7]]}])
+    assert integration_steps(precise) > 20 * integration_steps(scenario) > 0
