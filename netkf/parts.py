@@ -8,6 +8,7 @@ scenario file can name (``kinds()`` lists them); the contracts that users' own c
 from __future__ import annotations
 
 from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.constant_gain import ConstantGain
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.diffusion_kalman import DiffusionKalman
@@ -106,6 +107,7 @@ __all__ = [
     "Clock",
     "Complete",
     "ConstantDelay",
+    "ConstantGain",
     "CovarianceIntersection",
     "CsvGraph",
     "Cycle",

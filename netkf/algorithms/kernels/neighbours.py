@@ -14,6 +14,7 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotReadings,
     SlotRoom,
+    reflect_row,
     use_reading,
 )
 from netkf.linalg.arrays import FloatArray
@@ -120,3 +121,46 @@ def fuse_readings(
         arrived = load_flags(room.lanes, plan.up, b, s, 0, links.way[m])
         if any_lane(arrived):
             use_reading(nodes, readings, room, b, s, h, links.sender[m], arrived)
+
+
+@kernel
+def combine_convex_roots(
+    nodes: SlotNodes,
+    plan: SlotPlan,
+    links: SlotLinks,
+    room: SlotRoom,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Reset filter ``h`` of a block to the convex combination of its pair (xhat, P) and those that
+    it hears, H (7) and (9), from the copies of all pairs in ``room``; the weight of what does not
+    arrive stays with its own.
+    """
+    lanes, n = room.lanes, nodes.xhat.shape[2]
+    heard = spread(lanes, 0.0)
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        heard += select(arrived, links.weight[m], 0.0)
+    own = 1.0 - heard
+    size = root_of(select(own > 0.0, own, 0.0))
+    for i in range(n):
+        for j in range(i + 1):
+            store(lanes, nodes.root, b, h, i, j, size * load(lanes, room.root, h, i, j))
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        if not any_lane(arrived):
+            continue
+        sender, weight = links.sender[m], select(arrived, links.weight[m], 0.0)
+        size = root_of(weight)
+        # [S, sqrt(w) S_j] is reflected into one triangle.
+        for i in range(n):
+            for j in range(n):
+                store(lanes, room.moved, i, j, 0.0)
+            for j in range(i + 1):
+                store(lanes, room.moved, i, j, load(lanes, nodes.root, b, h, i, j))
+                store(lanes, room.noise, i, j, size * load(lanes, room.root, sender, i, j))
+            gap = load(lanes, room.xhat, sender, i) - load(lanes, room.xhat, h, i)
+            store(lanes, nodes.xhat, b, h, i, load(lanes, nodes.xhat, b, h, i) + weight * gap)
+        for i in range(n):
+            reflect_row(lanes, nodes.root, b, h, i, room.moved, room.noise)

@@ -1,0 +1,336 @@
+"""The hybrid filter with constant gains, H Remark 1: simpler, and never better than Riccati gains.
+
+    dxhat = A xhat dt + L (dy - H xhat dt),   dP/dt = (A - L H) P + P (A - L H)' + L R L' + Q
+
+for increments; a sample or a reading in slots moves the estimate by ``L (y - H xhat)`` and P to
+``(I - L H) P (I - L H)' + L R L'``. Resets are those of H (7) and (9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo
+from netkf.algorithms.kernels.neighbours import combine_convex_roots
+from netkf.algorithms.kernels.root_update import combine_roots, lower_root
+from netkf.algorithms.kernels.slots import (
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotReadings,
+    SlotRoom,
+    SlotSamples,
+    predict,
+    predict_root,
+    rebase,
+    show,
+)
+from netkf.algorithms.models import SlotModel, first_root, usable
+from netkf.algorithms.registry import built_in
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import SourceFile, either, field, matrix, nested, several
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import load, store
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """A filter with constant gain L (n, p) over increments: A and Q of the plant (n, n), H (p, n)
+    and R (p, p) of the sensors, as the filter believes them.
+    """
+
+    A: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+    L: FloatArray
+
+
+class ConstantGainState(NamedTuple):
+    """Estimate ``xhat`` (n,), ``root`` (n, n) of P, the model, the ``gain`` (n, p) of the node, and
+    its ``loop`` where its sensors give increments.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: Any
+    gain: FloatArray
+    loop: ClosedLoop | None
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+
+class ConstantGainArrays(NamedTuple):
+    """Of each filter, for whitened readings: ``closed`` (H, n, n), I - L H; ``noise`` (H, n, n),
+    the lower triangular root of L R L'; ``gain`` (H, n, p). Scratch: ``step`` (n, L).
+    """
+
+    closed: FloatArray
+    noise: FloatArray
+    gain: FloatArray
+
+
+@kernel
+def constant_gain_slots(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    room: SlotRoom,
+    arrays: ConstantGainArrays,
+) -> None:
+    """Carry filters with constant gains through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.sensed[s]:
+                predict(nodes, room, b)
+                for h in range(len(nodes.rows)):
+                    if nodes.rows[h] > 0:
+                        correct(nodes, readings, room, arrays, b, s, h)
+                copy_pairs(nodes, room, b)
+                for h in range(len(nodes.rows)):
+                    combine_convex_roots(nodes, plan, links, room, b, s, h)
+            show(nodes, plan, samples, room, b, s)
+            rebase(nodes, readings, room, b, s)
+
+
+@kernel
+def copy_pairs(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
+    """Copy what all filters of a block send."""
+    for h in range(len(nodes.rows)):
+        for i in range(nodes.xhat.shape[2]):
+            store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
+            for j in range(i + 1):
+                entry = load(room.lanes, nodes.root, b, h, i, j)
+                store(room.lanes, room.root, h, i, j, entry)
+
+
+@kernel
+def correct(
+    nodes: SlotNodes,
+    readings: SlotReadings,
+    room: SlotRoom,
+    arrays: ConstantGainArrays,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Use the reading of filter ``h`` of a block: ``xhat + L (y - H xhat)`` and P."""
+    lanes, n = room.lanes, nodes.xhat.shape[2]
+    for i in range(n):
+        store(lanes, room.moved_mean, i, 0.0)
+    for k in range(nodes.rows[h]):
+        innovation = load(lanes, readings.y, b, s, h, k)
+        for j in range(n):
+            weight = load(lanes, readings.H, 0, 0, h, k, j)
+            innovation -= weight * load(lanes, nodes.xhat, b, h, j)
+        for i in range(n):
+            moved = load(lanes, room.moved_mean, i) + arrays.gain[h, i, k] * innovation
+            store(lanes, room.moved_mean, i, moved)
+    for i in range(n):
+        total = load(lanes, nodes.xhat, b, h, i) + load(lanes, room.moved_mean, i)
+        store(lanes, nodes.xhat, b, h, i, total)
+    # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
+    predict_root(lanes, nodes.root, b, h, arrays.closed[h], arrays.noise[h], room.moved, room.noise)
+
+
+@built_in("constant-gain")
+@dataclass(frozen=True, eq=False)
+class ConstantGain(Filter):
+    """Constant gains for the node's own readings and convex resets with Metropolis weights.
+
+    gain  L (n, p): one for all nodes with sensors, or a list with one per node in the order of ids,
+          of which those of nodes without sensors are not used
+
+    In slots the estimate moves at each reading and then resets to the convex combination with the
+    neighbours that it hears; samples are filtered. P is no smaller than the covariance of the
+    error, as with Riccati gains, which make it smallest (H (15)).
+    """
+
+    gain: FloatArray | tuple[FloatArray, ...] = field(
+        either(matrix, several(matrix, "matrices"), nested(3))
+    )
+
+    paper: ClassVar[str] = "constant_gain"
+    combination: ClassVar[str] = "constant gain"
+    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
+    first_slot: ClassVar[int] = 1
+    one_way: ClassVar[bool] = True
+    fixed_sensors: ClassVar[bool] = True
+    slot_kernel = staticmethod(constant_gain_slots)
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[ConstantGainArrays]:
+        """Return the gains for whitened readings and what follows from them."""
+        n = len(states[0].xhat)
+        most = max(1, *(state.gain.shape[1] for state in states))
+        closed, noise = np.zeros((len(states), n, n)), np.zeros((len(states), n, n))
+        gain = np.zeros((len(states), n, most))
+        for k, state in enumerate(states):
+            p = len(state.model.H)
+            if p:
+                scaled = state.gain @ np.linalg.cholesky(state.model.R)
+                closed[k] = np.eye(n) - state.gain @ state.model.H
+                noise[k], gain[k, :, :p] = lower_root(scaled), scaled
+        return (ConstantGainArrays(closed, noise, gain),)
+
+    def init(
+        self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
+    ) -> ConstantGainState:
+        """The node takes its gain."""
+        gain = self.gain_of(node.place)
+        increments = not isinstance(model, SlotModel) and len(model.H)
+        loop = ClosedLoop(model.A, model.Q, model.H, model.R, gain) if increments else None
+        return ConstantGainState(mean, first_root(cov), model, gain, loop)
+
+    def gain_of(self, index: int) -> FloatArray:
+        """Return the gain of the node at a place in the order of ids."""
+        return self.gain[index] if isinstance(self.gain, tuple) else self.gain
+
+    def predict(self, state: ConstantGainState, gap: float) -> ConstantGainState:
+        """Predict; with increments P counts the readings of the gap already."""
+        if state.loop is None:
+            xhat, root = state.model.predict(state.xhat, state.root, gap)
+            return state._replace(xhat=xhat, root=root)
+        flow = closed_flow(state.loop, gap)
+        root = lower_root(np.concatenate([flow.closed @ state.root, flow.noise], axis=1))
+        return state._replace(xhat=flow.open @ state.xhat, root=root)
+
+    def update(self, state: ConstantGainState, reading: Any) -> ConstantGainState:
+        """Use a sample or the increments of the gap that just passed."""
+        if isinstance(reading, Increments):
+            assert state.loop is not None
+            flow = closed_flow(state.loop, reading.gap)
+            innovation = reading.moments - flow.predictor @ state.xhat
+            return state._replace(xhat=state.xhat + flow.gains @ innovation)
+        if not len(reading.y):
+            return state
+        closed = np.eye(len(state.xhat)) - state.gain @ reading.H
+        noise = state.gain @ np.linalg.cholesky(reading.R)
+        root = lower_root(np.concatenate([closed @ state.root, noise], axis=1))
+        xhat = state.xhat + state.gain @ (reading.y - reading.H @ state.xhat)
+        return state._replace(xhat=xhat, root=root)
+
+    def absorb(
+        self, state: ConstantGainState, messages: Sequence[Message], exchange: Exchange
+    ) -> ConstantGainState:
+        """Reset by H (7) and (9)."""
+        if not messages:
+            return state
+        own = max(0.0, 1.0 - sum(message.weight for message in messages))
+        pairs = [(state.xhat, state.root)]
+        pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]
+        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
+        weights = np.array([own, *(message.weight for message in messages)])
+        xhat, root = combine_roots(weights, means, roots)
+        return state._replace(xhat=xhat, root=root)
+
+    shift = Filter.shift  # affine: the weights sum to one
+
+    def max_measurement_interval(self, state: ConstantGainState) -> float:
+        """Return the seconds in which the gain lets the estimate follow the readings."""
+        loop = state.loop
+        return usable(float(np.linalg.norm(loop.L @ loop.H)) if loop is not None else 0.0)
+
+    def check_scenario(self, scenario: Any) -> None:
+        """Raise ScenarioError where gains do not fit the readings of the nodes."""
+        for k, sensor in enumerate(scenario.sensors):
+            if sensor.varying or isinstance(getattr(sensor, "path", None), SourceFile):
+                raise ScenarioError(
+                    f"sensors[{k}]",
+                    "must have a fixed H and all its rows for the constant-gain filter",
+                    None,
+                    "use linear sensors, or another filter",
+                )
+        nodes, n = scenario.nodes, scenario.plant.n
+        if isinstance(self.gain, tuple) and len(self.gain) != len(nodes):
+            rule = f"must be one matrix, or one for each of {len(nodes)} nodes"
+            raise ScenarioError("filter.gain", rule, f"{len(self.gain)} matrices", "add or remove")
+        for index, node in enumerate(nodes):
+            placed = scenario.placed.get(node, ())
+            _check_kinds(scenario, node, placed)
+            p = sum(len(scenario.sensors[place.entry].H) for place in placed)
+            shape = self.gain_of(index).shape
+            if p and shape != (n, p):
+                key = f"filter.gain[{index}]" if isinstance(self.gain, tuple) else "filter.gain"
+                rule = f"must be {n} x {p}, because node {node} has {p} rows of readings"
+                raise ScenarioError(key, rule, f"{shape[0]} x {shape[1]}", "one column per row")
+
+
+def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
+    """Raise ScenarioError if a node has readings at several times, which one gain cannot weigh."""
+    if scenario.slotted or len(placed) < 2:
+        return
+    if any(getattr(scenario.sensors[place.entry], "sampling", None) for place in placed):
+        raise ScenarioError(
+            "filter.gain",
+            f"node {node} has several sensors, and one that takes samples must be its only one",
+            None,
+            "give it one sensor, or another filter",
+        )
+
+
+class ClosedFlow(NamedTuple):
+    """Maps over a gap: ``open`` e^{A g} and ``closed`` e^{(A - L H) g} (n, n), ``noise``, a root
+    (n, n) of what both noises add to P; ``gains`` (n, 2 p) of the two moments of a reading and
+    ``predictor`` (2 p, n), the moments that the prediction at the end says it should have.
+    """
+
+    open: FloatArray
+    closed: FloatArray
+    noise: FloatArray
+    gains: FloatArray
+    predictor: FloatArray
+
+
+@lru_cache(maxsize=4096)
+def closed_flow(loop: ClosedLoop, gap: float) -> ClosedFlow:
+    """Return the maps of a filter with constant gain over ``gap`` seconds."""
+    closed = loop.A - loop.L @ loop.H
+    # The weight e^{(A - L H)(b - s)} L of dy(s) is projected on the Legendre polynomials P_0, P_1.
+    first, second = _moments(closed, gap)
+    gains = np.concatenate([first @ loop.L / gap, 3.0 * second @ loop.L / gap], axis=1)
+    back = _moments(-loop.A, gap)
+    predictor = np.concatenate([loop.H @ part for part in back])
+    E = np.asarray(scipy.linalg.expm(gap * closed))
+    W = _accumulated(closed, loop.Q + loop.L @ loop.R @ loop.L.T, gap)
+    return ClosedFlow(
+        np.asarray(scipy.linalg.expm(gap * loop.A)), E, square_root(W), gains, predictor
+    )
+
+
+def _moments(M: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
+    """Return ``int_0^g e^{M u} P_j(1 - 2 u / g) du`` (n, n) for the polynomials P_0 and P_1."""
+    n, eye = len(M), np.eye(len(M))
+    block = np.zeros((3 * n, 3 * n))
+    block[:n, :n], block[:n, n : 2 * n], block[n : 2 * n, 2 * n :] = M, eye, eye
+    made = scipy.linalg.expm(gap * block)
+    # J_1 = int e^{M u} du and J_2 = int (g - u) e^{M u} du (Van Loan 1978).
+    J1, J2 = made[:n, n : 2 * n], made[:n, 2 * n :]
+    return J1, 2.0 * J2 / gap - J1
+
+
+def _accumulated(M: FloatArray, Q: FloatArray, gap: float) -> FloatArray:
+    """Return ``int_0^g e^{M u} Q e^{M' u} du`` (n, n), by halves where the gap is long."""
+    n = len(M)
+    if np.abs(M).sum(axis=0).max() * gap > 1.0:
+        half = _accumulated(M, Q, 0.5 * gap)
+        E = scipy.linalg.expm(0.5 * gap * M)
+        return np.asarray(half + E @ half @ E.T)
+    block = np.zeros((2 * n, 2 * n))
+    block[:n, :n], block[:n, n:], block[n:, n:] = -M, Q, M.T
+    made = scipy.linalg.expm(gap * block)
+    whole = made[n:, n:].T @ made[:n, n:]
+    return np.asarray(0.5 * (whole + whole.T))

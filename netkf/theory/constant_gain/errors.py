@@ -1,0 +1,53 @@
+"""Exact errors of the filter with constant gains along the messages of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from netkf.algorithms.constant_gain import ConstantGain
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.theory.numerics.prediction import triangular_root
+from netkf.theory.numerics.updates import average_covariances
+from netkf.trace.run import Run
+
+
+class ConstantGainRule(EstimateExchangeRule):
+    """Updates with the given gains, and the resets H (7), (9)."""
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Move each error to ``(I - L H) e - L v``."""
+        algorithm, errors = self.scenario.filter.algorithm, self.errors
+        assert isinstance(algorithm, ConstantGain)
+        columns = errors.reading_noises(observations)
+        for host, one in observations.items():
+            L = algorithm.gain_of(host)
+            closed = np.eye(errors.n) - L @ one.H
+            noise = L @ np.linalg.cholesky(one.R)
+            root = triangular_root(np.concatenate([closed @ errors.roots[host], noise], axis=1))
+            errors.multiply(host, closed, root)
+            errors.stack.add(host, columns[host], -L @ one.root)
+
+    def combine(
+        self, node: int, weights: list[float], roots: list[FloatArray]
+    ) -> tuple[FloatArray, list[FloatArray]]:
+        """Give the node's own estimate the weight that the messages leave."""
+        return average_covariances([1.0 - sum(weights), *weights], roots)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter; raises TheoryError for sensors that give increments."""
+    if scenario.slotted:
+        require_traced_exchanges(scenario, run)
+    elif any(scenario.increment_sensors.values()):
+        raise TheoryError("the exact errors with constant gains are known for sampled sensors")
+    return ConstantGainRule(scenario, errors)
