@@ -1,0 +1,293 @@
+"""Pages in a headless Chromium, opened from disk with the network off.
+
+Skipped without Python's playwright (the extra ``browser``) or without a Chromium on the path. With
+NETKF_AXE naming axe.min.js (``npm pack axe-core``), axe looks at the pages too.
+"""
+
+import math
+import os
+import random
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.report.claims import worst_node
+from netkf.report.directories import read_source
+from netkf.report.page import write_report
+from netkf.runs.run import run_to_directory
+from netkf.runs.tables import format_number
+from tests.conftest import SCENARIOS
+from tests.report.conftest import EVIL, write_verdict
+from tests.report.oracle import last_heard, on_show, plain_messages, reachable
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
+AXE = os.environ.get("NETKF_AXE", "")
+TIMES = 20
+BOUND = 3000  # milliseconds until a page is ready
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as found:
+        browser = found.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def files(ring, delayed, slots, library, ensembles, sweep, folder):
+    """A page of each kind by its name."""
+    kinds = {"ring": [ring], "delayed": [delayed], "slots": [slots], "library": [library]}
+    kinds |= {"two": ensembles, "ensemble": ensembles[:1], "sweep": [sweep]}
+    return {k: write_report(found, folder / f"{k}.html") for k, found in kinds.items()}
+
+
+@pytest.fixture
+def look(chromium):
+    """Open a page; at the end there was no error, and nobody asked for anything else."""
+    asked, problems, contexts = [], [], []
+
+    def note(message):
+        if message.type == "error":
+            problems.append(message.text)
+
+    def opened(path, width=1440, **options):
+        size = {"width": width, "height": 900}
+        context = chromium.new_context(viewport=size, offline=True, **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("console", note)
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.goto(Path(path).as_uri())
+        page.wait_for_selector("html[data-ready=true]", timeout=BOUND)
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert problems == []
+    assert [url for url in asked if not url.startswith("file:")] == []
+    assert len(asked) == len(contexts)
+
+
+KINDS = ["ring", "delayed", "slots", "library", "two", "ensemble", "sweep"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("width", [360, 1440])
+def test_pages_open_and_nothing_overflows(files, look, kind, width):
+    page = look(files[kind], width)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    boxes = (
+        "[...document.querySelectorAll('main *')].filter((e) => !e.closest('.scroll, pre, svg'))"
+    )
+    wide = f"{boxes}.filter((e) => e.getBoundingClientRect().right > {width} + 1).length"
+    assert page.evaluate(wide) == 0
+
+
+@pytest.mark.parametrize("kind", ["ring", "delayed", "slots", "library"])
+def test_the_state_shown_is_that_of_the_trace(files, look, request, kind):
+    page, run = look(files[kind]), netkf.open(request.getfixturevalue(kind))
+    messages = plain_messages(run.events)
+    chance = random.Random(kind)
+    end = float(run.scenario.horizon)
+    times = [chance.uniform(0.0, end) for _ in range(TIMES - 4)]
+    times += [m[0] for m in chance.sample(list(messages.values()), 4)]  # at a sending
+    for t in times:
+        persist = chance.choice([0.001, 0.05]) * end
+        state = page.evaluate("([t, p]) => window.netkf.state(t, p)", [t, persist])
+        shown = {
+            (m["sender"], m["receiver"], m["number"], m["sent"], m["state"])
+            for m in state["messages"]
+        }
+        assert shown == on_show(messages, t, persist)
+        k = int(np.flatnonzero(run.times <= t)[-1])
+        assert state["sample"] == run.times[k]
+        i, j = np.triu_indices(run.x.shape[1])
+        for column, node in enumerate(state["nodes"]):
+            np.testing.assert_array_equal(node["xhat"], run.xhat[k, column])
+            np.testing.assert_array_equal(node["P"], run.P[k, column][i, j])
+            if run.truth_known:
+                assert node["error"] == pytest.approx(math.sqrt(run.sq_error[k, column]))
+                assert node["nees"] == run.nees[k, column] or node["nees"] is None
+        if run.truth_known:
+            np.testing.assert_array_equal(state["x"], run.x[k])
+
+
+@pytest.mark.parametrize("kind", ["ring", "delayed", "library"])
+def test_why_is_an_independent_backward_search(files, look, request, kind):
+    page, run = look(files[kind]), netkf.open(request.getfixturevalue(kind))
+    messages = plain_messages(run.events)
+    chance = random.Random(1)
+    senses = run.events[run.events["kind"] == "sense"]
+    for _ in range(TIMES):
+        node, t = chance.choice(run.nodes), chance.uniform(0.0, run.scenario.horizon)
+        found = page.evaluate("([i, t]) => window.netkf.why(i, t)", [node, t])
+        expected = last_heard(messages, node, t)
+        bad = page.evaluate(
+            "([i, t]) => window.netkf.why(i, t).links.map((link) => link.missing.filter("
+            "(row) => [1, 2].includes(window.netkf.app.run.messages.outcome[row])).length)",
+            [node, t],
+        )
+        links = {
+            run.nodes[link["sender"]]: (link["sent"] if link["newest"] >= 0 else None, count)
+            for link, count in zip(found["links"], bad, strict=True)
+        }
+        assert links == expected
+        moments = reachable(messages, node, t)
+        for reading in found["readings"]:
+            sensor = run.nodes[reading["node"]]
+            until = moments.get(sensor, -math.inf)
+            times = senses["t"][(senses["node"] == sensor) & (senses["t"] <= until)]
+            assert reading["at"] == (times.max() if len(times) else None) or not len(times)
+            assert math.isfinite(reading["at"] or math.nan) == bool(len(times))
+
+
+def test_numbers_are_written_as_on_the_command_line(files, look):
+    page = look(files["sweep"])
+    chance = np.random.default_rng(3)
+    values = (chance.standard_normal(2000) * 10.0 ** chance.integers(-12, 13, 2000)).tolist()
+    values += [0.0, 1.0, 12345.0, 12355.0, 0.5, 99995.0, 9999.5, 1e-5, 123.45, 1e300, -2.5e-308]
+    values += [float(k) + 0.5 for k in range(1000, 1100)]  # exact ties are rounded to even
+    shown = page.evaluate("(values) => values.map(window.netkf.format)", values)
+    assert shown == [format_number(value) for value in values]
+
+
+def test_it_plays_scrubs_and_filters_by_keyboard_alone(files, look):
+    page = look(files["ring"])
+    time = "() => window.netkf.time()"
+    reached = set()
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.className"))
+    wanted = {"play", "back", "forward", "next", "worst", "scrub", "speed", "node", "filter"}
+    wanted |= {"axis-x", "axis-y", "range", "view", "window", "lifelines", "sequence"}
+    assert {w for w in wanted if not any(w in str(r).split() for r in reached)} <= {"sequence"}
+    page.focus(".view")
+    page.keyboard.press("Home")
+    assert page.evaluate(time) == 0.0
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(time) == 0.5
+    page.keyboard.press("End")
+    assert page.evaluate(time) == 20.0
+    page.keyboard.press("w")
+    page.keyboard.press(" ")
+    for _ in range(50):  # wait_for_function evaluates texts, which the page forbids
+        page.wait_for_timeout(50)
+        if page.evaluate(time) > 16.2:
+            break
+    assert page.evaluate(time) > 16.2
+    page.keyboard.press(" ")
+    stopped = page.evaluate(time)
+    page.wait_for_timeout(150)
+    assert page.evaluate(time) == stopped
+    page.focus("#scrub")
+    page.keyboard.press("Home")
+    page.keyboard.press("ArrowRight")
+    assert 0.0 < page.evaluate(time) < 1.0
+    page.focus("#filter")
+    page.keyboard.press("l")  # lost and late only
+    page.keyboard.press("Enter")
+    assert page.evaluate("window.netkf.app.filter") == "trouble"
+    page.focus("#node")
+    before = page.evaluate("window.netkf.app.nodeId")
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate("window.netkf.app.nodeId") == before + 1
+    assert f"Why: node {before + 1}" in page.inner_text("#why-title")
+    assert f"node {before + 1} has error" in page.inner_text("#state")
+
+
+def test_the_first_sight_is_the_worst_instant(files, look, ring):
+    worst = worst_node(read_source(ring))
+    page = look(files["ring"])
+    assert page.evaluate("window.netkf.time()") == worst.time
+    assert page.inner_text("#why-title") == f"Why: node {worst.node} at {worst.time:g} s"
+    assert f"error {worst.peak:.4g}" in page.inner_text("#why")
+    page.click("text=All nodes at this time as a table")
+    row = page.locator("#table tbody tr").nth(worst.node).inner_text().split()
+    assert row[0] == str(worst.node)
+    assert f"{worst.peak:.4g}" in row
+
+
+def test_a_click_on_a_node_explains_it(files, look):
+    page = look(files["ring"])
+    box = page.locator(".view canvas").first.bounding_box()
+    before = page.inner_text("#why-title")
+    for x in range(30, int(box["width"]), 14):  # wherever the nodes are, a row of clicks meets one
+        page.locator(".view canvas").first.click(position={"x": x, "y": box["height"] / 2})
+        if page.inner_text("#why-title") != before:
+            break
+    assert page.inner_text("#why-title") != before
+    arrow = page.locator("#sequence .message title").first.text_content()
+    assert arrow.startswith("message ")
+
+
+def test_the_canvas_shows_what_is_lost(files, look):
+    """A lost message is drawn in the colour of losses, and nothing is where messages are off."""
+    page = look(files["ring"])
+    lost = "window.netkf.app.run.messages"
+    t = page.evaluate(f"{lost}.sent[{lost}.outcome.findIndex((o) => o === 1)]")
+    page.evaluate("(t) => window.netkf.app.setTime(t)", t)
+    count = """() => {
+      const canvas = document.querySelector('.view canvas'), wanted = [0xb8, 0x4a, 0x00];
+      const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+      let found = 0;
+      for (let k = 0; k < pixels.length; k += 4)
+        found += wanted.every((c, i) => Math.abs(pixels[k + i] - c) < 12);
+      return found;
+    }"""
+    page.wait_for_timeout(100)
+    assert page.evaluate(count) > 20
+    page.select_option("#filter", "none")
+    page.wait_for_timeout(100)
+    assert page.evaluate(count) == 0
+
+
+def test_markup_in_texts_runs_nothing(look, tmp_path):
+    changes = {"horizon": 1.0, "claim": EVIL, "name": f"name {EVIL}"}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    directory = run_to_directory(
+        scenario, tmp_path / "a<img src=x onerror=window.pwned=1>"
+    ).directory
+    write_verdict(directory, EVIL)
+    page = look(write_report([directory, directory], tmp_path / "page.html"))
+    page.click("text=Messages at this time as a table")
+    assert page.evaluate("window.pwned") is None
+    assert page.locator("img").count() == 0
+    assert EVIL in page.inner_text("h2 >> nth=0")
+
+
+def test_motion_is_reduced_where_that_is_asked_for(files, look):
+    page = look(files["ring"], reduced_motion="reduce", color_scheme="dark")
+    page.focus(".view")
+    page.keyboard.press("Home")
+    page.keyboard.press(" ")
+    times = page.evaluate(
+        """async () => {
+      const seen = new Set(), until = performance.now() + 1300;
+      while (performance.now() < until) {
+        seen.add(window.netkf.time());
+        await new Promise(requestAnimationFrame);
+      }
+      return seen.size;
+    }"""
+    )
+    assert 2 <= times <= 4
+
+
+@pytest.mark.skipif(not AXE, reason="NETKF_AXE does not name axe.min.js")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious(files, look, kind, scheme):
+    page = look(files[kind], color_scheme=scheme)
+    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    page.evaluate(Path(AXE).read_text(encoding="utf-8"))
+    found = page.evaluate("axe.run()")["violations"]
+    serious = [v for v in found if v["impact"] in ("serious", "critical")]
+    assert [(v["id"], v["nodes"][0]["html"][:200]) for v in serious] == []
