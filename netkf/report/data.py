@@ -69,6 +69,8 @@ def run_data(
         "sensors": [node for node in run.nodes if node in source.scenario.placed],
         "positions": positions(source, run),
         "knowledge": source.knowledge,
+        "flow": _flow(source),
+        "continuous": sorted(source.scenario.increment_sensors),
         "period": source.period,
         "axes": _axes(source, run.x.shape[1]),
         "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
@@ -155,6 +157,16 @@ def _layout(source: Source, run: StoredRun) -> dict[int, Any]:
     if few:
         return networkx.kamada_kawai_layout(graph)
     return networkx.spring_layout(graph, seed=1, iterations=30)
+
+
+def _flow(source: Source) -> str:
+    """Return how information flows: nodes ``combine`` what they hear, ``swap`` it for their own,
+    send ``readings`` that nobody passes on, or one filter has the readings of all (``pooled``).
+    """
+    hosted = source.scenario.hosted
+    if hosted.pooled:
+        return "pooled"
+    return hosted.combination if hosted.combination in ("swap", "readings") else "combine"
 
 
 def _axes(source: Source, n: int) -> list[int]:

@@ -19,12 +19,14 @@ from netkf.report.claims import findings
 from netkf.report.data import Budget, run_data, thinning_rules
 from netkf.report.directories import Source, read_source
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
+from netkf.report.mending import explain_worst, mending_claim, mending_section
 from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
 from netkf.runs.documents import ENDED, DamagedError
 from netkf.runs.files import write_text
 from netkf.runs.stored import StoredRun
 from netkf.studies.compare import Comparison, compare, damage_named
+from netkf.studies.explanation import Explanation
 from netkf.trace.schema import KINDS
 
 MAX_BYTES = 4_800_000
@@ -54,10 +56,13 @@ LEAST_BUDGET = 500
 
 
 class _Entry(NamedTuple):
-    """A source with its MESSAGE rows."""
+    """A source with its MESSAGE rows, and why its worst sample was what it was (or why that is not
+    said).
+    """
 
     source: Source
     messages: np.ndarray
+    worst: Explanation | str | None = None
 
     @property
     def moves(self) -> bool:
@@ -111,9 +116,10 @@ def _entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
         return _Entry(source, none)
     with damage_named(directory):
         try:
-            return _Entry(source, join_messages(source.run.log))
+            messages = join_messages(source.run.log)
         except ValueError as error:
             raise DamagedError(f"events.parquet: {error}") from None
+    return _Entry(source, messages, explain_worst(source))
 
 
 def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
@@ -122,7 +128,7 @@ def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
     if len(entries) == 2 and kinds[1] == "verdict" and kinds[0] in ("run", "ensemble"):
         first, verdict = entries
         source = replace(first.source, verdict=verdict.source.verdict)
-        return [_Entry(source, first.messages)]
+        return [first._replace(source=source)]
     if len(entries) == 2 and not {*kinds} <= {"run", "ensemble"}:
         rule = "compares runs and ensembles; a verdict can stand behind a run"
         raise ScenarioError("report", rule, " and ".join(kinds), "give one directory for each page")
@@ -190,7 +196,7 @@ def _assemble(
 def _header(entries: list[_Entry]) -> str:
     """Return the head of the page: names, claims, and what the data say."""
     parts = []
-    for letter, (source, messages) in zip("AB", entries, strict=False):
+    for letter, (source, messages, worst) in zip("AB", entries, strict=False):
         mark = f"{letter}: " if len(entries) > 1 else ""
         level = "h2" if len(entries) > 1 else "h1"
         title = f"{mark}{source.scenario.name}"
@@ -198,7 +204,10 @@ def _header(entries: list[_Entry]) -> str:
         parts.append(f"<{level}>{text(title + status)}</{level}>")
         if source.scenario.claim:
             parts.append(paragraph(f"Claim of the scenario: {source.scenario.claim}", "claim"))
-        parts.append(bullets((line + "." for line in findings(source, messages)), "findings"))
+        lines = findings(source, messages)
+        if isinstance(worst, Explanation):
+            lines.insert(min(2, len(lines)), mending_claim(worst))
+        parts.append(bullets((line + "." for line in lines), "findings"))
     heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
     return f'<header class="top">{heading}{"".join(parts)}</header>'
 
@@ -212,6 +221,9 @@ def _main(
 ) -> str:
     sources = [entry.source for entry in entries]
     parts = [_asset("live.html") if live else _nothing_moves(sources)]
+    mended = [mending_section(e.source, e.worst) for e in entries if e.worst is not None]
+    if mended:
+        parts.append(section("mending", "What would have mended the worst sample", "".join(mended)))
     if comparison is not None:
         parts.append(section("comparison", "What differs", _differences(comparison)))
     parts.append(section("figures", "Figures", '<div id="curves" class="curves"></div>'))

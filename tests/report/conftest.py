@@ -48,6 +48,18 @@ def library(folder):
 
 
 @pytest.fixture(scope="session")
+def gossip(folder):
+    """Slots in which pairs of nodes swap what they know; samples are predictions."""
+    return stored(folder, "gossip_ring", {"horizon": 40.0})
+
+
+@pytest.fixture(scope="session")
+def readings(folder):
+    """Slots in which messages carry readings, which nobody passes on."""
+    return stored(folder, "intermittent_random10", {"horizon": 12.0})
+
+
+@pytest.fixture(scope="session")
 def ensembles(folder):
     """Two ensembles of different link rates."""
     found = []

@@ -19,6 +19,7 @@ from netkf.report.directories import read_source
 from netkf.report.page import write_report
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import format_number
+from netkf.studies.why import why
 from tests.conftest import SCENARIOS
 from tests.report.conftest import EVIL, write_verdict
 from tests.report.oracle import last_heard, on_show, plain_messages, reachable
@@ -40,9 +41,10 @@ def chromium():
 
 
 @pytest.fixture(scope="module")
-def files(ring, delayed, slots, library, ensembles, sweep, folder):
+def files(ring, delayed, slots, library, gossip, readings, ensembles, sweep, folder):
     """A page of each kind by its name."""
     kinds = {"ring": [ring], "delayed": [delayed], "slots": [slots], "library": [library]}
+    kinds |= {"gossip": [gossip], "readings": [readings]}
     kinds |= {"two": ensembles, "ensemble": ensembles[:1], "sweep": [sweep]}
     return {k: write_report(found, folder / f"{k}.html") for k, found in kinds.items()}
 
@@ -76,7 +78,7 @@ def look(chromium):
     assert len(asked) == len(contexts)
 
 
-KINDS = ["ring", "delayed", "slots", "library", "two", "ensemble", "sweep"]
+KINDS = ["ring", "delayed", "slots", "library", "gossip", "two", "ensemble", "sweep"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -120,6 +122,25 @@ def test_the_state_shown_is_that_of_the_trace(files, look, request, kind):
             np.testing.assert_array_equal(state["x"], run.x[k])
 
 
+@pytest.mark.parametrize("kind", ["ring", "slots", "gossip", "readings", "library"])
+def test_why_agrees_with_the_command(files, look, request, kind):
+    """Filters that combine, swap, or send readings; samples before and after a slot, or of now."""
+    page, run = look(files[kind]), netkf.open(request.getfixturevalue(kind))
+    chance = random.Random(2)
+    nodes = {node: i for i, node in enumerate(run.nodes)}
+    for _ in range(4):
+        node, at = chance.choice(run.nodes), float(chance.choice(run.times[len(run.times) // 2 :]))
+        shown = page.evaluate("([i, t]) => window.netkf.why(i, t)", [node, at])
+        found = why(run, node, at, replays=1)
+        heard = {s.node: s.heard for s in found.sources if s.neighbour and s.heard == s.heard}
+        assert heard == {
+            run.nodes[x["sender"]]: x["sent"] for x in shown["links"] if x["newest"] >= 0
+        }
+        read = {s.node: s.reading for s in found.sources if s.sensor and s.reading == s.reading}
+        mine = {r["node"]: r["at"] for r in shown["readings"] if r["way"]}
+        assert mine == {nodes[node]: pytest.approx(t, abs=1e-9) for node, t in read.items()}
+
+
 @pytest.mark.parametrize("kind", ["ring", "delayed", "library"])
 def test_why_is_an_independent_backward_search(files, look, request, kind):
     page, run = look(files[kind]), netkf.open(request.getfixturevalue(kind))
@@ -144,9 +165,12 @@ def test_why_is_an_independent_backward_search(files, look, request, kind):
         for reading in found["readings"]:
             sensor = run.nodes[reading["node"]]
             until = moments.get(sensor, -math.inf)
-            times = senses["t"][(senses["node"] == sensor) & (senses["t"] <= until)]
-            assert reading["at"] == (times.max() if len(times) else None) or not len(times)
-            assert math.isfinite(reading["at"] or math.nan) == bool(len(times))
+            taken = senses["t"][(senses["node"] == sensor) & (senses["t"] <= until)]
+            expected = taken.max() if len(taken) else None
+            if sensor in run.scenario.increment_sensors:  # used up to the very moment
+                expected = until if sensor in moments else None
+            shown = reading["at"] if reading["way"] else None
+            assert shown == expected
 
 
 def test_numbers_are_written_as_on_the_command_line(files, look):

@@ -1,6 +1,6 @@
 // The sequence chart: a lifeline for each chosen node, time downwards, an arrow for each message.
 const Sequence = (() => {
-  const HEIGHT = 480, TOP = 34, LEFT = 70, RIGHT = 26, BOTTOM = 14;
+  const HEIGHT = 480, TOP = 34, LEFT = 70, RIGHT = 66, BOTTOM = 14;
   const MAX_ARROWS = 220, MAX_NEAR = 7;
   const make = Format.element;
 
@@ -55,7 +55,7 @@ const Sequence = (() => {
       const key = m.phase[row] + " " + (run.broadcasts ? m.sender[row] : row);
       return y(m.sent[row]) + (ranks.size > 1 ? (room.get(m.sent[row]) * ranks.get(key)) / ranks.size : 0);
     };
-    const ended = (row) => (m.ended[row] === m.sent[row] ? sent(row) : y(Math.min(m.ended[row], end * 1.01)));
+    const ended = (row) => (m.ended[row] === m.sent[row] ? sent(row) : y(Math.min(m.ended[row], run.horizon * 1.02)));
     return { y, sent, ended };
   }
 
@@ -137,9 +137,12 @@ const Sequence = (() => {
     const x1 = x.get(m.sender[row]), y1 = at.sent(row), whole = x.get(m.receiver[row]);
     // A lost message stops short of its receiver, between two lifelines.
     const x2 = lost ? whole - Math.sign(whole - x1) * 0.4 * x.gap : whole, y2 = lost ? y1 : at.ended(row);
+    const [from, to] = cut([x1, y1], [x2, y2]), ends = to[1] === y2;
     const group = make("g", { class: "message " + State.OUTCOMES[outcome].replace(" ", "-") },
       make("title", {}, sentence(run, row)),
-      make("line", { x1, y1, x2, y2 }), make("circle", { cx: x1, cy: y1, r: 2.5 }));
+      make("line", { x1: from[0], y1: from[1], x2: to[0], y2: to[1] }));
+    if (from[1] === y1) group.append(make("circle", { cx: x1, cy: y1, r: 2.5 }));
+    if (!ends) return group;
     if (lost) {
       group.append(make("path", { d: `M${x2 - 4} ${y2 - 4}L${x2 + 4} ${y2 + 4}M${x2 - 4} ${y2 + 4}L${x2 + 4} ${y2 - 4}` }));
     } else if (outcome === State.LATE) {
@@ -151,6 +154,14 @@ const Sequence = (() => {
       group.append(make("polygon", { points: `${x2},${y2} ${side(0.4)} ${side(-0.4)}` }));
     }
     return group;
+  }
+
+  // The part of a line that lies in the chart: messages may begin before and end after it.
+  function cut([x1, y1], [x2, y2]) {
+    const at = (y) => [x1 + ((x2 - x1) * (y - y1)) / (y2 - y1), y];
+    const bottom = HEIGHT - BOTTOM;
+    if (y1 === y2) return [[x1, y1], [x2, y2]];
+    return [y1 < TOP - 6 ? at(TOP - 6) : [x1, y1], y2 > bottom ? at(bottom) : [x2, y2]];
   }
 
   function sentence(run, row) {

@@ -26,11 +26,50 @@ const Why = (() => {
     return time <= t;
   }
 
-  // The latest moment of each node of which anything can have reached `node` by t. Messages are
-  // taken from the last arrival to the first, so a node's moment is final before any message into
-  // it is looked at. At one instant senders send before anybody receives, so a relay must have
-  // heard strictly before it sends.
-  function reach(run, node, t) {
+  // Stretches of time in which what a node learned can have reached `node` by t, as
+  // { node, from, to, way }: the node itself first, later stretches before earlier ones.
+  function stretches(run, node, t) {
+    const own = { node, from: -Infinity, to: t, way: [node], last: true };
+    if (run.flow === "pooled") return run.nodes.map((_, i) => ({ ...own, node: i, way: [i] }));
+    if (run.flow === "readings") return [own, ...direct(run, node, t)];
+    return run.flow === "swap" ? swaps(run, node, t) : combined(run, node, t);
+  }
+
+  // Messages that carry the reading of their instant, which nobody passes on.
+  function direct(run, node, t) {
+    const m = run.messages;
+    return run.messages.into[node].map((link) => heard(run, link, t)).filter((link) => link.newest >= 0)
+      .map((link) => ({ node: link.sender, from: link.sent, to: m.sent[link.newest], way: [link.sender, node] }));
+  }
+
+  // With each swap a node goes on with what the other knew: one chain backwards.
+  function swaps(run, node, t) {
+    const m = run.messages, found = [], way = [node];
+    let at = node, to = t, last = true;
+    for (let hops = 0; hops <= m.count; hops++) {
+      let row = -1;
+      for (const link of m.into[at]) {
+        for (let k = link.from; k < link.to; k++) {
+          const before = last ? known(run, m.ended[k], t) : m.ended[k] < to;
+          if (m.outcome[k] !== State.DELIVERED || !before) continue;
+          if (row < 0 || m.ended[k] >= m.ended[row]) row = k;
+        }
+      }
+      found.push({ node: at, from: row < 0 ? -Infinity : m.ended[row], to, way: way.slice().reverse(), last });
+      if (row < 0) break;
+      at = m.sender[row];
+      to = m.sent[row];
+      last = false;
+      way.push(at);
+    }
+    return found;
+  }
+
+  // Nodes that combine what they hear: the latest moment of each of which anything can have reached
+  // `node` by t. Messages are taken from the last arrival to the first, so a node's moment is final
+  // before any message into it is looked at. At one instant senders send before anybody receives,
+  // so a relay must have heard strictly before it sends.
+  function combined(run, node, t) {
     const m = run.messages, moments = new Array(run.N).fill(null);
     moments[node] = { t, row: -1 };
     for (const row of arrivals(run)) {
@@ -40,7 +79,11 @@ const Why = (() => {
       const from = moments[m.sender[row]];
       if (from === null || m.sent[row] > from.t) moments[m.sender[row]] = { t: m.sent[row], row };
     }
-    return moments;
+    const found = [];
+    moments.forEach((moment, i) => {
+      if (moment !== null) found.push({ node: i, from: -Infinity, to: moment.t, way: way(run, moments, i), last: i === node });
+    });
+    return found;
   }
 
   function arrivals(run) {
@@ -55,15 +98,24 @@ const Why = (() => {
 
   // For each sensing node its newest reading that can have reached the node, and by which way.
   function readings(run, node, t) {
-    const moments = reach(run, node, t), found = [];
-    for (let i = 0; i < run.N; i++) {
-      if (!run.sensing[i]) continue;
-      const times = run.readings[i], moment = moments[i];
-      let k = moment === null ? -1 : State.above(times, moment.t + (i === node ? run.period : 0)) - 1;
-      while (i === node && k >= 0 && !known(run, times[k], t)) k--;
-      found.push({ node: i, at: k < 0 ? NaN : times[k], way: k < 0 ? [] : way(run, moments, i) });
+    const found = new Map();
+    for (const stretch of stretches(run, node, t)) {
+      if (!run.sensing[stretch.node]) continue;
+      const at = newest(run, stretch, t), best = found.get(stretch.node);
+      if (Number.isFinite(at) && !(best && best.at >= at)) found.set(stretch.node, { node: stretch.node, at, way: stretch.way });
     }
-    return found;
+    return run.nodes.map((_, i) => i).filter((i) => run.sensing[i])
+      .map((i) => found.get(i) || { node: i, at: NaN, way: [] });
+  }
+
+  // The newest reading in a stretch. Continuous readings are used up to its very end.
+  function newest(run, stretch, t) {
+    if (run.continuous.includes(run.nodes[stretch.node])) return stretch.to;
+    const times = run.readings[stretch.node];
+    let k = State.above(times, stretch.to + (stretch.last ? run.period : 0)) - 1;
+    while (stretch.last && k >= 0 && !known(run, times[k], t)) k--;
+    if (k < 0 || times[k] < stretch.from) return NaN;
+    return run.period > 0 ? Math.floor(times[k] / run.period + 1e-6) * run.period : times[k];
   }
 
   function way(run, moments, from) {
@@ -169,5 +221,5 @@ const Why = (() => {
       Format.element("ul", {}, ...items));
   }
 
-  return { heard, reach, readings, explain, show };
+  return { heard, readings, explain, show };
 })();

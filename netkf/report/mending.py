@@ -1,0 +1,77 @@
+"""What would have mended the worst sample of a run: replays in which missing messages came."""
+
+from __future__ import annotations
+
+import math
+
+from netkf.core.errors import NetkfError
+from netkf.report.claims import Worst, worst_node
+from netkf.report.directories import Source
+from netkf.report.markup import bullets, paragraph, table
+from netkf.runs.tables import format_number
+from netkf.studies.explanation import Explanation
+from netkf.studies.why import why
+from netkf.studies.why_text import sentences
+
+MAX_EVENTS = 300_000
+"""Events of a run up to which a page replays it, some seconds."""
+REPLAYED_EVENTS, LEAST, MOST = 300_000, 5, 60
+"""Events of all replays of a page together, and the replays of a search at least and at most."""
+
+
+def explain_worst(source: Source) -> Explanation | str | None:
+    """Return why the worst sample of a single run was what it was, by replays; or the reason why it
+    cannot be said here, or None where there is nothing to explain.
+    """
+    worst, run = worst_node(source), source.run
+    if worst is None or run is None or source.kind != "run":
+        return None
+    if len(run.nodes) == 1 or not run.count("send"):
+        return None
+    if len(run.log) > MAX_EVENTS:
+        return f"a run of {len(run.log):,} events is not replayed here: {_command(source, worst)}"
+    replays = max(LEAST, min(MOST, REPLAYED_EVENTS // len(run.log)))
+    try:
+        return why(run, worst.node, worst.time, replays=replays)
+    except NetkfError as error:
+        return str(error)
+
+
+def _command(source: Source, worst: Worst) -> str:
+    return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
+
+
+def mending_claim(found: Explanation) -> str:
+    """Return a sentence that says what it would have taken."""
+    was, best = found.what_ifs[0], found.what_ifs[-1]
+    if len(found.what_ifs) < 2:
+        return "No message was missing, so none would have mended it"
+    change = f"trace P {format_number(best.trace)} in place of {format_number(was.trace)}"
+    if math.isfinite(best.error):
+        change += f" and error {format_number(best.error)} in place of {format_number(was.error)}"
+    some = ""
+    if found.smallest is not None and found.smallest.messages:
+        count = len(found.smallest.messages)
+        many = f"{count} message{'s' if count > 1 else ''}"
+        some = f"; {many} alone would have brought trace P to {format_number(found.smallest.trace)}"
+    return f"To mend it: with no message missing, a replay gives {change}{some}"
+
+
+def mending_section(source: Source, found: Explanation | str) -> str:
+    """Return the answer of ``netkf why`` about the worst sample: sentences, and a row a replay."""
+    worst = worst_node(source)
+    if isinstance(found, str) or worst is None:
+        return paragraph(f"The worst sample is not explained here: {found}", "note")
+    rows = [
+        (
+            what.label,
+            "all" if what.messages is None else len(what.messages),
+            format_number(what.trace),
+            format_number(what.error),
+        )
+        for what in found.what_ifs
+    ]
+    caption = f"Node {found.node} at {found.at:.10g} s, replayed with messages that did not come"
+    replays = table(caption, ("replayed with", "messages", "trace P", "error"), rows)
+    more = f"By replays of the run, nothing is guessed: {_command(source, worst)} says more"
+    return bullets(sentences(found)) + replays + paragraph(more, "note")
