@@ -72,7 +72,7 @@ def run_data(
         "flow": _flow(source),
         "continuous": sorted(source.scenario.increment_sensors),
         "period": source.period,
-        "axes": _axes(source, run.x.shape[1]),
+        "axes": _axes(source, run, worst),
         "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
         "worst": _worst_data(worst),
         "scale": _scales(),
@@ -169,15 +169,22 @@ def _flow(source: Source) -> str:
     return hosted.combination if hosted.combination in ("swap", "readings") else "combine"
 
 
-def _axes(source: Source, n: int) -> list[int]:
-    """Return the two components of the state to show first: those that sensors see, if two are."""
-    seen: list[int] = []
+def _axes(source: Source, run: StoredRun, worst: Worst | None) -> list[int]:
+    """Return the two components of the state to show first: the two that sensors see if one of
+    them was furthest off at the worst instant, else those that were furthest off.
+    """
+    n = run.x.shape[1]
+    seen: set[int] = set()
     for sensor in source.scenario.sensors:
         H = getattr(sensor, "H", None)
         if H is not None:
-            seen += np.flatnonzero(np.any(np.asarray(H) != 0.0, axis=0)).tolist()
-    first = sorted(set(seen))[:2] if len(set(seen)) >= 2 else [0, min(1, n - 1)]
-    return [int(k) for k in first]
+            seen |= set(np.flatnonzero(np.any(np.asarray(H) != 0.0, axis=0)).tolist())
+    first = sorted(seen)[:2] if len(seen) >= 2 else [0, min(1, n - 1)]
+    if worst is None or not worst.by_error:
+        return first
+    k, column = int(np.searchsorted(run.times, worst.time)), run.nodes.index(worst.node)
+    off = np.argsort(-np.abs(run.error[k, column]), kind="stable").tolist()
+    return first if off[0] in first else sorted(off[:2])
 
 
 def _broadcasts(run: StoredRun) -> bool:

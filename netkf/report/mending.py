@@ -13,6 +13,8 @@ from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
 from netkf.studies.why_text import sentences
 
+SAME = 1e-4
+"""Relative difference of numbers that look the same with four digits."""
 MAX_EVENTS = 300_000
 """Events of a run up to which a page replays it, some seconds."""
 REPLAYED_EVENTS, LEAST, MOST = 300_000, 5, 60
@@ -44,8 +46,9 @@ def _command(source: Source, worst: Worst) -> str:
 def mending_claim(found: Explanation) -> str:
     """Return a sentence that says what it would have taken."""
     was, best = found.what_ifs[0], found.what_ifs[-1]
-    if len(found.what_ifs) < 2:
-        return "No message was missing, so none would have mended it"
+    same = math.isclose(was.trace, best.trace, rel_tol=SAME) or math.isnan(was.trace)
+    if same and not abs(best.error - was.error) > SAME * was.error:
+        return "Messages would not have mended it: a replay in which none is missing is no better"
     change = f"trace P {format_number(best.trace)} in place of {format_number(was.trace)}"
     if math.isfinite(best.error):
         change += f" and error {format_number(best.error)} in place of {format_number(was.error)}"

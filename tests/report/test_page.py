@@ -275,13 +275,13 @@ def test_an_interrupted_a_diverged_and_a_lonely_run_say_so(ring, build, tmp_path
     with pytest.raises(KeyboardInterrupt):
         run_to_directory(scenario, tmp_path / "stopped", progress=interrupt)
     assert "poisson-ring (interrupted)" in Page(make_page([tmp_path / "stopped"])).shown
-    plant = {"kind": "diffusion", "A": [[60.0]], "B": [[1.0]], "cov": [[1.0]]}
-    wild = build(plant=plant, horizon=20.0, filter={"kind": "local", "cov": [[1.0]]})
+    plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
+    wild = build(plant=plant, horizon=600.0, probe=10.0, filter={"kind": "local"})
     done = run_to_directory(wild, tmp_path / "wild")
     assert done.status == "diverged"
     assert "Diverged: at t = " in Page(make_page([done.directory])).shown
     graph = {"graph": {"kind": "complete", "nodes": 1}}
-    alone = build(network=graph, filter={"kind": "local", "cov": [[1.0]]})
+    alone = build(network=graph, filter={"kind": "local"})
     shown = Page(make_page([run_to_directory(alone, tmp_path / "one").directory])).shown
     assert "There is one node, so nothing is sent" in shown
     run_to_directory(scenario, tmp_path / "empty", trace="none")

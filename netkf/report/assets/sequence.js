@@ -73,7 +73,9 @@ const Sequence = (() => {
     });
     drawFrame(svg, at, start, end, wide);
     drawLifelines(svg, run, app, chosen, x, at, start, end);
-    for (const row of app.filtered(run, found)) svg.append(arrow(run, row, x, at));
+    for (const row of app.filtered(run, found)) {
+      if (at.sent(row) <= HEIGHT - BOTTOM) svg.append(arrow(run, row, x, at));
+    }
     drawClock(svg, at, app.time, wide, end);
     svg.addEventListener("click", (event) => {
       const y = event.clientY - svg.getBoundingClientRect().top;
