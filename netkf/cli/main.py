@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 BAD_USAGE = 2
 COMMANDS = (
     *("run", "check", "theory", "sweep", "size", "consistency", "compare", "compare_filters"),
-    *("report", "why"),
+    *("report", "why", "schema", "new"),
 )
 """Modules of this package, each with a COMMAND."""
 
@@ -127,6 +127,7 @@ def make_parser() -> argparse.ArgumentParser:
     from importlib import import_module
 
     import netkf
+    from netkf.cli.completion import add_completion
     from netkf.cli.options import Parser
 
     parser = Parser(
@@ -135,6 +136,7 @@ def make_parser() -> argparse.ArgumentParser:
         "the guarantees of their papers.",
     )
     parser.add_argument("--version", action="version", version=f"netkf {netkf.__version__}")
+    add_completion(parser)
     commands: Any = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
     for name in COMMANDS:
         import_module(f"netkf.cli.{name}").COMMAND.add_to(commands)

@@ -29,12 +29,14 @@ class Rule:
     """A requirement on a value: its text, the conversion that enforces it, and the remedy.
 
     ``convert`` returns the value to store, or raises ``TypeError`` or ``ValueError``. ``remedy``
-    tells the user how to correct a value that breaks the rule.
+    tells the user how to correct a value that breaks the rule. ``schema`` is a JSON Schema that
+    every value of a file which obeys the rule validates with; empty if nothing is known.
     """
 
     requirement: str
     convert: Callable[[Any], Any]
     remedy: str = ""
+    schema: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
 
     def __call__(self, key: str, value: object) -> Any:
         """Return the converted value; raises ScenarioError at ``key`` if it breaks the rule."""
@@ -156,7 +158,17 @@ def number(
         f"must be a finite number{' ' if inside else ''}{inside}",
         convert,
         f"give a number {inside}" if inside else "give a finite number",
+        {
+            "type": "number",
+            **_bounds(exclusiveMinimum=above, minimum=low),
+            **_bounds(exclusiveMaximum=below, maximum=high),
+        },
     )
+
+
+def _bounds(**given: float) -> dict[str, float]:
+    """Return the finite ones of the bounds of a JSON Schema."""
+    return {name: bound for name, bound in given.items() if math.isfinite(bound)}
 
 
 positive = number(above=0.0)
@@ -172,7 +184,8 @@ def _seconds(value: Any) -> float:
     return result
 
 
-seconds = Rule(positive.requirement, _seconds, positive.remedy)
+_DURATION = {"type": "number", "minimum": SHORTEST, "maximum": LONGEST}
+seconds = Rule(positive.requirement, _seconds, positive.remedy, _DURATION)
 probability = number(low=0.0, high=1.0)
 
 
@@ -194,7 +207,9 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
 
     bound = "" if low is None else f" of at least {low}"
     bound += "" if high is None else f" and at most {high:,}"
-    return Rule(f"must be an integer{bound}", convert, f"give an integer{bound}")
+    limits = {"minimum": low, "maximum": high}
+    schema = {"type": "integer", **{k: v for k, v in limits.items() if v is not None}}
+    return Rule(f"must be an integer{bound}", convert, f"give an integer{bound}", schema)
 
 
 MAX_MAGNITUDE = 1e30
@@ -210,7 +225,12 @@ def _instance_of(kind: type) -> Callable[[Any], Any]:
     return convert
 
 
-boolean = Rule("must be true or false", _instance_of(bool), "write true or false without quotes")
+boolean = Rule(
+    "must be true or false",
+    _instance_of(bool),
+    "write true or false without quotes",
+    {"type": "boolean"},
+)
 
 
 def _one_line(value: Any) -> str:
@@ -225,8 +245,18 @@ def _nonempty_line(value: Any) -> str:
     return str(value)
 
 
-line = Rule("must be one line of text", _one_line, 'write it as "text" without line breaks')
-text = Rule("must be one line of text that is not empty", _nonempty_line, 'write it as "text"')
+line = Rule(
+    "must be one line of text",
+    _one_line,
+    'write it as "text" without line breaks',
+    {"type": "string"},
+)
+text = Rule(
+    "must be one line of text that is not empty",
+    _nonempty_line,
+    'write it as "text"',
+    {"type": "string", "minLength": 1},
+)
 
 
 def instance(*kinds: type) -> Rule:
@@ -250,7 +280,7 @@ def choice(*names: str) -> Rule:
         return str(value)
 
     listed = ", ".join(f'"{name}"' for name in names)
-    return Rule(f"must be one of {listed}", convert, "choose one of them")
+    return Rule(f"must be one of {listed}", convert, "choose one of them", {"enum": [*names]})
 
 
 def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
@@ -267,7 +297,8 @@ def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
             raise _SpecificError(requirement) from None
 
     requirement = f"{first.requirement}, or {second.requirement.removeprefix('must be ')}"
-    return Rule(requirement, convert, first.remedy)
+    known = [dict(rule.schema) for rule in (first, second)]
+    return Rule(requirement, convert, first.remedy, {"anyOf": known} if all(known) else {})
 
 
 def nested(depth: int) -> Callable[[Any], bool]:
@@ -304,7 +335,10 @@ def array(dimensions: int, kind: str) -> Rule:
         return result
 
     remedy = "write rows of equal length, [[a, b], [c, d]]" if dimensions == 2 else "write [a, b]"
-    return Rule(f"must be a {kind} with finite numbers", convert, remedy)
+    schema: dict[str, Any] = {"type": "number"}
+    for _ in range(dimensions):
+        schema = {"type": "array", "items": schema, "minItems": 1}
+    return Rule(f"must be a {kind} with finite numbers", convert, remedy, schema)
 
 
 def _has_bool(value: Any) -> bool:
@@ -325,7 +359,7 @@ def _square(value: Any) -> FloatArray:
     return np.asarray(result)
 
 
-square = Rule("must be a square matrix of finite numbers", _square, matrix.remedy)
+square = Rule("must be a square matrix of finite numbers", _square, matrix.remedy, matrix.schema)
 
 
 def _symmetric(value: Any) -> FloatArray:
@@ -355,11 +389,13 @@ covariance = Rule(
     "must be a covariance matrix",
     _covariance,
     "give a symmetric matrix without negative eigenvalues",
+    matrix.schema,
 )
 definite_covariance = Rule(
     "must be a positive definite covariance matrix",
     _definite,
     "give a symmetric matrix with positive eigenvalues",
+    matrix.schema,
 )
 
 
@@ -377,7 +413,8 @@ def several(rule: Rule, what: str, least: int = 1) -> Rule:
         return tuple(rule(f"[{k}]", item) for k, item in enumerate(value))
 
     some = "" if least == 0 else " that is not empty"
-    return Rule(f"must be a list of {what}{some}", convert, f"write a list of {what}")
+    schema = {"type": "array", "items": dict(rule.schema), "minItems": least}
+    return Rule(f"must be a list of {what}{some}", convert, f"write a list of {what}", schema)
 
 
 def row(*rules: Rule, what: str) -> Rule:
@@ -390,7 +427,13 @@ def row(*rules: Rule, what: str) -> Rule:
             rule(f"[{k}]", v) for k, (rule, v) in enumerate(zip(rules, value, strict=True))
         )
 
-    return Rule(f"must be {what}", convert, f"write {what}")
+    schema = {
+        "type": "array",
+        "prefixItems": [dict(rule.schema) for rule in rules],
+        "minItems": len(rules),
+        "maxItems": len(rules),
+    }
+    return Rule(f"must be {what}", convert, f"write {what}", schema)
 
 
 @dataclass(frozen=True, repr=False)
@@ -435,7 +478,10 @@ def _source_file(value: Any) -> SourceFile:
 
 
 source_file = Rule(
-    "must be the path of a file", _source_file, "give a path relative to the scenario file"
+    "must be the path of a file",
+    _source_file,
+    "give a path relative to the scenario file",
+    {"type": "string", "minLength": 1},
 )
 
 

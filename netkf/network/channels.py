@@ -341,7 +341,11 @@ class LognormalDelay(Delay):
 class Channel(Component):
     """The loss and the delay model of all messages.
 
-    If ``symmetric``, the two messages of one activation share one draw of each model, so that with
+    loss       which messages are lost
+    delay      how long the others take
+    symmetric  both messages of an activation share one fate; false: each direction has its own
+
+    If symmetric, the two messages of one activation share one draw of each model, so that with
     equal probabilities both arrive or none; otherwise each direction has draws of its own. A link
     of a directed graph is a single direction.
     """

@@ -95,7 +95,12 @@ def _one_rate(value: Any) -> tuple[float, ...]:
     return rates
 
 
-_entity_rate = Rule(_link_rate.requirement, _one_rate, _link_rate.remedy)
+_entity_rate = Rule(
+    _link_rate.requirement,
+    _one_rate,
+    _link_rate.remedy,
+    {"anyOf": [dict(_link_rate.schema), dict(_node_rate.schema)]},
+)
 
 
 @dataclass(frozen=True, eq=False)

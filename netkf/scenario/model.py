@@ -45,7 +45,12 @@ from netkf.plants.sensors import LinearSensor, Sensor
 
 @dataclass(frozen=True, eq=False)
 class Network(Component):
-    """The graph of a network, the activation of its links and the channel of its messages."""
+    """The graph of a network, the activation of its links and the channel of its messages.
+
+    graph       nodes and links
+    activation  when links, directions or nodes send; only filters that do not talk need none
+    channel     losses and delays of messages
+    """
 
     graph: Graph = field(instance(Graph))
     activation: LinkClock | SlotActivation | None = field(
@@ -58,8 +63,11 @@ class Network(Component):
 class Belief(Component):
     """The matrices that filters use where they differ from the true ones.
 
-    ``A`` (n, n) and ``B`` (n, m) of a diffusion, ``F`` and ``Q`` (n, n) of a linear plant, ``R`` of
-    the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry.
+    A  (n, n) of a diffusion
+    B  (n, m) of a diffusion
+    F  (n, n) of a linear plant
+    Q  (n, n) of a linear plant
+    R  of the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry
     """
 
     A: FloatArray | None = field(square, default=None)
@@ -76,8 +84,10 @@ class Belief(Component):
 class Filtering(Component):
     """The filter of every node: its ``algorithm``, its initial estimate and its model.
 
-    ``mean`` (n,) and ``cov`` (n, n) are one for all nodes or a tuple with one per node in the
-    order of node ids; both default to the plant's.
+    mean   estimate (n,) with which every node begins, or a list with one per node in the order of
+           node ids; the plant's by default
+    cov    its covariance (n, n), or a list with one per node; the plant's by default
+    model  what the filters believe where it differs from the truth
     """
 
     algorithm: AnyFilter = field(instance(Filter, FlowFilter, SlotFilter))

@@ -19,9 +19,18 @@ from netkf.scenario.tables import changed
 class Scenario(DerivedScenario):
     """Everything that determines a run.
 
+    name     one line of text; it names the run directory
+    horizon  simulated seconds; a run covers [0, horizon)
+    plant    how the state moves
+    sensors  who reads what; nodes named by no sensor only relay
+    network  the graph, the activation of its links, and the channel of its messages
+    filter   what every node computes
+    probe    period of the state samples in seconds, or increasing times in [0, horizon]
+    claim    what the scenario shows, one line
+    seed     root seed of all random numbers
+
     All fields are checked on construction, alone and against each other; ScenarioError names the
-    first mistake in one line. ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the
-    period of the state samples or a tuple of increasing times.
+    first mistake in one line.
     """
 
     def __post_init__(self) -> None:

@@ -1,0 +1,77 @@
+"""The reference of scenario files as a Markdown page, from the same source as their schema."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from netkf.core.fields import Component
+from netkf.network.channels import Channel
+from netkf.scenario.model import Belief, Filtering, Network
+from netkf.scenario.registry import KINDS
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.schema import KeyOf, keys_of, summary
+
+TABLES: dict[str, type[Component]] = {
+    "The file": Scenario,
+    "network": Network,
+    "network.channel": Channel,
+    "filter, beside its kind": Filtering,
+    "filter.model": Belief,
+}
+SECTIONS = {
+    "plant": "plant.kind",
+    "continuous plant": "plant.kind in continuous time, with A and B",
+    "sensor": "sensors.kind",
+    "sampling": "sensors.sampling.kind",
+    "graph": "network.graph.kind",
+    "activation": "network.activation.kind in continuous time",
+    "slot activation": "network.activation.kind in slots",
+    "loss": "network.channel.loss.kind",
+    "delay": "network.channel.delay.kind",
+    "filter": "filter.kind",
+}
+"""Headings by the families of registry.KINDS."""
+
+
+def schema_page() -> str:
+    """Return the page: a section for each table, with its kinds and their keys."""
+    return "\n".join(_lines())
+
+
+def _lines() -> Iterator[str]:
+    yield "# Keys of scenario files"
+    yield ""
+    yield "`netkf schema --markdown` prints this page. Keys whose default is a dash must be given."
+    for heading, cls in TABLES.items():
+        keys = [key for key in keys_of(cls) if key.name != "algorithm"]
+        yield from ("", f"## {heading}", "", summary(cls), "")
+        yield from _table(keys)
+    for family, heading in SECTIONS.items():
+        yield from ("", f"## {heading}")
+        for kind, cls in KINDS[family].items():
+            yield from ("", f"### {kind}", "", summary(cls))
+            keys = keys_of(cls)
+            if keys:
+                yield ""
+                yield from _table(keys)
+    yield ""
+
+
+def _table(keys: Sequence[KeyOf]) -> Iterator[str]:
+    yield "| key | value | default | |"
+    yield "|---|---|---|---|"
+    for key in keys:
+        cells = [f"`{key.name}`", key.rule, _default(key), key.description]
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _default(key: KeyOf) -> str:
+    if key.required:
+        return "-"
+    if isinstance(key.default, bool):
+        return str(key.default).lower()
+    if isinstance(key.default, str):
+        return f'"{key.default}"' if key.default else "none"
+    if isinstance(key.default, (int, float)):
+        return f"{key.default:g}"
+    return "none"
