@@ -58,6 +58,7 @@ class Finding(NamedTuple):
     early   : the promise is about a limit and the horizon is too short to tell
     blurred : rounding of a large state has left no errors to judge by
     horizon : seconds after which the limit would be reached, nan if that is not known
+    most_runs : number of runs after which further ones leave the interval as it is
     seen, expected, off, detectable, replica : see :class:`Evidence`; ``off`` is by default how far
         the margin is below 0
     """
@@ -73,6 +74,7 @@ class Finding(NamedTuple):
     off: float = math.nan
     detectable: float = math.nan
     replica: int | None = None
+    most_runs: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,14 @@ def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
     else:
         verdict = UNDECIDED
         # If the promise holds, a negative ``low`` is chance and shrinks as 1 / sqrt(runs).
-        wanted = 1.1 * runs * (-low / tolerance) ** 2 if tolerance > 0.0 else math.inf
-        needed = math.ceil(wanted) if wanted < MAX_RUNS else None
+        used = min(runs, finding.most_runs)
+        wanted = 1.1 * used * (-low / tolerance) ** 2 if tolerance > 0.0 else math.inf
+        needed = math.ceil(wanted) if wanted < min(MAX_RUNS, finding.most_runs) else None
+        if wanted > finding.most_runs:
+            message = (
+                f"{message}; exact covariances are those of {finding.most_runs:,} runs at most, "
+                "too few to decide it"
+            )
     return Evidence(
         promise.statement,
         promise.source,

@@ -40,9 +40,10 @@ from netkf.theory.common.stacked_errors import integration_steps
 from netkf.trace.nees import errors
 from netkf.trace.run import BLUR, Run, blurred
 
-MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 50_000
+MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 250_000
 """Replicas whose exact covariances are computed, fewer (but at least 20) where their errors are
-integrated in many short steps; the others show their errors only. A step takes some milliseconds.
+integrated in many short steps; the others show their errors only. A step takes a fraction of a
+millisecond.
 """
 MAX_ERRORS = 64
 """Errors of all nodes together for which the exact covariance (64, 64) is cheap."""
@@ -265,7 +266,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     found = compare_chi_square(ratios, freedom.tolist(), labels, level / 2.0, "e' Sigma^-1 e")
     pooled = _compare_pooled(runs.joint[:most], level / 2.0)
     found = pool(found, pooled, EVERYTHING)
-    return found._replace(message=found.message + samples.blurred_note)
+    return found._replace(message=found.message + samples.blurred_note, most_runs=most)
 
 
 def _compare_pooled(joint: FloatArray, level: float) -> Interval:
@@ -283,7 +284,8 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     The distance is that of the bias from 0 in standard deviations of an error that is typical, the
     inverse of the information that one run has on it.
     """
-    bias = samples.runs.bias[: most_replayed(samples.scenario)]
+    most = most_replayed(samples.scenario)
+    bias = samples.runs.bias[:most]
     bias = bias[np.isfinite(bias).all(axis=(1, 2))]
     n = bias.shape[1]
     if not len(bias) or not np.abs(bias).any():
@@ -305,7 +307,8 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
         0.0,
     )
     message = "bias that all errors share, in standard deviations of what one run tells of it,"
-    return find_largest([(apart, "all nodes and times")], BIAS_TOLERANCE, message)
+    found = find_largest([(apart, "all nodes and times")], BIAS_TOLERANCE, message)
+    return found._replace(most_runs=most)
 
 
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
@@ -346,7 +349,7 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     finding = pool(
         find_largest(found, NEES_TOLERANCE, message), together, EVERYTHING, NEES_TOLERANCE
     )
-    return finding._replace(message=finding.message + samples.blurred_note)
+    return finding._replace(message=finding.message + samples.blurred_note, most_runs=most)
 
 
 def check_nees(samples: RunSamples, level: float) -> Finding:

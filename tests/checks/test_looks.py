@@ -196,3 +196,18 @@ def test_broken_rows_come_first_and_again_with_their_command(tmp_path):
     assert len(replays) == len(shown)
     assert "[G ...]" in text
     assert "[H ...]" not in text
+
+
+def test_rows_that_use_some_of_the_runs_do_not_ask_for_more_than_help():
+    def judged(most):
+        interval = scale_interval(20.0, 20, 0.01)  # as expected, too wide to be decided
+        found = find_largest([(deviation_interval(1.0, interval), "it")], 0.05, "c")
+        promise = Promise("c is 1", "here", (), lambda _, __: found._replace(most_runs=most))
+        return judge([promise], None, [], 20, 0.01)[0]
+
+    limited, free = judged(20), judged(math.inf)
+    assert (limited.verdict, free.verdict) == (UNDECIDED, UNDECIDED)
+    assert limited.needed is None
+    assert "exact covariances are those of 20 runs at most" in limited.evidence
+    assert free.needed > 1000
+    assert judged(10 * free.needed).needed == free.needed
