@@ -35,7 +35,7 @@ def test_run_ends_with_a_table_and_a_picture(tmp_path, capsys):
 
 
 def test_a_missing_matplotlib_is_told_and_costs_the_picture_only(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "netkf.runs.plots", None)
+    monkeypatch.setitem(sys.modules, "netkf.figures.pictures", None)
     out = tmp_path / "out"
     assert main(["run", RING, "--out", str(out), "--set", "horizon=2.0"]) == 0
     assert "pip install matplotlib" in capsys.readouterr().err

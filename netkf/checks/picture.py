@@ -4,21 +4,39 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from netkf.checks.check import Verdict
 from netkf.checks.evidence import BROKEN, HOLDS, Evidence
-from netkf.runs.files import write_atomically
+from netkf.figures.style import (
+    EXACT,
+    INK,
+    LOST,
+    MUTED,
+    draw_legend,
+    finish,
+    look,
+    new_figure,
+    write,
+)
 
-COLOURS = {HOLDS: "#3b6ea5", BROKEN: "#c1440e"}
-OTHER = "#777777"
 LONGEST_LABEL = 72
 FURTHEST = 3.0
 """Tolerances at which the axis ends."""
+
+
+class _Mark(NamedTuple):
+    """How rows of a verdict are drawn, and what the legend calls them."""
+
+    colour: str
+    marker: str
+    label: str
+
+
+MARKS = {HOLDS: _Mark(EXACT, "o", "holds"), BROKEN: _Mark(LOST, "X", "BROKEN")}
+OTHER = _Mark(MUTED, "s", "undecided")
 
 
 def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
@@ -30,33 +48,48 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
     rows = [row for row in verdict.rows if row.low < row.high and row.tolerance > 0.0]
     if not rows:
         return False
-    with mpl.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(8.4, 1.1 + 0.27 * len(rows)), layout="constrained")
-        FigureCanvasAgg(figure)
+    with look():
+        figure = new_figure(8.8, 1.7 + 0.27 * len(rows))
         axes = figure.add_subplot()
         for place, row in enumerate(reversed(rows)):
             _draw_row(axes, place, row)
-        axes.axvline(1.0, color="#222222", linewidth=0.8, linestyle=":")
-        axes.set_yticks(range(len(rows)), [_label(row) for row in reversed(rows)])
+        for mark in dict.fromkeys(MARKS.get(row.verdict, OTHER) for row in rows):
+            axes.plot([], [], color=mark.colour, marker=mark.marker, label=mark.label)
+        axes.plot([], [], "|", color=INK, label="would have been seen")
+        axes.axvline(1.0, color=INK, lw=0.8, ls=":", label="tolerated")
+        axes.set_yticks(
+            range(len(rows)),
+            [_label(row) for row in reversed(rows)],
+            fontsize=7.5,
+            parse_math=False,
+        )
         axes.set_xlim(0.0, FURTHEST)
-        axes.set_xlabel("distance from the promise / what is tolerated; | would have been seen")
-        title = textwrap.fill(claim or verdict.scenario, 100)
-        note = f"{verdict.runs:,} runs, {verdict.confidence:.6g} for all intervals together"
-        figure.suptitle(f"{title}\n{note}", x=0.01, horizontalalignment="left", fontsize=9)
-        with write_atomically(path) as part:
-            figure.savefig(part, dpi=130, format="png")
+        axes.set_ylim(-0.7, len(rows) - 0.3)
+        axes.set_xlabel("distance from the promise / what is tolerated")
+        draw_legend(axes)
+        note = f"{verdict.scenario}: {verdict.runs:,} runs. Intervals hold together with "
+        note += f"probability {verdict.confidence:.6g}."
+        finish(figure, _title(rows, claim or verdict.scenario), [note])
+    write(figure, path)
     return True
 
 
-def _draw_row(axes: mpl.axes.Axes, place: int, row: Evidence) -> None:
+def _title(rows: list[Evidence], claim: str) -> str:
+    broken = sum(row.verdict == BROKEN for row in rows)
+    count = f"{broken} of {len(rows)} promises with an interval are broken"
+    return f"{count}: {claim}" if broken else claim
+
+
+def _draw_row(axes: Any, place: int, row: Evidence) -> None:
     """Draw the interval of a row at height ``place``."""
-    colour, unit = COLOURS.get(row.verdict, OTHER), row.tolerance
+    mark, unit = MARKS.get(row.verdict, OTHER), row.tolerance
     low, high = max(0.0, -row.high) / unit, min(max(0.0, -row.low) / unit, 2.0 * FURTHEST)
-    axes.plot([low, high], [place, place], color=colour, linewidth=3.0, solid_capstyle="butt")
-    axes.plot([min(row.off / unit, FURTHEST)], [place], "o", color=colour, markersize=4)
+    axes.plot([low, high], [place, place], color=mark.colour, lw=3.0, solid_capstyle="butt")
+    style = {"marker": mark.marker, "color": mark.colour, "ms": 4.5, "mec": INK, "mew": 0.5}
+    axes.plot([min(row.off / unit, FURTHEST)], [place], **style)
     if np.isfinite(row.detectable):
         seen = min(row.detectable / unit, FURTHEST)
-        axes.plot([seen], [place], "|", color="#222222", markersize=9)
+        axes.plot([seen], [place], "|", color=INK, ms=9)
 
 
 def _label(row: Evidence) -> str:

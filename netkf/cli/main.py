@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 BAD_USAGE = 2
 COMMANDS = (
     *("run", "check", "theory", "sweep", "size", "consistency", "compare", "compare_filters"),
-    *("report", "why", "schema", "new"),
+    *("plot", "report", "why", "schema", "new"),
 )
 """Modules of this package, each with a COMMAND."""
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
-RUN = "netkf.runs.plots", "run_picture"
-ENSEMBLE = "netkf.ensembles.picture", "ensemble_picture"
+RUN = "netkf.figures.pictures", "run_picture"
+ENSEMBLE = "netkf.figures.pictures", "ensemble_picture"
 SWEEP = "netkf.studies.picture", "sweep_picture"
 FILTERS = "netkf.studies.filter_picture", "filter_picture"
 VERDICT = "netkf.checks.picture", "verdict_picture"

@@ -89,7 +89,7 @@ def _draw(scenario: Scenario, completed: CompletedSweep) -> None:
     if draw is None:
         pictures.print_missing()
     elif not draw(scenario.name, completed):
-        reason = "it shows one or two keys, the second with few values"
+        reason = "it shows one or two keys"
         print(f"no picture: {reason}", file=sys.stderr)
 
 

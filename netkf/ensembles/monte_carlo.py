@@ -5,7 +5,7 @@ from __future__ import annotations
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
+from netkf.trace.run import plot_by_name
 from netkf.trace.schema import ensemble_columns
 
 if TYPE_CHECKING:
@@ -68,6 +69,13 @@ class Ensemble:
             f"{len(self.times)} samples, {len(self.nodes)} nodes, {self.mean_P.shape[-1]} states, "
             f"seed {self.seed}>"
         )
+
+    def plot(self, figure: str = "error") -> Any:
+        """Return a figure of the ensemble as a matplotlib Figure, as ``netkf plot`` draws it:
+        overview, error, quantiles, ratios, network, nees, stability or law; those of single runs
+        say so. Raises ScenarioError for another name or without matplotlib.
+        """
+        return plot_by_name(self, figure)
 
     @cached_property
     def table(self) -> pd.DataFrame:

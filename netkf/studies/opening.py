@@ -14,6 +14,7 @@ from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbe
 from netkf.runs.stored import MANIFEST, StoredRun, read_form, read_run
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
+from netkf.trace.run import plot_by_name
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,6 +38,10 @@ class StoredSweep:
     table: pd.DataFrame
     status: str
     manifest: dict[str, Any]
+
+    def plot(self, figure: str = "stability") -> Any:
+        """Return a figure of the sweep as a matplotlib Figure; there is ``stability`` only."""
+        return plot_by_name(self, figure)
 
     def __repr__(self) -> str:
         points = f"{len(self.table)} points of {', '.join(self.keys)}"

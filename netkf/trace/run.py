@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import quote
+from netkf.core.errors import ScenarioError, quote
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.nees import errors
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
@@ -105,9 +106,32 @@ class Run:
         size = carried(self.x, self.error, self.exact_errors)
         return rounding_from(self.times, size, self.P, self.error)
 
+    def plot(self, figure: str = "error") -> Any:
+        """Return a figure of the run as a matplotlib Figure, the one of ``netkf plot --figure``:
+        overview, error, quantiles, ratios, network, nees, nis, whiteness, age, links, stability,
+        law or delivery. Raises ScenarioError for another name or without matplotlib.
+        """
+        return plot_by_name(self, figure)
+
     def count(self, kind: str) -> int:
         """Return the number of events of a kind."""
         return int((self.log["kind"] == CODES[kind]).sum())
+
+
+def plot_by_name(result: Any, figure: str) -> Any:
+    """Return a figure of a result, drawn by netkf.figures.
+
+    That room is above this one, and it needs matplotlib, which may be missing. So it is looked up
+    by name when it is needed, as pandas looks up its plotting backend.
+    """
+    try:
+        catalogue = importlib.import_module("netkf.figures.catalogue")
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "matplotlib":
+            raise
+        rule, remedy = "needs matplotlib", "install it: pip install 'netkf[plot]'"
+        raise ScenarioError("plot", rule, None, remedy) from None
+    return catalogue.plot(result, figure)
 
 
 def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:

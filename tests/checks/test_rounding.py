@@ -122,7 +122,7 @@ def test_comparisons_leave_out_what_rounding_blurs(plugged, tmp_path):
 
 def test_a_filter_without_a_covariance_is_shown_without_one(silent, tmp_path):
     pytest.importorskip("matplotlib")
-    from netkf.runs.plots import run_picture
+    from netkf.figures.pictures import run_picture
     from netkf.runs.tables import summary_table
 
     done = run_to_directory(silent, tmp_path / "out", finish=lambda f: run_picture(silent, f))

@@ -1,0 +1,66 @@
+"""``netkf plot``: draw figures of finished runs, ensembles and sweeps."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from netkf.cli.options import Command
+from netkf.core.errors import ScenarioError
+
+FORMATS = ("png", "svg", "pdf")
+
+
+def _declare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
+    parser.add_argument(
+        "--figure",
+        action="append",
+        default=[],
+        metavar="NAME[,NAME]",
+        help="figures to draw: overview, error, quantiles, ratios, network, nees, nis, whiteness, "
+        "age, links, stability, law, delivery (default: all)",
+    )
+    parser.add_argument(
+        "--out", type=Path, help="file or directory of the figures (default: DIR/figures)"
+    )
+    parser.add_argument("--format", choices=FORMATS, help="format of the files (default: png)")
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="import classes that the scenario names from modules in DIR or the current folder",
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    try:
+        from netkf.figures.catalogue import plot_to_files
+    except ImportError:
+        rule, remedy = "needs matplotlib", "install it: pip install 'netkf[plot]'"
+        raise ScenarioError("plot", rule, None, remedy) from None
+    from netkf.studies.opening import open as open_directory
+
+    names = tuple(
+        name.strip() for text in options.figure for name in text.split(",") if name.strip()
+    )
+    several = len(options.directories) > 1
+    if several and options.out is not None and options.out.suffix.removeprefix(".") in FORMATS:
+        rule, remedy = "is one file for several directories", "name a directory"
+        raise ScenarioError("--out", rule, str(options.out), remedy)
+    for directory in options.directories:
+        out = directory / "figures" if options.out is None else options.out
+        if options.out is not None and several:
+            out = options.out / directory.name
+        result = open_directory(directory, trust=options.trust)
+        for path in plot_to_files(result, names, out, options.format or "png"):
+            print(path)
+    return 0
+
+
+COMMAND = Command(
+    "plot",
+    "draw figures of finished runs, ensembles and sweeps",
+    _declare,
+    _run,
+    takes_scenario=False,
+)

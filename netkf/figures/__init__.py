@@ -1,0 +1,1 @@
+"""Figures of runs, ensembles and sweeps, all with one look."""

@@ -1,0 +1,204 @@
+"""The figures ``nees``, ``nis`` and ``whiteness``: do the errors fit the covariances?"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from netkf.core.errors import NetkfError
+from netkf.figures.panels import draw_nees
+from netkf.figures.style import (
+    EXACT,
+    INK,
+    SECONDS,
+    SENSING,
+    SKY,
+    Picture,
+    draw_legend,
+    finish,
+    new_figure,
+    set_scale,
+)
+from netkf.figures.subject import LEVEL, Subject, UnavailableError
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.innovations import Innovations, innovations
+from netkf.runs.summary import CONFIDENCE, nees_bounds
+
+BINS = 40
+MAX_LAG = 20
+MIN_READINGS = 30
+
+
+def nees_figure(subject: Subject) -> Picture:
+    """Draw NEES over time with the interval that holds it if P is exact."""
+    subject.require_samples()
+    subject.require_truth()
+    subject.require_covariance()
+    n = subject.scenario.plant.n
+    low, high = nees_bounds(n, subject.runs)
+    values = subject.nees[subject.used]
+    values = values[np.isfinite(values)]
+    if not values.size:
+        raise UnavailableError("NEES is unavailable: it needs an error and a regular P.")
+    figure = new_figure(7.4, 4.2)
+    draw_nees(figure.add_subplot(), subject)
+    inside = float(((values >= low) & (values <= high)).mean())
+    over = f" over {subject.runs:,} runs" if subject.runs > 1 else ""
+    words = f"Band: chi-square with {subject.runs * n:,} degrees of freedom{over}."
+    finish(
+        figure,
+        subject.claim(_nees_claim(inside, float(values.mean()), n)),
+        subject.caption(words, notes="nees"),
+    )
+    return figure
+
+
+def _nees_claim(inside: float, mean: float, n: int) -> str:
+    words = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
+    return f"{words}; their mean is {mean:.3g} where exact covariances give {n}"
+
+
+def innovations_of(subject: Subject) -> Innovations:
+    """Return the innovations of a run; raises UnavailableError if there are none."""
+    if subject.run is None:
+        raise UnavailableError(
+            "Innovations are those of single runs: draw netkf.open(DIR).replica(0)."
+        )
+    if subject.status in ("interrupted", "failed"):
+        raise UnavailableError(
+            f"The run was {subject.status}, so that its readings are not replayed."
+        )
+    try:
+        return innovations(subject.run)
+    except NetkfError as error:
+        raise UnavailableError(f"There are no innovations to draw: {error}.") from None
+
+
+def nis_figure(subject: Subject) -> Picture:
+    """Draw the NIS of the readings over time with the interval of its means."""
+    found = innovations_of(subject)
+    figure = new_figure(7.4, 4.2)
+    share, mean = draw_nis(figure.add_subplot(), found)
+    claim = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
+    claim += f"{share:.0%} of {len(found.nis):,} readings lie in their {CONFIDENCE:.0%} interval"
+    words = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
+    finish(figure, subject.claim(claim), subject.caption(words))
+    return figure
+
+
+def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
+    """Draw NIS over its degrees of freedom; return the share of readings in their interval and the
+    mean.
+    """
+    known = np.isfinite(found.nis)
+    times, nis, rows = found.times[known], found.nis[known], found.rows[known]
+    chosen = np.linspace(0, len(nis) - 1, min(len(nis), 4000)).astype(int)
+    style = {"ls": "", "marker": ".", "ms": 2.5, "color": SKY, "alpha": 0.7}
+    axes.plot(times[chosen], (nis / rows)[chosen], label="readings", **style)
+    edges = np.linspace(0.0, max(float(times.max()), 1e-12), BINS + 1)
+    which = np.clip(np.digitize(times, edges[1:-1]), 0, BINS - 1)
+    sums, freedom = (np.bincount(which, weights=v, minlength=BINS) for v in (nis, rows))
+    full = freedom > 0.0
+    centres = 0.5 * (edges[1:] + edges[:-1])[full]
+    low, high = _chi_square(freedom[full])
+    axes.fill_between(
+        centres,
+        low,
+        high,
+        color=EXACT,
+        alpha=0.25,
+        lw=0,
+        label=f"{CONFIDENCE:.0%} of means if P is exact",
+    )
+    axes.plot(centres, sums[full] / freedom[full], color=INK, lw=1.6, label="mean of each bin")
+    axes.axhline(1.0, color=EXACT, ls="-.", lw=1.1, label="expected")
+    set_scale(axes, np.concatenate([nis / rows, high]))
+    if axes.get_yscale() == "log":
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3))
+    axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
+    draw_legend(axes)
+    ends = _chi_square(rows.astype(np.float64))
+    share = float(((nis / rows >= ends[0]) & (nis / rows <= ends[1])).mean())
+    return share, float(nis.sum() / rows.sum())
+
+
+def _chi_square(freedom: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the interval of chi-square over its degrees of freedom with probability CONFIDENCE."""
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    ends = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
+    low, high = (np.asarray(end) for end in ends)
+    return low, high
+
+
+def autocorrelation(values: FloatArray, lags: int) -> FloatArray:
+    """Return the autocorrelation at lags 1 .. ``lags`` of a series (M,) of mean 0 by model."""
+    total = float(values @ values)
+    return np.array([values[k:] @ values[:-k] for k in range(1, lags + 1)]) / max(total, 1e-300)
+
+
+def whiteness_figure(subject: Subject) -> Picture:
+    """Draw the autocorrelation of the whitened innovations: the mean node and the worst one."""
+    found = innovations_of(subject)
+    series = _series(found)
+    if not series:
+        raise UnavailableError(f"No node has {MIN_READINGS} readings of one kind.")
+    lags = min(MAX_LAG, min(map(len, series.values())) - 2)
+    curves = {node: autocorrelation(values, lags) for node, values in series.items()}
+    band = LEVEL / np.sqrt(min(map(len, series.values())))
+    outside = sum(
+        int((np.abs(c) > LEVEL / np.sqrt(len(series[n]))).sum()) for n, c in curves.items()
+    )
+    worst = max(curves, key=lambda node: float(np.abs(curves[node]).max()))
+    figure = new_figure(7.4, 4.2)
+    axes = figure.add_subplot()
+    _draw_correlations(axes, curves, worst, band, lags)
+    share = outside / (lags * len(curves))
+    white = "as white noise would" if share <= 0.1 else "so innovations are not white"
+    claim = f"{share:.0%} of autocorrelations are outside their 95% band, {white}"
+    smallest = min(map(len, series.values()))
+    words = (
+        f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
+    )
+    finish(figure, subject.claim(claim), subject.caption(words))
+    return figure
+
+
+def _series(found: Innovations) -> dict[int, FloatArray]:
+    """Return the first whitened component of the innovations of each node with enough of them."""
+    first = np.array([values[0] for values in found.whitened])
+    series = {}
+    for node in np.unique(found.nodes).tolist():
+        values = first[(found.nodes == node) & np.isfinite(first)]
+        if len(values) >= MIN_READINGS:
+            series[node] = values
+    return series
+
+
+def _draw_correlations(
+    axes: Any, curves: dict[int, FloatArray], worst: int, band: float, lags: int
+) -> None:
+    places = np.arange(1, lags + 1)
+    axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
+    axes.axhline(0.0, color=EXACT, lw=0.8)
+    whole = np.array(list(curves.values()))
+    if len(curves) > 1:
+        axes.fill_between(
+            places,
+            whole.min(axis=0),
+            whole.max(axis=0),
+            color=SKY,
+            alpha=0.35,
+            lw=0,
+            label="range of all nodes",
+        )
+        axes.plot(places, whole.mean(axis=0), "-o", color=INK, ms=3.5, label="mean of all nodes")
+    name = "all readings" if worst < 0 else f"node {worst}"
+    label = f"{name}, the largest" if len(curves) > 1 else name
+    axes.plot(places, curves[worst], "--s", color=SENSING, ms=3.5, label=label)
+    axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    top = max(1.3 * float(np.abs(whole).max()), 2.0 * band)
+    axes.set_ylim(-top, top)
+    draw_legend(axes)

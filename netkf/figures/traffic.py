@@ -1,0 +1,301 @@
+"""The figures ``age``, ``links`` and ``delivery``: what happened to the messages."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import binomtest
+
+from netkf.figures.panels import select_evenly
+from netkf.figures.style import (
+    EXACT,
+    FAINT,
+    INK,
+    LOST,
+    MUTED,
+    SECONDS,
+    SENSING,
+    SKY,
+    Picture,
+    draw_legend,
+    finish,
+    new_figure,
+)
+from netkf.figures.subject import Subject, UnavailableError
+from netkf.linalg.arrays import FloatArray
+from netkf.trace.schema import CODES
+
+GRID = 1200
+GOLDEN = 0.6180339887498949
+"""Offsets by multiples of it are spread evenly, so that periodic clocks show no false beats."""
+MAX_DIRECTIONS = 40
+MAX_MARKS = 3000
+CONFIDENCE = 0.95
+TIME_BINS = 30
+
+
+def freshest(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
+    """Return the times at which a node heard a message fresher than all before, and when those were
+    sent, in seconds.
+    """
+    heard = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
+    sent = np.maximum.accumulate(heard["t"] - np.nan_to_num(heard["age"]))
+    return heard["t"], sent
+
+
+def age_at(times: FloatArray, heard: FloatArray, sent: FloatArray) -> FloatArray:
+    """Return the age of information (T,) at ``times``: the time since the freshest message that was
+    heard by then was sent; since time 0 before the first one.
+    """
+    last = np.searchsorted(heard, times, side="right") - 1
+    origin = np.where(last >= 0, sent[np.maximum(last, 0)], 0.0) if len(sent) else 0.0
+    return np.asarray(times - origin)
+
+
+def age_figure(subject: Subject) -> Picture:
+    """Draw the age of information over time, quantiles over the nodes, and its mean per node."""
+    log = subject.log
+    end = _end(subject)
+    places = np.arange(GRID)
+    grid = end * (places + places * GOLDEN % 1.0) / GRID
+    receivers = [node for node in subject.nodes if subject.scenario.topology.degrees.get(node, 0)]
+    ages = {node: age_at(grid, *freshest(log, node)) for node in receivers}
+    if not ages:
+        raise UnavailableError("No node can hear another one.")
+    values = np.array(list(ages.values()))
+    figure = new_figure(8.4, 4.2)
+    left, right = figure.subplots(1, 2, width_ratios=[1.6, 1.0])
+    _draw_ages(left, grid, values)
+    _draw_age_law(right, values)
+    means = {node: float(age.mean()) for node, age in ages.items()}
+    worst = max(means, key=lambda node: means[node])
+    claim = f"On average the freshest message that a node has heard is {values.mean():.3g} s old"
+    if len(means) > 1:
+        claim += f"; node {worst} is worst off with {means[worst]:.3g} s"
+    words = "Age of information: time since the freshest message that a node has heard was sent."
+    finish(figure, subject.claim(claim), subject.caption(words))
+    return figure
+
+
+def _draw_ages(axes: Any, grid: FloatArray, values: FloatArray) -> None:
+    if len(values) > 1:
+        low, median, high = np.quantile(values, (0.05, 0.5, 0.95), axis=0)
+        axes.fill_between(grid, low, high, color=SKY, alpha=0.5, lw=0, label="90% of nodes")
+        axes.plot(
+            grid, values.max(axis=0), color=SENSING, ls="--", lw=1.0, label="worst node at the time"
+        )
+        axes.plot(grid, median, color=INK, lw=1.2, label="median node")
+    else:
+        axes.plot(grid, values[0], color=INK, lw=1.2, label="the node that hears others")
+    axes.set(xlabel=SECONDS, ylabel="age of information, seconds")
+    axes.set_ylim(0.0, 1.05 * max(float(values.max()), 1e-12))
+    draw_legend(axes)
+
+
+def _draw_age_law(axes: Any, values: FloatArray) -> None:
+    """Draw the share of time for which the age exceeds a value: of all nodes, best and worst."""
+    means = values.mean(axis=1)
+    rows: list[tuple[FloatArray, str, str, str]] = [(values.ravel(), INK, "-", "all nodes")]
+    if len(values) > 1:
+        rows += [
+            (values[int(means.argmax())], SENSING, "--", "worst node"),
+            (values[int(means.argmin())], EXACT, "-.", "best node"),
+        ]
+    for sample, colour, dashes, label in rows:
+        x = np.sort(sample)
+        axes.plot(x, 1.0 - np.arange(len(x)) / len(x), color=colour, ls=dashes, label=label)
+    axes.set_yscale("log")
+    axes.set_ylim(1.0 / values.shape[1], 1.3)
+    axes.set(xlabel="age, seconds", ylabel="share of time above")
+    draw_legend(axes, 1)
+
+
+def _end(subject: Subject) -> float:
+    last = float(subject.log["t"][-1])
+    if len(subject.times):
+        last = max(last, float(subject.times[-1]))
+    return last if last > 0.0 else subject.scenario.horizon
+
+
+class Direction(NamedTuple):
+    """Messages from ``sender`` to ``receiver``: when they were sent or lost, and delivered."""
+
+    sender: int
+    receiver: int
+    delivered: FloatArray
+    lost: FloatArray
+
+
+def directions_of(log: np.ndarray) -> list[Direction]:
+    """Return the messages of each direction over which some were sent, by delivery and loss."""
+    arrived = log[log["kind"] == CODES["deliver"]]
+    missed = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
+    # A message that arrived stands with its receiver first, one that was lost with its sender.
+    late = missed["kind"] == CODES["late"]
+    sender = np.where(late, missed["peer"], missed["node"])
+    receiver = np.where(late, missed["node"], missed["peer"])
+    pairs = {(int(i), int(j)) for i, j in zip(arrived["peer"], arrived["node"], strict=True)}
+    pairs |= {(int(i), int(j)) for i, j in zip(sender, receiver, strict=True)}
+    heard, gone = (
+        _by_pair(arrived["peer"], arrived["node"], arrived["t"]),
+        _by_pair(sender, receiver, missed["t"]),
+    )
+    none = np.empty(0)
+    return [Direction(*pair, heard.get(pair, none), gone.get(pair, none)) for pair in sorted(pairs)]
+
+
+def _by_pair(
+    senders: np.ndarray, receivers: np.ndarray, times: FloatArray
+) -> dict[tuple[int, int], FloatArray]:
+    """Return the times of each pair of nodes."""
+    if not len(times):
+        return {}
+    order = np.lexsort((times, receivers, senders))
+    i, j, t = senders[order], receivers[order], times[order]
+    begins = np.flatnonzero((i[1:] != i[:-1]) | (j[1:] != j[:-1])) + 1
+    starts = [0, *begins.tolist()]
+    parts = np.split(t, begins)
+    return {(int(i[s]), int(j[s])): part for s, part in zip(starts, parts, strict=True)}
+
+
+def links_figure(subject: Subject) -> Picture:
+    """Draw every message of each direction at its time: ticks for delivered, crosses for lost."""
+    found = _with_messages(subject)
+    chosen = [found[k] for k in select_evenly(np.arange(len(found)), MAX_DIRECTIONS).tolist()]
+    begin, end = _window(chosen, _end(subject))
+    figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(chosen)))
+    axes = figure.add_subplot()
+    for place, one in enumerate(chosen):
+        for times, marker, colour, size in (
+            (one.delivered, "|", INK, 5.0),
+            (one.lost, "x", LOST, 4.0),
+        ):
+            inside = times[(times >= begin) & (times <= end)]
+            style = {"ls": "", "marker": marker, "ms": size, "color": colour, "mew": 0.9}
+            axes.plot(inside, np.full(len(inside), place), **style)
+    axes.plot([], [], "|", color=INK, label="delivered")
+    axes.plot([], [], "x", color=LOST, label="lost")
+    axes.set_yticks(
+        range(len(chosen)), [f"{d.sender} to {d.receiver}" for d in chosen], fontsize=6.5
+    )
+    axes.set_ylim(-0.8, len(chosen) - 0.2)
+    axes.invert_yaxis()
+    axes.set_xlim(begin, end)
+    axes.set(xlabel=SECONDS, ylabel="sender to receiver")
+    draw_legend(axes)
+    lost, total = (
+        sum(len(d.lost) for d in found),
+        sum(len(d.lost) + len(d.delivered) for d in found),
+    )
+    claim = f"{lost:,} of {total:,} messages were lost ({lost / total:.1%})"
+    shown = f"{len(chosen)} of {len(found)} directions" if len(chosen) < len(found) else ""
+    part = f"the first {end:,.4g} s" if end < _end(subject) else ""
+    cut = " of ".join(filter(None, (shown, part)))
+    sentence = f"Shown: {cut}; the claim counts all." if cut else "All messages are shown."
+    finish(figure, subject.claim(claim), subject.caption(sentence))
+    return figure
+
+
+def _with_messages(subject: Subject) -> list[Direction]:
+    found = directions_of(subject.log)
+    if not found:
+        raise UnavailableError("No message was delivered or lost.")
+    return found
+
+
+def _window(chosen: list[Direction], end: float) -> tuple[float, float]:
+    """Return the longest time from 0 on with at most MAX_MARKS messages, seconds."""
+    times = np.sort(np.concatenate([np.concatenate([d.delivered, d.lost]) for d in chosen]))
+    return 0.0, float(times[MAX_MARKS]) if len(times) > MAX_MARKS else end
+
+
+def wilson(delivered: int, total: int) -> tuple[float, float]:
+    """Return Wilson's interval of a probability with CONFIDENCE."""
+    found = binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
+    return float(found.low), float(found.high)
+
+
+def delivery_figure(subject: Subject) -> Picture:
+    """Draw the delivered fraction of each direction with its interval, and the loss over time."""
+    found = _with_messages(subject)
+    shares = np.array([len(d.delivered) / (len(d.delivered) + len(d.lost)) for d in found])
+    ends = np.array([wilson(len(d.delivered), len(d.delivered) + len(d.lost)) for d in found])
+    figure = new_figure(8.4, 4.2)
+    left, right = figure.subplots(1, 2, width_ratios=[1.3, 1.0])
+    outside = _draw_shares(left, subject, found, shares, ends)
+    _draw_loss(right, found, _end(subject))
+    total = sum(len(d.delivered) + len(d.lost) for d in found)
+    arrived = sum(len(d.delivered) for d in found)
+    claim = f"{arrived / total:.1%} of {total:,} messages arrived"
+    if shares.min() < shares.max():
+        claim += f"; by direction between {shares.min():.0%} and {shares.max():.0%}"
+    words = "Intervals: Wilson, 95%."
+    if outside is not None:
+        words += f" {outside} of {len(found)} intervals miss what the channel of the scenario says."
+    finish(figure, subject.claim(claim), subject.caption(words))
+    return figure
+
+
+def _draw_shares(
+    axes: Any, subject: Subject, found: list[Direction], shares: FloatArray, ends: FloatArray
+) -> int | None:
+    """Draw the directions in the order of their shares; return how many intervals miss what the
+    channel says, None if it says nothing.
+    """
+    order = np.argsort(shares, kind="stable")
+    places = np.arange(len(order))
+    axes.vlines(
+        places,
+        *ends[order].T,
+        color=SKY,
+        lw=max(0.4, min(3.0, 150.0 / len(order))),
+        label="95% interval",
+    )
+    axes.plot(places, shares[order], ls="", marker=".", color=INK, ms=4, label="delivered")
+    said = np.array([_expected(subject, found[k]) for k in order.tolist()])
+    outside = None
+    if np.isfinite(said).any():
+        style = {"ls": "", "marker": "_", "ms": 5, "color": SENSING}
+        axes.plot(places, said, **style, label="the channel of the scenario")
+        outside = int(((said < ends[order, 0]) | (said > ends[order, 1])).sum())
+    axes.set_ylim(-0.02, 1.04)
+    if len(found) <= 16:
+        names = [f"{found[k].sender}>{found[k].receiver}" for k in order.tolist()]
+        axes.set_xticks(places, names, fontsize=6.5, rotation=90 if len(found) > 8 else 0)
+        axes.set_xlabel("direction, sender > receiver")
+    else:
+        axes.set_xlabel(f"{len(found)} directions, in the order of their share")
+    axes.set_ylabel("share of messages delivered")
+    draw_legend(axes)
+    return outside
+
+
+def _expected(subject: Subject, one: Direction) -> float:
+    """Return the delivery probability that the scenario gives a direction; nan if it varies."""
+    link = one.sender, one.receiver
+    loss = subject.scenario.network.channel.loss
+    try:
+        return float(loss.mean_delivery(link, subject.scenario.table_probability(link)))
+    except (ArithmeticError, LookupError, TypeError, ValueError):  # a loss of the user's
+        return float("nan")
+
+
+def _draw_loss(axes: Any, found: list[Direction], end: float) -> None:
+    """Draw the share of messages that were lost in each of TIME_BINS bins, with intervals."""
+    edges = np.linspace(0.0, end, TIME_BINS + 1)
+    lost, arrived = (
+        np.histogram(np.concatenate([getattr(d, name) for d in found]), edges)[0]
+        for name in ("lost", "delivered")
+    )
+    full = np.flatnonzero(lost + arrived)
+    ends = np.array([wilson(int(lost[k]), int(lost[k] + arrived[k])) for k in full.tolist()])
+    centres = 0.5 * (edges[1:] + edges[:-1])[full]
+    axes.fill_between(centres, *ends.T, color=FAINT, alpha=0.6, lw=0, label="95% interval")
+    share = (lost / np.maximum(lost + arrived, 1))[full]
+    axes.plot(centres, share, color=LOST, marker=".", label="lost in each part of the time")
+    whole = lost.sum() / max(int((lost + arrived).sum()), 1)
+    axes.axhline(whole, color=MUTED, ls="--", lw=1.0, label="lost in all")
+    axes.set_ylim(0.0, min(1.02, 1.3 * max(float(ends.max()), 0.02)))
+    axes.set(xlabel=SECONDS, ylabel="share of messages lost")
+    draw_legend(axes, 1)

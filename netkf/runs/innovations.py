@@ -1,0 +1,123 @@
+"""Innovations of a run: what each reading was against what the node expected.
+
+Traces keep no readings. A replay in the SimPy engine, whose events and states are those of the run,
+hands every reading to the filter again, and this time it is noted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.filter import Filter, Reading
+from netkf.core.errors import NetkfError
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.simulate import simulate
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+MAX_EVENTS = 400_000
+"""Events of a run up to which it is replayed: half a minute."""
+
+
+class Innovations(NamedTuple):
+    """Innovations v = y - H xhat of M readings in their order, with S = H P H' + R.
+
+    times (M,); nodes (M,); ``rows`` (M,): the length p of v; nis (M,): v' S^-1 v; ``whitened``: a
+    list of M arrays (p,), the roots of S^-1 times v.
+    """
+
+    times: FloatArray
+    nodes: np.ndarray
+    rows: np.ndarray
+    nis: FloatArray
+    whitened: list[FloatArray]
+
+
+def innovations(run: Run) -> Innovations:
+    """Return the innovations of the samples of a run, by a replay.
+
+    Raises NetkfError with a sentence if there are none: readings are increments, the filter has its
+    own form of readings or gives no covariance, or the run is too long to be replayed.
+    """
+    scenario: Scenario = run.scenario
+    if len(run.log) > MAX_EVENTS:
+        raise NetkfError(f"a run of more than {MAX_EVENTS:,} events is not replayed")
+    if not isinstance(scenario.filter.algorithm, Filter):
+        raise NetkfError("filters of the former contracts keep their readings to themselves")
+    if not scenario.slotted and not scenario.sampled_sensors:
+        raise NetkfError("sensors give increments and no samples")
+    noted: list[tuple[Reading, FloatArray, FloatArray | None]] = []
+    filtering = dataclasses.replace(
+        scenario.filter, algorithm=_noting(scenario.filter.algorithm, noted)
+    )
+    again = simulate(_with_filter(scenario, filtering), run.seed, run.replica, "simpy")
+    return _collect(again, noted)
+
+
+def _with_filter(scenario: Scenario, filtering: Any) -> Scenario:
+    """Return a scenario with another filter that keeps its topology and folder."""
+    found = dataclasses.replace(scenario, filter=filtering)
+    for name in ("_folder", "_trust", "topology"):
+        if name in scenario.__dict__:
+            found.__dict__[name] = scenario.__dict__[name]
+    return found
+
+
+def _noting(algorithm: Filter, noted: list[Any]) -> Filter:
+    """Return the filter with an ``update`` that notes each sample and the estimate before it."""
+    base: Any = type(algorithm)
+
+    def update(self: Any, state: Any, reading: Any) -> Any:
+        if isinstance(reading, Reading):
+            noted.append((reading, *self.estimate(state)))
+        return base.update(self, state, reading)
+
+    def shift(self: Any, state: Any, offset: FloatArray) -> Any:
+        return base.shift(self, state, offset)
+
+    # A class that defines ``update`` must define ``shift`` too, or it would lose its moving frame.
+    own = {"update": update, "shift": shift, "__module__": base.__module__}
+    made: Any = object.__new__(type(base.__name__, (base,), own))
+    made.__dict__.update(algorithm.__dict__)
+    return made  # type: ignore[no-any-return]
+
+
+def _collect(run: Run, noted: list[Any]) -> Innovations:
+    """Return the innovations of what was noted, in the order of the events ``sense``."""
+    nodes, kept = _matched(run, [one for one in noted if len(one[0].y)])
+    whitened = [_whiten(*one) for one in kept]
+    nis = np.array([float(v @ v) for v in whitened])
+    if not np.isfinite(nis).any():
+        raise NetkfError(
+            "there are no readings, or the filter gives no covariance to judge them by"
+        )
+    times = np.array([reading.time for reading, *_ in kept])
+    rows = np.array([len(reading.y) for reading, *_ in kept])
+    return Innovations(times, nodes, rows, nis, whitened)
+
+
+def _matched(run: Run, noted: list[Any]) -> tuple[np.ndarray, list[Any]]:
+    """Return the nodes of what was noted, -1 where a pooled filter reads for several at once."""
+    senses = run.log[run.log["kind"] == CODES["sense"]][["t", "node"]]
+    # A node with several sensors uses them together, and may have an event for each.
+    first = np.ones(len(senses), dtype=bool)
+    first[1:] = senses[1:] != senses[:-1]
+    senses = senses[first]
+    times = np.array([reading.time for reading, *_ in noted])
+    # In slots the last readings come after the last sample, when events are no longer recorded.
+    if len(senses) <= len(noted) and np.array_equal(senses["t"], times[: len(senses)]):
+        return senses["node"], noted[: len(senses)]
+    return np.full(len(noted), -1), noted
+
+
+def _whiten(reading: Reading, xhat: FloatArray, P: FloatArray | None) -> FloatArray:
+    """Return the innovation (p,) times the inverse root of its covariance, nan without one."""
+    if P is None or not np.isfinite(P).all():
+        return np.full(len(reading.y), np.nan)
+    S = reading.H @ P @ reading.H.T + reading.R
+    v = reading.y - reading.H @ xhat
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(S), v))

@@ -1,0 +1,198 @@
+"""Every figure of every kind of result: drawn, within its canvas, and without overlapping text."""
+
+import itertools
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import netkf
+from netkf.cli.main import main
+from netkf.figures.catalogue import FIGURES, Drawing
+from netkf.figures.style import look
+from tests.figures.conftest import KINDS
+
+SLACK = 1.0
+"""Pixels by which boxes may touch: letters do not fill theirs."""
+
+
+def shown_texts(figure):
+    """Return the texts that are drawn: axes that are off hide theirs, and ticks beyond the limits
+    are not drawn.
+    """
+    hidden = set()
+    for axes in figure.axes:
+        if not axes.axison:
+            hidden |= {
+                id(t) for axis in (axes.xaxis, axes.yaxis) for t in axis.findobj(mpl.text.Text)
+            }
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_transform().transform(axis.get_view_interval()))
+            pad = 1e-9 * (high - low)
+            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
+                place = float(axis.get_transform().transform([tick.get_loc()])[0])
+                if not low - pad <= place <= high + pad:
+                    hidden |= {id(tick.label1), id(tick.label2)}
+    renderer = figure.canvas.get_renderer()
+    seen = [
+        text
+        for text in figure.findobj(mpl.text.Text)
+        if text.get_visible() and text.get_text().strip() and id(text) not in hidden
+    ]
+    return [(text.get_text(), text.get_window_extent(renderer)) for text in seen]
+
+
+def assert_well_laid_out(figure):
+    with look():
+        figure.draw(figure.canvas.get_renderer())
+    texts = shown_texts(figure)
+    width, height = figure.bbox.width, figure.bbox.height
+    for words, box in texts:
+        inside = box.x0 >= -SLACK and box.y0 >= -SLACK
+        inside &= box.x1 <= width + SLACK and box.y1 <= height + SLACK
+        assert inside, f"{words!r} leaves the canvas: {box}"
+    for (one, a), (other, b) in itertools.combinations(texts, 2):
+        across = min(a.x1, b.x1) - max(a.x0, b.x0)
+        along = min(a.y1, b.y1) - max(a.y0, b.y0)
+        assert min(across, along) <= SLACK, f"{one!r} overlaps {other!r}"
+
+
+@pytest.fixture(scope="module")
+def drawing(results):
+    made = {}
+
+    def of(kind):
+        if kind not in made:
+            made[kind] = Drawing(results(kind))
+        return made[kind]
+
+    return of
+
+
+@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_text_neither_overlaps_nor_leaves_the_canvas(drawing, kind, name):
+    assert_well_laid_out(drawing(kind).draw(name))
+
+
+SAYS = {
+    "one node": ("error", "In this run the node claims"),
+    "no truth": ("error", "Without ground truth"),
+    "no samples": ("error", "There are no samples"),
+    "interrupted": ("error", "Interrupted: "),
+    "diverged": ("error", "Diverged: "),
+    "ring": ("nis", "sensors give increments and no samples"),
+    "ensemble": ("age", "Events are those of single runs"),
+    "slots": ("stability", "There is no map of the bound H(12)"),
+}
+
+
+@pytest.mark.parametrize("kind", SAYS)
+def test_what_a_run_lacks_stands_in_its_figure(drawing, kind):
+    name, words = SAYS[kind]
+    figure = drawing(kind).draw(name)
+    assert words in " ".join(" ".join(text for text, _ in shown_texts(figure)).split())
+
+
+def test_titles_say_what_the_data_says(results, drawing):
+    """Computed again from the arrays of the run, with numpy alone."""
+    run = results("ring")
+    bound = np.trace(netkf.theory.covariance_bound(run.scenario, run.times), axis1=2, axis2=3)
+    trace = np.trace(run.P, axis1=2, axis2=3)
+    after = run.times > 0.0
+    below = (trace[after].mean(axis=0) <= bound[after].mean(axis=0)).sum()
+    title = drawing("ring").draw("error").get_suptitle()
+    assert title == f"In this run {below} of 6 nodes claim no more than the bound"
+    error = np.sqrt(((run.x[:, None] - run.xhat) ** 2).sum(axis=2))[after]
+    at, worst = np.unravel_index(error.argmax(), error.shape)
+    title = drawing("ring").draw("quantiles").get_suptitle()
+    when = f"{run.times[after][at]:g} s"
+    assert title.startswith(f"Node {worst} was worst: {error.max():.3g} at {when}")
+    kinds = run.events["kind"].value_counts()
+    lost = drawing("ring").draw("links").get_suptitle()
+    total = kinds["lost"] + kinds["deliver"]
+    assert (
+        lost == f"{kinds['lost']:,} of {total:,} messages were lost ({kinds['lost'] / total:.1%})"
+    )
+
+
+def test_an_ensemble_claims_only_what_its_intervals_show(results, drawing):
+    ensemble = results("ensemble")
+    bound = np.trace(
+        netkf.theory.covariance_bound(ensemble.scenario, ensemble.times), axis1=2, axis2=3
+    )[1:].mean(axis=0)
+    sure = ensemble.average[:6, 1] + 1.96 * ensemble.se_average[:6, 1] <= bound
+    title = drawing("ensemble").draw("ratios").get_suptitle()
+    expected = "All 6 nodes stay" if sure.all() else f"{sure.sum()} of 6 nodes stay"
+    assert title.startswith(f"{expected} below the bound in the mean")
+
+
+def test_captions_name_runs_seed_and_interval(drawing):
+    text = drawing("ensemble").draw("error")._supxlabel.get_text().replace("\n", " ")
+    assert "12 runs, seed 1" in text
+    assert "95% intervals" in text
+
+
+def test_axes_have_units(drawing):
+    for kind in ("ring", "ensemble", "slots"):
+        for axes in drawing(kind).draw("error").axes:
+            assert "units" in axes.get_ylabel() or "error |x - xhat|" in axes.get_ylabel()
+
+
+def test_results_draw_themselves(results, sweeps):
+    for kind in ("ring", "ensemble"):
+        figure = results(kind).plot("ratios")
+        assert isinstance(figure, mpl.figure.Figure)
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    assert sweeps["two"].plot().get_suptitle().startswith("The largest RMS error is smallest")
+    with pytest.raises(
+        netkf.ScenarioError, match=r'is not known; got .eror.; did you mean "error"'
+    ):
+        results("ring").plot("eror")
+
+
+@pytest.mark.parametrize("name", ["one", "two", "parts"])
+def test_sweeps_are_drawn_as_maps_and_curves(sweeps, name):
+    figure = sweeps[name].plot()
+    assert_well_laid_out(figure)
+    table = sweeps[name].table
+    assert f"{table['worst_rms'].min():.3g}" in figure.get_suptitle()
+
+
+def test_the_settings_of_the_user_change_nothing_and_are_left_alone(results):
+    with mpl.rc_context({"font.size": 30.0, "axes.spines.top": True}):
+        assert_well_laid_out(results("ring").plot("ratios"))
+        assert mpl.rcParams["font.size"] == 30.0
+
+
+def test_the_command_writes_files(results, tmp_path, capsys):
+    run = results("ring")
+    folder = netkf.save(run, run.scenario, tmp_path / "run")
+    assert main(["plot", str(folder), "--figure", "error,age", "--format", "svg"]) == 0
+    written = capsys.readouterr().out.splitlines()
+    assert written == [str(folder / "figures" / f"{name}.svg") for name in ("error", "age")]
+    assert main(["plot", str(folder), "--figure", "links", "--out", str(tmp_path / "l.pdf")]) == 0
+    assert (tmp_path / "l.pdf").read_bytes().startswith(b"%PDF")
+    capsys.readouterr()
+    for arguments, words in (
+        ([str(tmp_path)], "manifest.json is missing"),
+        ([str(folder), "--figure", "eror"], 'did you mean "error"'),
+        ([str(folder), "--out", str(tmp_path / "one.png")], "one file for several figures"),
+    ):
+        assert main(["plot", *arguments]) == 2
+        line = capsys.readouterr().err
+        assert words in line
+        assert len(line.splitlines()) == 1
+
+
+def test_a_missing_matplotlib_is_one_line(results, monkeypatch, capsys, tmp_path):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    for name in [n for n in sys.modules if n.startswith("netkf.figures")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(netkf.ScenarioError, match=r"needs matplotlib; install it: pip install"):
+        results("ring").plot()
+    assert main(["plot", str(tmp_path)]) == 2
+    assert "pip install 'netkf[plot]'" in capsys.readouterr().err

@@ -1,0 +1,92 @@
+"""The numbers behind figures, against plain loops over events and replays of textbook filters."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import netkf
+from netkf.figures.consistency import autocorrelation
+from netkf.figures.traffic import age_at, directions_of, freshest, wilson
+from netkf.runs.innovations import innovations
+from netkf.studies.consistency import run_consistency
+from tests.conftest import SCENARIOS
+from tests.figures.conftest import one_node
+
+
+def test_the_age_of_information_is_that_of_a_plain_loop(results):
+    run = results("no truth")
+    events = run.events
+    grid = np.linspace(0.0, 1200.0, 50)
+    for node in (1, 8):
+        heard = events[(events["kind"] == "deliver") & (events["node"] == node)]
+        expected = []
+        for t in grid:
+            sent = [0.0, *(e.t - e.age for e in heard.itertuples() if e.t <= t)]
+            expected.append(t - max(sent))
+        np.testing.assert_allclose(age_at(grid, *freshest(run.log, node)), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["ring", "no truth", "slots"])
+def test_directions_have_the_messages_of_the_log(results, kind):
+    run = results(kind)
+    events = run.events
+    for one in directions_of(run.log):
+        sent = events[(events["kind"] == "send") & (events["node"] == one.sender)]
+        sent = sent[sent["peer"] == one.receiver]
+        # What is on its way at the end has neither arrived nor been lost.
+        assert 0 <= len(sent) - len(one.delivered) - len(one.lost) <= 1
+    found = directions_of(run.log)
+    assert sum(len(d.delivered) for d in found) == run.count("deliver")
+    assert sum(len(d.lost) for d in found) == run.count("lost") + run.count("late")
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 5), (5, 5), (3, 10), (500, 1000)])
+def test_wilson_is_the_formula(k, n):
+    z, p = scipy.stats.norm.ppf(0.975), k / n
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    np.testing.assert_allclose(wilson(k, n), (centre - half, centre + half), atol=1e-12)
+
+
+def test_innovations_are_those_of_a_plain_kalman_filter(results):
+    """One node, a scalar plant: xhat and P from the readings by the textbook recursion."""
+    run = results("one node")
+    found = innovations(run)
+    assert len(found.nis) == run.count("sense")
+    np.testing.assert_array_equal(found.nodes, 0)
+    a, R, q = -0.5, 0.5, 1.0
+    now, xhat, P, nis = 0.0, 0.0, 1.0, []
+    again = innovations(netkf.simulate(one_node()))
+    for t, z in zip(found.times, found.whitened, strict=True):
+        f = np.exp(a * (t - now))
+        P = f * f * P + q * (f * f - 1.0) / (2.0 * a)
+        S = P + R
+        v = float(z[0]) * np.sqrt(S)  # the reading is xhat + v
+        nis.append(v * v / S)
+        xhat, P, now = f * xhat + P / S * v, P - P * P / S, t
+        k = np.searchsorted(run.times, t, side="right")
+        if k < len(run.times) and not ((found.times > t) & (found.times <= run.times[k])).any():
+            gap = np.exp(a * (run.times[k] - t))
+            np.testing.assert_allclose(run.xhat[k, 0, 0], gap * xhat, atol=1e-9)
+    np.testing.assert_allclose(found.nis, nis, rtol=1e-9)
+    np.testing.assert_array_equal(again.nis, found.nis)
+
+
+def test_innovations_of_slots_have_the_nis_of_netkf_consistency():
+    scenario = netkf.load(SCENARIOS / "diffusion_regression.toml", {"horizon": 40.0, "probe": 1.0})
+    found = innovations(netkf.simulate(scenario))
+    expected = run_consistency(scenario, scenario.seed, 0).nis
+    for node, nis in zip(scenario.nodes, expected, strict=True):
+        mine = found.nis[(found.nodes == node) & (found.times > 0.0)]
+        np.testing.assert_allclose(mine.mean(), nis, rtol=0.05)  # the last slot is one's alone
+
+
+def test_white_noise_is_found_white_and_coloured_noise_is_not():
+    random = np.random.default_rng(1)
+    white = random.normal(size=4000)
+    found = autocorrelation(white, 10)
+    expected = [np.sum(white[k:] * white[:-k]) / np.sum(white**2) for k in range(1, 11)]
+    np.testing.assert_allclose(found, expected)
+    assert np.abs(found).max() < 4.0 / np.sqrt(4000)
+    moving = white[1:] + 0.8 * white[:-1]
+    assert autocorrelation(moving, 3)[0] == pytest.approx(0.8 / 1.64, abs=0.05)
