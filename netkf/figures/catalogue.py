@@ -47,8 +47,9 @@ class Drawing:
     """Draws several figures of one result, which is reduced once."""
 
     def __init__(self, result: Any) -> None:
-        self._sweep = result if hasattr(result, "keys") and hasattr(result, "table") else None
-        self._subject = None if self._sweep is not None else subject_of(result)
+        is_sweep = hasattr(result, "keys") and hasattr(result, "table")
+        self._sweep: Any = result if is_sweep else None
+        self._subject = None if is_sweep else subject_of(result)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -72,9 +73,10 @@ class Drawing:
                 return message_figure(*self._explain(name, str(reason)))
 
     def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
+        claim = f"No {name} to show"
         if self._subject is None:
-            return f"No {name} to show", reason, [f"{self._sweep.scenario.name}, a sweep."]
-        return self._subject.claim(f"No {name} to show"), reason, self._subject.caption()
+            return claim, reason, [f"{self._sweep.scenario.name}, a sweep."]
+        return self._subject.claim(claim), reason, self._subject.caption()
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, kind: str) -> list[Path]:

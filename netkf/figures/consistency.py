@@ -93,13 +93,17 @@ def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
     mean.
     """
     known = np.isfinite(found.nis)
-    times, nis, rows = found.times[known], found.nis[known], found.rows[known]
+    times, nis = found.times[known], found.nis[known]
+    rows = found.rows[known].astype(np.float64)
     chosen = np.linspace(0, len(nis) - 1, min(len(nis), 4000)).astype(int)
     style = {"ls": "", "marker": ".", "ms": 2.5, "color": SKY, "alpha": 0.7}
     axes.plot(times[chosen], (nis / rows)[chosen], label="readings", **style)
     edges = np.linspace(0.0, max(float(times.max()), 1e-12), BINS + 1)
     which = np.clip(np.digitize(times, edges[1:-1]), 0, BINS - 1)
-    sums, freedom = (np.bincount(which, weights=v, minlength=BINS) for v in (nis, rows))
+    sums, freedom = (
+        np.asarray(np.bincount(which, weights=v, minlength=BINS), dtype=np.float64)
+        for v in (nis, rows)
+    )
     full = freedom > 0.0
     centres = 0.5 * (edges[1:] + edges[:-1])[full]
     low, high = _chi_square(freedom[full])
@@ -119,7 +123,7 @@ def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3))
     axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
     draw_legend(axes)
-    ends = _chi_square(rows.astype(np.float64))
+    ends = _chi_square(rows)
     share = float(((nis / rows >= ends[0]) & (nis / rows <= ends[1])).mean())
     return share, float(nis.sum() / rows.sum())
 

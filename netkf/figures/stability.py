@@ -150,10 +150,10 @@ def _draw_map(axes: Any, table: Any, keys: list[str]) -> str:
         (diverged, "x", "runs diverged"),
         (unbounded, "o", "no bound H(12)"),
     ):
-        at = np.argwhere(group)
-        if len(at):
+        up, along = np.nonzero(group)
+        if len(up):
             style = {"marker": marker, "ls": "", "ms": 8, "mec": LOST, "mfc": "none", "mew": 1.5}
-            axes.plot(at[:, 1], at[:, 0], label=label, **style)
+            axes.plot(along, up, label=label, **style)
     axes.set_xticks(range(len(columns)), [_short(v) for v in columns])
     axes.set_yticks(range(len(rows)), [_short(v) for v in rows])
     axes.set(xlabel=keys[0], ylabel=keys[1])

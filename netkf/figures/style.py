@@ -51,7 +51,7 @@ SERIES = (
 SEQUENTIAL = "cividis_r"
 """Colour map of quantities: its lightness falls as the quantity grows, in grey and for all eyes."""
 
-RC = {
+RC: dict[str, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 9.0,
     "axes.titlelocation": "left",
@@ -87,7 +87,8 @@ def look() -> Iterator[None]:
     """Draw the body's figures with the look of netkf, whatever the user's settings are."""
     with mpl.rc_context():
         mpl.rcdefaults()
-        mpl.rcParams.update(RC)
+        parameters: Any = mpl.rcParams
+        parameters.update(RC)
         yield
 
 
@@ -138,7 +139,7 @@ def _cut(line: str, width: float, size: float, weight: str) -> list[str]:
 def text_width(text: str, size: float, weight: str = "normal") -> float:
     """Return the width of a text in points."""
     font = FontProperties(size=size, weight=weight)
-    measured = TextToPath().get_text_width_height_descent(text, font, ismath=False)  # type: ignore[no-untyped-call]
+    measured = TextToPath().get_text_width_height_descent(text, font, ismath=False)
     return float(measured[0])
 
 

@@ -172,7 +172,13 @@ def links_figure(subject: Subject) -> Picture:
             (one.lost, "x", LOST, 4.0),
         ):
             inside = times[(times >= begin) & (times <= end)]
-            style = {"ls": "", "marker": marker, "ms": size, "color": colour, "mew": 0.9}
+            style: dict[str, Any] = {
+                "ls": "",
+                "marker": marker,
+                "ms": size,
+                "color": colour,
+                "mew": 0.9,
+            }
             axes.plot(inside, np.full(len(inside), place), **style)
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
