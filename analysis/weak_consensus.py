@@ -1,6 +1,8 @@
-"""Weak consensus of the gossip filter: the law of P at each sensor, a random sensor, a token.
+r"""Weak consensus of the gossip filter: the law of P at each sensor, a random sensor, a token.
 
-    python analysis/weak_consensus.py --out weak_consensus.png
+    netkf run scenarios/gossip_ring.toml --runs 400 --trace full --out gossip --set horizon=60 \
+        --set probe=60
+    python analysis/weak_consensus.py gossip --out weak_consensus.png
 
 G Theorem 10: the law at a uniformly random sensor is that of the stationary switched chain at every
 time; every token converges to the same law. Fixed sensors do not share one law (derived; the
@@ -15,39 +17,38 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import netkf
-from netkf.trace.schema import CODES
-
-RING = Path(__file__).parent.parent / "scenarios" / "gossip_ring.toml"
 
 
 def token_positions(run, slots):
-    """(slots, N) place of each token at the end of each slot, from the swaps in the trace."""
-    swaps = run.log[run.log["kind"] == CODES["swap"]]
+    """(N,) place of each token after that many slots, from the swaps in the trace."""
+    swaps = run.events[run.events.kind == "swap"]
+    period = run.scenario.plant.period
     index = {node: k for k, node in enumerate(run.nodes)}
-    position, places = np.arange(len(index)), []
-    for slot in range(slots):
-        came_from = np.arange(len(index))
-        for row in swaps[np.floor(swaps["t"]) == slot]:
-            came_from[index[int(row["node"])]] = index[int(row["peer"])]
-        position = np.argsort(came_from)[position]
-        places.append(position)
-    return np.array(places)
+    position = np.arange(len(index))
+    for slot, rows in swaps.groupby(np.floor(swaps.t / period).astype(int)):
+        if slot < slots:
+            came_from = np.arange(len(index))
+            for node, peer in zip(rows.node, rows.peer, strict=True):
+                came_from[index[node]] = index[peer]
+            position = np.argsort(came_from)[position]
+    return position
 
 
-def main():
+def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("directory", type=Path, metavar="DIR", help="an ensemble with all traces")
     parser.add_argument("--out", type=Path, default=Path("weak_consensus.png"))
-    parser.add_argument("--runs", type=int, default=400)
-    parser.add_argument("--slots", type=int, default=60)
-    options = parser.parse_args()
-    slots = options.slots
-    scenario = netkf.load(RING).replace({"horizon": float(slots), "probe": [float(slots)]})
+    options = parser.parse_args(arguments)
+    ensemble = netkf.open(options.directory)
+    if not isinstance(ensemble, netkf.Ensemble):
+        raise SystemExit(f"{options.directory}: holds no ensemble; make one with netkf run --runs")
+    scenario, slots = ensemble.scenario, round(ensemble.times[-1] / ensemble.scenario.plant.period)
     traces, tokens = [], []
-    for replica in range(options.runs):  # one value a replica: no correlated samples
-        run = netkf.simulate(scenario, replica=replica)
+    for replica in range(ensemble.runs[-1]):  # one value a replica: no correlated samples
+        run = ensemble.replica(replica)
         trace = np.trace(run.P[-1], axis1=1, axis2=2)
         traces.append(trace)
-        tokens.append(trace[token_positions(run, slots)[-1]])
+        tokens.append(trace[token_positions(run, slots)])
     traces, tokens = np.array(traces), np.array(tokens)
     pick = np.random.default_rng(0).integers(traces.shape[1], size=len(traces))
     random_sensor = np.sort(traces[np.arange(len(traces)), pick])
@@ -68,11 +69,12 @@ def main():
     spread = lambda values: np.ptp(np.median(values, axis=0)) / np.median(values)  # noqa: E731
     print(
         f"spread of the medians: sensors {spread(traces):.2f}, tokens {spread(tokens):.2f} "
-        f"({options.runs} replicas, one value each)"
+        f"({len(traces)} replicas, one value each)"
     )
     print("as in the paper: tokens and a random sensor share one law;")
     print("not as in its introduction: fixed sensors do not, the blind one is worst for ever.")
     print(f"written to {options.out}")
+    return spread(traces), spread(tokens)
 
 
 if __name__ == "__main__":
