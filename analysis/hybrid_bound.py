@@ -6,8 +6,8 @@
 
 Each line is a directory: its link rate, the trace of the mean of P at the worst node at the end
 with its standard error, the bound on it, how much of the bound is used, and the limit S of
-infinitely frequent resets. H Theorem 2 says that the mean stays below the bound; Theorem 3 that the bound
-approaches S as one over the rate. Only public names of netkf are used.
+infinitely frequent resets. H Theorem 2 says that the mean stays below the bound; Theorem 3 that
+the bound approaches S as one over the rate. Only public names of netkf are used.
 """
 
 import argparse
