@@ -28,6 +28,7 @@ from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.information_consensus import Hcmci, Icf
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kalman_consensus import Kcf
+from netkf.algorithms.one_bit import OneBit
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
@@ -147,6 +148,7 @@ __all__ = [
     "NoLoss",
     "NodeInfo",
     "OnReadings",
+    "OneBit",
     "PathGraph",
     "PerLink",
     "Periodic",

@@ -164,6 +164,7 @@ class ConstantGain(Filter):
 
     paper: ClassVar[str] = "constant_gain"
     combination: ClassVar[str] = "constant gain"
+    P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True

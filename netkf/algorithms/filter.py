@@ -307,7 +307,7 @@ class Filter(Component):
         """
         return True
 
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+    def payload_numbers(self, n: int, rows: int, phase: int) -> float:
         """Return how many numbers a message holds that a node sends in exchange number ``phase`` of
         a slot (-1 under clocks): n states, so many ``rows`` of readings of its own. Of a symmetric
         matrix one triangle counts; by default a message is an estimate with its covariance.

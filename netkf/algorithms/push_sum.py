@@ -82,10 +82,20 @@ class Network(NamedTuple):
     root: FloatArray | None = None
 
 
+class Sums(NamedTuple):
+    """Running sums of one node: the total (2 + n^2,) that it has ever ``offered`` to each of its
+    neighbours, and the last totals that it ``heard``, by sender.
+    """
+
+    offered: FloatArray
+    heard: Mapping[int, FloatArray]
+
+
 class PushSumState(NamedTuple):
     """Estimate ``xhat`` (n,), z between the exchanges; ``root`` (n, n) of its covariance; ``mass``
     (2 + n^2,), the weight w, the number n~ and the information C~ of P (3)-(5); what the node makes
-    of it, ``network``; whether that is frozen, ``stopped``; its nominal ``degree``.
+    of it, ``network``; whether that is frozen, ``stopped``; its nominal ``degree``; its running
+    ``sums``, if mass is exchanged by them.
     """
 
     xhat: FloatArray
@@ -95,6 +105,7 @@ class PushSumState(NamedTuple):
     network: Network
     stopped: bool
     degree: int
+    sums: Sums | None = None
 
     @property
     def P(self) -> FloatArray:
@@ -106,6 +117,9 @@ class PushSumArrays(NamedTuple):
     """Mass (B, H, m, L) and nominal ``degree`` (H,) of the nodes; what they take the network to be,
     ``information`` (B, H, n, n, L) and ``number`` (B, H, L); the information of a node ``alone``
     (H, n, n); the settings, and the root of P_inf, ``limit`` (n, n), with asymptotic gains.
+
+    Where sums are ``running``: the totals that each node has ``offered`` (B, H, m, L), and those
+    last ``heard`` on each direction (B, W, m, L).
 
     Scratch: ``share`` (H, m, L), ``before`` (m, L), ``found`` (n, n, L), ``found_number`` (1, L),
     ``silent`` (L,); of one lane ``stop``.
@@ -128,6 +142,9 @@ class PushSumArrays(NamedTuple):
     found_number: FloatArray
     silent: np.ndarray
     stop: StopRoom
+    running: bool
+    offered: FloatArray
+    heard: FloatArray
 
 
 class StopRoom(NamedTuple):
@@ -175,17 +192,26 @@ def push_sum_slots(
                         1.0 / arrays.delta,
                     )  # fmt: skip
             if plan.sample[s] >= 0:
-                keep_sums(arrays, samples, room, b)
+                keep_sums(arrays, links, samples, room, b)
             show(nodes, plan, samples, room, b, s)
             rebase(nodes, readings, room, b, s)
 
 
 @kernel
-def keep_sums(arrays: PushSumArrays, samples: SlotSamples, room: SlotRoom, b: int) -> None:
-    """Write what the nodes hold of the sums over the network: the weight, to 1, and n~, to N."""
+def keep_sums(
+    arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, room: SlotRoom, b: int
+) -> None:
+    """Write what the nodes hold of the sums over the network: the weight, to 1, and n~, to N; with
+    running sums also what is on its way to them.
+    """
     for h in range(len(arrays.degree)):
         for k in range(2):
             value = load(room.lanes, arrays.mass, b, h, k)
+            if arrays.running:
+                # Offered to each of the neighbours, less what was heard of theirs.
+                for m in range(links.first[h], links.first[h + 1]):
+                    offered = load(room.lanes, arrays.offered, b, links.sender[m], k)
+                    value += offered - load(room.lanes, arrays.heard, b, m, k)
             store(room.lanes, samples.conserved, b, h, k, value)
 
 
@@ -204,6 +230,8 @@ def exchange_mass(
     # All shares before any mass changes: everyone sends what it had at the start of the exchange.
     for h in range(H):
         split_mass(room.lanes, arrays.mass, b, h, arrays.degree[h], arrays.share)
+    if arrays.running:
+        add_to_totals(arrays, room, b)
     if arrays.rule == PAPER:  # nodes that have stopped send no mass
         # The same as a link that is down, so that receivers keep the mass conserved.
         for m in range(len(links.sender)):
@@ -213,8 +241,43 @@ def exchange_mass(
     for h in range(H):
         for q in range(len(room.lanes)):
             arrays.silent[q] = samples.stopped[b, h, q] < slot
-        received = mix_mass(arrays, plan, links, room, b, s, h)
-        learn(arrays, samples, room, b, h, received, slot)
+        if arrays.running:
+            hear_totals(arrays, plan, links, room, b, s, h)
+            # Without a stop rule nobody asks how many shares came.
+            learn(arrays, samples, room, b, h, spread(room.lanes, 0.0), slot)
+        else:
+            received = mix_mass(arrays, plan, links, room, b, s, h)
+            learn(arrays, samples, room, b, h, received, slot)
+
+
+@kernel
+def add_to_totals(arrays: PushSumArrays, room: SlotRoom, b: int) -> None:
+    """Add the share of each node to the total that it has offered to each of its neighbours."""
+    for h in range(len(arrays.degree)):
+        for i in range(arrays.mass.shape[2]):
+            total = load(room.lanes, arrays.offered, b, h, i)
+            store(room.lanes, arrays.offered, b, h, i, total + load(room.lanes, arrays.share, h, i))
+
+
+@kernel
+def hear_totals(
+    arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, room: SlotRoom, b: int, s: int, h: int
+) -> None:
+    """Make the mass of node ``h`` what has grown of the totals that arrive, and its own share."""
+    lanes, mass = room.lanes, arrays.mass
+    for i in range(mass.shape[2]):
+        store(lanes, mass, b, h, i, 0.0)
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        for i in range(mass.shape[2]):
+            last = load(lanes, arrays.heard, b, m, i)
+            total = load(lanes, arrays.offered, b, links.sender[m], i)
+            gain = select(arrived, total - last, 0.0)
+            store(lanes, mass, b, h, i, load(lanes, mass, b, h, i) + gain)
+            store(lanes, arrays.heard, b, m, i, select(arrived, total, last))
+    for i in range(mass.shape[2]):
+        own = load(lanes, arrays.share, h, i)
+        store(lanes, mass, b, h, i, own + load(lanes, mass, b, h, i))
 
 
 @kernel(inlined=True)
@@ -384,6 +447,9 @@ class PushSum(Filter):
                than ``tolerance`` (spectral norm); "safe": it goes on exchanging but freezes G^(i)
                and N^(i) once they moved by less than ``tolerance`` (relative) while all its links
                were up and its weight positive
+    running_sums  mass is exchanged by totals (Hadjicostis, Vaidya and Dominguez-Garcia, IEEE Trans.
+               Automatic Control 61, 2016): a message holds all that its sender ever offered, so
+               that one that is lost, in one direction alone too, only postpones
     """
 
     gamma: int = field(integer(low=1, high=MOST_STEPS), default=None)
@@ -393,6 +459,7 @@ class PushSum(Filter):
     links: str = field(choice("fresh", "held"), default="fresh")
     stop: str = field(choice(*RULES), default="never")
     tolerance: float = field(number(low=0.0), default=1e-6)
+    running_sums: bool = field(boolean, default=False)
 
     paper: ClassVar[str] = "push_sum"
     combination: ClassVar[str] = "sums"
@@ -432,7 +499,8 @@ class PushSum(Filter):
         # Unused without asymptotic gains, but kernels need an array of the right shape.
         limit = np.zeros((n, n)) if known[0].root is None else known[0].root
         mass = np.stack([state.mass for state in states])
-        m = mass.shape[1]
+        m, running = mass.shape[1], self._keeps_totals
+        ways = sum(info.degree for info in infos) if running else 0
         shapes = (1, m), (m,), (1, n, n), (1,), (1, n, n), (1,), (n, n)
         return (
             PushSumArrays(
@@ -454,6 +522,9 @@ class PushSum(Filter):
                 found_number=aligned((1, LANES)),
                 silent=np.zeros(LANES, dtype=np.uint8),
                 stop=StopRoom(*(np.zeros(shape) for shape in shapes)),
+                running=running,
+                offered=aligned((blocks, H if running else 0, m, LANES)),
+                heard=aligned((blocks, ways, m, LANES)),
             ),
         )
 
@@ -471,7 +542,13 @@ class PushSum(Filter):
         if self.asymptotic:
             root = asymptotic_root(model.F, model.Q, node.information)
             known = Network(node.information, float(node.nodes), root)
-        return PushSumState(mean, first_root(cov), model, mass, known, False, node.degree)
+        sums = Sums(np.zeros(mass.shape), {}) if self._keeps_totals else None
+        return PushSumState(mean, first_root(cov), model, mass, known, False, node.degree, sums)
+
+    @property
+    def _keeps_totals(self) -> bool:
+        """True if masses are exchanged in slots, by running sums."""
+        return self.running_sums and not self.asymptotic
 
     def predict(self, state: Any, gap: float) -> Any:
         """Estimate, covariance and, in running sums, all information."""
@@ -494,6 +571,9 @@ class PushSum(Filter):
         if exchange.phase == AVERAGE:
             # The average is of z, which is the corrected estimate.
             return state, state.xhat
+        if state.sums is not None:
+            offered = state.sums.offered + share(state.mass, state.degree)
+            return state._replace(sums=state.sums._replace(offered=offered)), offered
         # None: nothing is sent, but the links draw all the same.
         silent = self.asymptotic or (self.stop == "paper" and state.stopped)
         return state, None if silent else share(state.mass, state.degree)
@@ -508,6 +588,8 @@ class PushSum(Filter):
             return state._replace(xhat=averaged(state.xhat, received, self.delta or math.inf))
         if self.asymptotic or (self.stop == "paper" and state.stopped):
             return state
+        if state.sums is not None:
+            return self._learned(_heard_totals(state, state.sums, messages), state.mass, False)
         # P steps 2.2, (3)-(5), and 2.3, (6) with the stop rule.
         mass = mixed(state.mass, received, state.degree)
         whole = len(received) == state.degree
@@ -554,7 +636,16 @@ class PushSum(Filter):
         """The sum of the weights is 1, that of the numbers N."""
         if isinstance(state, RunningSums):
             return running_sums.weights(state)
-        return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
+        if state.sums is None:
+            return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
+        return {
+            name: [
+                float(state.mass[k]),
+                float(state.sums.offered[k]) * state.degree,
+                *(-float(total[k]) for total in state.sums.heard.values()),
+            ]
+            for k, name in enumerate(("weight", "number"))
+        }
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
         """Affine: averaging weights sum to one."""
@@ -579,6 +670,9 @@ class PushSum(Filter):
                 words = "is missing for a plant in slots"
                 raise ScenarioError(f"filter.{name}", words, None, f"add {name} = ...")
         self._check_gain(scenario.topology.laplacian_radius)
+        if self.running_sums and self.stop != "never":
+            rule = "must be never with running sums, which a node that stops would freeze"
+            raise ScenarioError("filter.stop", rule, self.stop, 'write stop = "never"')
         for k, sensor in enumerate(scenario.sensors):
             if sensor.varying:
                 raise ScenarioError(
@@ -630,6 +724,15 @@ class PushSum(Filter):
             f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging contracts, "
             "but P Theorems 3, 5 and 6 ask for more than rho(L)",
         )
+
+
+def _heard_totals(state: PushSumState, sums: Sums, messages: Sequence[Message]) -> PushSumState:
+    """Return the state whose mass is its own share and what has grown of the totals it hears."""
+    heard, nothing = dict(sums.heard), np.zeros(state.mass.shape)
+    gained = [message.payload - heard.get(message.sender, nothing) for message in messages]
+    heard |= {message.sender: message.payload for message in messages}
+    mass = share(state.mass, state.degree) + sum(gained, nothing)
+    return state._replace(mass=mass, sums=sums._replace(heard=heard))
 
 
 def corrected(

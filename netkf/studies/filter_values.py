@@ -73,7 +73,7 @@ class Traffic(NamedTuple):
     """What all nodes send in a run: ``transmissions``, a broadcast once, and their ``bytes``."""
 
     transmissions: int
-    bytes: int
+    bytes: float
 
 
 def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:

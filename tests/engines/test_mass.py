@@ -2,10 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import netkf
 from netkf.scenario.reading import from_table
+from netkf.theory.common.errors import error_law
+from tests.engines.agreement import assert_agree
+from tests.theory.test_replay import close, engine_covariance
 
 
 def scenario(rounds, loss, delay):
@@ -57,3 +61,64 @@ def test_mass_in_nodes_and_under_way_stays(engine, rounds):
     start, end = run.sums["weight"]
     assert start == 5.0
     assert abs(end - start) < 1e-12 * start
+
+
+ASYMMETRIC = {"loss": {"kind": "bernoulli", "delivery": 0.7}, "symmetric": False}
+
+
+def in_slots(**settings):
+    table = {
+        "format": 1,
+        "name": "mass in slots",
+        "horizon": 81.0,
+        "probe": 10.0,
+        "seed": 4,
+        "plant": {
+            "kind": "linear",
+            "F": [[0.9, 0.1], [-0.1, 0.9]],
+            "Q": [[0.1, 0.0], [0.0, 0.1]],
+            "cov": [[1.0, 0.0], [0.0, 1.0]],
+            "period": 1.0,
+        },
+        "sensors": [
+            {"nodes": [0, 4], "H": [[1.0, 0.0]], "R": [[0.1]]},
+            {"nodes": [2], "H": [[0.0, 1.0]], "R": [[0.2]]},
+        ],
+        "network": {
+            "graph": {"kind": "grid", "rows": 2, "columns": 3},
+            "activation": {"kind": "broadcast"},
+            "channel": ASYMMETRIC,
+        },
+        "filter": {"kind": "push-sum", "gamma": 2, "delta": 5.1, **settings},
+    }
+    return from_table(table, Path())
+
+
+def test_running_sums_in_slots_lose_nothing_to_one_way_losses():
+    """The ordinary exchange does; P is then what all sensors together are worth."""
+    running, ordinary = in_slots(running_sums=True), in_slots()
+    runs = [netkf.simulate(one) for one in (running, ordinary)]
+    for name, exact in (("weight", 1.0), ("number", 6.0)):
+        start, end = runs[0].sums[name]
+        assert start == exact
+        assert abs(end - start) < 1e-12 * start
+    limit = netkf.theory.push_sum_limits(running).P
+    off = [abs(run.P[-1] - limit).max() / abs(limit).max() for run in runs]
+    assert off[0] < 1e-6 < 1e-2 < off[1]
+
+
+def test_both_engines_keep_the_same_totals_and_theory_follows_them():
+    scenario = in_slots(running_sums=True).replace({"horizon": 12.0, "probe": 1.0})
+    fast = assert_agree(scenario)
+    scenario = scenario.replace({"probe": [0.0, 1.0, 3.0, 9.0]})
+    run = netkf.simulate(scenario)
+    np.testing.assert_allclose(error_law(scenario, run).P, run.P, rtol=1e-9, atol=1e-12)
+    again = in_slots(running_sums=True).replace({"horizon": 3.0, "probe": [0.0, 1.0, 2.0]})
+    exact, run = engine_covariance(again)
+    close(netkf.theory.error_covariance(again, run), exact, 1e-9)
+    assert fast.count("lost") > 50
+
+
+def test_running_sums_go_with_no_stop_rule():
+    with pytest.raises(netkf.ScenarioError, match=r"filter\.stop: must be never with running sums"):
+        in_slots(running_sums=True, stop="safe")

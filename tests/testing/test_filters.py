@@ -27,12 +27,14 @@ SOUND = {
     ],
     "hcmci": [parts.Hcmci(consensus="information", steps=2)],
     "icf": [parts.Icf()],
+    "one-bit": [parts.OneBit()],
     "kcf": [parts.Kcf(epsilon=0.2)],
     "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [
         parts.PushSum(gamma=3, delta=4.0),
         parts.PushSum(gamma=1, delta=4.0, stop="paper", tolerance=0.1),
         parts.PushSum(gamma=1, delta=4.0, asymptotic=True),
+        parts.PushSum(gamma=1, delta=4.0, running_sums=True),
     ],
 }
 KINDS = parts.kinds()

@@ -335,7 +335,7 @@ class SlotRuns:
         found, sums = {}, by_run(self._conserved, self.runs)
         for k, name in enumerate(given[0]):
             # fsum: the check is of the exchanges, and not of its own rounding.
-            start = math.fsum(values[name] for values in given)
+            start = math.fsum(np.concatenate([np.atleast_1d(values[name]) for values in given]))
             now = [math.fsum(column) for column in sums[:, :, k].tolist()]
             found[name] = np.array([[start, value] for value in now])
         return found

@@ -66,12 +66,21 @@ class AveragingRule(ErrorRule):
         # Masses z = (w, n~, C~) of each node, P (3): only the leader starts with a weight.
         self._z = np.concatenate([np.zeros((self._N, 1)), np.ones((self._N, 1)), own], axis=1)
         self._z[scenario.topology.index[algorithm.leader], 0] = 1.0
+        # Running sums: totals offered by each node, and those last heard by i of j.
+        self._running = algorithm.running_sums
+        self._offered = np.zeros_like(self._z)
+        self._heard = np.zeros((self._N, *self._z.shape))
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Exchange the masses, P (3)-(5) (phase 0), or average the estimates, P step 5."""
         if phase == 0:
             received = self._received(slot, 0, 0)
             shares = self._z / self._nu[:, None]
+            if self._running:
+                self._offered = self._offered + shares
+                news = np.where(received[..., None] > 0.0, self._offered - self._heard, 0.0)
+                self._heard, self._z = self._heard + news, shares + news.sum(axis=1)
+                return
             # A node keeps the share of each link over which nothing came: links fail both ways.
             retained = (self._nu - received.sum(axis=1))[:, None]
             self._z = retained * shares + received @ shares
