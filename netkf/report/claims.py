@@ -13,12 +13,17 @@ from netkf.report.messages import DELIVERED, LATE, LOST, information_age
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import SampleIndices, averaged_samples
 from netkf.runs.tables import format_number
+from netkf.studies.compare import Comparison
+from netkf.trace.run import first_difference
 from netkf.trace.schema import CODES
 
 UNUSUAL = 0.9
 """Share of a node's samples whose age of information an unusual one exceeds."""
 MAX_LISTED = 4
 """Links that a sentence lists."""
+MAX_COMPARED = 500_000
+"""Events of a run up to which two runs are compared event by event."""
+LABELS = {"rms_error": "RMS error", "mean_trace": "mean trace P", "mean_nees": "mean NEES"}
 LARGE_NEES = 2.0
 """Squared errors, in units of what P says, that are called larger than P says."""
 
@@ -89,6 +94,43 @@ def findings(source: Source, messages: np.ndarray) -> list[str]:
     if source.verdict is not None:
         found += _of_verdict(source)
     return found
+
+
+def difference_findings(comparison: Comparison | str, one: Source, other: Source) -> list[str]:
+    """Return sentences on how two sources, A and B, differ: certain differences of all nodes
+    together, and the first event in which two single runs differ.
+    """
+    if isinstance(comparison, str):
+        return [comparison]
+    found = []
+    for quantity, node, entries in comparison.rows:
+        entry = entries[1]
+        if entry.real and node < 0:
+            name = LABELS.get(quantity, f"messages {quantity}")
+            found.append(
+                f"Certain: {name} of B is {format_number(entry.value)}, of A "
+                f"{format_number(entries[0].value)}; the difference lies in "
+                f"{format_number(entry.low)} .. {format_number(entry.high)}"
+            )
+    if not found:
+        single = min(comparison.runs) < 2
+        found = ["One run says nothing about certainty" if single else "No difference is certain"]
+    return found + _first_event(one, other)
+
+
+def _first_event(one: Source, other: Source) -> list[str]:
+    """Return the first event in which two recorded runs differ."""
+    if one.run is None or other.run is None:
+        return []
+    if max(len(one.run.log), len(other.run.log)) > MAX_COMPARED:
+        return []
+    if (one.run.nodes, one.run.seed) != (other.run.nodes, other.run.seed):
+        return []  # they differ from the start
+    which = "" if one.kind == "run" else f" of replica {one.run.replica}"
+    difference = first_difference(one.run, other.run)
+    if difference is None:
+        return [f"All {len(one.run.log):,} events{which} are the same"]
+    return [f"First difference{which}: {difference}"]
 
 
 def _ending(source: Source) -> list[str]:

@@ -85,6 +85,7 @@ def run_data(
             "events": len(run.log),
             "messages": len(messages),
             "samples": len(run.times),
+            "links": len(source.scenario.topology.directions),
         },
         "limits": _limits(source),
     }
@@ -106,6 +107,10 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
             f"of {totals['samples']:,} sample times the page holds {data['samples']['count']:,}: "
             f"every {data['samples']['step']}th, the last, and the worst instant of each node. "
             "Averages are of all samples"
+        )
+    if totals["links"] > len(data["links"]):
+        rules.append(
+            f"of {totals['links']:,} directed links the first {len(data['links']):,} are drawn"
         )
     for name, label in (("senses", "sensor readings"), ("marks", "other events of nodes")):
         if data[name]["step"] > 1:

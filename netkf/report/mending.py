@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from netkf.core.errors import NetkfError
 from netkf.report.claims import Worst, worst_node
 from netkf.report.directories import Source
@@ -15,8 +17,8 @@ from netkf.studies.why_text import sentences
 
 SAME = 1e-4
 """Relative difference of numbers that look the same with four digits."""
-MAX_EVENTS = 300_000
-"""Events of a run up to which a page replays it, some seconds."""
+MAX_EVENTS = 60_000
+"""Events until the worst instant up to which a page replays a run, a second or two."""
 REPLAYED_EVENTS, LEAST, MOST = 300_000, 5, 60
 """Events of all replays of a page together, and the replays of a search at least and at most."""
 
@@ -30,9 +32,10 @@ def explain_worst(source: Source) -> Explanation | str | None:
         return None
     if len(run.nodes) == 1 or not run.count("send"):
         return None
-    if len(run.log) > MAX_EVENTS:
-        return f"a run of {len(run.log):,} events is not replayed here: {_command(source, worst)}"
-    replays = max(LEAST, min(MOST, REPLAYED_EVENTS // len(run.log)))
+    events = int(np.searchsorted(run.log["t"], worst.time, side="right"))
+    if events > MAX_EVENTS:
+        return f"{events:,} events until then are many to replay; {_command(source, worst)} does it"
+    replays = max(LEAST, min(MOST, REPLAYED_EVENTS // max(1, events)))
     try:
         return why(run, worst.node, worst.time, replays=replays)
     except NetkfError as error:

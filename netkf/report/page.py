@@ -15,7 +15,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.version import __version__
 from netkf.report import tables
-from netkf.report.claims import findings
+from netkf.report.claims import difference_findings, findings
 from netkf.report.data import Budget, run_data, thinning_rules
 from netkf.report.directories import Source, read_source
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
@@ -177,7 +177,7 @@ def _assemble(
         "labels": [entry.source.label for entry in entries],
         "sweep": tables.sweep_curves(entries[0].source),
     }
-    body = _header(entries) + _main(entries, comparison, command, rules, bool(runs))
+    body = _header(entries, comparison) + _main(entries, comparison, command, rules, bool(runs))
     title = " and ".join(dict.fromkeys(entry.source.scenario.name for entry in entries))
     script, style = _script(), _style()
     policy = POLICY.format(script=content_hash(script), style=content_hash(style))
@@ -193,7 +193,7 @@ def _assemble(
     )
 
 
-def _header(entries: list[_Entry]) -> str:
+def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
     """Return the head of the page: names, claims, and what the data say."""
     parts = []
     for letter, (source, messages, worst) in zip("AB", entries, strict=False):
@@ -209,6 +209,10 @@ def _header(entries: list[_Entry]) -> str:
             lines.insert(min(2, len(lines)), mending_claim(worst))
         parts.append(bullets((line + "." for line in lines), "findings"))
     heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
+    if comparison is not None:
+        sources = [entry.source for entry in entries]
+        lines = difference_findings(comparison, sources[0], sources[1])
+        heading += bullets((line + "." for line in lines), "findings")
     return f'<header class="top">{heading}{"".join(parts)}</header>'
 
 

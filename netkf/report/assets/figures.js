@@ -33,6 +33,20 @@ const Figures = (() => {
     return run.traces;
   }
 
+  // What can be seen of errors without truth: how far a node is from what all nodes say on average.
+  function apart(run, i) {
+    const n = run.n, xhat = run.samples.xhat;
+    return Array.from({ length: run.samples.count }, (_, k) => {
+      let sum = 0;
+      for (let c = 0; c < n; c++) {
+        let mean = 0;
+        for (let j = 0; j < run.N; j++) mean += xhat[(k * run.N + j) * n + c] / run.N;
+        sum += (xhat[(k * run.N + i) * n + c] - mean) ** 2;
+      }
+      return Math.sqrt(sum);
+    });
+  }
+
   function errors(app, runs) {
     const series = [], lines = [];
     runs.forEach((run, r) => {
@@ -45,12 +59,13 @@ const Figures = (() => {
         const all = overNodes(run, traces(run));
         series.push({ label: name + "square root of trace P, all nodes; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
       }
+      if (!run.truth && i >= 0) series.push({ label: name + "distance of node " + run.nodes[i] + "'s estimate from the mean of all nodes'", x, y: apart(run, i), colour, width: 2.5 });
       if (i >= 0) series.push({ label: name + "square root of trace P of node " + run.nodes[i], x, y: root(column(run, traces(run), i)), colour: r ? "orange" : "green", width: 2, dash: "dashed" });
       if (i >= 0 && run.samples.bound) series.push({ label: name + "square root of the bound H(12) on the mean of trace P", x, y: root(column(run, run.samples.bound, i)), colour: "ink", width: 2, dash: r ? "dashed" : "solid" });
     });
     for (const [label, value] of Object.entries(runs[0].limits)) lines.push({ label: label + ", square root:", y: Math.sqrt(value), colour: "purple", dash: lines.length ? "dotted" : "dashed" });
     const truth = runs.some((run) => run.truth);
-    return { title: truth ? "Error and bound" : "Uncertainty", unit: truth ? "|x - xhat|" : "root of trace P", timed: true, series, lines,
+    return { title: truth ? "Error and bound" : "Uncertainty and disagreement", unit: truth ? "|x - xhat|" : "units of the state", timed: true, series, lines,
       note: truth ? "One run: the bound is about the mean over runs." : "Without truth there is no error." };
   }
 
@@ -83,13 +98,16 @@ const Figures = (() => {
   }
 
   function traffic(app, runs) {
-    const names = { delivered: ["blue", "solid"], lost: ["red", "dashed"], late: ["orange", "dotted"], "under way": ["purple", "dotted"] };
+    const dashes = { delivered: "solid", lost: "dashed", late: "dotted", "under way": "dotted" };
+    const colours = [{ delivered: "blue", lost: "red", late: "orange", "under way": "purple" },
+      { delivered: "purple", lost: "green", late: "ink", "under way": "orange" }];
     const series = [];
     runs.forEach((run, r) => {
-      for (const [kind, [colour, dash]] of Object.entries(names)) {
+      for (const [kind, dash] of Object.entries(dashes)) {
+        const colour = colours[r][kind];
         const y = run.traffic[kind], wide = run.horizon / y.length;
         if (!y.some(Boolean)) continue;
-        series.push({ label: letter(runs, r) + kind, x: y.map((_, k) => (k + 0.5) * wide), y, colour, dash, width: r ? 1 : 2 });
+        series.push({ label: letter(runs, r) + kind, x: y.map((_, k) => (k + 0.5) * wide), y, colour, dash, width: 1.8 });
       }
     });
     if (!series.length) return null;
@@ -147,7 +165,8 @@ const Figures = (() => {
     const sure = y.map((v, k) => (low[k] > 0 || high[k] < 0 ? v : NaN));
     const series = [{ label: "B - A, mean squared error of node " + app.nodeId + "; shaded: interval", x, y, low, high, colour: "blue" }];
     if (sure.some(Number.isFinite)) series.push({ label: "certain: the interval leaves out 0", x, y: sure, colour: "red", points: true, width: 3 });
-    return { title: "Where they differ for certain", unit: "squared units", timed: true, series, lines: [{ label: "no difference", y: 0, colour: "ink", dash: "dotted" }],
+    const title = sure.some(Number.isFinite) ? "Where they differ for certain" : "The difference over time, nowhere certain";
+    return { title, unit: "squared units", timed: true, series, lines: [{ label: "no difference", y: 0, colour: "ink", dash: "dotted" }],
       note: "All intervals, of all nodes and times, hold together with probability " + found.confidence + "." };
   }
 

@@ -6,9 +6,11 @@ const Network = (() => {
 
   function view(run, canvas, app) {
     const shades = shadeRange(run);
-    let places = [], radius = 8, spacing = 40;
+    let places = [], radius = 8, spacing = 40, laid = "";
 
     function layout(width, height) {
+      if (laid === width + " " + height) return;
+      laid = width + " " + height;
       const margin = run.N <= MAX_GLYPHS ? 64 : 34, size = Math.max(1, Math.min(width, height) - 2 * margin);
       const wide = Math.max(1, width - 2 * margin), high = Math.max(1, height - 2 * margin);
       const xs = run.positions.map((p) => p[0]), ys = run.positions.map((p) => p[1]);
