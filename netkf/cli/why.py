@@ -34,8 +34,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--replays",
         type=parse_count,
-        default=1000,
-        help="replays that look for the set at most (default: 1000)",
+        help="replays that look for the set at most (default: 100 to 1000, by the events of one)",
     )
     parser.add_argument(
         "--trust",

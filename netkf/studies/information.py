@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.recorded import RecordedSensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.trace.schema import CODES
 
@@ -45,7 +46,8 @@ class Messages:
     """The M messages of a log, ordered by directed link and number.
 
     ``sender``, ``receiver`` and ``number`` (M,) name them; ``sent`` and ``arrived`` (M,) are times
-    in seconds (nan: not arrived), ``outcome`` (M,) is an index of OUTCOMES. ``sent_row`` and
+    in seconds (nan: not arrived), ``phase`` (M,) the exchange of the slot (-1 under clocks),
+    ``outcome`` (M,) is an index of OUTCOMES. ``sent_row`` and
     ``used_row`` (M,) are the rows of the log at which the message was sent and at which its
     receiver used what had arrived (NEVER if it did not arrive in time).
     """
@@ -55,6 +57,7 @@ class Messages:
     number: IntArray
     sent: FloatArray
     arrived: FloatArray
+    phase: IntArray
     outcome: IntArray
     sent_row: IntArray
     used_row: IntArray
@@ -95,7 +98,8 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     if swaps:
         chosen = np.flatnonzero(outcome == USED)
         outcome[chosen[~_last_of_instant(used[chosen], sender[chosen], rows[chosen])]] = UNUSED
-    return Messages(sender, receiver, number, log["t"][rows], arrived, outcome, rows, used)
+    sent, phase = log["t"][rows], log["phase"][rows]
+    return Messages(sender, receiver, number, sent, arrived, phase, outcome, rows, used)
 
 
 class _Links(NamedTuple):
@@ -197,22 +201,37 @@ def find_flow(
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
-    own = np.searchsorted(nodes, messages.receiver)
     combination, count = scenario.hosted.combination, len(messages)
-    if combination == "readings":
-        # What a message carries is the reading of its instant, and nobody passes it on.
-        start = np.searchsorted(log["t"], messages.sent, side="left")
-        node = np.concatenate([nodes, messages.sender])
-        begin = np.concatenate([np.zeros(len(nodes), dtype=np.int64), start])
-        origin = len(nodes) + np.arange(count)
-        last = dict(zip(scenario.nodes, range(len(nodes)), strict=True))
-        return Flow(messages, len(log), node, begin, origin, own, 1 - used, last)
     if combination == "swap":
         return _swaps(nodes, len(log), messages, np.asarray(used))
     origin = np.searchsorted(nodes, messages.sender)
-    start, last = np.zeros(len(nodes), dtype=np.int64), {n: k for k, n in enumerate(scenario.nodes)}
-    pooled = scenario.hosted.pooled
-    return Flow(messages, len(log), nodes, start, origin, own, 1 - used, last, pooled)
+    node, start = nodes, np.zeros(len(nodes), dtype=np.int64)
+    readings = _carry_readings(combination, messages)
+    if readings.any():
+        # What such a message carries is the reading of its instant: a segment of its own, which
+        # nothing flows into.
+        node = np.concatenate([nodes, messages.sender])
+        taken = np.searchsorted(log["t"], messages.sent, side="left")
+        start = np.concatenate([start, taken])
+        origin = np.where(readings, len(nodes) + np.arange(count), origin)
+    return Flow(
+        messages=messages,
+        rows=len(log),
+        node=node,
+        start=start,
+        origin=origin,
+        target=np.searchsorted(nodes, messages.receiver),
+        cost=1 - used,
+        last={n: k for k, n in enumerate(scenario.nodes)},
+        pooled=scenario.hosted.pooled,
+    )
+
+
+def _carry_readings(combination: str, messages: Messages) -> IntArray:
+    """(M,) bool: messages that carry the reading of their sender and nothing else."""
+    if combination == "readings, then estimates":
+        return np.asarray(messages.phase == 0)
+    return np.full(len(messages), combination == "readings")
 
 
 def _swaps(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
@@ -300,7 +319,24 @@ class Readings:
     def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
         self._scenario, self._times, self._at = scenario, log["t"], at
         sensed = np.flatnonzero(log["kind"] == CODES["sense"])
-        self._rows = {node: sensed[log["node"][sensed] == node] for node in scenario.sensing}
+        self._rows = {
+            node: self._with_values(node, sensed[log["node"][sensed] == node])
+            for node in scenario.sensing
+        }
+
+    def _with_values(self, node: int, rows: IntArray) -> IntArray:
+        """Return the rows at which a node took a reading that had values.
+
+        In slots a node with sensors reads in every slot, but a record may lack rows.
+        """
+        scenario = self._scenario
+        sensors = [scenario.sensors[place.entry] for place in scenario.placed[node]]
+        if not scenario.slotted or not all(isinstance(s, RecordedSensor) for s in sensors):
+            return rows
+        recorded = [s.row_times for s in sensors if isinstance(s, RecordedSensor)]
+        times = [t for listed in recorded for other, t in listed if other == node]
+        slots_of = scenario.slot_plant.slots_of
+        return rows[np.isin(slots_of(self._times[rows]), slots_of(np.array(times)))]
 
     def newest(self, node: int, start: int, end: int) -> float:
         """Return the time in seconds of the newest reading of a node in the rows from ``start`` to

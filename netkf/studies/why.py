@@ -44,7 +44,9 @@ from netkf.trace.run import Run
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST, REPLAYS = 3, 1000
+MOST = 3
+MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 100, 1000, 5_000_000
+"""By default as many replays look for a set as have so many events together, within the limits."""
 NEAR = 0.05
 """By default a set is good enough if it brings the trace of P as close as that, relatively, to the
 one of the run in which every message came.
@@ -83,7 +85,7 @@ def why(
     replica: int | None = None,
     below: float | None = None,
     most: int = MOST,
-    replays: int = REPLAYS,
+    replays: int | None = None,
     trust: bool = False,
 ) -> Why:
     """Explain what ``node`` knew at ``at`` seconds in a run: whom it had heard, how old its
@@ -94,7 +96,8 @@ def why(
     (default 0) names one. ``scenario`` is only needed for a run that does not know its own.
     ``below`` is the trace of P that the smallest set of messages has to reach; by default that of
     the run without losses, but for 5 %. The set has at most ``most`` messages, and at most
-    ``replays`` replays look for it. ``trust`` imports classes of modules in the directory.
+    ``replays`` replays look for it, by default 100 to 1000. ``trust`` imports classes of modules in
+    the directory.
 
     Raises ScenarioError for a node, time or run that is not there, and for a run without events.
     """
@@ -114,7 +117,9 @@ def why(
     found = None
     if math.isfinite(before.trace):
         target = (1.0 + NEAR) * replayer.outcome(None).trace if limit is None else limit
-        found = smallest_set(replayer, evidence.candidates(), target, most, replays)
+        wanted = _default_replays(len(replayer.log)) if replays is None else replays
+        count = integer(low=1)("replays", wanted)
+        found = smallest_set(replayer, evidence.candidates(), target, most, count)
     return Why(
         scenario=known.name,
         node=node,
@@ -161,6 +166,10 @@ def _opened(directory: str | Path, replica: int | None, trust: bool) -> Run:
     raise ScenarioError(shorten(directory), rule, None, "run one of its points with netkf run")
 
 
+def _default_replays(events: int) -> int:
+    return min(MAX_REPLAYS, max(MIN_REPLAYS, MAX_EVENTS // max(1, events)))
+
+
 def _instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
     """Return the time that is asked about, in slots the start of its slot."""
     if node not in scenario.topology.index:
@@ -194,6 +203,8 @@ class _Evidence:
     def __init__(self, replayer: Replayer, node: int, most: int) -> None:
         self._replayer, self._node, self._most = replayer, node, most
         self.scenario = replayer.scenario
+        talks, links = self.scenario.hosted.talks, self.scenario.topology.directions
+        self._links = frozenset(links if talks else ())
         swaps, slotted = self.scenario.hosted.combination == "swap", self.scenario.slotted
         self.messages = match_messages(replayer.log, swaps, slotted)
         full = match_messages(replayer.full_log, swaps, slotted)
@@ -252,7 +263,7 @@ class _Evidence:
         return Source(
             node=node,
             sensor=node in self.scenario.placed,
-            neighbour=(node, self._node) in self.scenario.topology.directions,
+            neighbour=(node, self._node) in self._links,
             heard=math.nan if last is None else float(self.messages.sent[last]),
             arrived=math.nan if last is None else float(self.messages.arrived[last]),
             unheard=unheard,

@@ -129,7 +129,7 @@ def _heard(found: Explanation) -> Iterator[str]:
     """Whom the node heard directly."""
     neighbours = [s for s in found.sources if s.neighbour]
     if not neighbours:
-        yield f"Nobody can send to node {found.node}."
+        yield f"No other node sends to node {found.node}."
         return
     heard = sorted((s for s in neighbours if not math.isnan(s.heard)), key=lambda s: -s.heard)
     silent = [s.node for s in neighbours if math.isnan(s.heard)]

@@ -66,6 +66,12 @@ CASES = {
     "gossip": tables(SLOTS, {"kind": "matching", "protocol": "maximal"}, {"kind": "gossip"}),
     "late": tables(SLOTS, {"kind": "broadcast"}, {"kind": "intermittent"}, delay=LATE),
     "diffusion": tables(SLOTS, {"kind": "broadcast"}, {"kind": "diffusion"}),
+    "readings": tables(
+        SLOTS,
+        {"kind": "broadcast"},
+        {"kind": "diffusion-kalman"},
+        [{"nodes": [0, 1, 2, 3, 4], "H": [[1.0]], "R": [[0.2]]}],
+    ),
     "push-sum": tables(
         SLOTS, {"kind": "broadcast"}, {"kind": "push-sum", "gamma": 2, "delta": 4.0}
     ),
@@ -96,7 +102,7 @@ class EventGraph:
         self.scenario, self.kind = scenario, scenario.hosted.combination
         self.now = {node: (node, -1) for node in scenario.nodes}
         self.graph.add_nodes_from(self.now.values())
-        self.cargo, self.waiting = {}, {node: [] for node in scenario.nodes}
+        self.cargo, self.waiting, self.reading = {}, {node: [] for node in scenario.nodes}, {}
         self.time, self.sensed, self.last = {}, {}, []
         for row in events.itertuples():
             self.add(row, used)
@@ -107,12 +113,14 @@ class EventGraph:
         if row.kind in ("sense", "send", "absorb", "swap"):
             self.time[here] = row.t
         if row.kind == "sense":
-            self.sensed[here] = row.t
+            self.reading[row.node] = (*here, "reading")
+            self.sensed[self.reading[row.node]] = row.t
             self.step(here)
+            self.graph.add_edge(self.reading[row.node], here, weight=0)
         elif row.kind == "send":
             key = (row.node, row.peer, row.message)
-            if self.kind == "readings":
-                self.cargo[key] = self.now[row.node]  # the reading just taken, and no more
+            if self.kind == "readings" or (self.kind[:9] == "readings," and row.phase == 0):
+                self.cargo[key] = self.reading[row.node]  # the one just taken, and no more
             else:
                 self.step(here)
                 self.cargo[key] = here
@@ -140,24 +148,14 @@ class EventGraph:
         at most so many others.
         """
         target = self.last[row][node] if row >= 0 else (node, -1)
-        if self.kind == "readings":
-            sources = self.one_hop(target, most)
-        else:
-            backwards = self.graph.reverse(copy=False)
-            lengths = nx.single_source_dijkstra_path_length(backwards, target, cutoff=most)
-            sources = set(lengths)
+        backwards = self.graph.reverse(copy=False)
+        sources = set(nx.single_source_dijkstra_path_length(backwards, target, cutoff=most))
         found = {}
         for vertex in sources:
             if vertex in self.sensed:
                 when = self.taken(self.sensed[vertex])
                 found[vertex[0]] = max(found.get(vertex[0], -math.inf), when)
         return found, sources
-
-    def one_hop(self, target, most):
-        """What the node used itself: its own readings and those that came to it."""
-        own = {v for v in self.graph if v[0] == target[0] and v[1] <= target[1]}
-        into = [(a, b, w) for a, b, w in self.graph.in_edges(own, data="weight") if a[0] != b[0]]
-        return own | {a for a, _, weight in into if weight <= most}
 
     def taken(self, t):
         if not self.scenario.slotted:
@@ -189,7 +187,7 @@ def test_the_newest_readings_are_those_of_a_search_in_a_graph_of_events(runs, na
     scenario, run = runs[name]
     graph = EventGraph(scenario, run.events, used_messages(scenario, run.events))
     random, reached = np.random.default_rng(7), 0
-    for _ in range(25):  # 200 in all cases together
+    for _ in range(25):  # 225 in all cases together
         node = int(random.choice(scenario.nodes))
         at = float(random.uniform(0.0, 12.0))
         at = math.floor(at / 0.5) * 0.5 if scenario.slotted else at
@@ -386,6 +384,32 @@ def test_an_unstable_run_is_not_asked_about_after_it_diverged(build):
     assert run.status == "diverged"
     with pytest.raises(ScenarioError, match="lies after the run had diverged"):
         why(run, 1, 3.0)
+
+
+def test_a_record_without_a_row_is_no_reading(build, tmp_path):
+    rows = [(0.0, 0, 1.0), (0.5, 0, 0.9), (2.0, 0, 1.1)]
+    write(tmp_path / "readings.csv", "t,node,y0", rows)
+    model = {"kind": "unknown", "F": [[0.9]], "Q": [[0.1]], "period": 0.5, "cov": [[1.0]]}
+    sensor = {"kind": "recorded", "nodes": [0], "path": "readings.csv", "H": [[1.0]], "R": [[0.1]]}
+    network = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}}
+    scenario = build(
+        plant=model, sensors=[sensor], network=network, filter={"kind": "diffusion"}, horizon=4.0
+    )
+    found = why(netkf.simulate(scenario), 1, 1.5)
+    assert found.sources[0].reading == 0.5
+    assert math.isnan(found.error)
+    assert "error" not in str(found).replace("RMS error", "")
+    assert why(netkf.simulate(scenario), 1, 3.0).sources[0].reading == 2.0
+
+
+@pytest.mark.parametrize(("kind", "known"), [("local", {1}), ("central", {0, 1})])
+def test_filters_that_do_not_talk_have_no_missing_messages(build, kind, known):
+    sensors = [{"nodes": [0, 1], "H": [[1.0]], "R": [[0.5]]}]
+    run = netkf.simulate(build(filter={"kind": kind}, sensors=sensors))
+    found = why(run, 1, 2.0)
+    assert {s.node for s in found.sources if not math.isnan(s.reading)} == known
+    assert found.smallest.messages == ()
+    assert "No other node sends to node 1." in str(found)
 
 
 @pytest.fixture(scope="module")
