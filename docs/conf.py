@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 from netkf import __version__
+from netkf.scenario.schema_page import schema_page
 
 project = "netkf"
 author = "The netkf developers"
@@ -76,7 +78,16 @@ def short_types(
     )
 
 
+def write_keys(app: Any) -> None:
+    """Write the page of all keys, which `netkf schema --markdown` prints."""
+    page = Path(__file__).with_name("keys.md")
+    text = schema_page()
+    if not page.exists() or page.read_text(encoding="utf-8") != text:
+        page.write_text(text, encoding="utf-8")
+
+
 def setup(app: Any) -> None:
-    """Connect the reading of docstrings and signatures."""
+    """Connect the page of keys, and the reading of docstrings and signatures."""
+    app.connect("builder-inited", write_keys)
     app.connect("autodoc-process-signature", short_types)
     app.connect("autodoc-process-docstring", literal_text)
