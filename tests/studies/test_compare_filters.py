@@ -10,6 +10,7 @@ import scipy.stats
 
 import netkf
 from netkf.cli.main import main
+from tests.conftest import SCENARIOS
 
 RUNS = 6
 SLOTS = """
@@ -185,3 +186,20 @@ def test_under_clocks_a_broadcast_is_one_transmission(ring):
     transmitted = netkf.simulate(chosen).count("transmit")
     assert ci.transmissions == hybrid.transmissions == transmitted > 10
     assert ci.bytes == hybrid.bytes == 8 * 5 * transmitted
+
+
+@pytest.mark.parametrize(
+    "file", sorted((SCENARIOS / "benchmark").glob("*.toml")), ids=lambda f: f.stem
+)
+def test_the_networks_of_the_benchmark_run(file):
+    """Each says what it is: the share of messages that is lost, and how long they take."""
+    scenario = netkf.load(file, {"horizon": 6.0})
+    run = netkf.simulate(scenario)
+    lost = run.count("lost") / run.count("send")
+    if "lossless" in file.stem:
+        assert lost == 0.0
+    elif file.stem != "intel_lab":
+        assert 0.25 < lost < 0.55
+    ages = run.events.loc[run.events["kind"] == "deliver", "age"]
+    assert (ages.max() > 0.1) == (file.stem == "one_way")
+    assert np.isfinite(run.P).all()

@@ -1,0 +1,95 @@
+"""The tables of docs/benchmark.md: filters on the eight networks of scenarios/benchmark.
+
+    python analysis/benchmark.py [RUNS] > tables.md
+
+All filters of a network meet the same truth, the same readings and the same draws. An entry is the
+RMS error over that of the central filter, then NEES / n; a dash says that the filter cannot run
+there. A second table has the bytes that all nodes send per second.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import netkf
+
+FOLDER = Path(__file__).parent.parent / "scenarios" / "benchmark"
+NETWORKS = (
+    *("ring_lossless", "ring_loss", "grid_lossless", "grid_bursts"),
+    *("geometric_loss", "geometric_bursts", "intel_lab", "one_way"),
+)
+UNSTABLE = 100.0
+"""Times the error of the central filter beyond which errors grow for ever."""
+
+
+def filters_of(scenario: netkf.Scenario) -> dict[str, object]:
+    """Return the filters by the names that the table gives them."""
+    degree = max(scenario.topology.degrees.values())
+    # Just above the largest eigenvalue of the Laplacian: averaging contracts for any loss.
+    delta = 1.01 * scenario.topology.laplacian_radius
+    return {
+        "central": "central",
+        "HCMCI, 3 steps": {"kind": "hcmci", "steps": 3},
+        "ICF, 1 step": {"kind": "icf", "steps": 1},
+        "CI, 3 steps": {"kind": "hcmci", "consensus": "information", "steps": 3},
+        "CI, 1 step": {"kind": "hcmci", "consensus": "information", "steps": 1},
+        "CM, 3 steps": {"kind": "hcmci", "consensus": "measurements", "steps": 3},
+        "KCF": {"kind": "kcf", "epsilon": 0.1},
+        "diffusion Kalman": {"kind": "diffusion-kalman"},
+        "diffusion": {"kind": "diffusion"},
+        "push-sum, gamma 10": {
+            **{"kind": "push-sum", "gamma": 10, "delta": delta, "running_sums": True},
+            "leader": scenario.nodes[0],
+        },
+        "hybrid": {"kind": "hybrid", "epsilon": 1.0 / (1.0 + degree)},
+        "intermittent": {"kind": "intermittent"},
+        "local": "local",
+    }
+
+
+def main(runs: int) -> None:
+    """Run all comparisons and print both tables."""
+    names: list[str] = []
+    found: list[Any] = []
+    for network in NETWORKS:
+        scenario = netkf.load(FOLDER / f"{network}.toml")
+        chosen = filters_of(scenario)
+        names = list(chosen)
+        found.append(netkf.compare_filters(scenario, list(chosen.values()), runs, workers=1))
+        print(network, file=sys.stderr, flush=True)
+    header = f"| | {' | '.join(network.replace('_', ' ') for network in NETWORKS)} |"
+    rule = "|---" * (1 + len(NETWORKS)) + "|"
+    print(
+        "\n".join([header, rule, *(_row(name, k, found, _quality) for k, name in enumerate(names))])
+    )
+    print()
+    print(
+        "\n".join([header, rule, *(_row(name, k, found, _traffic) for k, name in enumerate(names))])
+    )
+
+
+def _row(name: str, k: int, found: list[Any], cell: object) -> str:
+    assert callable(cell)
+    return f"| {name} | {' | '.join(cell(one, k) for one in found)} |"
+
+
+def _quality(found: Any, k: int) -> str:
+    row, central = found.rows[k], found.rows[0]
+    if not row.ran:
+        return "-"
+    ratio = row.quantities["rms_error"].value / central.quantities["rms_error"].value
+    nees = row.quantities["nees_ratio"].value
+    if ratio > UNSTABLE or row.status != "complete":
+        return "unstable"
+    return f"{ratio:.2f} ({nees:.2f})"
+
+
+def _traffic(found: Any, k: int) -> str:
+    row = found.rows[k]
+    return f"{row.bytes / 60.0:,.0f}" if row.ran else "-"
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
