@@ -282,7 +282,7 @@ def test_what_ifs_are_those_of_a_run_from_recorded_losses(runs, name, node, at, 
     for what_if in found.what_ifs[1:-1]:
         if any(found.missing[key].outcome != "lost" for key in what_if.messages):
             continue
-        engine = "auto" if name == "hybrid" else "simpy"
+        engine = "simpy" if scenario.slotted else "auto"  # which takes seconds under clocks
         again = recorded(scenario, run, set(what_if.messages), tmp_path, engine=engine)
         assert what_if.trace == pytest.approx(np.trace(again.P[k, node]), rel=1e-9)
         assert what_if.error == pytest.approx(np.linalg.norm(again.error[k, node]), rel=1e-7)
