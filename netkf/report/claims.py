@@ -249,23 +249,22 @@ def _unusual(source: Source, run: StoredRun, into: np.ndarray, worst: Worst) -> 
 
 
 def _of_ensemble(source: Source) -> list[str]:
-    summary = source.summary
-    known = [row for row in summary.get("nodes", []) if row["rms_error"] is not None]
-    if not known:
-        unknown = not source.scenario.plant.truth_known
-        return [
-            "There is no ground truth: errors are unavailable"
-            if unknown
-            else "No node has a finite RMS error"
-        ]
-    worst = max(known, key=lambda row: float(row["rms_error"]))
-    error = worst.get("rms_error_se")
+    """Return which node was worst over all runs, or over those that were kept."""
+    found = source.ensemble
+    assert found is not None
+    errors = np.sqrt(found.average[:, 0])  # of the nodes, and last of all together
+    if not np.isfinite(errors[:-1]).any():
+        if not source.scenario.plant.truth_known:
+            return ["There is no ground truth: errors are unavailable"]
+        return ["No node has a finite RMS error"]
+    k = int(np.nanargmax(errors[:-1]))
+    rows = {row["node"]: row for row in source.summary.get("nodes", [])}
+    error = rows.get(found.nodes[k], {}).get("rms_error_se")
     interval = f" +- {error:.1g}" if error is not None else ""
-    overall = format_number(summary["overall"]["rms_error"])
     return [
-        f"Over {source.runs:,} runs node {worst['node']} was worst: RMS error "
-        f"{format_number(worst['rms_error'])}{interval}, the largest of {len(known)} nodes (all "
-        f"nodes {overall})"
+        f"Over {source.runs:,} runs node {found.nodes[k]} was worst: RMS error "
+        f"{format_number(float(errors[k]))}{interval}, the largest of {len(found.nodes)} nodes "
+        f"(all nodes {format_number(float(errors[-1]))})"
     ]
 
 

@@ -13,6 +13,7 @@ import scipy.stats
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
+from netkf.ensembles.directory import runs_to_directory
 from netkf.report import page as pages
 from netkf.report.claims import findings, worst_node
 from netkf.report.data import Budget
@@ -288,6 +289,26 @@ def test_an_interrupted_a_diverged_and_a_lonely_run_say_so(ring, build, tmp_path
     page = Page(make_page([tmp_path / "empty"]))
     assert "No samples were recorded" in page.shown
     assert page.data["runs"] == []
+
+
+def test_an_interrupted_ensemble_shows_the_runs_that_were_kept(tmp_path):
+    blocks = []
+
+    def interrupt(*_):
+        blocks.append(1)
+        if len(blocks) > 3:
+            raise KeyboardInterrupt
+
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 1.0})
+    with pytest.raises(KeyboardInterrupt):
+        runs_to_directory(scenario, 400, tmp_path / "many", workers=1, progress=interrupt)
+    found = netkf.open(tmp_path / "many")
+    errors = np.sqrt(found.average[:-1, 0])
+    shown = Page(make_page([tmp_path / "many"])).shown
+    done = found.manifest["runs"]["done"]
+    assert 0 < done < 400
+    assert f"Interrupted: {done} of 400 runs are done" in shown
+    assert f"node {found.nodes[errors.argmax()]} was worst: RMS error {errors.max():.4g}" in shown
 
 
 def test_the_command(ring, tmp_path, capsys):

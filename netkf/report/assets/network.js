@@ -6,20 +6,21 @@ const Network = (() => {
 
   function view(run, canvas, app) {
     const shades = shadeRange(run);
-    let places = [], radius = 8, spacing = 40, laid = "";
+    let places = [], radius = 8, spacing = 40, laid = "", named = true;
 
     function layout(width, height) {
       if (laid === width + " " + height) return;
       laid = width + " " + height;
-      const margin = run.N <= MAX_GLYPHS ? 64 : 34, size = Math.max(1, Math.min(width, height) - 2 * margin);
+      const margin = Math.min(run.N <= MAX_GLYPHS ? 64 : 34, width / 8), size = Math.max(1, Math.min(width, height) - 2 * margin);
       const wide = Math.max(1, width - 2 * margin), high = Math.max(1, height - 2 * margin);
       const xs = run.positions.map((p) => p[0]), ys = run.positions.map((p) => p[1]);
       const spanX = Math.max(...xs) - Math.min(...xs) || 1e-9;
       const spanY = Math.max(...ys) - Math.min(...ys) || 1e-9;
       const zoom = Math.min(wide / spanX, high / spanY, 3 * size);
       places = run.positions.map(([x, y]) => [width / 2 + (x - 0.5) * zoom, height / 2 + (y - 0.5) * zoom]);
-      spacing = nearest(places, size);
-      radius = Math.max(3, Math.min(11, spacing * 0.22));
+      spacing = Math.max(12, Math.min(120, (0.7 * size) / Math.sqrt(run.N)));
+      radius = Math.max(2.5, Math.min(11, spacing * 0.22));
+      named = run.N <= (width > 500 ? 60 : 20);
     }
 
     function draw(t) {
@@ -69,7 +70,7 @@ const Network = (() => {
         context.strokeStyle = Theme.colours.ink;
         context.stroke();
         if (chosen) mark(context, x, y);
-        if (run.N <= 60 || chosen) label(context, String(run.nodes[i]), x + radius + 3, y - radius - 2);
+        if (named || chosen) label(context, String(run.nodes[i]), x + radius + 3, y - radius - 2);
       }
     }
 
@@ -214,21 +215,10 @@ const Network = (() => {
     return sorted[Math.floor(0.9 * (sorted.length - 1))] || 1;
   }
 
-  function nearest(places, size) {
-    let least = size;
-    for (let i = 0; i < places.length; i++) {
-      for (let j = 0; j < i; j++) {
-        const gap = Math.hypot(places[i][0] - places[j][0], places[i][1] - places[j][1]);
-        if (gap > 1) least = Math.min(least, gap);
-      }
-    }
-    return Math.max(26, Math.min(140, least));
-  }
-
   // Pixels per unit of each of two components: the same for all nodes and times, so that sizes
   // compare, and one for each component, which may have different units.
   function glyphScale(run, axes, spacing) {
-    return axes.map((c) => (0.34 * Math.min(spacing, 120)) / usualSize(run, c));
+    return axes.map((c) => (0.4 * spacing) / usualSize(run, c));
   }
 
   function usualSize(run, c) {
