@@ -101,6 +101,12 @@ class Everything(Filter):
     def max_measurement_interval(self, state: Own) -> float:
         return 0.1
 
+    def exchange_steps(self, phase: int) -> int:
+        return super().exchange_steps(phase)
+
+    def payload_numbers(self, n: int, rows: int, phase: int) -> float:
+        return 2.0 * n
+
     def steps(self, phase: int) -> int:
         return 1 + phase
 
