@@ -273,6 +273,24 @@ def test_the_canvas_shows_what_is_lost(files, look):
     assert page.evaluate(count) == 0
 
 
+def test_curves_over_many_orders_of_magnitude_are_drawn(look, build, tmp_path):
+    plant = {"kind": "diffusion", "A": [[2.0]], "B": [[1.0]], "cov": [[1.0]]}
+    scenario = build(plant=plant, horizon=600.0, probe=10.0, filter={"kind": "local"})
+    directory = run_to_directory(scenario, tmp_path / "wild").directory
+    assert netkf.open(directory).sq_error.max() > 1e200
+    page = look(write_report([directory], tmp_path / "page.html"))
+    blue = """() => {
+      const canvas = document.querySelector('.curve canvas'), wanted = [0x00, 0x72, 0xb2];
+      const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+      const columns = new Set();
+      for (let k = 0; k < pixels.length; k += 4)
+        if (wanted.every((c, i) => Math.abs(pixels[k + i] - c) < 30))
+          columns.add((k / 4) % canvas.width);
+      return columns.size / canvas.width;
+    }"""
+    assert page.evaluate(blue) > 0.6  # a curve from the left to the right
+
+
 def test_markup_in_texts_runs_nothing(look, tmp_path):
     changes = {"horizon": 1.0, "claim": EVIL, "name": f"name {EVIL}"}
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)

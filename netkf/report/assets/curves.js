@@ -10,12 +10,13 @@ const Curves = (() => {
     const whole = Format.element("figure", { class: "curve" },
       Format.element("figcaption", {}, Format.element("strong", {}, title), " ", note || ""), box,
       legend(series, lines, band));
+    const steep = isSteep(series);
     let plot = null;
     function build() {
       if (plot) plot.destroy();
       box.replaceChildren();
       const width = Math.max(260, box.clientWidth);
-      plot = new uPlot(options(width), data(series), box);
+      plot = new uPlot(options(width), data(series, steep), box);
       box.querySelectorAll("canvas").forEach((canvas) => canvas.setAttribute("aria-hidden", "true"));
       if (timed) plot.over.addEventListener("click", () => app.setTime(plot.posToVal(plot.cursor.left, "x")));
     }
@@ -25,23 +26,31 @@ const Curves = (() => {
       return {
         width, height: HEIGHT, padding: [12, 12, 0, 0], legend: { show: false },
         cursor: { drag: { x: false, y: false }, y: false },
-        scales: { x: { time: false }, y: { range: (u, low, high) => yRange(low, high, lines, band) } },
-        axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34 }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(tick) }],
+        scales: { x: { time: false }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
+        axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
+          ...(xlabel === "node" ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],
         bands: bandsOf(series),
-        hooks: { drawClear: [(u) => drawBand(u, band)], draw: [(u) => overlay(u, lines, timed ? app.time : null)] },
+        hooks: { drawClear: [(u) => drawBand(u, band, steep)], draw: [(u) => overlay(u, lines, timed ? app.time : null, steep)] },
       };
     }
     return { whole, build, redraw: () => plot && plot.redraw(false) };
   }
 
   function tick(value) {
-    return Number.isFinite(value) ? String(Number(value.toPrecision(6))) : "";
+    if (!Number.isFinite(value)) return "";
+    return Math.abs(value) >= 1e5 ? Format.number(value) : String(Number(value.toPrecision(6)));
   }
 
-  function yRange(low, high, lines, band) {
-    const all = [low, high, ...(lines || []).map((line) => line.y), ...(band || [])].filter(Number.isFinite);
+  function powerOfTen(value) {
+    return Number.isInteger(value) ? "1e" + value : "";
+  }
+
+  function yRange(low, high, lines, band, steep) {
+    const marked = [...(lines || []).map((line) => line.y), ...(band || [])];
+    const all = [low, high, ...marked.map((y) => scaled(y, steep))].filter(Number.isFinite);
     if (!all.length) return [0, 1];
+    if (steep) return [Math.floor(Math.min(...all)), Math.ceil(Math.max(...all))];
     const top = Math.max(...all), bottom = Math.min(0, ...all);
     return [bottom, top > bottom ? top + 0.06 * (top - bottom) : bottom + 1];
   }
@@ -72,28 +81,42 @@ const Curves = (() => {
     return /^#[0-9a-f]{6}$/i.test(name) ? name + "38" : name;
   }
 
-  function data(series) {
+  // Curves that grow over orders of magnitude, as those of unstable plants, have a logarithmic
+  // scale: their logarithms are drawn, since uPlot's own scale ends at 1e32.
+  function isSteep(series) {
+    const values = series.flatMap((s) => Array.from(s.y)).filter((v) => v !== null && Number.isFinite(v) && v !== 0);
+    if (!values.length || values.some((v) => v < 0)) return false;
+    values.sort((a, b) => a - b);
+    return values[values.length - 1] > 100 * values[Math.floor(values.length / 2)];
+  }
+
+  function scaled(value, steep) {
+    return steep ? (value > 0 ? Math.log10(value) : NaN) : value;
+  }
+
+  function data(series, steep) {
     const tables = series.map((s) => {
       const columns = s.low ? [s.y, s.low, s.high] : [s.y];
-      return [s.x, ...columns].map((column) => Array.from(column, (v) => (Number.isFinite(v) ? v : null)));
+      const known = (value) => (Number.isFinite(value) ? value : null);
+      return [Array.from(s.x, known), ...columns.map((column) => Array.from(column, (v) => known(scaled(v, steep))))];
     });
     return tables.length ? uPlot.join(tables) : [[]];
   }
 
-  function drawBand(u, band) {
+  function drawBand(u, band, steep) {
     if (!band) return;
-    const { ctx, bbox } = u, top = u.valToPos(band[1], "y", true), bottom = u.valToPos(band[0], "y", true);
+    const [bottom, top] = band.map((y) => u.valToPos(scaled(y, steep), "y", true)), { ctx, bbox } = u;
     ctx.save();
     ctx.fillStyle = faded(Theme.colours.green);
     ctx.fillRect(bbox.left, top, bbox.width, bottom - top);
     ctx.restore();
   }
 
-  function overlay(u, lines, time) {
+  function overlay(u, lines, time, steep) {
     const { ctx, bbox } = u;
     ctx.save();
     for (const line of lines || []) {
-      const y = u.valToPos(line.y, "y", true);
+      const y = u.valToPos(scaled(line.y, steep), "y", true);
       ctx.strokeStyle = colour(line.colour);
       ctx.lineWidth = 1.5 * devicePixelRatio;
       ctx.setLineDash((DASHES[line.dash] || []).map((part) => part * devicePixelRatio));
