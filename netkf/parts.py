@@ -18,6 +18,7 @@ from netkf.algorithms.filter import (
     Filter,
     Increments,
     Message,
+    Model,
     NodeInfo,
     Reading,
     State,
@@ -34,12 +35,14 @@ from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.fields import (
     boolean,
+    covariance,
     integer,
     matrix,
     number,
     positive,
     probability,
     setting,
+    square,
     vector,
 )
 from netkf.network.channels import (
@@ -99,6 +102,10 @@ def kinds() -> dict[str, dict[str, type]]:
     return {family: dict(names) for family, names in KINDS.items()}
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 __all__ = [
     "Belief",
     "Bernoulli",
@@ -143,6 +150,7 @@ __all__ = [
     "Loss",
     "Matching",
     "Message",
+    "Model",
     "Network",
     "NoDelay",
     "NoLoss",
@@ -180,6 +188,7 @@ __all__ = [
     "UnknownDiffusion",
     "UnknownPlant",
     "boolean",
+    "covariance",
     "integer",
     "kinds",
     "matrix",
@@ -187,5 +196,6 @@ __all__ = [
     "positive",
     "probability",
     "setting",
+    "square",
     "vector",
 ]

@@ -1,5 +1,6 @@
 """The Python face: what users touch first."""
 
+import dataclasses
 import json
 import pickle
 
@@ -8,6 +9,7 @@ import pandas as pd
 import pytest
 
 import netkf
+from netkf.ensembles.blocks import packed
 from netkf.runs.run import run_to_directory
 
 
@@ -133,3 +135,95 @@ def test_theory_can_be_sent_to_other_processes():
     for name in netkf.theory.__all__:
         function = getattr(netkf.theory, name)
         assert pickle.loads(pickle.dumps(function)) is function
+
+
+def test_parts_stand_for_tables_in_replace(ring):
+    parts = netkf.parts
+    cases = [
+        ({"filter": parts.Hybrid(0.2)}, {"filter": {"kind": "hybrid", "epsilon": 0.2}}),
+        ({"network.graph": parts.PathGraph(6)}, {"network.graph": {"kind": "path", "nodes": 6}}),
+        (
+            {"network.channel": parts.Channel(loss=parts.Bernoulli(0.5))},
+            {"network.channel": {"loss": {"kind": "bernoulli", "delivery": 0.5}}},
+        ),
+        (
+            {"network.channel.delay": parts.ConstantDelay(0.1)},
+            {"network.channel.delay": {"kind": "constant", "seconds": 0.1}},
+        ),
+        (
+            {"network.activation": parts.Poisson(rate=3.0)},
+            {"network.activation": {"kind": "poisson", "rate": 3.0}},
+        ),
+        (
+            {"sensors.0.sampling": parts.Periodic(period=0.1)},
+            {"sensors.0.sampling": {"kind": "periodic", "period": 0.1}},
+        ),
+        (
+            {"filter": netkf.Filtering(parts.Central(), cov=2.0 * np.eye(2))},
+            {"filter": {"kind": "central", "cov": [[2.0, 0.0], [0.0, 2.0]]}},
+        ),
+        (
+            {"filter": parts.Hybrid(0.2), "filter.epsilon": 0.25},
+            {"filter": {"kind": "hybrid", "epsilon": 0.25}},
+        ),
+    ]
+    for given, table in cases:
+        assert ring.replace(given) == ring.replace(table)
+    with pytest.raises(netkf.ScenarioError, match=r"network.graph.kind: must be one of .*; got 'hybrid'"):
+        ring.replace({"network.graph": parts.Hybrid(0.2)})
+
+
+def test_a_sweep_takes_parts(ring):
+    filters = [netkf.parts.Hybrid(0.3), netkf.parts.Local()]
+    table = netkf.sweep(ring.replace({"horizon": 1.0}), {"filter": filters})
+    assert table["filter"].tolist() == [
+        '{ kind = "hybrid", epsilon = 0.3 }',
+        '{ kind = "local" }',
+    ]
+
+
+def test_classes_that_nobody_can_import_are_refused_in_one_line(ring, tmp_path):
+    class Mine(netkf.parts.Hybrid):
+        pass
+
+    scenario = dataclasses.replace(ring, horizon=1.0, filter=netkf.Filtering(Mine(0.3)))
+    run = netkf.simulate(scenario)
+    with pytest.raises(netkf.ScenarioError, match=r"cannot name the class Mine .*; put it into a"):
+        netkf.save(run, scenario, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(
+        netkf.EngineError, match=r"workers cannot import the class Mine .*workers=1"
+    ):
+        packed(scenario)
+
+
+def test_results_show_themselves_in_a_line_and_as_a_table(ring):
+    short = ring.replace({"horizon": 2.0, "name": "<b>ring</b>"})
+    shown = {
+        "run": netkf.simulate(short),
+        "ensemble": netkf.monte_carlo(short, 10, workers=1),
+        "verdict": netkf.check(short, 20, workers=1),
+        "consistency": netkf.consistency(short, 10, workers=1),
+        "size": netkf.size(short, "network.activation.rate", 1.0, 50.0, "worst_trace<=4"),
+    }
+    for name, result in shown.items():
+        line = str(result)
+        assert line == repr(result)
+        assert len(line) < 200
+        assert line.startswith("<netkf")
+        page = result._repr_html_()
+        assert "<b>ring" not in page
+        assert page.count("<tr>") + page.count("<tr ") > len(short.nodes) or name == "size"
+        assert not [attribute for attribute in dir(result) if attribute.startswith("_")]
+    assert "20 runs" in str(shown["verdict"])
+    run, table = shown["run"], shown["run"]._shown_table()
+    after = run.times > 0.0
+    rms = np.sqrt(((run.x[after, None] - run.xhat[after]) ** 2).sum(axis=2).mean(axis=0))
+    np.testing.assert_allclose(table["RMS error"], rms)
+
+
+def test_completion_offers_public_names_only():
+    for module in (netkf, netkf.parts, netkf.theory, netkf.testing):
+        private = {"annotations", "Any", "TYPE_CHECKING", "importlib", "np"}
+        assert not private & set(dir(module))
+        assert all(hasattr(module, name) for name in dir(module))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import partial
@@ -17,6 +18,7 @@ from netkf.checks.clocked import CHECKS as UNDER_CLOCKS
 from netkf.checks.evidence import (
     BROKEN,
     NOT_PROMISED,
+    VERDICTS,
     Assumption,
     Evidence,
     Finding,
@@ -41,6 +43,7 @@ from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
+from netkf.core.shown import Shown
 from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.ensembles.replicas import replicate
@@ -61,7 +64,7 @@ TWIN_TOLERANCE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class Verdict:
+class Verdict(Shown):
     """Evidence for every promise; true if none is broken.
 
     ``confidence``: all intervals of all rows, of earlier looks too, hold together with at least
@@ -85,6 +88,11 @@ class Verdict:
 
     def __bool__(self) -> bool:
         return all(row.verdict != BROKEN for row in self.rows)
+
+    def __repr__(self) -> str:
+        counts = Counter(row.verdict for row in self.rows)
+        told = ", ".join(f"{counts[name]} {name}" for name in VERDICTS if counts[name])
+        return f"<netkf verdict on {self.scenario!r}: {told or 'no row'}; {self.runs:,} runs>"
 
     @property
     def table(self) -> pd.DataFrame:

@@ -14,7 +14,7 @@ from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.imports import forget_other
-from netkf.scenario.plugins import in_words, plugged_in
+from netkf.scenario.plugins import in_words, plugged_in, unnamed_class
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]
@@ -79,6 +79,10 @@ def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replic
 
 def packed(scenario: Scenario) -> PackedScenario:
     """A scenario for other processes; raises EngineError where it cannot be pickled."""
+    unnamed = unnamed_class(scenario)
+    if unnamed is not None:
+        words = f"workers cannot import the class {unnamed} of a notebook, a prompt or a function"
+        raise EngineError(f"{words}; put it into a module (a .py file), or use workers=1")
     try:
         payload = pickle.dumps(scenario, protocol=pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError) as error:

@@ -11,6 +11,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer
+from netkf.core.shown import Shown
 from netkf.ensembles.replicas import Progress, replicate_blocks
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
 from netkf.linalg.arrays import FloatArray
@@ -27,7 +28,7 @@ LOAD = "load it first: netkf.monte_carlo(netkf.load(path), runs)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Ensemble:
+class Ensemble(Shown):
     """What many runs of one scenario came to.
 
     times (T,), nodes (N,), ``runs`` (T,): how many have that sample (runs that diverge end early);
@@ -76,6 +77,19 @@ class Ensemble:
         say so. Raises ScenarioError for another name or without matplotlib.
         """
         return plot_by_name(self, figure)
+
+    def _shown_table(self) -> pd.DataFrame:
+        """Averages over the samples after time 0, a row per node and one for all."""
+        import pandas as pd
+
+        mean, error = self.average, self.se_average
+        columns = {
+            "RMS error": np.sqrt(mean[:, 0]),
+            "mean trace P": mean[:, 1],
+            "its standard error": error[:, 1],
+            "NEES": mean[:, 2],
+        }
+        return pd.DataFrame(columns, index=pd.Index([*map(str, self.nodes), "all"], name="node"))
 
     @cached_property
     def table(self) -> pd.DataFrame:

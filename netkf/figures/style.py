@@ -69,7 +69,7 @@ RC: dict[str, Any] = {
 FORMATS = ("png", "svg", "pdf")
 RESOLUTION = 130
 SECONDS = "simulated seconds"
-TITLE_SIZE, CAPTION_SIZE = 10.5, 7.5
+TITLE_SIZE, CAPTION_SIZE, LEGEND_SIZE = 10.5, 7.5, 7.5
 
 
 class Picture(Figure):
@@ -162,16 +162,25 @@ def draw_legend(axes: Any, columns: int | None = None) -> None:
     figure = axes.figure
     share = axes.get_subplotspec().get_position(figure).width if axes.get_subplotspec() else 1.0
     room = share * float(figure.get_size_inches()[0]) * 72.0 * 0.88
-    widest = max(text_width(label, 7.5) for label in labels) + 7.5 * 4.6
     axes.legend(
         handles,
         labels,
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
-        ncols=columns or max(1, min(len(labels), int(room / widest))),
+        ncols=columns or _columns(labels, room),
         columnspacing=1.4,
         borderaxespad=0.2,
     )
+
+
+def _columns(labels: Sequence[str], room: float) -> int:
+    """Return the largest number of columns of a legend that fits ``room`` points."""
+    widths = [text_width(label, LEGEND_SIZE) + 4.6 * LEGEND_SIZE for label in labels]
+    for count in range(len(labels), 1, -1):
+        rows = -(-len(labels) // count)
+        if sum(max(widths[k : k + rows]) for k in range(0, len(labels), rows)) <= room:
+            return count
+    return 1
 
 
 def draw_message(axes: Any, message: str) -> None:

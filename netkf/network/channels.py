@@ -345,9 +345,9 @@ class Channel(Component):
     delay      how long the others take
     symmetric  both messages of an activation share one fate; false: each direction has its own
 
-    If symmetric, the two messages of one activation share one draw of each model, so that with
-    equal probabilities both arrive or none; otherwise each direction has draws of its own. A link
-    of a directed graph is a single direction.
+    If symmetric, the two messages of one activation share one draw of each model: with equal
+    probabilities both arrive or none, and both take the same random delay. Otherwise each direction
+    has draws of its own. A link of a directed graph is a single direction.
     """
 
     loss: Loss = field(instance(Loss), default=NoLoss())

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError, WriteError
-from netkf.scenario.plugins import module_files
+from netkf.scenario.plugins import module_files, unnamed_class
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolved, to_toml
@@ -193,7 +193,14 @@ def remove_own(directory: Path, scenario: Scenario) -> None:
 
 
 def check_sources(scenario: Scenario) -> None:
-    """Raise ScenarioError for a file of the scenario with the name of a file of run directories."""
+    """Raise ScenarioError for a file of the scenario with the name of a file of run directories,
+    and for a class that scenario.toml cannot name.
+    """
+    unnamed = unnamed_class(scenario, in_script=False)
+    if unnamed is not None:
+        words = f"cannot name the class {unnamed} of this script, notebook or function"
+        remedy = "put it into a module (a .py file beside the scenario) and import it from there"
+        raise ScenarioError("scenario.toml", words, None, remedy)
     for source in source_files(scenario):
         if source.name in OWN_FILES:
             words = "is a name that run directories use themselves"

@@ -27,6 +27,23 @@ def is_ours(cls: type) -> bool:
     return cls.__module__.partition(".")[0] == "netkf"
 
 
+def unnamed_class(scenario: Any, in_script: bool = True) -> str | None:
+    """Return the name of a class of a user that no module has, so that a file or another process
+    cannot name it: one of a notebook, of a prompt or of a function. None if there is none. With
+    ``in_script`` it may be one of the script that runs, which worker processes run once more.
+    """
+    for part in plugged_in(scenario):
+        cls = type(part)
+        main = sys.modules.get("__main__")
+        file = getattr(main, "__file__", None)
+        is_script = file is not None and Path(file).is_file()
+        if "<locals>" in cls.__qualname__:
+            return cls.__name__
+        if cls.__module__ == "__main__" and not (in_script and is_script):
+            return cls.__name__
+    return None
+
+
 def module_files(scenario: Component) -> dict[str, Path | None]:
     """Return the modules of users' classes: the file if it is beside the scenario, else None."""
     folder = getattr(scenario, "_folder", None)

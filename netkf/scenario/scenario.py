@@ -61,7 +61,9 @@ class Scenario(DerivedScenario):
     def replace(self, changes: Mapping[str, Any]) -> Scenario:
         """Return the scenario with some keys changed, e.g. ``{"network.activation.rate": 5.0}``.
 
-        Keys are paths as in a scenario file; entries of a list are numbered, ``sensors.0.R``.
+        Keys are paths as in a scenario file; entries of a list are numbered, ``sensors.0.R``. A
+        table may be given as a part, ``{"filter": netkf.parts.Hybrid(0.3)}``; it replaces the whole
+        table, so that ``mean`` and ``cov`` of the filter are the plant's again.
         Raises ScenarioError for a key that does not exist or a value that breaks a rule.
         """
         return changed(self, changes)

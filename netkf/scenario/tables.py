@@ -16,7 +16,7 @@ from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.plugins import blame, in_words, is_ours
 from netkf.scenario.registry import KINDS, SLOTTED, find
-from netkf.scenario.writing import as_table
+from netkf.scenario.writing import as_table, part_as_table
 
 FORMAT = 1
 MAX_DEPTH = 30
@@ -80,6 +80,8 @@ def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
 def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
     if not keys:
         return value
+    if isinstance(node, Component):
+        node = part_as_table(node)
     key, rest = keys[0], keys[1:]
     if isinstance(node, (list, tuple)):
         if not key.isdecimal() or int(key) >= len(node):
@@ -211,6 +213,8 @@ def _kind(family: str, origin: Origin, value: Any, default: str | None = None) -
 
 
 def _table(value: Any) -> dict[str, Any]:
+    if isinstance(value, Component):
+        return part_as_table(value)
     if not isinstance(value, Mapping):
         raise ScenarioError("", "must be a table", value, "write key = value pairs")
     return dict(value)
@@ -226,7 +230,7 @@ def _list(value: Any, origin: Origin) -> tuple[Any, ...]:
 
 def _sensor(value: Any, origin: Origin) -> Any:
     table = _table(value)
-    if isinstance(table.get("sampling"), Mapping):
+    if isinstance(table.get("sampling"), (Mapping, Component)):
         read = partial(_kind, "sampling", origin)
         table["sampling"] = _under("sampling", read, table["sampling"])
     return _kind("sensor", origin, table, "linear")

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from netkf.core.fields import Component, SourceFile
+from netkf.network.channels import Channel
 from netkf.network.graphs import RandomGraph
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import Filtering, Network
-from netkf.scenario.registry import name_of
+from netkf.scenario.registry import FAMILIES, FORMER, name_of
 
 
 def as_table(scenario: DerivedScenario) -> dict[str, Any]:
@@ -49,15 +50,42 @@ def _scenario(
     table = _fields(scenario, defaults)
     table["plant"] = _kind("plant", plant, defaults)
     table["sensors"] = [_sensor(sensor, defaults) for sensor in scenario.sensors]
-    table["network"] = {"graph": _kind("graph", network.graph, defaults)}
-    if network.activation is not None:
-        table["network"]["activation"] = _kind("activation", network.activation, defaults)
-    channel = _fields(network.channel, True)
-    channel["loss"] = _kind("loss", network.channel.loss, defaults)
-    channel["delay"] = _kind("delay", network.channel.delay, defaults)
-    table["network"]["channel"] = channel
+    table["network"] = _network(network, defaults)
     table["filter"] = _filtering(filtering, defaults)
     return {"format": 1, **table}
+
+
+def part_as_table(part: Component) -> dict[str, Any]:
+    """Return the table of a scenario file for a part: a plant, a sensor, a filter, a network and
+    everything inside one, or a Filtering or Belief; without fields at their defaults.
+    """
+    if isinstance(part, Network):
+        return _network(part, defaults=False)
+    if isinstance(part, Channel):
+        return _channel(part, defaults=False)
+    if isinstance(part, Filtering):
+        return _filtering(part, defaults=False)
+    if isinstance(part, Sensor):
+        return _sensor(part, defaults=False)
+    families = (f for f, contract in FAMILIES.items() if isinstance(part, contract))
+    family = next(families, "filter" if isinstance(part, FORMER["filter"]) else None)
+    if family == "sampling" and isinstance(part, FAMILIES["activation"]):
+        family = "activation"  # a clock of links is a clock too
+    return _fields(part, False) if family is None else _kind(family, part, defaults=False)
+
+
+def _network(network: Network, defaults: bool) -> dict[str, Any]:
+    table = {"graph": _kind("graph", network.graph, defaults)}
+    if network.activation is not None:
+        table["activation"] = _kind("activation", network.activation, defaults)
+    return {**table, "channel": _channel(network.channel, defaults)}
+
+
+def _channel(channel: Channel, defaults: bool) -> dict[str, Any]:
+    table = _fields(channel, True)
+    table["loss"] = _kind("loss", channel.loss, defaults)
+    table["delay"] = _kind("delay", channel.delay, defaults)
+    return table
 
 
 def _sensor(sensor: Sensor, defaults: bool) -> dict[str, Any]:

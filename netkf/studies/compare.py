@@ -18,6 +18,7 @@ import scipy.special
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import number
 from netkf.core.printable import shorten
+from netkf.core.shown import Shown
 from netkf.runs.documents import (
     COUNT,
     ENDED,
@@ -202,7 +203,7 @@ def damage_named(directory: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Shown):
     """Rows side by side; all marks together are right with probability ``confidence``.
 
     ``notes`` are those of the summaries, on what their averages leave out.
@@ -214,6 +215,25 @@ class Comparison:
     confidence: float
     rows: tuple[ComparedRow, ...]
     notes: tuple[tuple[str, ...], ...] = ()
+
+    def __repr__(self) -> str:
+        real = sum(any(entry.real for entry in row.entries) for row in self.rows)
+        names = ", ".join(self.directories[:3]) + (", ..." if len(self.directories) > 3 else "")
+        return f"<netkf comparison of {names}: {real} of {len(self.rows)} rows differ for certain>"
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row per quantity and node, -1 for all nodes, with the value of every directory;
+        ``differs`` names those that differ from the first for certain.
+        """
+        rows = []
+        for row in self.rows:
+            values = {d: e.value for d, e in zip(self.directories, row.entries, strict=True)}
+            real = [d for d, e in zip(self.directories, row.entries, strict=True) if e.real]
+            rows.append(
+                {"quantity": row.quantity, "node": row.node, **values, "differs": ", ".join(real)}
+            )
+        return pd.DataFrame(rows)
 
     def document(self) -> dict[str, Any]:
         """Return plain JSON values."""

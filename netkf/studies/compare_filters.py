@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from netkf.algorithms.filter import Filter
 from netkf.core.errors import EngineError, ScenarioError, nearest
 from netkf.core.fields import integer, number
+from netkf.core.shown import Shown
 from netkf.ensembles.pools import Pool
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.documents import write_sealed
@@ -96,7 +97,7 @@ class ComparedFilter:
 
 
 @dataclass(frozen=True)
-class FilterComparison:
+class FilterComparison(Shown):
     """Filters side by side; all intervals of differences from the first that can run hold together
     with probability ``confidence``.
     """
@@ -113,6 +114,10 @@ class FilterComparison:
         import pandas as pd
 
         return pd.DataFrame([row.document() for row in self.rows])
+
+    def __repr__(self) -> str:
+        names = ", ".join(row.filter for row in self.rows)
+        return f"<netkf comparison of filters on {self.scenario!r}: {names}; {self.runs:,} runs>"
 
     @property
     def first(self) -> str:

@@ -21,6 +21,7 @@ import scipy.special
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
+from netkf.core.shown import Shown
 from netkf.engines.base import Engine
 from netkf.ensembles.replicas import replicate
 from netkf.linalg.arrays import FloatArray, block_diagonal
@@ -235,7 +236,7 @@ class NodeConsistency:
 
 
 @dataclass(frozen=True)
-class Consistency:
+class Consistency(Shown):
     """Rows by node; false if the errors of one are not what they should be.
 
     ``low`` and ``high`` are the chi-square bounds on the mean NEES of one sample over the runs if P
@@ -251,6 +252,11 @@ class Consistency:
     high: float
     rows: tuple[NodeConsistency, ...]
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        broken = sum(row.verdict.startswith("BROKEN") for row in self.rows)
+        told = f"{broken} of {len(self.rows)} nodes BROKEN" if broken else f"{len(self.rows)} nodes"
+        return f"<netkf consistency of {self.scenario!r}: {told}; {self.runs:,} runs>"
 
     def __bool__(self) -> bool:
         return not any(row.verdict.startswith("BROKEN") for row in self.rows)

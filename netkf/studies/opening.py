@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
+from netkf.core.shown import Shown
 from netkf.ensembles.stored import StoredEnsemble, read_ensemble
 from netkf.runs.documents import TEXT, DamagedError, check_files, require
 from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbers, read_words
@@ -24,7 +25,7 @@ RESULTS = ("worst_rms", "mean_rms", "mean_trace", "worst_trace", "bound", "centr
 
 
 @dataclass(frozen=True, eq=False)
-class StoredSweep:
+class StoredSweep(Shown):
     """A sweep that is read back from ``directory``.
 
     ``scenario`` is what was varied, ``keys`` the paths of its keys that were varied, ``table`` has

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import Component
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.values import split_setting, typed_values
-from netkf.scenario.writing import resolved, toml_text
+from netkf.scenario.writing import part_as_table, resolved, toml_text
 
 MAX_POINTS = 10_000
 _RANGE = re.compile(r"^([^:,\[{\"']+):([^:,]+):(\d+)$")
@@ -65,7 +66,9 @@ def check_grid(grid: Any) -> dict[str, list[Any]]:
         listed = isinstance(values, (list, tuple, range, np.ndarray)) and len(values)
         if not listed:
             raise ScenarioError("--vary", f"{key} needs a list of values", values, "give some")
-        found[str(key)] = values.tolist() if isinstance(values, np.ndarray) else list(values)
+        plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
+        # Parts stand for their tables, which manifests and tables of results can hold.
+        found[str(key)] = [part_as_table(v) if isinstance(v, Component) else v for v in plain]
     size = math.prod(map(len, found.values()))
     if size > MAX_POINTS:
         rule = f"is a grid of {size:,} points, at most {MAX_POINTS:,} are possible"

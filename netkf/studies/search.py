@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from netkf.core.errors import ScenarioError
+from netkf.core.shown import Shown
 from netkf.ensembles.blocks import BlockTask
 from netkf.ensembles.pools import Pool
 from netkf.ensembles.replicas import replicate_blocks
@@ -59,7 +60,7 @@ class Probe(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sizing:
+class Sizing(Shown):
     """The result of a search; true if a value reaches the target.
 
     ``value`` is the smallest value that reaches it (``grows`` False: the quantity falls as the key
@@ -83,6 +84,10 @@ class Sizing:
 
     def __bool__(self) -> bool:
         return self.value is not None
+
+    def __repr__(self) -> str:
+        found = "no value reaches" if self.value is None else f"{self.value:.6g} reaches"
+        return f"<netkf size of {self.key}: {found} {self.target}, by {self.by}>"
 
     @property
     def table(self) -> pd.DataFrame:

@@ -39,7 +39,7 @@ from netkf.studies.metrics import (
     square_root_of,
     worst_node,
 )
-from netkf.studies.parameter_grid import GridPoint, expand_grid, table_value
+from netkf.studies.parameter_grid import GridPoint, check_grid, expand_grid, table_value
 from netkf.studies.pools import PoolOptions, shared_pool
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ def _write_manifest(
         "name": scenario.name,
         "versions": versions(),
         "seed": scenario.seed,
-        "vary": vary,
+        "vary": check_grid(vary),
         "runs": {"wanted": plan.runs * len(plan.points), "done": plan.runs * done},
         "status": status,
     }

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from netkf.core.errors import ScenarioError, quote
+from netkf.core.shown import Shown
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.nees import errors
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
@@ -25,7 +26,7 @@ the largest one are rounding themselves.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Run:
+class Run(Shown):
     """The samples and events of one run.
 
     times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n), nan where the filter gives no
@@ -112,6 +113,19 @@ class Run:
         law or delivery. Raises ScenarioError for another name or without matplotlib.
         """
         return plot_by_name(self, figure)
+
+    def _shown_table(self) -> pd.DataFrame:
+        """Averages over the samples after time 0, a row per node."""
+        import pandas as pd
+
+        after = self.times > 0.0
+        columns = {
+            "RMS error": np.sqrt(self.sq_error[after].mean(axis=0)) if after.any() else np.nan,
+            "mean trace P": np.trace(self.P[after], axis1=2, axis2=3).mean(axis=0)
+            if after.any()
+            else np.nan,
+        }
+        return pd.DataFrame(columns, index=pd.Index(self.nodes, name="node"))
 
     def count(self, kind: str) -> int:
         """Return the number of events of a kind."""
