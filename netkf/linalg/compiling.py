@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast, overload
 
 from netkf.linalg.linking import linked_once
+from netkf.linalg.shortcuts import kernel_compiler, without_collection
 
 ROOMS = ("linalg", "rng", "core", "algorithms", "plants", "trace", "engines", "ensembles")
 """Whose code and numbers compiled functions may hold."""
@@ -91,8 +92,8 @@ class Kernel:
 
     @cached_property
     def _called_from_kernels(self) -> Any:
-        made = _numba().njit(**self._options)(self._loops)
-        _for_any_constant(made)
+        made = _numba().njit(pipeline_class=kernel_compiler(), **self._options)(self._loops)
+        _for_any_number(made)
         return made
 
     @cached_property
@@ -103,7 +104,9 @@ class Kernel:
         # numba looks at the file of the function alone, and what it calls may have changed.
         config.CACHE_DIR = str(_folder(before))
         try:
-            made: Callable[..., Any] = numba.njit(cache=True, **self._options)(self._loops)
+            made: Callable[..., Any] = numba.njit(
+                cache=True, pipeline_class=kernel_compiler(), **self._options
+            )(self._loops)
         finally:
             config.CACHE_DIR = before
         # numba's level is global: it is set while this function compiles.
@@ -122,15 +125,22 @@ def _registered(
     return Kernel(loops, options)
 
 
-def _for_any_constant(function: Any) -> None:
-    """Compile a function once for the types of its arguments, whatever constants it is given."""
+def _for_any_number(function: Any) -> None:
+    """Compile a function once for the types of its arguments, whatever constants it is given, and
+    however many bits integers have.
+    """
     from numba.core import types
 
-    template_for, unliteral = function.get_call_template, cast(Any, types.unliteral)
+    kinds, template_for = cast(Any, types), function.get_call_template
+
+    def widened(kind: Any) -> Any:
+        kind = kinds.unliteral(kind)
+        # Fields of records may be narrow.
+        return kinds.int64 if isinstance(kind, kinds.Integer) and kind.signed else kind
 
     def for_types(args: Any, kws: Any) -> Any:
-        named = {name: unliteral(kind) for name, kind in kws.items()}
-        return template_for(tuple(unliteral(kind) for kind in args), named)
+        named = {name: widened(kind) for name, kind in kws.items()}
+        return template_for(tuple(widened(kind) for kind in args), named)
 
     function.get_call_template = for_types
 
@@ -144,7 +154,7 @@ def _moderately_optimised(made: Any, config: Any) -> None:
         config.OPT = type(before)(2)
         try:
             # One link step for the function and all that it calls, see linking.
-            with linked_once():
+            with linked_once(), without_collection():
                 return compile_for(*args, **kwargs)
         finally:
             config.OPT = before
@@ -166,7 +176,7 @@ def announce(function: Callable[..., Any]) -> None:
     _said.add(function)
     folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
     if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
-        words = "netkf: compiling, once after an installation (10 to 20 s) ..."
+        words = "netkf: compiling, once after an installation (5 to 10 s) ..."
         print(words, file=sys.stderr, flush=True)
 
 

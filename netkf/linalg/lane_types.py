@@ -17,6 +17,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import models, register_model
 
 from netkf.linalg import lanes as names
+from netkf.linalg.lean_lowering import entry_pointer
 
 DOUBLE, BYTE, BIT, I32 = ir.DoubleType(), ir.IntType(8), ir.IntType(1), ir.IntType(32)
 I64 = ir.IntType(64)
@@ -109,7 +110,6 @@ def _typed(function: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 def _pointer(context: Any, builder: Any, sig: Any, args: Any, last: int) -> Any:
     """Address of the first lane: args are lanes, the array, and its indices up to ``last``."""
     kind = sig.args[1]
-    array = context.make_array(kind)(context, builder, args[1])
     places = [
         context.cast(builder, value, number, types.intp)
         for value, number in zip(args[2:last], sig.args[2:last], strict=True)
@@ -117,7 +117,7 @@ def _pointer(context: Any, builder: Any, sig: Any, args: Any, last: int) -> Any:
     # The last axis is that of the lanes, unless places name an entry.
     if len(places) < kind.ndim:
         places.append(context.get_constant(types.intp, 0))
-    return cgutils.get_item_pointer(context, builder, kind, array, places, wraparound=False)
+    return entry_pointer(builder, kind, args[1], places)
 
 
 def _as_vector(builder: Any, pointer: Any, element: Any, count: int) -> Any:

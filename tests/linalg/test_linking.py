@@ -1,5 +1,7 @@
 """Inner functions are linked into the outermost one; nothing of numba stays changed."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numba
 import numpy as np
 import pytest
@@ -42,3 +44,30 @@ def test_a_function_gives_what_it_gives_otherwise(monkeypatch, known):
     monkeypatch.undo()
     assert [owner.__dict__[name] for owner, name, _ in patched] == before
     assert outer_function()(x) == 12.0
+
+
+def test_what_numba_itself_defines_serves_later_functions_too():
+    """Whatever called it first, and in whichever thread."""
+    x = np.array([4.0, 1.0])
+    with linked_once():
+        assert numba.njit(lambda x: np.prod(x) + np.cumsum(x)[-1])(x) == 9.0
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(in_one_piece, x).result() == 10.0
+    assert numba.njit(lambda x: 3.0 + np.prod(x) + np.cumsum(x)[-1])(x) == 12.0
+
+
+def in_one_piece(x):
+    with linked_once():
+        return numba.njit(lambda x: 1.0 + np.prod(x) + np.cumsum(x)[-1])(x)
+
+
+def test_calls_that_take_no_known_type_are_refused_as_ever():
+    """What is remembered of calls is what was found, and not what was refused."""
+
+    @numba.njit
+    def refused(x):
+        return x + "a"
+
+    for _ in range(2):
+        with linked_once(), pytest.raises(numba.TypingError):
+            refused(np.ones(2))

@@ -1,0 +1,171 @@
+"""Short code for what kernels do most: loops over ranges, and entries of C-contiguous arrays.
+
+numba writes 70 lines of LLVM's language for ``for i in range(n)`` and 40 for ``a[i, j]``, most of
+which LLVM removes again: writing and reading them is half of the time that compiling takes. The
+lines that are written here compute the same. Whatever is not met here goes to numba.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import ir as numba_ir
+from numba.core.compiler_machinery import register_pass
+from numba.core.ir_utils import get_definition, guard
+from numba.core.lowering import Lower
+from numba.core.typed_passes import NativeLowering
+from numba.np.arrayobj import load_item, store_item
+
+I64 = ir.IntType(64)
+ZERO, ONE = ir.Constant(I64, 0), ir.Constant(I64, 1)
+# Fields of numba's array structure, see tests/linalg/test_structs.py.
+MEMINFO, PARENT, ITEMS, ITEMSIZE, DATA, SHAPE, STRIDES = range(7)
+ENTRIES = (types.Float, types.Integer, types.Boolean, types.Record)
+NUMBERS = (types.Float, types.Integer)
+
+
+def entry_pointer(builder: Any, kind: Any, array: Any, places: Any) -> Any:
+    """Return the address of an entry of a C-contiguous array, from as many ``places`` as it has
+    axes, which are not negative.
+    """
+    assert kind.layout == "C", f"{kind} is not contiguous"
+    # A sum of products, of which LLVM takes those of outer loops out of inner ones.
+    at, step = places[-1], ONE
+    for axis in range(kind.ndim - 1, 0, -1):
+        length = builder.extract_value(array, [SHAPE, axis])
+        step = length if step is ONE else builder.mul(step, length)
+        at = builder.add(builder.mul(places[axis - 1], step), at)
+    return builder.gep(builder.extract_value(array, DATA), [at], inbounds=True)
+
+
+class KernelLower(Lower):
+    """Writes the code of kernels."""
+
+    def lower_expr(self, resty: Any, expr: Any) -> Any:
+        """Return the value of an expression."""
+        # Neither ``iternext`` nor ``shape``: what numba writes for them lets LLVM know more, and
+        # small kernels are a tenth slower without.
+        made = None
+        if expr.op == "getiter":
+            made = self._iterator(resty, expr)
+        elif expr.op in ("pair_first", "pair_second"):
+            value = self.loadvar(expr.value.name)
+            made = self.builder.extract_value(value, int(expr.op == "pair_second"))
+            self.incref(resty, made)
+        return super().lower_expr(resty, expr) if made is None else made
+
+    def lower_call(self, resty: Any, expr: Any) -> Any:
+        """Return the value of a call."""
+        if resty == types.range_state64_type:
+            signature = self.fndesc.calltypes[expr]
+            if signature.args in ((types.int64,), (types.int64,) * 2) and not expr.kws:
+                places = [self._cast_var(var, types.int64) for var in expr.args]
+                start, stop = places if len(places) == 2 else (ZERO, places[0])
+                return self._struct(resty, start, stop, ONE)
+        return super().lower_call(resty, expr)
+
+    def _struct(self, kind: Any, *fields: Any) -> Any:
+        made = ir.Constant(self.context.get_value_type(kind), ir.Undefined)
+        for k, value in enumerate(fields):
+            made = self.builder.insert_value(made, value, k)
+        return made
+
+    def _iterator(self, resty: Any, expr: Any) -> Any:
+        if self.typeof(expr.value.name) != types.range_state64_type:
+            return None
+        # Only steps of 1: of others the number is a division.
+        made = guard(get_definition, self.func_ir, expr.value)
+        if not (isinstance(made, numba_ir.Expr) and made.op == "call" and len(made.args) < 3):
+            return None
+        state, builder = self.loadvar(expr.value.name), self.builder
+        start, stop = (builder.extract_value(state, k) for k in range(2))
+        following, count = (self.alloca_lltype(name, I64) for name in ("following", "count"))
+        builder.store(start, following)
+        builder.store(builder.sub(stop, start), count)
+        return self._struct(resty, following, stop, ONE, count)
+
+    def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
+        """Return ``value[index]``."""
+        kind, places = self.typeof(value.name), self._places(value, index)
+        if places is None or not isinstance(kind.dtype, ENTRIES):
+            return super().lower_getitem(resty, expr, value, index, signature)
+        array = self.loadvar(value.name)
+        if len(places) < kind.ndim:
+            return self._row(resty, kind, array, places[0])
+        pointer = entry_pointer(self.builder, kind, array, places)
+        found = load_item(self.context, self.builder, kind, pointer)
+        return self.context.cast(self.builder, found, kind.dtype, resty)
+
+    def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
+        """Write ``target[index] = value``."""
+        kind, given = self.typeof(target_var.name), self.typeof(value_var.name)
+        places = self._places(target_var, index_var)
+        known = places is not None and isinstance(kind.dtype, NUMBERS)
+        if not (known and len(places) == kind.ndim and isinstance(given, NUMBERS)):
+            return super().lower_setitem(target_var, index_var, value_var, signature)
+        array, value = self.loadvar(target_var.name), self.loadvar(value_var.name)
+        number = self.context.cast(self.builder, value, given, kind.dtype)
+        pointer = entry_pointer(self.builder, kind, array, places)
+        return store_item(self.context, self.builder, kind, number, pointer)
+
+    def _places(self, array: Any, index: Any) -> Any:
+        """Indices as integers that are not negative: one for each axis, or the first one alone.
+        None where they are something else.
+        """
+        kind: Any = self.typeof(array.name)
+        given: Any = self.typeof(index.name)
+        if not isinstance(kind, types.Array) or kind.layout != "C":
+            return None
+        kinds: Any = given if isinstance(given, types.BaseTuple) else (given,)
+        if not all(isinstance(each, types.Integer) for each in kinds):
+            return None
+        # A row of an array that somebody owns would have to be counted.
+        if len(kinds) != kind.ndim and (len(kinds) > 1 or self.context.enable_nrt):
+            return None
+        value, owner, places = self.loadvar(index.name), self.loadvar(array.name), []
+        for axis, each in enumerate(kinds):
+            part = self.builder.extract_value(value, axis) if kinds is given else value
+            place = self.context.cast(self.builder, part, each, types.intp)
+            places.append(self._wrapped(place, owner, axis) if each.signed else place)
+        return places
+
+    def _wrapped(self, place: Any, array: Any, axis: int) -> Any:
+        """As in Python, negative places count from the end."""
+        builder = self.builder
+        if isinstance(place, ir.Constant) and place.constant >= 0:
+            return place
+        length = builder.extract_value(array, [SHAPE, axis])
+        below = builder.icmp_signed("<", place, ZERO)
+        return builder.select(below, builder.add(place, length), place)
+
+    def _row(self, resty: Any, kind: Any, array: Any, place: Any) -> Any:
+        """Return ``array[place]`` of an array that has more axes, and no owner."""
+        builder, axes = self.builder, range(1, kind.ndim)
+        shape = [builder.extract_value(array, [SHAPE, axis]) for axis in axes]
+        items = shape[0]
+        for length in shape[1:]:
+            items = builder.mul(items, length)
+        data = builder.gep(builder.extract_value(array, DATA), [builder.mul(place, items)])
+        made = ir.Constant(self.context.get_value_type(resty), ir.Undefined)
+        for field in (MEMINFO, PARENT, ITEMSIZE):
+            made = builder.insert_value(made, builder.extract_value(array, field), field)
+        made = builder.insert_value(builder.insert_value(made, items, ITEMS), data, DATA)
+        for k, axis in enumerate(axes):
+            stride = builder.extract_value(array, [STRIDES, axis])
+            made = builder.insert_value(made, shape[k], [SHAPE, k])
+            made = builder.insert_value(made, stride, [STRIDES, k])
+        return made
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class KernelLowering(NativeLowering):
+    """The last step of numba's pipeline, with KernelLower."""
+
+    _name = "kernel_lowering"
+
+    @property
+    def lowering_class(self) -> Any:
+        """The class that writes the code."""
+        return KernelLower

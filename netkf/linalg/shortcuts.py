@@ -1,0 +1,118 @@
+"""What numba does while it compiles and kernels do not need, left out.
+
+numba is written in Python, and most of its time goes to the steps before LLVM. Here: no garbage
+collection, the types of a call found once, no timers, a light first optimisation, and a pipeline
+without the passes for closures, array expressions and annotations, which kernels do not have. The
+pipeline is a public extension of numba; the others are replaced methods, see ``linking``.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import cache
+from typing import Any
+
+Patch = tuple[Any, str, Callable[..., Any]]
+
+FIRST_LEVEL = 1
+"""LLVM's level for single functions, which are all optimised once more when they are linked."""
+
+NOT_NEEDED = (
+    *("WithLifting", "InlineClosureLikes", "RewriteDynamicRaises", "MakeFunctionToJitFunction"),
+    *("InlineInlinables", "FindLiterallyCalls", "LiteralUnroll", "NopythonRewrites"),
+    *("LiteralPropagationSubPipelinePass", "AnnotateTypes", "DumpParforDiagnostics"),
+)
+"""Passes of numba for what kernels do not contain."""
+
+
+@contextmanager
+def without_collection() -> Iterator[None]:
+    """Inside, no garbage is collected: the compiler makes many objects, hardly any of which become
+    garbage, and each collection looks at all of them. It costs some 100 MB of memory meanwhile.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@cache
+def kernel_compiler() -> Any:
+    """Return numba's compiler without the passes that are not needed."""
+    from numba.core.compiler import CompilerBase, DefaultPassBuilder
+
+    from netkf.linalg.lean_lowering import KernelLowering
+
+    builder: Any = DefaultPassBuilder
+
+    class KernelCompiler(CompilerBase):
+        """Compiles kernels."""
+
+        def define_pipelines(self) -> list[Any]:
+            pipeline = builder.define_nopython_pipeline(self.state)
+            steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
+            pipeline.passes = [
+                (KernelLowering if step.__name__ == "NativeLowering" else step, said)
+                for step, said in steps
+            ]
+            pipeline.finalize()
+            return [pipeline]
+
+    return KernelCompiler
+
+
+def shortcuts() -> list[Patch]:
+    """Return replacements of numba's methods: owner, name, method."""
+    from numba.core import config, event
+    from numba.core.codegen import CPUCodeLibrary
+    from numba.core.types.functions import BaseFunction
+
+    return [
+        (BaseFunction, "get_call_type", _found_once(BaseFunction.get_call_type)),
+        (event, "install_timer", _no_timer),
+        (
+            CPUCodeLibrary,
+            "_optimize_functions",
+            _at_first_level(CPUCodeLibrary._optimize_functions, config),
+        ),
+    ]
+
+
+def _found_once(find: Callable[..., Any]) -> Callable[..., Any]:
+    """Remember the signatures of calls of functions that numba knows: it tries all of their
+    definitions, which are dozens for an operator, at each call.
+    """
+    known: dict[Any, Any] = {}
+
+    def found(function: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws:
+            return find(function, context, args, kws)
+        # Definitions may be added, but are never taken away.
+        call = function, context, tuple(args), len(function.templates)
+        if call not in known:
+            known[call] = find(function, context, args, kws)
+        return known[call]
+
+    return found
+
+
+def _no_timer(*_: Any) -> AbstractContextManager[None]:
+    """Each function that is being compiled would time each call of LLVM for its statistics."""
+    return nullcontext()
+
+
+def _at_first_level(optimize: Callable[..., Any], config: Any) -> Callable[..., Any]:
+    def optimize_lightly(library: Any, module: Any) -> Any:
+        before = config.OPT
+        config.OPT = type(before)(FIRST_LEVEL)
+        try:
+            return optimize(library, module)
+        finally:
+            config.OPT = before
+
+    return optimize_lightly
