@@ -123,7 +123,7 @@ def draw_network(
             offset: dict[str, Any] = {"xytext": (away, away), "textcoords": "offset points"}
             axes.annotate(str(node), places[node], **offset, **style)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.1)
+    axes.margins(0.13)
     axes.axis("off")
     if dots is not None:
         bar = axes.figure.colorbar(

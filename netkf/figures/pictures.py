@@ -43,7 +43,7 @@ def overview(subject: Subject) -> Picture:
         draw(axes, subject)
     key, label = error_label(subject)
     draw_network(network, subject, shades_of(subject, key), label)
-    network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.2)
+    network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=2, borderaxespad=0.2)
     scenario = subject.scenario
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     finish(figure, subject.claim(title), subject.caption(*_sentences(subject), notes="both"))

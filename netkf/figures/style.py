@@ -161,7 +161,7 @@ def draw_legend(axes: Any, columns: int | None = None) -> None:
         return
     figure = axes.figure
     share = axes.get_subplotspec().get_position(figure).width if axes.get_subplotspec() else 1.0
-    room = share * float(figure.get_size_inches()[0]) * 72.0 * 0.88
+    room = share * float(figure.get_size_inches()[0]) * 72.0 * 1.08
     axes.legend(
         handles,
         labels,
