@@ -12,9 +12,10 @@ from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.documents import COUNT, NUMBER, TEXT, check_files
+from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, check_files, require
 from netkf.runs.stored import StoredRun, read_form
 from netkf.runs.summary import PromisedTraces
+from netkf.runs.tables import COLUMNS
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare import damage_named
@@ -35,6 +36,16 @@ VERDICT: dict[str, Any] = {
     "confidence": NUMBER,
     "rows": [VERDICT_ROW],
 }
+ROW: dict[str, Any] = dict.fromkeys(COLUMNS, NUMBER)
+SUMMARY: dict[str, Any] = {
+    "nodes": [ROW],
+    "overall": ROW,
+    **dict.fromkeys(("limit", "central"), NUMBER),
+    "bound": TEXT,
+    "notes": TEXTS,
+    "messages": {"in_flight?": NUMBER},
+}
+"""What a page needs of summary.json, beside what ``netkf.open`` has checked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +138,13 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
     found = open_directory(directory, trust=trust)
     text = _read_text(directory / "scenario.toml")
     if isinstance(found, StoredSweep):
+        if len(found.table) and "worst_rms_se" not in found.table:
+            rule = "is not the directory of a sweep: sweep.parquet lacks worst_rms_se"
+            raise ScenarioError(shorten(directory), rule, None, "name what netkf sweep left")
         return Source(str(directory), found.manifest, found.scenario, text, sweep=found)
+    if found.summary:
+        with damage_named(directory):
+            require(found.summary, SUMMARY, "summary.json")
     run, ensemble = _choose_run(found, replica)
     scenario = found.scenario
     assert isinstance(scenario, Scenario)

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -22,6 +23,7 @@ from netkf.report.markup import script_json
 from netkf.report.messages import MESSAGE, information_age, join_messages, keep_messages
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
+from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
 from tests.conftest import SCENARIOS
@@ -319,6 +321,22 @@ def test_the_command(ring, tmp_path, capsys):
         assert main(arguments) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert main(["report", str(ring), str(ring), str(ring)]) == 2
+
+
+def test_a_summary_without_its_parts_is_refused_in_one_line(ring, tmp_path):
+    directory = shutil.copytree(ring, tmp_path / "run")
+    for name in ("limit", "notes", "bound"):
+        summary = json.loads((ring / "summary.json").read_text())
+        del summary[name]
+        (directory / "summary.json").write_text(json.dumps(summary))
+        manifest = json.loads((ring / "manifest.json").read_text())
+        manifest["files"]["summary.json"] = file_digests(directory, ["summary.json"])[
+            "summary.json"
+        ]
+        del manifest["sha256"]
+        write_sealed(directory / "manifest.json", manifest)
+        with pytest.raises(ScenarioError, match=f"lacks summary.json.{name}"):
+            make_page([directory])
 
 
 def test_sweeps_are_not_compared(ring, sweep):
