@@ -37,6 +37,7 @@ from tests.conftest import ROOT
 DOCS = ROOT / "docs"
 FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"# (\S+\.(?:py|toml|csv|sh))\n")
+STATUS = "echo $?"
 LANGUAGES = {"python", "toml", "console", "sh", "text", "json"}
 
 
@@ -187,21 +188,38 @@ def compare(what, shown, printed):
 
 
 def shell_script(page):
-    """A shell script that writes the files of a page and gives its commands, in order."""
-    lines = ["set -e"]
-    code = 0
-    for block in blocks(page):
-        if block.name or block.language == "python":
-            code += not block.name
-            name = block.name or f"page_{code}.py"
-            lines += [f"mkdir -p $(dirname {name})"]
-            lines += [f"cat > {name} <<'END_OF_FILE'", block.text + "END_OF_FILE"]
-            lines += [] if block.name else [f"python {name}"]
+    """A shell script that writes the files of a page and gives its commands, in order.
+
+    It ends at the first command that fails, but for one whose status the page shows.
+    """
+    lines, found = ["set -e"], blocks(page)
+    statuses = iter(expected_statuses(found))
+    for block in found:
+        if block.name:
+            lines += [f"mkdir -p $(dirname {block.name})"]
+            lines += [f"cat > {block.name} <<'END_OF_FILE'", block.text + "END_OF_FILE"]
         elif block.language == "sh":
             lines.append(block.text)
         elif block.language == "console":
-            lines += [command for command, _ in sessions(block)]
+            commands = [c for c, _ in sessions(block) if c != STATUS]
+            lines += [checked(command, next(statuses)) for command in commands]
     return "\n".join(lines)
+
+
+def expected_statuses(found):
+    """The exit status of each command of a page: 0 unless `echo $?` below it shows another."""
+    statuses = []
+    for command, shown in [p for b in found if b.language == "console" for p in sessions(b)]:
+        if command == STATUS:
+            statuses[-1] = int(shown[0])
+        else:
+            statuses.append(0)
+    return statuses
+
+
+def checked(command, status):
+    """The command, or a line that fails unless the command ends with a status."""
+    return command if status == 0 else f"{command} && exit 1 || test $? -eq {status}"
 
 
 if __name__ == "__main__":

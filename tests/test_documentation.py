@@ -75,6 +75,7 @@ def test_a_tutorial_is_a_script(page):
     assert all(block.name for block in blocks(page) if block.language in ("python", "toml"))
     text = shell_script(page)
     assert "pip install" in text
+    assert "test $? -eq 2" in text  # the command that fails on purpose
     subprocess.run(["bash", "-n"], input=text, text=True, check=True)
 
 
