@@ -25,7 +25,8 @@ def only_writer(directory: Path | None) -> Iterator[None]:
     if directory is None:
         yield
         return
-    made = not directory.exists()
+    # os.path instead of Path.exists, which raises for names that no file can have.
+    made = not os.path.exists(directory)
     make_directory(directory)
     try:
         with _locked(directory):
@@ -41,22 +42,28 @@ def _locked(directory: Path) -> Iterator[None]:
     opened = None
     try:
         opened = _open(directory)
-        _lock(opened)
-    except (BlockingIOError, PermissionError) as error:
-        if opened is not None:
-            os.close(opened)
-            rule = "is in use: another netkf command writes there"
-            remedy = "wait for its end, or choose another"
-            raise ScenarioError("--out", rule, str(directory), remedy) from None
-        _print_note(directory, error)
     except OSError as error:
         _print_note(directory, error)
+    else:
+        _lock_or_refuse(opened, directory)
     try:
         yield
     finally:
         if opened is not None:
             with contextlib.suppress(OSError):
                 os.close(opened)
+
+
+def _lock_or_refuse(opened: int, directory: Path) -> None:
+    try:
+        _lock(opened)
+    except (BlockingIOError, PermissionError):  # the latter on Windows
+        os.close(opened)
+        rule = "is in use: another netkf command writes there"
+        remedy = "wait for its end, or choose another"
+        raise ScenarioError("--out", rule, str(directory), remedy) from None
+    except OSError as error:
+        _print_note(directory, error)
 
 
 def _print_note(directory: Path, error: OSError) -> None:
