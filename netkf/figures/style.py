@@ -175,7 +175,7 @@ def draw_legend(axes: Any, columns: int | None = None) -> None:
 
 def _columns(labels: Sequence[str], room: float) -> int:
     """Return the largest number of columns of a legend that fits ``room`` points."""
-    widths = [text_width(label, LEGEND_SIZE) + 4.6 * LEGEND_SIZE for label in labels]
+    widths = [text_width(label, LEGEND_SIZE) + 6.0 * LEGEND_SIZE for label in labels]
     for count in range(len(labels), 1, -1):
         rows = -(-len(labels) // count)
         if sum(max(widths[k : k + rows]) for k in range(0, len(labels), rows)) <= room:
