@@ -140,9 +140,11 @@ def _nees_lines(nees: dict[str, Any]) -> list[str]:
 
 def _message_line(messages: dict[str, Any]) -> str:
     transmissions = messages.get("transmissions")
+    if transmissions is None or math.isnan(transmissions):  # in slots they are not counted
+        transmissions = messages["sent"]
     line = f"messages: {_count(messages['sent'])} sent"
     # A broadcast is one transmission and a message to each node in range.
-    if transmissions is not None and transmissions != messages["sent"]:
+    if transmissions != messages["sent"]:
         line += f" in {_count(transmissions)} transmissions"
     line += f", {_count(messages['delivered'])} delivered, {_count(messages['lost'])} lost"
     if messages["in_flight"]:
