@@ -97,7 +97,7 @@ def constant_gain_slots(
                 predict(nodes, room, b)
                 for h in range(len(nodes.rows)):
                     if nodes.rows[h] > 0:
-                        correct(nodes, readings, room, arrays, b, s, h)
+                        correct_by_gain(nodes, readings, room, arrays, b, s, h)
                 copy_pairs(nodes, room, b)
                 for h in range(len(nodes.rows)):
                     combine_convex_roots(nodes, plan, links, room, b, s, h)
@@ -117,7 +117,7 @@ def copy_pairs(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
 
 
 @kernel
-def correct(
+def correct_by_gain(
     nodes: SlotNodes,
     readings: SlotReadings,
     room: SlotRoom,

@@ -16,7 +16,7 @@ from netkf.figures.style import (
     LOST,
     MUTED,
     draw_legend,
-    finish,
+    finish_figure,
     look,
     new_figure,
     write,
@@ -69,7 +69,7 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
         draw_legend(axes)
         note = f"{verdict.scenario}: {verdict.runs:,} runs. Intervals hold together with "
         note += f"probability {verdict.confidence:.6g}."
-        finish(figure, _title(rows, claim or verdict.scenario), [note])
+        finish_figure(figure, _title(rows, claim or verdict.scenario), [note])
     write(figure, path)
     return True
 

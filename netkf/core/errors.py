@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
-from netkf.core.printable import cut, shorten
+from netkf.core.printable import cut_middle, shorten
 
 
 class NetkfError(Exception):
@@ -84,4 +84,4 @@ def quote(value: object, longest: int = 80) -> str:
         text = " ".join(repr(tolist() if callable(tolist) else value).split())
     except (ValueError, RecursionError):  # an integer of thousands of digits, tables within tables
         text = f"a large {type(value).__name__}"
-    return cut(text, longest)
+    return cut_middle(text, longest)

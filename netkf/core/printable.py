@@ -21,10 +21,10 @@ def one_line(text: object) -> str:
 
 def shorten(text: object, longest: int = 200) -> str:
     """Return a text as one line, without its middle if it is long."""
-    return cut(one_line(text), longest)
+    return cut_middle(one_line(text), longest)
 
 
-def cut(text: str, longest: int) -> str:
+def cut_middle(text: str, longest: int) -> str:
     """Return a text of at most ``longest`` characters, without its middle if it is longer."""
     half = (longest - 5) // 2
     return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"

@@ -22,7 +22,7 @@ import numpy as np
 from netkf.core.errors import EngineError
 from netkf.ensembles.moments import Moments
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace
-from netkf.runs.documents import DamagedError, reading
+from netkf.runs.documents import DamagedError, reading_file
 from netkf.runs.files import BLOCKS, write_atomically, writing
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT
@@ -219,7 +219,7 @@ def _describe(bad: list[tuple[str, str]]) -> list[str]:
 
 def _verify(file: Path) -> None:
     """Raise DamagedError unless a file ends with the digest of all bytes before its last line."""
-    with reading(file), file.open("rb") as opened:
+    with reading_file(file), file.open("rb") as opened:
         length = max(0, opened.seek(0, os.SEEK_END) - SEAL_BYTES)
         opened.seek(length)
         seal = opened.read()

@@ -40,10 +40,10 @@ def plot(result: Any, figure: str = "error") -> Picture:
 
     Raises ScenarioError for an unknown name and for anything that is no result.
     """
-    return Drawing(result).draw(figure)
+    return FigureSet(result).draw(figure)
 
 
-class Drawing:
+class FigureSet:
     """Draws several figures of one result, which is reduced once."""
 
     def __init__(self, result: Any) -> None:
@@ -84,7 +84,7 @@ def plot_to_files(result: Any, names: tuple[str, ...], out: Path, kind: str) -> 
 
     Raises ScenarioError for unknown names, before anything is written, and WriteError.
     """
-    drawing = Drawing(result)
+    drawing = FigureSet(result)
     wanted = names or drawing.names
     single = out.suffix.removeprefix(".").lower() in FORMATS and not out.is_dir()
     if single and len(wanted) > 1:

@@ -17,7 +17,7 @@ from netkf.figures.style import (
     SKY,
     Picture,
     draw_legend,
-    finish,
+    finish_figure,
     new_figure,
     set_scale,
 )
@@ -47,7 +47,7 @@ def nees_figure(subject: Subject) -> Picture:
     inside = float(((values >= low) & (values <= high)).mean())
     over = f" over {subject.runs:,} runs" if subject.runs > 1 else ""
     words = f"Band: chi-square with {subject.runs * n:,} degrees of freedom{over}."
-    finish(
+    finish_figure(
         figure,
         subject.claim(_nees_claim(inside, float(values.mean()), n)),
         subject.caption(words, notes="nees"),
@@ -84,7 +84,7 @@ def nis_figure(subject: Subject) -> Picture:
     claim = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
     claim += f"{share:.0%} of {len(found.nis):,} readings lie in their {CONFIDENCE:.0%} interval"
     words = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
-    finish(figure, subject.claim(claim), subject.caption(words))
+    finish_figure(figure, subject.claim(claim), subject.caption(words))
     return figure
 
 
@@ -165,7 +165,7 @@ def whiteness_figure(subject: Subject) -> Picture:
     words = (
         f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
     )
-    finish(figure, subject.claim(claim), subject.caption(words))
+    finish_figure(figure, subject.claim(claim), subject.caption(words))
     return figure
 
 

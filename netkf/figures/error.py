@@ -19,7 +19,7 @@ from netkf.figures.style import (
     Picture,
     draw_legend,
     draw_message,
-    finish,
+    finish_figure,
     new_figure,
     set_scale,
 )
@@ -45,7 +45,9 @@ def error_figure(subject: Subject) -> Picture:
         sentences = _interval_words(subject)
     else:
         sentences = _draw_innovations(below, subject)
-    finish(figure, subject.claim(bound_claim(subject)), subject.caption(*sentences, notes="bound"))
+    finish_figure(
+        figure, subject.claim(bound_claim(subject)), subject.caption(*sentences, notes="bound")
+    )
     return figure
 
 
@@ -146,7 +148,7 @@ def quantiles_figure(subject: Subject) -> Picture:
     draw_legend(axes)
     over = "means over the runs" if subject.runs > 1 else "this run"
     caption = subject.caption(f"Quantiles over the nodes of {over}, at each sample.")
-    finish(figure, subject.claim(claim), caption)
+    finish_figure(figure, subject.claim(claim), caption)
     return figure
 
 
@@ -210,7 +212,7 @@ def ratios_figure(subject: Subject) -> Picture:
         f"The {MAX_ROWS // 2} smallest and largest ratios." if len(subject.rows) > MAX_ROWS else ""
     )
     claim = bound_claim(subject) if key == "ratio" else _nees_claim(rows, key, scale)
-    finish(
+    finish_figure(
         figure,
         subject.claim(claim),
         subject.caption(bars, cut, notes="bound" if key == "ratio" else "nees"),

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.ticker import FuncFormatter
 
 from netkf.figures.layout import Positions, positions_of
-from netkf.figures.style import INK, MUTED, SEQUENTIAL, Picture, finish, new_figure
+from netkf.figures.style import INK, MUTED, SEQUENTIAL, Picture, finish_figure, new_figure
 from netkf.figures.subject import Subject
 
 MAX_LINKS = 20_000
@@ -36,7 +36,7 @@ def network_figure(subject: Subject) -> Picture:
     for axes, (label, shades) in zip(panels, quantities.items(), strict=True):
         draw_network(axes, subject, shades, label, positions)
     panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2)
-    finish(figure, subject.claim(_claim(subject)), subject.caption(_explain(subject)))
+    finish_figure(figure, subject.claim(_claim(subject)), subject.caption(_explain(subject)))
     return figure
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from netkf.ensembles.directory import FinishedEnsemble
 from netkf.figures.network import draw_network, error_label, shades_of
 from netkf.figures.panels import draw_covariances, draw_errors, draw_nees
-from netkf.figures.style import Picture, finish, look, new_figure, write
+from netkf.figures.style import Picture, finish_figure, look, new_figure, write
 from netkf.figures.subject import Subject, subject_of_completed, subject_of_ensemble
 from netkf.runs.run import CompletedRun
 from netkf.scenario.scenario import Scenario
@@ -46,7 +46,7 @@ def overview(subject: Subject) -> Picture:
     network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=2, borderaxespad=0.2)
     scenario = subject.scenario
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
-    finish(figure, subject.claim(title), subject.caption(*_sentences(subject), notes="both"))
+    finish_figure(figure, subject.claim(title), subject.caption(*_sentences(subject), notes="both"))
     return figure
 
 

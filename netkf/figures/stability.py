@@ -19,7 +19,7 @@ from netkf.figures.style import (
     SERIES,
     Picture,
     draw_legend,
-    finish,
+    finish_figure,
     new_figure,
 )
 from netkf.figures.subject import Subject, UnavailableError
@@ -72,7 +72,7 @@ def stability_figure(subject: Subject) -> Picture:
     caption = subject.caption(
         "From theory alone: no simulation. Existence of the steady state of H(12)."
     )
-    finish(figure, claim, caption)
+    finish_figure(figure, claim, caption)
     return figure
 
 
@@ -98,7 +98,7 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
     axes = figure.add_subplot()
     claim = (_draw_curve if len(keys) == 1 else _draw_map)(axes, table, list(keys))
     prefix = "" if status == "complete" else "Interrupted: "
-    finish(figure, prefix + claim, caption)
+    finish_figure(figure, prefix + claim, caption)
     return figure
 
 
@@ -230,7 +230,7 @@ def law_figure(subject: Subject) -> Picture:
     axes.set(xlabel="trace of P, squared units of the state", ylabel="share of samples above")
     draw_legend(axes)
     words = "The first fifth of the samples is left out. Samples of one run are not independent."
-    finish(figure, subject.claim(claim), subject.caption(words))
+    finish_figure(figure, subject.claim(claim), subject.caption(words))
     return figure
 
 

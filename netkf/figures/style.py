@@ -99,7 +99,7 @@ def new_figure(width: float = 7.4, height: float = 4.4) -> Picture:
     return figure
 
 
-def finish(figure: Figure, claim: str, caption: Sequence[str]) -> None:
+def finish_figure(figure: Figure, claim: str, caption: Sequence[str]) -> None:
     """Put the claim above a figure and the sentences of its caption below, in as many lines as fit
     its width.
     """
@@ -196,7 +196,7 @@ def message_figure(claim: str, message: str, caption: Sequence[str]) -> Picture:
     """Return a figure that says why there is nothing to draw."""
     figure = new_figure(7.4, 2.2)
     draw_message(figure.add_subplot(), message)
-    finish(figure, claim, caption)
+    finish_figure(figure, claim, caption)
     return figure
 
 

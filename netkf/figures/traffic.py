@@ -19,7 +19,7 @@ from netkf.figures.style import (
     SKY,
     Picture,
     draw_legend,
-    finish,
+    finish_figure,
     new_figure,
 )
 from netkf.figures.subject import Subject, UnavailableError
@@ -74,7 +74,7 @@ def age_figure(subject: Subject) -> Picture:
     if len(means) > 1:
         claim += f"; node {worst} is worst off with {means[worst]:.3g} s"
     words = "Age of information: time since the freshest message that a node has heard was sent."
-    finish(figure, subject.claim(claim), subject.caption(words))
+    finish_figure(figure, subject.claim(claim), subject.caption(words))
     return figure
 
 
@@ -118,7 +118,7 @@ def _end(subject: Subject) -> float:
     return last if last > 0.0 else subject.scenario.horizon
 
 
-class Direction(NamedTuple):
+class DirectedMessages(NamedTuple):
     """Messages from ``sender`` to ``receiver``: when they were sent or lost, and delivered."""
 
     sender: int
@@ -127,7 +127,7 @@ class Direction(NamedTuple):
     lost: FloatArray
 
 
-def directions_of(log: np.ndarray) -> list[Direction]:
+def directions_of(log: np.ndarray) -> list[DirectedMessages]:
     """Return the messages of each direction over which some were sent, by delivery and loss."""
     arrived = log[log["kind"] == CODES["deliver"]]
     missed = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
@@ -142,7 +142,10 @@ def directions_of(log: np.ndarray) -> list[Direction]:
         _by_pair(sender, receiver, missed["t"]),
     )
     none = np.empty(0)
-    return [Direction(*pair, heard.get(pair, none), gone.get(pair, none)) for pair in sorted(pairs)]
+    return [
+        DirectedMessages(*pair, heard.get(pair, none), gone.get(pair, none))
+        for pair in sorted(pairs)
+    ]
 
 
 def _by_pair(
@@ -199,18 +202,18 @@ def links_figure(subject: Subject) -> Picture:
     part = f"the first {end:,.4g} s" if end < _end(subject) else ""
     cut = " of ".join(filter(None, (shown, part)))
     sentence = f"Shown: {cut}; the claim counts all." if cut else "All messages are shown."
-    finish(figure, subject.claim(claim), subject.caption(sentence))
+    finish_figure(figure, subject.claim(claim), subject.caption(sentence))
     return figure
 
 
-def _with_messages(subject: Subject) -> list[Direction]:
+def _with_messages(subject: Subject) -> list[DirectedMessages]:
     found = directions_of(subject.log)
     if not found:
         raise UnavailableError("No message was delivered or lost.")
     return found
 
 
-def _window(chosen: list[Direction], end: float) -> tuple[float, float]:
+def _window(chosen: list[DirectedMessages], end: float) -> tuple[float, float]:
     """Return the longest time from 0 on with at most MAX_MARKS messages, seconds."""
     times = np.sort(np.concatenate([np.concatenate([d.delivered, d.lost]) for d in chosen]))
     return 0.0, float(times[MAX_MARKS]) if len(times) > MAX_MARKS else end
@@ -239,12 +242,12 @@ def delivery_figure(subject: Subject) -> Picture:
     words = "Intervals: Wilson, 95%."
     if outside is not None:
         words += f" {outside} of {len(found)} intervals miss what the channel of the scenario says."
-    finish(figure, subject.claim(claim), subject.caption(words))
+    finish_figure(figure, subject.claim(claim), subject.caption(words))
     return figure
 
 
 def _draw_shares(
-    axes: Any, subject: Subject, found: list[Direction], shares: FloatArray, ends: FloatArray
+    axes: Any, subject: Subject, found: list[DirectedMessages], shares: FloatArray, ends: FloatArray
 ) -> int | None:
     """Draw the directions in the order of their shares; return how many intervals miss what the
     channel says, None if it says nothing.
@@ -277,7 +280,7 @@ def _draw_shares(
     return outside
 
 
-def _expected(subject: Subject, one: Direction) -> float:
+def _expected(subject: Subject, one: DirectedMessages) -> float:
     """Return the delivery probability that the scenario gives a direction; nan if it varies."""
     link = one.sender, one.receiver
     loss = subject.scenario.network.channel.loss
@@ -287,7 +290,7 @@ def _expected(subject: Subject, one: Direction) -> float:
         return float("nan")
 
 
-def _draw_loss(axes: Any, found: list[Direction], end: float) -> None:
+def _draw_loss(axes: Any, found: list[DirectedMessages], end: float) -> None:
     """Draw the share of messages that were lost in each of TIME_BINS bins, with intervals."""
     edges = np.linspace(0.0, end, TIME_BINS + 1)
     lost, arrived = (

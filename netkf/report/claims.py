@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.report.directories import Source
+from netkf.report.directories import Opened
 from netkf.report.messages import DELIVERED, LATE, LOST, information_age
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import SampleIndices, averaged_samples
@@ -42,7 +42,7 @@ class Worst(NamedTuple):
     by_error: bool
 
 
-def worst_node(source: Source) -> Worst | None:
+def node_most_off(source: Opened) -> Worst | None:
     """Return the worst node of the trace of a source: the one with the largest RMS error over time,
     or, without ground truth, with the largest mean trace of P. None without a finite number.
     """
@@ -71,14 +71,14 @@ def worst_node(source: Source) -> Worst | None:
     )
 
 
-def _averaged(source: Source, run: StoredRun) -> SampleIndices:
+def _averaged(source: Opened, run: StoredRun) -> SampleIndices:
     """Return the indices of the samples that the summary averages over."""
     found = source.summary.get("rounding_from")
     blurred = math.inf if found is None else float(found)
     return averaged_samples(run.times, blurred, run.count("diverged") > 0)
 
 
-def findings(source: Source, messages: np.ndarray) -> list[str]:
+def findings(source: Opened, messages: np.ndarray) -> list[str]:
     """Return sentences about a source with these MESSAGE rows, the most important first."""
     if source.kind == "sweep":
         return [*_ending(source), *_of_sweep(source)]
@@ -96,7 +96,7 @@ def findings(source: Source, messages: np.ndarray) -> list[str]:
     return found
 
 
-def difference_findings(comparison: Comparison | str, one: Source, other: Source) -> list[str]:
+def difference_findings(comparison: Comparison | str, one: Opened, other: Opened) -> list[str]:
     """Return sentences on how two sources, A and B, differ: certain differences of all nodes
     together, and the first event in which two single runs differ.
     """
@@ -118,7 +118,7 @@ def difference_findings(comparison: Comparison | str, one: Source, other: Source
     return found + _first_event(one, other)
 
 
-def _first_event(one: Source, other: Source) -> list[str]:
+def _first_event(one: Opened, other: Opened) -> list[str]:
     """Return the first event in which two recorded runs differ."""
     if one.run is None or other.run is None:
         return []
@@ -133,7 +133,7 @@ def _first_event(one: Source, other: Source) -> list[str]:
     return [f"First difference{which}: {difference}"]
 
 
-def _ending(source: Source) -> list[str]:
+def _ending(source: Opened) -> list[str]:
     """Return sentences on a run that did not end as planned, or on one that never began."""
     found, run = [], source.run
     if source.status == "interrupted":
@@ -163,8 +163,8 @@ def _last(run: StoredRun | None) -> float:
     return float(run.times[-1]) if run is not None and len(run.times) else 0.0
 
 
-def _of_trace(source: Source, run: StoredRun, messages: np.ndarray) -> list[str]:
-    worst = worst_node(source)
+def _of_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]:
+    worst = node_most_off(source)
     if worst is None:
         return []
     count = len(run.nodes)
@@ -186,7 +186,7 @@ def _of_trace(source: Source, run: StoredRun, messages: np.ndarray) -> list[str]
     ]
 
 
-def _why(source: Source, run: StoredRun, messages: np.ndarray, worst: Worst) -> list[str]:
+def _why(source: Opened, run: StoredRun, messages: np.ndarray, worst: Worst) -> list[str]:
     """Return what the worst node had heard by its worst instant, and what its P said."""
     into = messages[messages["receiver"] == worst.node]
     found = []
@@ -227,7 +227,7 @@ def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:
     return f"Why: {listed}; {lost}"
 
 
-def _unusual(source: Source, run: StoredRun, into: np.ndarray, worst: Worst) -> str:
+def _unusual(source: Opened, run: StoredRun, into: np.ndarray, worst: Worst) -> str:
     """Return if the age of what the node had heard was unusual at its worst instant."""
     cuts = source.cuts(run.times)
     ages: FloatArray = information_age(into, (worst.node,), run.times, cuts)[:, 0]
@@ -248,7 +248,7 @@ def _unusual(source: Source, run: StoredRun, into: np.ndarray, worst: Worst) -> 
     )
 
 
-def _of_ensemble(source: Source) -> list[str]:
+def _of_ensemble(source: Opened) -> list[str]:
     """Return which node was worst over all runs, or over those that were kept."""
     found = source.ensemble
     assert found is not None
@@ -268,7 +268,7 @@ def _of_ensemble(source: Source) -> list[str]:
     ]
 
 
-def _of_bound(source: Source) -> list[str]:
+def _of_bound(source: Opened) -> list[str]:
     """Return how the traces of P lie beside the bound: one run does not decide about a mean."""
     summary = source.summary
     if not summary:
@@ -299,7 +299,7 @@ def _se(row: dict[str, Any]) -> str:
     return f" +- {error:.1g}" if error is not None else ""
 
 
-def _of_verdict(source: Source) -> list[str]:
+def _of_verdict(source: Opened) -> list[str]:
     verdict = source.verdict or {}
     rows = verdict.get("rows", [])
     broken = [row for row in rows if row["verdict"] == "broken"]
@@ -318,7 +318,7 @@ def _verdicts(rows: list[dict[str, Any]]) -> list[str]:
     return sorted({str(row["verdict"]) for row in rows})
 
 
-def _of_sweep(source: Source) -> list[str]:
+def _of_sweep(source: Opened) -> list[str]:
     assert source.sweep is not None
     table, varied = source.sweep.table, source.sweep.keys
     if not len(table):

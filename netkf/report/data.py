@@ -10,8 +10,8 @@ import networkx
 import numpy as np
 import scipy.special
 
-from netkf.report.claims import Worst, worst_node
-from netkf.report.directories import Source
+from netkf.report.claims import Worst, node_most_off
+from netkf.report.directories import Opened
 from netkf.report.messages import (
     Kept,
     information_age,
@@ -46,12 +46,12 @@ class Budget(NamedTuple):
 
 
 def run_data(
-    source: Source, run: StoredRun, messages: np.ndarray, budget: Budget, packer: Packer
+    source: Opened, run: StoredRun, messages: np.ndarray, budget: Budget, packer: Packer
 ) -> dict[str, Any]:
     """Return what the views show of the trace of a source with these MESSAGE rows; columns go to
     ``packer``.
     """
-    worst = worst_node(source)
+    worst = node_most_off(source)
     times = sample_indices(run, budget.values)
     horizon = float(source.scenario.horizon)
     instant = worst.time if worst is not None else horizon
@@ -138,7 +138,7 @@ def sample_indices(run: StoredRun, values: int) -> np.ndarray:
     return np.array(sorted(chosen))
 
 
-def positions(source: Source, run: StoredRun) -> list[list[float]]:
+def positions(source: Opened, run: StoredRun) -> list[list[float]]:
     """Return a place (x, y) between 0 and 1 for each node, y downwards: the scenario's positions to
     scale, or a layout by the links.
     """
@@ -154,7 +154,7 @@ def positions(source: Source, run: StoredRun) -> list[list[float]]:
     return [[round(0.5 + x, 5), round(0.5 - y, 5)] for x, y in places.tolist()]
 
 
-def _layout(source: Source, run: StoredRun) -> dict[int, Any]:
+def _layout(source: Opened, run: StoredRun) -> dict[int, Any]:
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(run.nodes)
     graph.add_edges_from(source.scenario.topology.links)
@@ -164,7 +164,7 @@ def _layout(source: Source, run: StoredRun) -> dict[int, Any]:
     return networkx.spring_layout(graph, seed=1, iterations=30)
 
 
-def _flow(source: Source) -> str:
+def _flow(source: Opened) -> str:
     """Return how information flows: nodes ``combine`` what they hear, ``swap`` it for their own,
     send ``readings`` that nobody passes on, or one filter has the readings of all (``pooled``).
     """
@@ -174,7 +174,7 @@ def _flow(source: Source) -> str:
     return hosted.combination if hosted.combination in ("swap", "readings") else "combine"
 
 
-def _axes(source: Source, run: StoredRun, worst: Worst | None) -> list[int]:
+def _axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int]:
     """Return the two components of the state to show first: the two that sensors see if one of
     them was furthest off at the worst instant, else those that were furthest off.
     """
@@ -210,7 +210,7 @@ def _scales() -> dict[str, float]:
     }
 
 
-def _limits(source: Source) -> dict[str, Any]:
+def _limits(source: Opened) -> dict[str, Any]:
     """Return the horizontal lines of curves: limits of the bound and the interval of NEES."""
     promised = source.promised
     if promised is None:
@@ -220,7 +220,7 @@ def _limits(source: Source) -> dict[str, Any]:
 
 
 def _sample_columns(
-    source: Source, run: StoredRun, chosen: np.ndarray, messages: np.ndarray, packer: Packer
+    source: Opened, run: StoredRun, chosen: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
     n = run.x.shape[1]
     i, j = np.triu_indices(n)

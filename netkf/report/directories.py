@@ -49,7 +49,7 @@ SUMMARY: dict[str, Any] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class Opened:
     """A directory as a page shows it; what it does not have is None or empty.
 
     ``label`` is the directory as the user has named it; ``run`` a recorded run with its trace, of
@@ -121,7 +121,7 @@ class Source:
         return np.asarray(np.nextafter(ends, -np.inf))
 
 
-def read_source(directory: Path, replica: int | None = None, trust: bool = False) -> Source:
+def read_source(directory: Path, replica: int | None = None, trust: bool = False) -> Opened:
     """Return what a page shows of a directory of ``netkf run``, ``sweep`` or ``check``.
 
     ``replica`` chooses one of the recorded runs of an ensemble, by default the first. Runs that
@@ -141,14 +141,14 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
         if len(found.table) and "worst_rms_se" not in found.table:
             rule = "is not the directory of a sweep: sweep.parquet lacks worst_rms_se"
             raise ScenarioError(shorten(directory), rule, None, "name what netkf sweep left")
-        return Source(str(directory), found.manifest, found.scenario, text, sweep=found)
+        return Opened(str(directory), found.manifest, found.scenario, text, sweep=found)
     if found.summary:
         with damage_named(directory):
             require(found.summary, SUMMARY, "summary.json")
     run, ensemble = _choose_run(found, replica)
     scenario = found.scenario
     assert isinstance(scenario, Scenario)
-    return Source(str(directory), found.manifest, scenario, text, run, ensemble, verdict=verdict)
+    return Opened(str(directory), found.manifest, scenario, text, run, ensemble, verdict=verdict)
 
 
 def _choose_run(
@@ -165,7 +165,7 @@ def _choose_run(
     return found.replica(replica or 0), found
 
 
-def _verdict_source(directory: Path, verdict: dict[str, Any], trust: bool) -> Source:
+def _verdict_source(directory: Path, verdict: dict[str, Any], trust: bool) -> Opened:
     runs = {"done": verdict["runs"], "wanted": verdict["runs"]}
     manifest = {"seed": verdict.get("seed"), "status": "complete", "runs": runs}
     manifest |= {"versions": verdict.get("versions", {})}
@@ -173,7 +173,7 @@ def _verdict_source(directory: Path, verdict: dict[str, Any], trust: bool) -> So
         check_files(directory, verdict, ["scenario.toml"])
     scenario = load(directory / "scenario.toml", trust=trust)
     text = _read_text(directory / "scenario.toml")
-    return Source(str(directory), manifest, scenario, text, verdict=verdict)
+    return Opened(str(directory), manifest, scenario, text, verdict=verdict)
 
 
 def _read_text(path: Path) -> str:

@@ -30,7 +30,7 @@ def bullets(values: Iterable[object], css: str = "") -> str:
     return f"<ul{kind}>{items}</ul>" if items else ""
 
 
-def table(
+def table_box(
     caption: str, header: Sequence[object], rows: Iterable[Sequence[object]], css: str = "numbers"
 ) -> str:
     """Return a table in a box that scrolls by itself, so that the page never does sideways. The

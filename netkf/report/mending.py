@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from netkf.core.errors import NetkfError
-from netkf.report.claims import Worst, worst_node
-from netkf.report.directories import Source
-from netkf.report.markup import bullets, paragraph, table
+from netkf.report.claims import Worst, node_most_off
+from netkf.report.directories import Opened
+from netkf.report.markup import bullets, paragraph, table_box
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
@@ -23,11 +23,11 @@ REPLAYED_EVENTS, LEAST, MOST = 300_000, 5, 60
 """Events of all replays of a page together, and the replays of a search at least and at most."""
 
 
-def explain_worst(source: Source) -> Explanation | str | None:
+def explain_worst(source: Opened) -> Explanation | str | None:
     """Return why the worst sample of a single run was what it was, by replays; or the reason why it
     cannot be said here, or None where there is nothing to explain.
     """
-    worst, run = worst_node(source), source.run
+    worst, run = node_most_off(source), source.run
     if worst is None or run is None or source.kind != "run":
         return None
     if len(run.nodes) == 1 or not run.count("send"):
@@ -42,7 +42,7 @@ def explain_worst(source: Source) -> Explanation | str | None:
         return str(error)
 
 
-def _command(source: Source, worst: Worst) -> str:
+def _command(source: Opened, worst: Worst) -> str:
     return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
 
 
@@ -63,9 +63,9 @@ def mending_claim(found: Explanation) -> str:
     return f"To mend it: with no message missing, a replay gives {change}{some}"
 
 
-def mending_section(source: Source, found: Explanation | str) -> str:
+def mending_section(source: Opened, found: Explanation | str) -> str:
     """Return the answer of ``netkf why`` about the worst sample: sentences, and a row a replay."""
-    worst = worst_node(source)
+    worst = node_most_off(source)
     if isinstance(found, str) or worst is None:
         return paragraph(f"The worst sample is not explained here: {found}", "note")
     rows = [
@@ -78,6 +78,6 @@ def mending_section(source: Source, found: Explanation | str) -> str:
         for what in found.what_ifs
     ]
     caption = f"Node {found.node} at {found.at:.10g} s, replayed with messages that did not come"
-    replays = table(caption, ("replayed with", "messages", "trace P", "error"), rows)
+    replays = table_box(caption, ("replayed with", "messages", "trace P", "error"), rows)
     more = f"By replays of the run, nothing is guessed: {_command(source, worst)} says more"
     return bullets(sentences(found)) + replays + paragraph(more, "note")

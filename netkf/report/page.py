@@ -17,7 +17,7 @@ from netkf.core.version import __version__
 from netkf.report import tables
 from netkf.report.claims import difference_findings, findings
 from netkf.report.data import Budget, run_data, thinning_rules
-from netkf.report.directories import Source, read_source
+from netkf.report.directories import Opened, read_source
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
 from netkf.report.mending import explain_worst, mending_claim, mending_section
 from netkf.report.messages import MESSAGE, join_messages
@@ -60,7 +60,7 @@ class _Entry(NamedTuple):
     said).
     """
 
-    source: Source
+    source: Opened
     messages: np.ndarray
     worst: Explanation | str | None = None
 
@@ -243,7 +243,7 @@ def _differences(comparison: Comparison | str) -> str:
     return tables.comparison_section(comparison)
 
 
-def _nothing_moves(sources: list[Source]) -> str:
+def _nothing_moves(sources: list[Opened]) -> str:
     if sources[0].kind in ("sweep", "verdict"):
         reason = (
             f"A {sources[0].kind} keeps no trace of single runs. To see one move: netkf run "
@@ -258,7 +258,7 @@ def _nothing_moves(sources: list[Source]) -> str:
     return section("live", "The network in motion", paragraph(reason, "note"))
 
 
-def _results(source: Source) -> str:
+def _results(source: Opened) -> str:
     parts = []
     if source.verdict is not None:
         parts.append(tables.verdict_table(source))
@@ -277,7 +277,7 @@ def _results(source: Source) -> str:
     return "".join(parts)
 
 
-def _scenario(source: Source) -> str:
+def _scenario(source: Opened) -> str:
     label = f"scenario.toml of {source.label}"
     return (
         f"<h3>{text(label)}</h3>"
@@ -293,7 +293,7 @@ def _event_counts(run: StoredRun) -> str:
     return f"Events of replica {run.replica}: {len(run.log):,}{listed}"
 
 
-def _origin(sources: list[Source], command: str, rules: list[str]) -> str:
+def _origin(sources: list[Opened], command: str, rules: list[str]) -> str:
     parts = [
         paragraph("This page was made by:"),
         f'<pre tabindex="0" role="group" aria-label="command">{text(command)}</pre>',

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from netkf.linalg.arrays import FloatArray
-from netkf.report.directories import Source
-from netkf.report.markup import bullets, paragraph, table
+from netkf.report.directories import Opened
+from netkf.report.markup import bullets, paragraph, table_box
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 from netkf.runs.tables import COLUMNS, format_number, standard_error
 from netkf.studies.compare import Comparison, Entry
@@ -22,7 +22,7 @@ INTERVAL = 2.0
 """Standard errors on each side of an interval in a curve."""
 
 
-def verdict_table(source: Source) -> str:
+def verdict_table(source: Opened) -> str:
     """Return the rows of a verdict, broken ones first."""
     verdict = source.verdict or {}
     rows = sorted(verdict.get("rows", []), key=_rank)
@@ -41,14 +41,14 @@ def verdict_table(source: Source) -> str:
     ]
     caption = f"Promises held against {verdict.get('runs', 0):,} runs by netkf check"
     header = ("verdict", "promise", "source", "seen", "expected", "off by", "would see", "evidence")
-    return table(caption, header, cells, "words")
+    return table_box(caption, header, cells, "words")
 
 
 def _rank(row: dict[str, Any]) -> int:
     return ORDER.index(row["verdict"]) if row["verdict"] in ORDER else len(ORDER)
 
 
-def summary_section(source: Source) -> str:
+def summary_section(source: Opened) -> str:
     """Return the table that ends ``netkf run``, with its notes."""
     summary = source.summary
     if not summary:
@@ -72,14 +72,14 @@ def summary_section(source: Source) -> str:
         if messages.get(name) is not None
     )
     notes = [f"messages: {counts}", *_bound_notes(source), *summary.get("notes", [])]
-    return table(caption, ["node", *COLUMNS.values()], shown) + bullets(notes)
+    return table_box(caption, ["node", *COLUMNS.values()], shown) + bullets(notes)
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
     return [format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS]
 
 
-def _bound_notes(source: Source) -> list[str]:
+def _bound_notes(source: Opened) -> list[str]:
     summary = source.summary
     found = [] if any(row["bound"] for row in summary["nodes"]) else [f"bound: {summary['bound']}"]
     if source.promised is not None:
@@ -114,7 +114,7 @@ def comparison_section(comparison: Comparison) -> str:
         else "One run says nothing about certainty: compare ensembles (netkf run --runs 100) to "
         "see which differences are certain"
     )
-    return paragraph(certain) + table("Differences of B from A", header, rows)
+    return paragraph(certain) + table_box("Differences of B from A", header, rows)
 
 
 def _value(entry: Entry) -> str:
@@ -131,7 +131,7 @@ def _difference(entry: Entry) -> list[str]:
     return [format_number(entry.difference), interval, mark]
 
 
-def sweep_table(source: Source) -> str:
+def sweep_table(source: Opened) -> str:
     """Return the points of a sweep."""
     assert source.sweep is not None
     found = source.sweep.table
@@ -142,7 +142,7 @@ def sweep_table(source: Source) -> str:
         [_cell(record[name], record.get(f"{name}_se")) for name in names]
         for record in found.to_dict("records")[:MAX_ROWS]
     ]
-    return table("Points of the sweep, +- one standard error", names, rows)
+    return table_box("Points of the sweep, +- one standard error", names, rows)
 
 
 def _cell(value: Any, error: Any) -> str:
@@ -153,16 +153,16 @@ def _cell(value: Any, error: Any) -> str:
     return str(value)
 
 
-def versions_table(source: Source) -> str:
+def versions_table(source: Opened) -> str:
     """Return the versions that the results depend on, and what else the manifest says."""
     manifest = source.manifest
     rows = [(name, value) for name, value in manifest.get("versions", {}).items()]
     keys = ("seed", "replica", "engine", "status", "events", "fingerprint")
     rows += [(key, manifest[key]) for key in keys if key in manifest]
-    return table("Versions and identity of the run", ("what", "value"), rows, "words")
+    return table_box("Versions and identity of the run", ("what", "value"), rows, "words")
 
 
-def ensemble_curves(source: Source) -> dict[str, Any] | None:
+def ensemble_curves(source: Opened) -> dict[str, Any] | None:
     """Return curves of an ensemble with their intervals for the page: for each node the mean of
     trace P, the mean squared error and the mean NEES, as lists over times; None for single runs.
 
@@ -186,7 +186,7 @@ def ensemble_curves(source: Source) -> dict[str, Any] | None:
     return {"times": found.times.tolist(), "nodes": nodes, "nees_interval": interval}
 
 
-def difference_curves(one: Source, other: Source) -> dict[str, Any] | None:
+def difference_curves(one: Opened, other: Opened) -> dict[str, Any] | None:
     """Return the difference of mean squared errors of two ensembles, for each node a list of means
     and of both ends of their intervals over time; None if their nodes or times differ.
 
@@ -215,7 +215,7 @@ def _trace(matrices: FloatArray) -> FloatArray:
     return np.asarray(np.trace(matrices, axis1=2, axis2=3))
 
 
-def averages(source: Source) -> list[dict[str, Any]] | None:
+def averages(source: Opened) -> list[dict[str, Any]] | None:
     """Return the averages of each node as in summary.json, None without a summary."""
     if not source.summary:
         return None
@@ -234,7 +234,7 @@ def finite(values: Any) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in np.asarray(values).tolist()]
 
 
-def sweep_curves(source: Source) -> dict[str, Any] | None:
+def sweep_curves(source: Opened) -> dict[str, Any] | None:
     """Return the results of a sweep over its first varied key if that has numbers, else None."""
     if source.sweep is None or not len(source.sweep.table):
         return None

@@ -49,7 +49,7 @@ def _digest(document: Mapping[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def reading(path: Path, name: str = "") -> Iterator[None]:
+def reading_file(path: Path, name: str = "") -> Iterator[None]:
     """Raise DamagedError in place of what the body raises while it reads a file, whatever is in it,
     and for anything but a regular file. ``name`` begins the message.
     """
@@ -67,7 +67,7 @@ def reading(path: Path, name: str = "") -> Iterator[None]:
 
 def read_document(path: Path) -> dict[str, Any]:
     """Return the JSON object in a file; raises DamagedError for everything else."""
-    with reading(path):
+    with reading_file(path):
         if path.stat().st_size > MAX_BYTES:
             raise DamagedError(f"is larger than {MAX_BYTES >> 20} MiB")
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)

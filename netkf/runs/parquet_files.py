@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.documents import DamagedError, reading
+from netkf.runs.documents import DamagedError, reading_file
 from netkf.runs.files import publish, writing
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Sink
@@ -40,7 +40,7 @@ def read_numbers(
     Raises DamagedError for any other file, for one with more than MAX_READ_ROWS rows, and for
     empty cells that are not allowed.
     """
-    with reading(path, path.name), pq.ParquetFile(path) as file:
+    with reading_file(path, path.name), pq.ParquetFile(path) as file:
         names, types = file.schema_arrow.names, file.schema_arrow.types
         known = dict(zip(names, types, strict=True))
         wrong = [name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])]
@@ -57,7 +57,7 @@ def read_words(path: Path, column: str, run: int | None = None) -> pd.Series[str
     """Return a column of texts of a Parquet file, of one ``run`` if it is given; raises
     DamagedError for any other file.
     """
-    with reading(path, path.name), pq.ParquetFile(path) as file:
+    with reading_file(path, path.name), pq.ParquetFile(path) as file:
         names = file.schema_arrow.names
         if names.count(column) != 1:
             raise DamagedError(f"{path.name} has no column {column}")
@@ -79,13 +79,13 @@ def _read(file: Any, path: Path, columns: Sequence[str], run: int | None) -> Any
 
 def column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file; raises DamagedError."""
-    with reading(path, path.name):
+    with reading_file(path, path.name):
         return list(pq.read_schema(path).names)
 
 
 def is_numeric_column(path: Path, name: str) -> bool:
     """Return True if a column of a Parquet file holds numbers; raises DamagedError."""
-    with reading(path, path.name):
+    with reading_file(path, path.name):
         return _is_numeric(pq.read_schema(path).field(name).type)
 
 

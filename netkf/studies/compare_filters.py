@@ -32,9 +32,9 @@ from netkf.studies.filter_values import (
     Traffic,
     block_values,
     count_traffic,
+    credibility,
     estimate_quantities,
     join_values,
-    judge_consistency,
 )
 from netkf.studies.pools import PoolOptions, shared_pool
 
@@ -50,7 +50,7 @@ Choice = str | Mapping[str, Any] | Filter
 """A filter: its kind, its table in a scenario file, or an object."""
 
 
-class Candidate(NamedTuple):
+class FilterEntry(NamedTuple):
     """A filter to compare: its ``label``, and its scenario or why it cannot run there."""
 
     label: str
@@ -200,7 +200,7 @@ def _row(
     return ComparedFilter(
         label,
         estimate_quantities(values, first, n, level),
-        judge_consistency(values, n, level),
+        credibility(values, n, level),
         *traffic,
         f"{diverged} of {len(values.diverged)} runs diverged" if diverged else "complete",
     )
@@ -208,7 +208,7 @@ def _row(
 
 def _candidates(
     scenario: Scenario, filters: Sequence[Choice], engine: str
-) -> tuple[Candidate, ...]:
+) -> tuple[FilterEntry, ...]:
     """Return the filters with their scenarios; raises ScenarioError if none can run."""
     if isinstance(filters, (str, Mapping, Filter)) or not filters:
         rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
@@ -224,7 +224,7 @@ def _candidates(
     return tuple(found)
 
 
-def _candidate(scenario: Scenario, choice: Choice, engine: str) -> Candidate:
+def _candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
     if isinstance(choice, Filter):
         filtering = dataclasses.replace(scenario.filter, algorithm=choice)
         make = partial(dataclasses.replace, scenario, filter=filtering)
@@ -240,8 +240,8 @@ def _candidate(scenario: Scenario, choice: Choice, engine: str) -> Candidate:
         made = make()
         choose_engine(engine, made)
     except (ScenarioError, EngineError) as error:
-        return Candidate(label, None, f"cannot run here: {error}")
-    return Candidate(label, made)
+        return FilterEntry(label, None, f"cannot run here: {error}")
+    return FilterEntry(label, made)
 
 
 def _label(kind: str, settings: Mapping[str, Any]) -> str:

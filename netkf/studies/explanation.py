@@ -25,7 +25,7 @@ class Missing:
 
 
 @dataclass(frozen=True)
-class Source:
+class Origin:
     """What had reached the node from one other, ``node``. Times are in seconds, nan if unknown.
 
     neighbour       it can send to the node directly
@@ -79,7 +79,7 @@ class Explanation:
     at: float
     seed: int
     replica: int
-    sources: tuple[Source, ...]
+    sources: tuple[Origin, ...]
     what_ifs: tuple[WhatIf, ...]
     smallest: SmallestSet | None
     missing: dict[MessageKey, Missing] = field(repr=False)

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from netkf.core.printable import shorten
-from netkf.figures.style import BLUE, MUTED, finish, look, new_figure, write
+from netkf.figures.style import BLUE, MUTED, finish_figure, look, new_figure, write
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare_filters import ComparedFilter, CompletedComparison
 
@@ -33,7 +33,7 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         panels[0].set_yticks(range(len(rows)), labels, parse_math=False)
         panels[0].invert_yaxis()
         runs = f"{completed.comparison.runs:,} runs on the same draws; bars: two standard errors."
-        finish(figure, _claim(rows), [f"{scenario.name}: {runs}"])
+        finish_figure(figure, _claim(rows), [f"{scenario.name}: {runs}"])
     write(figure, completed.directory / "filters.png")
 
 

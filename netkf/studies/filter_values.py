@@ -160,7 +160,7 @@ def _width(values: FloatArray, level: float) -> float:
     )
 
 
-def judge_consistency(values: FilterValues, n: int, level: float) -> str:
+def credibility(values: FilterValues, n: int, level: float) -> str:
     """Return "too sure", "too careful" or "consistent" by the interval of NEES / n, "-" where NEES
     is unknown or one run shows nothing.
     """

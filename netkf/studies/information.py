@@ -313,7 +313,7 @@ def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
     return Reach(flow, np.array(deadline), np.array(via))
 
 
-class Readings:
+class KeptReadings:
     """The times at which the nodes of a log took readings, by row."""
 
     def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
@@ -371,7 +371,7 @@ class Newest(NamedTuple):
 
 
 def newest_information(
-    reach: Reach, log: IntArray, readings: Readings, budget: int
+    reach: Reach, log: IntArray, readings: KeptReadings, budget: int
 ) -> dict[int, Newest]:
     """Return by node the newest information that reached the node of a search within a budget."""
     flow, found = reach.flow, dict[int, Newest]()

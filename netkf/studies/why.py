@@ -16,17 +16,17 @@ from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.scenario.scenario import Scenario
-from netkf.studies.explanation import Explanation, Missing, Source, WhatIf
+from netkf.studies.explanation import Explanation, Missing, Origin, WhatIf
 from netkf.studies.information import (
     OUTCOMES,
     USED,
     Flow,
     IntArray,
+    KeptReadings,
     MessageKey,
     Messages,
     Newest,
     Reach,
-    Readings,
     at_once,
     find_flow,
     match_messages,
@@ -234,20 +234,20 @@ class _Evidence:
                 found.append(Candidate(self.messages.key(m), sent, needed))
         return found
 
-    def sources(self) -> tuple[Source, ...]:
+    def sources(self) -> tuple[Origin, ...]:
         """Return what had reached the node from every other node, and from its own sensor."""
         scenario, at = self.scenario, self._replayer.at
-        readings = Readings(scenario, self._log, at)
+        readings = KeptReadings(scenario, self._log, at)
         by_budget = [
             newest_information(self._reach, self._log, readings, budget)
             for budget in range(self._most + 1)
         ]
         log, reach = self._every
-        every = newest_information(reach, log, Readings(scenario, log, at), 0)
+        every = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         wanted = [n for n in scenario.nodes if n != self._node or n in scenario.placed]
         return tuple(self._source(n, [b.get(n) for b in by_budget], every.get(n)) for n in wanted)
 
-    def _source(self, node: int, found: Sequence[Newest | None], every: Newest | None) -> Source:
+    def _source(self, node: int, found: Sequence[Newest | None], every: Newest | None) -> Origin:
         reading, *more = [math.nan if n is None else n.reading for n in found]
         last, unheard = self._direct(node)
         way: tuple[int, ...] = ()
@@ -260,7 +260,7 @@ class _Evidence:
             assert segment is not None
             passed = self._reach.messages_from(segment.segment, newer)
             missing = tuple(_missing(self.messages, m) for m in passed if self._flow.cost[m])
-        return Source(
+        return Origin(
             node=node,
             sensor=node in self.scenario.placed,
             neighbour=(node, self._node) in self._links,
@@ -305,7 +305,7 @@ def _missing(messages: Messages, m: int) -> Missing:
 
 
 def _what_ifs(
-    replayer: Replayer, sources: Sequence[Source], smallest: SmallestSet | None
+    replayer: Replayer, sources: Sequence[Origin], smallest: SmallestSet | None
 ) -> tuple[WhatIf, ...]:
     """Return the run as it was, and the replays that the answer names."""
     sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]

@@ -8,7 +8,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.figures.catalogue import FIGURES, Drawing
+from netkf.figures.catalogue import FIGURES, FigureSet
 from netkf.figures.style import look
 from tests.figures.conftest import KINDS
 
@@ -64,7 +64,7 @@ def drawing(results):
 
     def of(kind):
         if kind not in made:
-            made[kind] = Drawing(results(kind))
+            made[kind] = FigureSet(results(kind))
         return made[kind]
 
     return of

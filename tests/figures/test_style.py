@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from netkf.figures.catalogue import Drawing
+from netkf.figures.catalogue import FigureSet
 from netkf.figures.style import RELAY, SENSING, SERIES, break_lines, look, new_figure, text_width
 
 # Machado, Oliveira and Fernandes (2009), severity 1.0, on linear RGB.
@@ -71,7 +71,7 @@ def test_categorical_series_differ_by_more_than_colour():
 
 @pytest.mark.parametrize("kind", ["ring", "ensemble", "slots", "no truth"])
 def test_no_two_series_of_a_figure_look_alike(results, kind):
-    drawing = Drawing(results(kind))
+    drawing = FigureSet(results(kind))
     pairs = 0
     for name in drawing.names:
         for axes in drawing.draw(name).axes:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.report.claims import worst_node
+from netkf.report.claims import node_most_off
 from netkf.report.directories import read_source
 from netkf.report.page import write_report
 from netkf.runs.run import run_to_directory
@@ -228,7 +228,7 @@ def test_it_plays_scrubs_and_filters_by_keyboard_alone(files, look):
 
 
 def test_the_first_sight_is_the_worst_instant(files, look, ring):
-    worst = worst_node(read_source(ring))
+    worst = node_most_off(read_source(ring))
     page = look(files["ring"])
     assert page.evaluate("window.netkf.time()") == worst.time
     assert page.inner_text("#why-title") == f"Why: node {worst.node} at {worst.time:g} s"

@@ -16,7 +16,7 @@ from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.directory import runs_to_directory
 from netkf.report import page as pages
-from netkf.report.claims import findings, worst_node
+from netkf.report.claims import findings, node_most_off
 from netkf.report.data import Budget
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
@@ -123,7 +123,7 @@ def test_tables_show_the_numbers_of_the_command_line(ring, ensembles):
 def test_the_claim_names_the_worst_node_of_the_tables(ring, slots, library):
     for directory in (ring, slots):
         source = read_source(directory)
-        worst, rows = worst_node(source), source.summary["nodes"]
+        worst, rows = node_most_off(source), source.summary["nodes"]
         top = max(rows, key=lambda row: row["rms_error"])
         assert worst.node == top["node"]
         assert worst.value == pytest.approx(top["rms_error"], rel=1e-12)
@@ -138,7 +138,7 @@ def test_the_claim_names_the_worst_node_of_the_tables(ring, slots, library):
 
 
 def test_why_counts_what_was_lost_since_the_worst_node_last_heard(ring):
-    worst = worst_node(read_source(ring))
+    worst = node_most_off(read_source(ring))
     messages = plain_messages(netkf.open(ring).events)
     lost = 0
     for sender in {key[0] for key in messages if key[1] == worst.node}:
@@ -178,7 +178,7 @@ def test_thinned_pages_keep_what_they_say(ring, monkeypatch):
     sent = run.log["t"][run.log["kind"] == 2]
     assert inside.sum() == ((sent >= kept["start"]) & (sent <= kept["end"])).sum() > 0
     assert (numbers[~inside] % kept["step"] == 0).all()
-    worst = worst_node(read_source(ring))
+    worst = node_most_off(read_source(ring))
     times = page.column(samples["columns"]["t"])
     assert worst.time in times
     assert run.times[-1] in times

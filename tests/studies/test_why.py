@@ -14,7 +14,7 @@ from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.scenario.reading import from_table
 from netkf.studies.information import (
-    Readings,
+    KeptReadings,
     find_flow,
     match_messages,
     newest_information,
@@ -196,7 +196,7 @@ def test_the_newest_readings_are_those_of_a_search_in_a_graph_of_events(runs, na
         assert len(log) == count
         messages = match_messages(log, scenario.hosted.combination == "swap", scenario.slotted)
         reach = search_back(find_flow(scenario, log, messages), node)
-        found = newest_information(reach, log, Readings(scenario, log, at), 0)
+        found = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         ours = {n: f.reading for n, f in found.items() if not math.isnan(f.reading)}
         expected, sources = graph.newest(node, count - 1)
         if name == "hybrid":  # continuous readings reach up to the moment of sending

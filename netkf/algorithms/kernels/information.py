@@ -41,7 +41,7 @@ def take_inverse(lanes: Lanes, out: FloatArray, share: float, inverse: FloatArra
 
 
 @kernel(inlined=True)
-def add_reading(
+def add_reading_pair(
     lanes: Lanes,
     total: FloatArray,
     share: float,
@@ -132,7 +132,7 @@ def begin_part(
     """
     take_inverse(lanes, total, shares[k, 0], inverse, place[2])
     if shares[k, 1] > 0.0:
-        add_reading(lanes, total, shares[k, 1], y, H, place, rows, centre, work)
+        add_reading_pair(lanes, total, shares[k, 1], y, H, place, rows, centre, work)
     keep_part(lanes, parts, (0, k, place[2]), total)
 
 
