@@ -32,9 +32,9 @@ def source_table(found: Explanation) -> pd.DataFrame:
             "heard": s.heard,
             "arrived": s.arrived,
             "unheard": s.unheard,
-            "known_age": found.at - s.known,
+            "known_age": _age(found, s.known),
             "reading": s.reading,
-            "reading_age": found.at - s.reading,
+            "reading_age": _age(found, s.reading),
             "route": " -> ".join(map(str, s.route)),
             **{f"age_with_{k}_more": found.at - s.with_more[k - 1] for k in range(1, more + 1)},
             "age_without_losses": found.at - s.without_losses,
@@ -275,8 +275,14 @@ def _time(seconds: float) -> str:
     return "-" if math.isnan(seconds) else f"{seconds:.6g}"
 
 
+def _age(found: Explanation, seconds: float) -> float:
+    return seconds if math.isnan(seconds) else max(0.0, found.at - seconds)
+
+
 def _ago(found: Explanation, seconds: float) -> str:
-    return f"at {seconds:.6g} s ({found.at - seconds:.4g} s before)"
+    # A filtered sample is labelled with the beginning of the slot whose exchanges it has.
+    since = "in this slot" if seconds > found.at else f"{found.at - seconds:.4g} s before"
+    return f"at {seconds:.6g} s ({since})"
 
 
 def _route(source: Origin) -> str:

@@ -402,6 +402,16 @@ def test_a_record_without_a_row_is_no_reading(build, tmp_path):
     assert why(netkf.simulate(scenario), 1, 3.0).sources[0].reading == 2.0
 
 
+def test_messages_of_the_slot_of_a_filtered_sample_are_not_of_its_future(build):
+    network = {"graph": {"kind": "path", "nodes": 3}, "activation": {"kind": "broadcast"}}
+    filtered = {"kind": "hcmci", "consensus": "information", "steps": 3}
+    plant = {"kind": "linear", "F": [[0.9]], "Q": [[0.1]], "period": 0.5, "cov": [[1.0]]}
+    found = why(netkf.simulate(build(plant=plant, network=network, filter=filtered)), 1, 2.0)
+    assert found.sources[0].heard > 2.0  # sent within the slot from 2.0 to 2.5 s
+    assert "(in this slot)" in str(found)
+    assert (found.table.known_age.dropna() >= 0.0).all()
+
+
 @pytest.mark.parametrize(("kind", "known"), [("local", {1}), ("central", {0, 1})])
 def test_filters_that_do_not_talk_have_no_missing_messages(build, kind, known):
     sensors = [{"nodes": [0, 1], "H": [[1.0]], "R": [[0.5]]}]
