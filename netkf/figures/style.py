@@ -177,8 +177,8 @@ def _columns(labels: Sequence[str], room: float) -> int:
     """Return the largest number of columns of a legend that fits ``room`` points."""
     widths = [text_width(label, LEGEND_SIZE) + 6.0 * LEGEND_SIZE for label in labels]
     for count in range(len(labels), 1, -1):
-        rows = -(-len(labels) // count)
-        if sum(max(widths[k : k + rows]) for k in range(0, len(labels), rows)) <= room:
+        # Legends split their labels so: the first columns have one more where they are not equal.
+        if sum(column.max() for column in np.array_split(widths, count)) <= room:
             return count
     return 1
 
