@@ -13,6 +13,11 @@ from netkf.ensembles.blocks import packed
 from netkf.runs.run import run_to_directory
 
 
+def test_directories_to_compare_are_a_list():
+    with pytest.raises(netkf.ScenarioError, match=r"one list: netkf.compare\(\[one, other\]\)"):
+        netkf.compare("one", "other")
+
+
 def test_all_parts_can_be_taken_at_once():
     names = {}
     exec("from netkf.parts import *", names)

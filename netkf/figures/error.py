@@ -174,7 +174,8 @@ def _mark_worst(axes: Any, subject: Subject, times: FloatArray, values: FloatArr
             ls="",
             label=f"worst of node {subject.nodes[k]}: {value:.3g} at {t:g} s",
         )
-        words = words or f"Node {subject.nodes[k]} was worst: {value:.3g} at {t:g} s"
+        of_node = f"of node {subject.nodes[k]} at {t:g} s"
+        words = words or f"The largest error after the start is {value:.3g}, {of_node}"
     typical = float(np.nanmedian(values[used]))
     return f"{words}, {value_ratio(values[used], typical)}" if words else "No error is finite"
 

@@ -72,7 +72,7 @@ def age_figure(subject: Subject) -> Picture:
     worst = max(means, key=lambda node: means[node])
     claim = f"On average the freshest message that a node has heard is {values.mean():.3g} s old"
     if len(means) > 1:
-        claim += f"; node {worst} is worst off with {means[worst]:.3g} s"
+        claim += f"; node {worst} waits longest, {means[worst]:.3g} s"
     words = "Age of information: time since the freshest message that a node has heard was sent."
     finish_figure(figure, subject.claim(claim), subject.caption(words))
     return figure

@@ -260,6 +260,9 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     ``confidence`` (Bonferroni). A single run says nothing about certainty. Raises ScenarioError for
     a directory that is not that of a finished run.
     """
+    if isinstance(directories, (str, Path)):
+        remedy = "give all of them in one list: netkf.compare([one, other])"
+        raise ScenarioError("directories", "must be a list", str(directories), remedy)
     sure = number(above=0.0, below=1.0)("--confidence", confidence)
     found = [read_directory(Path(directory)) for directory in directories]
     if not found:

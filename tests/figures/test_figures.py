@@ -107,8 +107,8 @@ def test_titles_say_what_the_data_says(results, drawing):
     error = np.sqrt(((run.x[:, None] - run.xhat) ** 2).sum(axis=2))[after]
     at, worst = np.unravel_index(error.argmax(), error.shape)
     title = drawing("ring").draw("quantiles").get_suptitle()
-    when = f"{run.times[after][at]:g} s"
-    assert title.startswith(f"Node {worst} was worst: {error.max():.3g} at {when}")
+    where = f"of node {worst} at {run.times[after][at]:g} s"
+    assert title.startswith(f"The largest error after the start is {error.max():.3g}, {where}")
     kinds = run.events["kind"].value_counts()
     lost = drawing("ring").draw("links").get_suptitle()
     total = kinds["lost"] + kinds["deliver"]
