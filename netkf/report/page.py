@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, WriteError
 from netkf.core.version import __version__
 from netkf.report import tables
 from netkf.report.claims import difference_findings, findings
@@ -53,6 +53,9 @@ POLICY = (
     "base-uri 'none'; form-action 'none'"
 )
 LEAST_BUDGET = 500
+MARK = b'<meta name="generator" content="netkf '
+"""What every page has among its first HEAD bytes, and other files have not."""
+HEAD = 4096
 
 
 class _Entry(NamedTuple):
@@ -81,11 +84,27 @@ def write_report(
 
     The path is ``out``, by default ``report.html`` in the first directory. A second directory may
     hold the verdict of ``netkf check`` on the first. Raises ScenarioError for a directory that is
-    not one of netkf's, WriteError if the page cannot be written.
+    not one of netkf's or a ``path`` that holds anything but a page, WriteError if the page cannot
+    be written.
     """
     path = Path(directories[0]) / "report.html" if out is None else out
+    _refuse_other_files(path)
     write_text(path, make_page(directories, replica, trust, path))
     return path
+
+
+def _refuse_other_files(path: Path) -> None:
+    """Raise ScenarioError if there is a file that is not a page: it would be lost."""
+    if not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+    except OSError as error:
+        raise WriteError(error, path) from error
+    if MARK not in head:
+        rule = "would overwrite a file that is not a page of netkf report"
+        raise ScenarioError("--out", rule, str(path), "choose another name, or remove the file")
 
 
 def make_page(

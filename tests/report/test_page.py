@@ -323,6 +323,20 @@ def test_the_command(ring, tmp_path, capsys):
     assert main(["report", str(ring), str(ring), str(ring)]) == 2
 
 
+def test_only_pages_are_overwritten(ring, tmp_path, capsys):
+    page, notes = tmp_path / "page.html", tmp_path / "notes.html"
+    for _ in range(2):  # a page may be made again
+        assert main(["report", str(ring), "--out", str(page)]) == 0
+    notes.write_text("<!DOCTYPE html>\n<title>netkf: my notes</title>\n")
+    kept = notes.read_bytes()
+    capsys.readouterr()
+    assert main(["report", str(ring), "--out", str(notes)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "not a page of netkf report" in said
+    assert notes.read_bytes() == kept
+
+
 def test_a_summary_without_its_parts_is_refused_in_one_line(ring, tmp_path):
     directory = shutil.copytree(ring, tmp_path / "run")
     for name in ("limit", "notes", "bound"):
