@@ -6,6 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.special
 
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import Opened
@@ -24,8 +25,11 @@ MAX_LISTED = 4
 MAX_COMPARED = 500_000
 """Events of a run up to which two runs are compared event by event."""
 LABELS = {"rms_error": "RMS error", "mean_trace": "mean trace P", "mean_nees": "mean NEES"}
-LARGE_NEES = 2.0
-"""Squared errors, in units of what P says, that are called larger than P says."""
+CERTAIN = 0.01
+"""Probability that, where P is exact, the NEES of any sample of a run is called too large."""
+COME_DOWN, SETTLED = 0.8, 0.25
+"""Trace P has a start-up if its mean over the last quarter of the samples is below this share of
+its first value."""
 
 
 class Worst(NamedTuple):
@@ -69,6 +73,41 @@ def node_most_off(source: Opened) -> Worst | None:
         math.sqrt(max(0.0, float(square[at, k]))),
         by_error,
     )
+
+
+class StartUp(NamedTuple):
+    """Trace P of a node at its first sample, ``now``, and its mean over its last samples."""
+
+    first: float
+    now: float
+    last: float
+
+
+def after_start_up(source: Opened, worst: Worst) -> tuple[Worst, StartUp | None]:
+    """Return the worst sample of the worst node after its start-up, and, if its worst sample of all
+    was in the start-up, its trace P then.
+
+    The start-up lasts until trace P has come down halfway from its first value to its last ones.
+    """
+    run = source.run
+    assert run is not None
+    k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
+    traces = np.trace(run.P[:, k], axis1=1, axis2=2)
+    first, now = float(traces[0]), float(traces[at])
+    last = float(traces[-max(1, int(SETTLED * len(traces))) :].mean())
+    low = np.flatnonzero(traces <= 0.5 * (first + last))
+    if not last < COME_DOWN * first or not len(low) or low[0] <= at:
+        return worst, None
+    used = _averaged(source, run)
+    chosen = used.errors if worst.by_error else used.covariances
+    rest = chosen[chosen >= low[0]]
+    start = StartUp(first, now, last)
+    if not len(rest):
+        return worst, start
+    square = run.sq_error[:, k] if worst.by_error else traces
+    then = int(rest[np.argmax(square[rest])])
+    peak = math.sqrt(max(0.0, float(square[then])))
+    return worst._replace(time=float(run.times[then]), peak=peak), start
 
 
 def _averaged(source: Opened, run: StoredRun) -> SampleIndices:
@@ -172,37 +211,79 @@ def _of_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]
         return [
             "There is no ground truth, so nobody knows which node was most wrong. Least certain by "
             f"its own covariance was node {worst.node}: square root of mean trace P "
-            f"{format_number(worst.value)}, the largest of {count} nodes; it peaked at "
-            f"{_time(worst.time)} with {format_number(worst.peak)}",
+            f"{format_number(worst.value)}, the largest of {count} nodes; {_since(run, worst)}it "
+            f"peaked at {_time(worst.time)} with {format_number(worst.peak)}",
             *_why(source, run, messages, worst),
         ]
     overall = source.summary.get("overall", {}).get("rms_error")
     rank = f", the largest of {count} nodes (all nodes {format_number(overall)})"
     return [
         f"Node {worst.node} was worst: RMS error {format_number(worst.value)} over time"
-        f"{rank if count > 1 else ''}. Its error was largest at {_time(worst.time)}: "
-        f"{format_number(worst.peak)}",
+        f"{rank if count > 1 else ''}. {_since(run, worst).capitalize()}its error was largest at "
+        f"{_time(worst.time)}: {format_number(worst.peak)}",
         *_why(source, run, messages, worst),
     ]
 
 
+def _since(run: StoredRun, worst: Worst) -> str:
+    """Return the words that say that the worst sample is not looked for at time 0."""
+    return "after time 0 " if run.times[0] <= 0.0 < worst.time else ""
+
+
 def _why(source: Opened, run: StoredRun, messages: np.ndarray, worst: Worst) -> list[str]:
-    """Return what the worst node had heard by its worst instant, and what its P said."""
+    """Return what the worst node had heard by its worst instant after its start-up, and what its P
+    said.
+    """
     into = messages[messages["receiver"] == worst.node]
     found = []
+    later, start = after_start_up(source, worst)
+    if start is not None:
+        found.append(_started(worst, later, start))
+        worst = later
     if len(into):
         cut = float(source.cuts(np.array([worst.time]))[0])
         found.append(_heard(into, worst, cut) + _unusual(source, run, into, worst))
+    if worst.by_error:
+        found += _judged(source, run, worst)
+    return found
+
+
+def _started(worst: Worst, later: Worst, start: StartUp) -> str:
+    """Return that the worst sample was in the start-up, and which one is explained instead."""
+    said = (
+        f"The filters had just started at {_time(worst.time)}: trace P was "
+        f"{format_number(start.now)}, {format_number(start.first)} at the first sample and "
+        f"{format_number(start.last)} on average over the last ones"
+    )
+    if later.time == worst.time:
+        return said
+    what = "error" if worst.by_error else "square root of trace P"
+    return (
+        f"{said}. The largest {what} after this start-up was {format_number(later.peak)} at "
+        f"{_time(later.time)}, which is explained here"
+    )
+
+
+def _judged(source: Opened, run: StoredRun, worst: Worst) -> list[str]:
+    """Return if P allows the error of a sample that was chosen because it is large."""
     k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
     nees, n = float(run.nees[at, k]), run.x.shape[1]
-    if worst.by_error and math.isfinite(nees):
-        large = nees > LARGE_NEES * n
-        judged = "far more than its P says" if large else "no more than its P allows"
-        found.append(
-            f"The error then was {judged}: NEES {format_number(nees)}, expected {n} where P is "
-            "exact"
-        )
-    return found
+    if not math.isfinite(nees):
+        return []
+    # NEES is chi-square with n degrees of freedom where P is exact. Bonferroni: the samples of all
+    # nodes were looked at, dependent as they are.
+    looked = len(_averaged(source, run).errors) * len(run.nodes)
+    limit = float(scipy.special.chdtri(n, CERTAIN / looked))
+    judged = (
+        f"far more than its P says: NEES {format_number(nees)}, above"
+        if nees > limit
+        else f"within what its P allows: NEES {format_number(nees)}, not above"
+    )
+    return [
+        f"The error at {_time(worst.time)} was {judged} {format_number(limit)}, which the worst of "
+        f"{looked:,} samples exceeds with probability {CERTAIN:.0%} at most where P is exact (the "
+        f"mean is {n} then)"
+    ]
 
 
 def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:

@@ -10,7 +10,7 @@ import networkx
 import numpy as np
 import scipy.special
 
-from netkf.report.claims import Worst, node_most_off
+from netkf.report.claims import Worst, after_start_up, node_most_off
 from netkf.report.directories import Opened
 from netkf.report.messages import (
     Kept,
@@ -52,9 +52,11 @@ def run_data(
     ``packer``.
     """
     worst = node_most_off(source)
-    times = sample_indices(run, budget.values)
+    if worst is not None:
+        worst, _ = after_start_up(source, worst)
     horizon = float(source.scenario.horizon)
     instant = worst.time if worst is not None else horizon
+    times = sample_indices(run, budget.values, instant)
     kept = keep_messages(messages, budget.messages, instant)
     return {
         "label": source.label,
@@ -120,9 +122,9 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
     return rules
 
 
-def sample_indices(run: StoredRun, values: int) -> np.ndarray:
+def sample_indices(run: StoredRun, values: int, instant: float) -> np.ndarray:
     """Return the indices of the samples to keep, so that there are at most about ``values``
-    numbers: every k-th, the last one, and the worst instant of each node.
+    numbers: every k-th, the last one, that at ``instant``, and the worst instant of each node.
     """
     n, count = run.x.shape[1], len(run.nodes)
     each = count * (n + n * (n + 1) // 2 + 4) + n + 1
@@ -131,7 +133,8 @@ def sample_indices(run: StoredRun, values: int) -> np.ndarray:
     if total <= most:
         return np.arange(total)
     step = -(-total // max(1, most - 1))
-    chosen = {*range(0, total, step), total - 1}
+    shown = min(int(np.searchsorted(run.times, instant)), total - 1)
+    chosen = {*range(0, total, step), shown, total - 1}
     if run.truth_known:
         error = np.where(np.isfinite(run.sq_error), run.sq_error, -1.0)
         chosen |= set(error.argmax(axis=0).tolist())

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from netkf.core.errors import NetkfError
-from netkf.report.claims import Worst, node_most_off
+from netkf.report.claims import Worst, after_start_up, node_most_off
 from netkf.report.directories import Opened
 from netkf.report.markup import bullets, paragraph, table_box
 from netkf.runs.tables import format_number
@@ -24,10 +24,10 @@ REPLAYED_EVENTS, LEAST, MOST = 300_000, 5, 60
 
 
 def explain_worst(source: Opened) -> Explanation | str | None:
-    """Return why the worst sample of a single run was what it was, by replays; or the reason why it
-    cannot be said here, or None where there is nothing to explain.
+    """Return why the worst sample of a single run after the start-up was what it was, by replays;
+    or the reason why it cannot be said here, or None where there is nothing to explain.
     """
-    worst, run = node_most_off(source), source.run
+    worst, run = _explained(source), source.run
     if worst is None or run is None or source.kind != "run":
         return None
     if len(run.nodes) == 1 or not run.count("send"):
@@ -40,6 +40,11 @@ def explain_worst(source: Opened) -> Explanation | str | None:
         return why(run, worst.node, worst.time, replays=replays)
     except NetkfError as error:
         return str(error)
+
+
+def _explained(source: Opened) -> Worst | None:
+    worst = node_most_off(source)
+    return None if worst is None else after_start_up(source, worst)[0]
 
 
 def _command(source: Opened, worst: Worst) -> str:
@@ -65,7 +70,7 @@ def mending_claim(found: Explanation) -> str:
 
 def mending_section(source: Opened, found: Explanation | str) -> str:
     """Return the answer of ``netkf why`` about the worst sample: sentences, and a row a replay."""
-    worst = node_most_off(source)
+    worst = _explained(source)
     if isinstance(found, str) or worst is None:
         return paragraph(f"The worst sample is not explained here: {found}", "note")
     rows = [

@@ -225,7 +225,8 @@ def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
             parts.append(paragraph(f"Claim of the scenario: {source.scenario.claim}", "claim"))
         lines = findings(source, messages)
         if isinstance(worst, Explanation):
-            lines.insert(min(2, len(lines)), mending_claim(worst))
+            why = (k for k, line in enumerate(lines, 1) if line.startswith("Why: "))
+            lines.insert(next(why, len(lines)), mending_claim(worst))
         parts.append(bullets((line + "." for line in lines), "findings"))
     heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
     if comparison is not None:

@@ -16,10 +16,11 @@ from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.directory import runs_to_directory
 from netkf.report import page as pages
-from netkf.report.claims import findings, node_most_off
+from netkf.report.claims import after_start_up, findings, node_most_off
 from netkf.report.data import Budget
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
+from netkf.report.mending import explain_worst
 from netkf.report.messages import MESSAGE, information_age, join_messages, keep_messages
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
@@ -147,6 +148,55 @@ def test_why_counts_what_was_lost_since_the_worst_node_last_heard(ring):
         lost += sum(m[1] == "lost" and heard < m[0] <= worst.time for m in link)
         assert f"node {sender} ({worst.time - heard:.4g} s before)" in findings_of(ring)[1]
     assert f"; {lost:,} message" in findings_of(ring)[1]
+
+
+def hybrid_ring(folder, name, changes):
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 10.0, **changes})
+    return run_to_directory(scenario, folder / name).directory
+
+
+def test_the_worst_of_many_samples_is_judged_as_that(ring, tmp_path):
+    wrong = hybrid_ring(tmp_path, "wrong", {"plant.cov": [[100.0, 0.0], [0.0, 100.0]]})
+    for directory, words in (
+        (ring, "within what its P allows"),
+        (wrong, "far more than its P says"),
+    ):
+        source = read_source(directory)
+        states = netkf.open(directory).states
+        looked = states[states["t"] > 0]
+        limit = scipy.stats.chi2(2).isf(0.01 / len(looked))
+        worst, _ = after_start_up(source, node_most_off(source))
+        at = looked[(looked["node"] == worst.node) & (looked["t"] == worst.time)]
+        nees = at["nees"].item()
+        assert (nees > limit) == words.startswith("far")
+        (said,) = [line for line in findings_of(directory) if line.startswith("The error at")]
+        assert f"t = {worst.time:g} s was {words}: NEES {nees:.4g}," in said
+        assert f"above {limit:.4g}, which the worst of {len(looked)} samples" in said
+
+
+def test_errors_of_the_start_up_are_called_so(tmp_path):
+    far = {key: [[25.0, 0.0], [0.0, 25.0]] for key in ("plant.cov", "filter.cov")}
+    directory = hybrid_ring(tmp_path, "far", {**far, "network.activation.rate": 4.0})
+    source, run = read_source(directory), netkf.open(directory)
+    worst = node_most_off(source)
+    k = run.nodes.index(worst.node)
+    traces = run.P[:, k, 0, 0] + run.P[:, k, 1, 1]
+    halfway = (50.0 + traces[-5:].mean()) / 2  # of 21 samples the last quarter
+    settled = next(i for i, trace in enumerate(traces) if trace <= halfway)
+    later = settled + int(run.sq_error[settled:, k].argmax())
+    peak = np.sqrt(run.sq_error[later, k])
+    assert worst.time < run.times[settled]
+    assert run.sq_error[0, k] > worst.peak**2 > peak**2  # time 0 is left out, in words
+    lines = findings_of(directory)
+    assert f"After time 0 its error was largest at t = {worst.time:g} s" in lines[0]
+    assert lines[1].startswith(f"The filters had just started at t = {worst.time:g} s: trace P was")
+    assert f"after this start-up was {peak:.4g} at t = {run.times[later]:g} s" in lines[1]
+    assert lines[2].startswith("Why: ")
+    assert explain_worst(source).at == run.times[later]
+    page = Page(make_page([directory]))
+    assert page.data["runs"][0]["worst"]["time"] == run.times[later]
+    told = page.shown
+    assert told.index("just started") < told.index("Why: ") < told.index("To mend it")
 
 
 def test_ages_of_information_are_means_over_links(delayed):
