@@ -252,6 +252,28 @@ def test_a_click_on_a_node_explains_it(files, look):
     assert arrow.startswith("message ")
 
 
+def test_counts_are_of_the_messages_that_are_drawn(files, look):
+    page = look(files["ring"])
+    page.evaluate("""() => {
+      const { app } = window.netkf, m = app.run.messages, node = app.nodeOf(app.run);
+      const others = (_, k) => m.sender[k] !== node && m.receiver[k] !== node;
+      app.setTime(m.sent[m.sent.findIndex(others)]);
+    }""")
+    every = page.evaluate("window.netkf.state(window.netkf.time()).messages.length")
+    numbers = {}
+    for kind in ("all", "node", "trouble", "none"):
+        page.select_option("#filter", kind)
+        page.wait_for_timeout(100)
+        drawn = page.locator("#sequence .message").count()
+        assert page.inner_text("#sequence-note").startswith(f"{drawn} messages")
+        assert f", {drawn} messages;" in page.get_attribute("#sequence svg", "aria-label")
+        page.evaluate("document.getElementById('messages-box').open = true")
+        page.wait_for_timeout(100)
+        numbers[kind] = page.locator("#message-table tbody tr").count()
+        assert f"; {numbers[kind]} messages on show" in page.inner_text("#state")
+    assert numbers["all"] == every > numbers["node"] >= numbers["none"] == 0
+
+
 def test_the_canvas_shows_what_is_lost(files, look):
     """A lost message is drawn in the colour of losses, and nothing is where messages are off."""
     page = look(files["ring"])

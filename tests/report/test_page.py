@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 
+import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,6 +16,7 @@ import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.directory import runs_to_directory
+from netkf.figures.style import SEQUENTIAL
 from netkf.report import page as pages
 from netkf.report.claims import after_start_up, findings, node_most_off
 from netkf.report.data import Budget
@@ -89,6 +91,15 @@ def test_nothing_comes_from_outside(ring, ensembles):
             assert f"{kind}-src 'sha256-{digest}'" in policy
         assert policy.startswith("default-src 'none'")
         assert "unsafe" not in policy
+
+
+def test_colours_are_those_of_the_figures():
+    """The larger the darker: the stops of the page are those of the map that figures use."""
+    found = re.search(r"const STOPS = (\[\[.*?\]\]);", pages._asset("theme.js"))
+    stops = json.loads(found.group(1))
+    shares = np.linspace(0.0, 1.0, len(stops))
+    colours = matplotlib.colormaps[SEQUENTIAL](shares)[:, :3]
+    np.testing.assert_allclose(np.array(stops) / 255, colours, rtol=0, atol=0.003)
 
 
 def test_texts_of_files_are_escaped(tmp_path):

@@ -27,6 +27,11 @@ const app = {
     return rows;
   },
 
+  // What is left of the messages, in words behind their number; nothing where all are shown.
+  filterWords() {
+    return this.filter === "all" ? "" : " (" + find("filter").selectedOptions[0].text + ")";
+  },
+
   setTime(t, moving) {
     this.time = Math.min(this.end, Math.max(0, t));
     schedule(moving);
@@ -80,7 +85,9 @@ function drawSlowly(now) {
 function say() {
   find("state").textContent = app.runs.map((run, r) => {
     const state = State.at(run, app.time, app.persist()), i = app.nodeOf(run);
-    const of = (kind) => state.messages.filter((message) => message.state === kind).length;
+    const rows = app.filtered(run, State.messagesAt(run, app.time, app.persist()));
+    const states = rows.map((row) => State.outcomeAt(run, row, app.time));
+    const of = (kind) => states.filter((found) => found === kind).length;
     const parts = [(app.runs.length > 1 ? "AB"[r] + " at " : "At ") + Format.time(app.time) + " s"];
     if (state.sample === null) parts.push("no sample yet");
     else if (i >= 0) {
@@ -90,7 +97,8 @@ function say() {
         " (sample of " + Format.time(state.sample) + " s)");
     }
     const counts = State.OUTCOMES.map((kind) => Format.count(of(kind)) + " " + kind).join(", ");
-    parts.push(Format.count(state.messages.length) + " messages on show: " + counts);
+    const most = rows.length > Network.MAX_DRAWN ? ", of which " + Network.MAX_DRAWN + " are drawn" : "";
+    parts.push(Format.count(rows.length) + " messages on show" + app.filterWords() + most + ": " + counts);
     return parts.join("; ") + ".";
   }).join(" ");
 }

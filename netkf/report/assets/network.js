@@ -205,7 +205,7 @@ const Network = (() => {
     return run.truth ? s.error : Math.sqrt(s.trace);
   }
 
-  // Nine of ten samples lie below the end of the scale: one wild node does not make all others dark.
+  // Nine of ten samples lie below the end of the scale: one wild node does not make all others light.
   function shadeRange(run) {
     const values = [];
     for (let k = 0; k < run.samples.count; k++) {
@@ -237,5 +237,5 @@ const Network = (() => {
     return run.sizes[c];
   }
 
-  return { view, colour };
+  return { view, colour, MAX_DRAWN };
 })();

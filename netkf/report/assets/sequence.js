@@ -24,11 +24,11 @@ const Sequence = (() => {
     return found;
   }
 
-  // Half of the width until no more than MAX_ARROWS messages are left around t.
-  function narrow(run, chosen, t, width) {
+  // The messages to draw, with half of the width until no more than MAX_ARROWS are left around t.
+  function narrow(run, chosen, t, width, app) {
     for (;;) {
       const start = Math.max(0, t - 0.75 * width), end = start + width;
-      const found = rows(run, chosen, start, end);
+      const found = app.filtered(run, rows(run, chosen, start, end));
       if (found.length <= MAX_ARROWS || width < 1e-9 * run.horizon) return { found, start, end, width };
       width /= 2;
     }
@@ -61,28 +61,26 @@ const Sequence = (() => {
 
   function draw(box, note, run, app) {
     const chosen = app.lifelines === "near" ? near(run, app.nodeOf(run), app.time) : app.picks.slice();
-    const { found, start, end, width } = narrow(run, chosen, app.time, app.window);
+    const { found, start, end, width } = narrow(run, chosen, app.time, app.window, app);
     const wide = Math.max(box.clientWidth - 2, LEFT + RIGHT + 44 * chosen.length);
     const step = (wide - LEFT - RIGHT) / Math.max(1, chosen.length - 1 || 1);
     const x = new Map(chosen.map((i, k) => [i, chosen.length > 1 ? LEFT + 14 + (k * (step * (chosen.length - 1) - 28)) / (chosen.length - 1) : wide / 2]));
     x.gap = chosen.length > 1 ? Math.abs(x.get(chosen[1]) - x.get(chosen[0])) : 0;
-    const at = heights(run, found, start, end);
+    const at = heights(run, found, start, end), drawn = found.filter((row) => at.sent(row) <= HEIGHT - BOTTOM);
     const svg = make("svg", {
       width: wide, height: HEIGHT, role: "img", class: "sequence",
-      "aria-label": describe(run, chosen, found, start, end),
+      "aria-label": describe(run, chosen, drawn, start, end),
     });
     drawFrame(svg, at, start, end, wide);
     drawLifelines(svg, run, app, chosen, x, at, start, end);
-    for (const row of app.filtered(run, found)) {
-      if (at.sent(row) <= HEIGHT - BOTTOM) svg.append(arrow(run, row, x, at));
-    }
+    for (const row of drawn) svg.append(arrow(run, row, x, at));
     drawClock(svg, at, app.time, wide, end);
     svg.addEventListener("click", (event) => {
       const y = event.clientY - svg.getBoundingClientRect().top;
       if (y > TOP) app.setTime(start + ((y - TOP) / (HEIGHT - TOP - BOTTOM)) * (end - start));
     });
     box.replaceChildren(svg);
-    note.textContent = words(run, found, start, end, width, app);
+    note.textContent = words(run, drawn, start, end, width, app);
   }
 
   function describe(run, chosen, found, start, end) {
@@ -92,14 +90,15 @@ const Sequence = (() => {
   }
 
   function words(run, found, start, end, width, app) {
-    let said = Format.count(found.length) + " messages from " + Format.time(start) + " to " + Format.time(end) + " s";
+    let said = Format.count(found.length) + " messages" + app.filterWords() + " from " + Format.time(start) + " to " + Format.time(end) + " s";
     if (width < app.window) said += "; the window is narrowed so that they can be told apart";
     const m = run.messages;
     if (m.step > 1 && (start < m.start || end > m.end)) {
       said += "; outside of " + Format.time(m.start) + " to " + Format.time(m.end) +
         " s the page holds only every " + m.step + "th message of a link";
     }
-    return said + ". Ticks on a lifeline are readings of its sensor.";
+    return said + ". Messages sent at one instant, such as the two of an exchange, are drawn one below the other. " +
+      "Ticks on a lifeline are readings of its sensor.";
   }
 
   function drawFrame(svg, at, start, end, wide) {

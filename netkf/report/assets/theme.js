@@ -9,9 +9,9 @@ const Theme = (() => {
     return found;
   }
 
-  // Dark blue to yellow: increasing in lightness, so that it is read in grey and by colour-blind
-  // readers (the ends and middle of the map cividis).
-  const STOPS = [[0, 34, 78], [60, 77, 110], [124, 123, 120], [188, 173, 108], [254, 232, 56]];
+  // Yellow to dark blue: the larger the darker, as in the figures of netkf plot, so that it is read
+  // in grey and by colour-blind readers (the ends and middle of the map cividis_r).
+  const STOPS = [[254, 232, 56], [187, 173, 109], [124, 123, 120], [66, 78, 108], [0, 34, 78]];
 
   function scale(share) {
     const at = Math.min(1, Math.max(0, Number.isFinite(share) ? share : 1)) * (STOPS.length - 1);
