@@ -13,7 +13,7 @@ from netkf.report.markup import bullets, paragraph, table_box
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
-from netkf.studies.why_text import sentences
+from netkf.studies.why_text import relative_change, sentences
 
 SAME = 1e-4
 """Relative difference of numbers that look the same with four digits."""
@@ -78,11 +78,12 @@ def mending_section(source: Opened, found: Explanation | str) -> str:
             what.label,
             "all" if what.messages is None else len(what.messages),
             format_number(what.trace),
+            "" if k == 0 else relative_change(what.trace, found.trace),
             format_number(what.error),
         )
-        for what in found.what_ifs
+        for k, what in enumerate(found.what_ifs)
     ]
     caption = f"Node {found.node} at {found.at:.10g} s, replayed with messages that did not come"
-    replays = table_box(caption, ("replayed with", "messages", "trace P", "error"), rows)
+    replays = table_box(caption, ("replayed with", "messages", "trace P", "change", "error"), rows)
     more = f"By replays of the run, nothing is guessed: {_command(source, worst)} says more"
     return bullets(sentences(found)) + replays + paragraph(more, "note")

@@ -7,6 +7,11 @@ from dataclasses import dataclass, field
 from netkf.studies.information import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
+NEAR = 0.05
+"""By default a set is good enough if it brings the trace of P as close as that, relatively, to the
+one of the run in which every message came.
+"""
+
 
 @dataclass(frozen=True)
 class Missing:

@@ -16,7 +16,7 @@ from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.scenario.scenario import Scenario
-from netkf.studies.explanation import Explanation, Missing, Origin, WhatIf
+from netkf.studies.explanation import NEAR, Explanation, Missing, Origin, WhatIf
 from netkf.studies.information import (
     OUTCOMES,
     USED,
@@ -47,10 +47,6 @@ if TYPE_CHECKING:
 MOST = 3
 MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 100, 1000, 5_000_000
 """By default as many replays look for a set as have so many events together, within the limits."""
-NEAR = 0.05
-"""By default a set is good enough if it brings the trace of P as close as that, relatively, to the
-one of the run in which every message came.
-"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

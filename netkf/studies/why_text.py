@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.printable import shorten
 from netkf.runs.files import finite
 from netkf.runs.tables import format_number, shorten_rows, table
-from netkf.studies.explanation import Explanation, Origin, WhatIf
+from netkf.studies.explanation import NEAR, Explanation, Origin, WhatIf
 from netkf.studies.information import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
@@ -178,11 +178,10 @@ def _smallest(found: Explanation) -> Iterator[str]:
     smallest, whole = found.smallest, found.what_ifs[-1]
     if smallest is None:
         return
-    change = _change(whole.trace, found.trace)
+    change = relative_change(whole.trace, found.trace)
     yield f"Had no message been missing, trace P would be {whole.trace:.4g} ({change})."
     if smallest.messages == ():
-        limit = f"{smallest.limit:.4g}"
-        yield f"No message had to come: trace P is at most {limit} as it is."
+        yield f"No message had to come: trace P as it was is at most {_limit(found, smallest)}."
         return
     tried = _tried(smallest)
     if smallest.messages is not None:
@@ -192,10 +191,10 @@ def _smallest(found: Explanation) -> Iterator[str]:
         fewer = "" if one else ("; fewer would not" if smallest.proven else "; perhaps fewer would")
         yield (
             f"{what} have brought trace P to {smallest.trace:.4g} (wanted: at most "
-            f"{smallest.limit:.4g}): {named}{fewer} ({tried})."
+            f"{_limit(found, smallest)}): {named}{fewer} ({tried})."
         )
         return
-    limit = f"{smallest.limit:.4g}"
+    limit = _limit(found, smallest)
     if smallest.proven:
         yield f"No {smallest.most} messages or fewer would have brought it to {limit} ({tried})."
     else:
@@ -205,8 +204,16 @@ def _smallest(found: Explanation) -> Iterator[str]:
         )
     if smallest.best:
         named = _and([str(found.missing[key]) for key in smallest.best])
-        change = _change(smallest.best_trace, found.trace)
+        change = relative_change(smallest.best_trace, found.trace)
         yield f"The best that was tried brings it to {smallest.best_trace:.4g} ({change}): {named}."
+
+
+def _limit(found: Explanation, smallest: SmallestSet) -> str:
+    """The trace that was wanted, and where it comes from unless it was asked for."""
+    usual = (1.0 + NEAR) * found.what_ifs[-1].trace
+    where = f", {1.0 + NEAR:g} times that with no message missing"
+    own = math.isclose(smallest.limit, usual, rel_tol=1e-9)
+    return f"{smallest.limit:.4g}{where if own else ''}"
 
 
 def _tried(smallest: SmallestSet) -> str:
@@ -253,7 +260,7 @@ def _replays(found: Explanation) -> str:
             w.label,
             _count(w),
             format_number(w.trace),
-            "" if k == 0 else _change(w.trace, found.trace),
+            "" if k == 0 else relative_change(w.trace, found.trace),
             *([format_number(w.error)] if truth else []),
         ]
         for k, w in enumerate(found.what_ifs)
@@ -265,7 +272,8 @@ def _count(what_if: WhatIf) -> str:
     return "all" if what_if.messages is None else str(len(what_if.messages))
 
 
-def _change(trace: float, base: float) -> str:
+def relative_change(trace: float, base: float) -> str:
+    """Return by how many percent a trace differs from another."""
     if not (math.isfinite(trace) and base > 0.0):
         return "-"
     return f"{100.0 * (trace / base - 1.0):+.1f} %"

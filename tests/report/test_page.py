@@ -210,6 +210,15 @@ def test_errors_of_the_start_up_are_called_so(tmp_path):
     assert told.index("just started") < told.index("Why: ") < told.index("To mend it")
 
 
+def test_the_table_of_replays_has_the_changes_of_the_command_line(ring):
+    page, found = Page(make_page([ring])), explain_worst(read_source(ring))
+    was, best = found.what_ifs[0].trace, found.what_ifs[-1].trace
+    assert f"{best:.4g} {100 * (best / was - 1):+.1f} %" in page.shown
+    limit = f"{1.05 * best:.4g}, 1.05 times that with no message missing"
+    assert limit in page.shown
+    assert limit in str(found)
+
+
 def test_ages_of_information_are_means_over_links(delayed):
     run = netkf.open(delayed)
     messages, links = plain_messages(run.events), {}

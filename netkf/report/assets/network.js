@@ -2,13 +2,14 @@
 const Network = (() => {
   const MAX_DRAWN = 600; // messages drawn at once; the state in words counts all of them
   const MAX_GLYPHS = 80; // nodes up to which each has its ellipse
-  const HEIGHT = 420;
+  const HEIGHT = 420, CAPTION = 36; // pixels; the scale of colours has the lowest of them
 
   function view(run, canvas, app) {
     const shades = shadeRange(run);
     let places = [], radius = 8, spacing = 40, laid = "", named = true;
 
-    function layout(width, height) {
+    function layout(width, whole) {
+      const height = whole - CAPTION;
       if (laid === width + " " + height) return;
       laid = width + " " + height;
       const margin = Math.min(run.N <= MAX_GLYPHS ? 64 : 34, width / 8), size = Math.max(1, Math.min(width, height) - 2 * margin);
@@ -164,6 +165,8 @@ const Network = (() => {
       context.font = "12px system-ui, sans-serif";
       context.textBaseline = "bottom";
       const what = run.truth ? "error |x - xhat|" : "square root of trace P";
+      context.fillStyle = Theme.colours.panel;
+      context.fillRect(0, height - CAPTION, width, CAPTION);
       const bar = Math.min(110, width / 4), left = 8, top = height - 10;
       for (let x = 0; x < bar; x++) {
         context.fillStyle = Theme.scale(x / bar);
