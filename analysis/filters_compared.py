@@ -1,6 +1,6 @@
-"""The tables of docs/benchmark.md: filters on the eight networks of scenarios/benchmark.
+"""The tables of docs/filters_compared.md: filters on the eight networks of scenarios/benchmark.
 
-    python analysis/benchmark.py [RUNS] > tables.md
+    python analysis/filters_compared.py [RUNS] > tables.md
 
 All filters of a network meet the same truth, the same readings and the same draws. An entry is the
 RMS error over that of the central filter, then NEES / n; a dash says that the filter cannot run
