@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.special import stdtrit
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import Opened
 from netkf.report.markup import bullets, paragraph, table_box
+from netkf.runs.files import finite
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 from netkf.runs.tables import COLUMNS, format_number, standard_error
 from netkf.studies.compare import Comparison, Entry
@@ -181,7 +181,7 @@ def ensemble_curves(source: Opened) -> dict[str, Any] | None:
             "nees": _with_interval(found.mean_nees[:, k], found.se_nees[:, k]),
         }
         if found.bound is not None:
-            nodes[str(node)]["bound"] = finite(found.bound[:, k])
+            nodes[str(node)]["bound"] = finite(found.bound[:, k].tolist())
     interval = list(nees_bounds(source.scenario.plant.n, max(1, source.runs)))
     return {"times": found.times.tolist(), "nodes": nodes, "nees_interval": interval}
 
@@ -204,7 +204,7 @@ def difference_curves(one: Opened, other: Opened) -> dict[str, Any] | None:
     level = (1.0 - CONFIDENCE) / (2.0 * gap.size)
     wide = float(stdtrit(freedom, 1.0 - level)) * error
     nodes = {
-        str(node): [finite(part[:, k]) for part in (gap, gap - wide, gap + wide)]
+        str(node): [finite(part[:, k].tolist()) for part in (gap, gap - wide, gap + wide)]
         for k, node in enumerate(first.nodes)
     }
     return {"confidence": CONFIDENCE, "times": first.times.tolist(), "nodes": nodes}
@@ -226,12 +226,10 @@ def averages(source: Opened) -> list[dict[str, Any]] | None:
 def _with_interval(mean: Any, error: Any) -> list[list[float | None]]:
     """Return mean, lower and upper end as JSON values."""
     wide = INTERVAL * np.asarray(error, dtype=float)
-    return [finite(column) for column in (np.asarray(mean, dtype=float), mean - wide, mean + wide)]
-
-
-def finite(values: Any) -> list[float | None]:
-    """Return numbers as JSON values, None where they are not finite."""
-    return [value if math.isfinite(value) else None for value in np.asarray(values).tolist()]
+    return [
+        finite(column.tolist())
+        for column in (np.asarray(mean, dtype=float), mean - wide, mean + wide)
+    ]
 
 
 def sweep_curves(source: Opened) -> dict[str, Any] | None:

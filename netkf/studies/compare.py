@@ -260,13 +260,8 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     ``confidence`` (Bonferroni). A single run says nothing about certainty. Raises ScenarioError for
     a directory that is not that of a finished run.
     """
-    if isinstance(directories, (str, Path)):
-        remedy = "give all of them in one list: netkf.compare([one, other])"
-        raise ScenarioError("directories", "must be a list", str(directories), remedy)
+    found = _read_all(directories)
     sure = number(above=0.0, below=1.0)("--confidence", confidence)
-    found = [read_directory(Path(directory)) for directory in directories]
-    if not found:
-        raise ScenarioError("compare", "needs run directories", None, "name at least one")
     first = found[0]
     wanted = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
     if all(other.nodes == first.nodes for other in found):
@@ -287,6 +282,15 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         tuple(rows),
         tuple(tuple(other.summary.get("notes", ())) for other in found),
     )
+
+
+def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
+    if isinstance(directories, (str, Path)):
+        remedy = "give all of them in one list: netkf.compare([one, other])"
+        raise ScenarioError("directories", "must be a list", str(directories), remedy)
+    if not directories:
+        raise ScenarioError("compare", "needs run directories", None, "name at least one")
+    return [read_directory(Path(directory)) for directory in directories]
 
 
 def _entry(

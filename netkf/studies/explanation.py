@@ -30,7 +30,7 @@ class Missing:
 
 
 @dataclass(frozen=True)
-class Origin:
+class InformationSource:
     """What had reached the node from one other, ``node``. Times are in seconds, nan if unknown.
 
     neighbour       it can send to the node directly
@@ -84,7 +84,7 @@ class Explanation:
     at: float
     seed: int
     replica: int
-    sources: tuple[Origin, ...]
+    sources: tuple[InformationSource, ...]
     what_ifs: tuple[WhatIf, ...]
     smallest: SmallestSet | None
     missing: dict[MessageKey, Missing] = field(repr=False)

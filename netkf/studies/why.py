@@ -16,7 +16,7 @@ from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.scenario.scenario import Scenario
-from netkf.studies.explanation import NEAR, Explanation, Missing, Origin, WhatIf
+from netkf.studies.explanation import NEAR, Explanation, InformationSource, Missing, WhatIf
 from netkf.studies.information import (
     OUTCOMES,
     USED,
@@ -230,7 +230,7 @@ class _Evidence:
                 found.append(Candidate(self.messages.key(m), sent, needed))
         return found
 
-    def sources(self) -> tuple[Origin, ...]:
+    def sources(self) -> tuple[InformationSource, ...]:
         """Return what had reached the node from every other node, and from its own sensor."""
         scenario, at = self.scenario, self._replayer.at
         readings = KeptReadings(scenario, self._log, at)
@@ -243,7 +243,9 @@ class _Evidence:
         wanted = [n for n in scenario.nodes if n != self._node or n in scenario.placed]
         return tuple(self._source(n, [b.get(n) for b in by_budget], every.get(n)) for n in wanted)
 
-    def _source(self, node: int, found: Sequence[Newest | None], every: Newest | None) -> Origin:
+    def _source(
+        self, node: int, found: Sequence[Newest | None], every: Newest | None
+    ) -> InformationSource:
         reading, *more = [math.nan if n is None else n.reading for n in found]
         last, unheard = self._direct(node)
         way: tuple[int, ...] = ()
@@ -256,7 +258,7 @@ class _Evidence:
             assert segment is not None
             passed = self._reach.messages_from(segment.segment, newer)
             missing = tuple(_missing(self.messages, m) for m in passed if self._flow.cost[m])
-        return Origin(
+        return InformationSource(
             node=node,
             sensor=node in self.scenario.placed,
             neighbour=(node, self._node) in self._links,
@@ -301,7 +303,7 @@ def _missing(messages: Messages, m: int) -> Missing:
 
 
 def _what_ifs(
-    replayer: Replayer, sources: Sequence[Origin], smallest: SmallestSet | None
+    replayer: Replayer, sources: Sequence[InformationSource], smallest: SmallestSet | None
 ) -> tuple[WhatIf, ...]:
     """Return the run as it was, and the replays that the answer names."""
     sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.printable import shorten
 from netkf.runs.files import finite
 from netkf.runs.tables import format_number, shorten_rows, table
-from netkf.studies.explanation import NEAR, Explanation, Origin, WhatIf
+from netkf.studies.explanation import NEAR, Explanation, InformationSource, WhatIf
 from netkf.studies.information import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
@@ -293,7 +293,7 @@ def _ago(found: Explanation, seconds: float) -> str:
     return f"at {seconds:.6g} s ({since})"
 
 
-def _route(source: Origin) -> str:
+def _route(source: InformationSource) -> str:
     if not source.route:
         return "-"
     if len(source.route) == 1:
