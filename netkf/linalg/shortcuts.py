@@ -42,8 +42,10 @@ def without_collection() -> Iterator[None]:
 
 
 @cache
-def kernel_compiler() -> Any:
-    """Return numba's compiler without the passes that are not needed."""
+def kernel_compiler(lean: bool) -> Any:
+    """Return numba's compiler without the passes that are not needed, and with short code for loops
+    and entries of arrays if ``lean``.
+    """
     from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
     from netkf.linalg.lean_lowering import KernelLowering
@@ -57,7 +59,7 @@ def kernel_compiler() -> Any:
             pipeline = builder.define_nopython_pipeline(self.state)
             steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
             pipeline.passes = [
-                (KernelLowering if step.__name__ == "NativeLowering" else step, said)
+                (KernelLowering if lean and step.__name__ == "NativeLowering" else step, said)
                 for step, said in steps
             ]
             pipeline.finalize()
