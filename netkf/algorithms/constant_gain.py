@@ -32,6 +32,7 @@ from netkf.algorithms.kernels.slots import (
     show,
 )
 from netkf.algorithms.models import SlotModel, first_root, usable
+from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, either, field, matrix, nested, several
@@ -230,11 +231,7 @@ class ConstantGain(Filter):
         """Reset by H (7) and (9)."""
         if not messages:
             return state
-        own = max(0.0, 1.0 - sum(message.weight for message in messages))
-        pairs = [(state.xhat, state.root)]
-        pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]
-        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
-        weights = np.array([own, *(message.weight for message in messages)])
+        weights, means, roots = weighted_pairs(state, messages)
         xhat, root = combine_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
 

@@ -30,6 +30,7 @@ from netkf.algorithms.kernels.slots import (
     show,
 )
 from netkf.algorithms.models import first_root
+from netkf.algorithms.pairs import pairs_now
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import choice, either, field, nested, square
@@ -213,12 +214,7 @@ class DiffusionFilter(Filter):
         # Nothing to combine, or all weight at home.
         if own == 1.0 or not messages:
             return state
-        pairs = [(state.xhat, state.root)]
-        for message in messages:
-            pair = message.payload
-            # Under clocks a message may be old: predicted to now without readings.
-            pairs.append(state.model.extrapolate(pair.xhat, pair.root, message.age))
-        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
+        means, roots = pairs_now(state, messages)
         xhat, root = intersect_roots(np.array([own, *heard]), means, roots)
         return state._replace(xhat=xhat, root=root)
 

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.kernels.root_update import combine_roots
+from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import field, number
 from netkf.linalg.arrays import FloatArray
@@ -41,11 +40,7 @@ class Hybrid(Filter):
         self, state: State, messages: Sequence[Message]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return weights (k,), estimates (k, n) and roots (k, n, n) now, the node's own first."""
-        own = max(0.0, 1.0 - sum(message.weight for message in messages))
-        pairs = [(state.xhat, state.root)]
-        pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]
-        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
-        return np.array([own, *(message.weight for message in messages)]), means, roots
+        return weighted_pairs(state, messages)
 
     def weight(self, degree: int, peer_degree: int) -> float:
         """Return ``epsilon``, the weight of every link."""

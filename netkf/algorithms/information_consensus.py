@@ -41,6 +41,7 @@ from netkf.algorithms.kernels.slots import (
     whitened,
 )
 from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, field, integer, positive
@@ -221,12 +222,12 @@ class InformationConsensus(Filter):
         return (ConsensusArrays(self.steps, *made, parts),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """In slots a message is K pairs (Omega, q)."""
+        """Return those of K pairs (Omega, q) in slots, of one pair under clocks."""
         pairs = 1 if phase < 0 else len(self.recipe(2).shares)
         return pairs * (n + n * (n + 1) // 2)
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ConsensusState:
-        """The node knows how many nodes there are."""
+        """Return the first state of a node, which knows how many nodes there are."""
         return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))
 
     def update(self, state: ConsensusState, reading: Any) -> ConsensusState:
@@ -257,11 +258,7 @@ class InformationConsensus(Filter):
 
     def _intersect(self, state: ConsensusState, messages: Sequence[Message]) -> ConsensusState:
         """Under clocks: one step of consensus on the pairs of those heard, predicted to now."""
-        own = max(0.0, 1.0 - sum(message.weight for message in messages))
-        pairs = [(state.xhat, state.root)]
-        pairs += [state.model.extrapolate(m.payload.xhat, m.payload.root, m.age) for m in messages]
-        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
-        weights = np.array([own, *(message.weight for message in messages)])
+        weights, means, roots = weighted_pairs(state, messages)
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.neighbours import fuse_readings
 from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
@@ -18,14 +19,12 @@ from netkf.algorithms.kernels.slots import (
     predict,
     rebase,
     show,
-    use_reading,
 )
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import choice, field, positive
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import any_lane, load_flags
 
 SLACK = 1.0 + 1e-6
 """Ages are rounded."""
@@ -84,29 +83,9 @@ def intermittent_slots(
             rebase(nodes, readings, room, b, s)
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):
-                    use_readings(nodes, readings, plan, links, room, b, s, h)
+                    # One after the other: with independent noise that equals one update.
+                    fuse_readings(nodes, readings, plan, links, room, True, b, s, h)
                 predict(nodes, room, b)
-
-
-@kernel
-def use_readings(
-    nodes: SlotNodes,
-    readings: SlotReadings,
-    plan: SlotPlan,
-    links: SlotLinks,
-    room: SlotRoom,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Update filter ``h`` of a block with its own reading and those that arrive."""
-    use_reading(nodes, readings, room, b, s, h, h, True)
-    # Readings of others are used one after the other: with independent noise that equals one
-    # update.
-    for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(room.lanes, plan.up, b, s, 0, links.way[m])
-        if any_lane(arrived):
-            use_reading(nodes, readings, room, b, s, h, links.sender[m], arrived)
 
 
 @built_in("intermittent")

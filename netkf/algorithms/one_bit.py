@@ -68,7 +68,7 @@ class OneBit(Filter):
         return rows / 64.0
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> OneBitState:
-        """The node knows its turn."""
+        """Return the first state of a node, which knows its turn."""
         return OneBitState(mean, first_root(cov), model, None, node.place, node.nodes)
 
     def update(self, state: OneBitState, reading: Reading) -> OneBitState:

@@ -66,10 +66,15 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
         metavar="KEY.PATH=VALUE",
         help="override a key of the scenario; VALUE is written as in TOML",
     )
+    add_trust(parser, "its folder")
+
+
+def add_trust(parser: argparse.ArgumentParser, folder: str) -> None:
+    """Add ``--trust``; ``folder`` is where the modules may be besides the current folder."""
     parser.add_argument(
         "--trust",
         action="store_true",
-        help="import classes that the scenario names from modules in its folder or the current one",
+        help=f"import classes that the scenario names from modules in {folder} or the current one",
     )
 
 

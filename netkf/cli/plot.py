@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from netkf.cli.options import Command
+from netkf.cli.options import Command, add_trust
 from netkf.core.errors import ScenarioError
 
 FORMATS = ("png", "svg", "pdf")
@@ -25,11 +25,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, help="file or directory of the figures (default: DIR/figures)"
     )
     parser.add_argument("--format", choices=FORMATS, help="format of the files (default: png)")
-    parser.add_argument(
-        "--trust",
-        action="store_true",
-        help="import classes that the scenario names from modules in DIR or the current folder",
-    )
+    add_trust(parser, "DIR")
 
 
 def _run(options: argparse.Namespace) -> int:

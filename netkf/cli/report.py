@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from netkf.cli.options import Command, parse_replica
+from netkf.cli.options import Command, add_trust, parse_replica
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
@@ -21,12 +21,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--replica", type=parse_replica, help="recorded run to show (default: the first)"
     )
-    parser.add_argument(
-        "--trust",
-        action="store_true",
-        help="import classes that the scenario names from modules in the directory or the current "
-        "one",
-    )
+    add_trust(parser, "the directory")
 
 
 def _run(options: argparse.Namespace) -> int:

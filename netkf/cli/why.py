@@ -6,7 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from netkf.cli.options import Command, add_json, parse_count, parse_replica, print_json
+from netkf.cli.options import (
+    Command,
+    add_json,
+    add_trust,
+    parse_count,
+    parse_replica,
+    print_json,
+)
 
 if TYPE_CHECKING:
     from netkf.studies.why import Why
@@ -36,11 +43,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         type=parse_count,
         help="replays that look for the set at most (default: 100 to 1000, by the events of one)",
     )
-    parser.add_argument(
-        "--trust",
-        action="store_true",
-        help="import classes that the scenario names from modules in DIR or the current folder",
-    )
+    add_trust(parser, "DIR")
     parser.add_argument("--out", type=Path, help="keep the answer in this directory")
     add_json(parser)
 

@@ -132,7 +132,7 @@ class KernelLower(Lower):
         return places
 
     def _wrapped(self, place: Any, array: Any, axis: int) -> Any:
-        """As in Python, negative places count from the end."""
+        """Return a place; as in Python, negative ones count from the end."""
         builder = self.builder
         if isinstance(place, ir.Constant) and place.constant >= 0:
             return place

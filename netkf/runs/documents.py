@@ -65,6 +65,15 @@ def reading_file(path: Path, name: str = "") -> Iterator[None]:
         raise DamagedError(f"{where}cannot be read ({type(error).__name__})") from None
 
 
+@contextlib.contextmanager
+def damage_in(name: str) -> Iterator[None]:
+    """Put the name of a file into a DamagedError about it."""
+    try:
+        yield
+    except DamagedError as error:
+        raise DamagedError(f"{name} {error}") from None
+
+
 def read_document(path: Path) -> dict[str, Any]:
     """Return the JSON object in a file; raises DamagedError for everything else."""
     with reading_file(path):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +19,7 @@ from netkf.runs.documents import (
     DamagedError,
     check_files,
     check_seal,
+    damage_in,
     read_document,
     require,
 )
@@ -102,15 +102,6 @@ class StoredRun(Run):
         if name not in self.stored:
             return np.full(shape, np.nan)
         return self.stored[name].to_numpy(dtype=np.float64).reshape(shape)
-
-
-@contextmanager
-def damage_in(name: str) -> Iterator[None]:
-    """Put the name of a file into a DamagedError about it."""
-    try:
-        yield
-    except DamagedError as error:
-        raise DamagedError(f"{name} {error}") from None
 
 
 def read_form(directory: Path, name: str, form: Mapping[str, Any]) -> dict[str, Any]:

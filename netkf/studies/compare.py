@@ -29,6 +29,7 @@ from netkf.runs.documents import (
     DamagedError,
     check_files,
     check_seal,
+    damage_in,
     read_document,
     require,
 )
@@ -170,26 +171,17 @@ def read_directory(directory: Path) -> RunDirectory:
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
         summary = _read(directory, "summary.json", SUMMARY)
         if SEAL in manifest:  # older versions wrote none
-            with _named("manifest.json"):
+            with damage_in("manifest.json"):
                 check_seal(manifest)
         check_files(directory, manifest, ["scenario.toml", "summary.json"])
     return RunDirectory(directory, manifest, summary)
 
 
 def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
-    with _named(name):
+    with damage_in(name):
         document = read_document(directory / name)
         require(document, form)
     return document
-
-
-@contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Put the name of a file into a DamagedError about it."""
-    try:
-        yield
-    except DamagedError as error:
-        raise DamagedError(f"{name} {error}") from None
 
 
 @contextmanager
