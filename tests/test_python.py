@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import netkf
-from netkf.ensembles.blocks import packed
+from netkf.ensembles.blocks import pack_scenario
 from netkf.runs.run import run_to_directory
 
 
@@ -199,7 +199,7 @@ def test_classes_that_nobody_can_import_are_refused_in_one_line(ring, tmp_path):
     with pytest.raises(
         netkf.EngineError, match=r"workers cannot import the class Mine .*workers=1"
     ):
-        packed(scenario)
+        pack_scenario(scenario)
 
 
 def test_results_show_themselves_in_a_line_and_as_a_table(ring):

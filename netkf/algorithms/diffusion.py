@@ -65,7 +65,7 @@ class DiffusionWeights(NamedTuple):
 
 
 @kernel(inlined=True)
-def effective_weights(lanes: Lanes, own: float, heard: Any, keep_own: bool) -> tuple[Any, Any]:
+def applied_weights(lanes: Lanes, own: float, heard: Any, keep_own: bool) -> tuple[Any, Any]:
     """Return the own weight and the divisor of the others, so that all of them sum to 1.
 
     ``own`` and ``heard`` are the nominal own weight and the sum of those of the messages that
@@ -83,8 +83,8 @@ def effective_weights(lanes: Lanes, own: float, heard: Any, keep_own: bool) -> t
 
 @kernel
 def weights_of_one(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
-    """``effective_weights`` of one filter with one lane."""
-    found: tuple[float, float] = effective_weights(ONE, own, heard, keep_own)
+    """``applied_weights`` of one filter with one lane."""
+    found: tuple[float, float] = applied_weights(ONE, own, heard, keep_own)
     return found
 
 
@@ -134,7 +134,7 @@ def combine(
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
         heard += select(arrived, links.weight[m], 0.0)
-    own, divisor = effective_weights(lanes, weights.own[h], heard, weights.keep_own)
+    own, divisor = applied_weights(lanes, weights.own[h], heard, weights.keep_own)
     # Weight 1: nothing heard counts, and the estimate stays to the last bit.
     if not any_lane(own != 1.0):
         return

@@ -72,7 +72,7 @@ MAX_SPREAD = 1e14
 """The largest ``|G| |P|`` at which double precision still tells a steady covariance."""
 
 
-class Network(NamedTuple):
+class NetworkInformation(NamedTuple):
     """What a node takes the whole network to be: ``information`` (n, n) of all sensors, G^(i) of
     P (6), the ``number`` of nodes, N^(i), and the ``root`` of P_inf where the gains are the limits.
     """
@@ -102,7 +102,7 @@ class PushSumState(NamedTuple):
     root: FloatArray
     model: Any
     mass: FloatArray
-    network: Network
+    network: NetworkInformation
     stopped: bool
     degree: int
     sums: Sums | None = None
@@ -537,11 +537,11 @@ class PushSum(Filter):
         # P step 1: w is 1 at the leader and 0 elsewhere, n~ = 1, C~ = the node's own information.
         weight = 1.0 if node.node == self.leader else 0.0
         mass = np.concatenate([[weight, 1.0], information.reshape(-1)])
-        known = Network(information, 1.0)
+        known = NetworkInformation(information, 1.0)
         # Everyone knows the whole network from the start.
         if self.asymptotic:
             root = asymptotic_root(model.F, model.Q, node.information)
-            known = Network(node.information, float(node.nodes), root)
+            known = NetworkInformation(node.information, float(node.nodes), root)
         sums = Sums(np.zeros(mass.shape), {}) if self._keeps_totals else None
         return PushSumState(mean, first_root(cov), model, mass, known, False, node.degree, sums)
 
@@ -779,12 +779,12 @@ def mixed(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> Floa
     return total
 
 
-def network(mass: FloatArray, model: SlotModel) -> Network:
+def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
     """P (6): C~ / w and n~ / w, or what the node knows of itself while its weight is exactly 0."""
     alone = model.information
     information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
     learn_one(mass.reshape(1, 1, -1, 1), alone[None], information, number)
-    return Network(information[:, :, 0], float(number[0, 0]))
+    return NetworkInformation(information[:, :, 0], float(number[0, 0]))
 
 
 def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:

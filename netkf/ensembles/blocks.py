@@ -77,7 +77,7 @@ def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replic
     return tree.result()
 
 
-def packed(scenario: Scenario) -> PackedScenario:
+def pack_scenario(scenario: Scenario) -> PackedScenario:
     """A scenario for other processes; raises EngineError where it cannot be pickled."""
     unnamed = unnamed_class(scenario)
     if unnamed is not None:

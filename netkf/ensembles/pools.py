@@ -13,7 +13,7 @@ from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.core.printable import shorten
 from netkf.ensembles.ask_scheduler import scheduler_answers
-from netkf.ensembles.blocks import Job, PackedScenario, packed, work
+from netkf.ensembles.blocks import Job, PackedScenario, pack_scenario, work
 from netkf.ensembles.workers import WorkerProcesses
 from netkf.linalg.compiling import seconds_spent
 from netkf.runs.provenance import versions
@@ -168,7 +168,7 @@ class Elsewhere(Pool):
         return self._send(job)
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
-        return packed(scenario)
+        return pack_scenario(scenario)
 
     @abstractmethod
     def _send(self, job: Job) -> Future[Any]:
@@ -215,7 +215,7 @@ class Cluster(Elsewhere):
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
         # Workers may join at any time, so each looks at its own versions.
-        return packed(scenario)._replace(versions=tuple(versions().items()))
+        return pack_scenario(scenario)._replace(versions=tuple(versions().items()))
 
     def _send(self, job: Job) -> Future[Any]:
         future: Future[Any] = self._executor.submit(work, job)

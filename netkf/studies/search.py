@@ -285,22 +285,29 @@ def advise(
     runs = _advise_runs(nearest, problem.target)
     if value is not None:
         return runs
-    # The quantity follows a power of the key between the nearest end and the next value tried.
+    # The nearest end and the next value tried.
     end, inner = (by_value[0], by_value[1]) if grows else (by_value[-1], by_value[-2])
+    further = _advise_beyond(problem, end, inner, grows)
+    return "; ".join(text for text in (further, runs) if text)
+
+
+def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool) -> str:
+    """Return where the target may be met beyond the ``end`` of the range, an empty string if its
+    two last probes do not tell.
+    """
+    # The quantity follows a power of the key.
     numbers = (end.value, inner.value, end.quantity, inner.quantity)
     if not all(math.isfinite(x) and x > 0.0 for x in numbers) or end.value == inner.value:
-        return runs
+        return ""
     power = math.log(end.quantity / inner.quantity) / math.log(end.value / inner.value)
     needed = math.log(problem.target.limit / end.quantity) / power if power else math.inf
     beyond = (needed < 0.0) if grows else (needed > 0.0)
-    if not beyond or abs(needed) > math.log(MAX_EXTRAPOLATION):
-        flat = (
-            f"{problem.target.quantity} hardly changes beyond {problem.key} = {end.value:g}, where "
-            f"it is {end.quantity:.4g}: other values may not reach the target either"
-        )
-        return "; ".join(text for text in (flat, runs) if text)
-    further = _advise_range(problem, end.value, end.value * math.exp(MARGIN * needed))
-    return "; ".join(text for text in (further, runs) if text)
+    if beyond and abs(needed) <= math.log(MAX_EXTRAPOLATION):
+        return _advise_range(problem, end.value, end.value * math.exp(MARGIN * needed))
+    return (
+        f"{problem.target.quantity} hardly changes beyond {problem.key} = {end.value:g}, where it "
+        f"is {end.quantity:.4g}: other values may not reach the target either"
+    )
 
 
 def _advise_range(problem: SizingProblem, end: float, other: float) -> str:

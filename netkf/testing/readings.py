@@ -20,14 +20,14 @@ CUTS: tuple[tuple[float, ...], ...] = ((), (0.3,), (0.2, 0.65), (0.9,))
 """Shares of a step at which increments are cut, step after step."""
 
 
-class Readings(NamedTuple):
+class ReadingSeries(NamedTuple):
     """Readings y (K, p) with their matrices H (K, p, n)."""
 
     y: FloatArray
     H: FloatArray
 
 
-class Reader:
+class SensorReader:
     """Makes readings of a sensor; ``method`` of its class makes the path of one run."""
 
     method = "slot_path"
@@ -47,25 +47,27 @@ class Reader:
     def _made(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
         return self.sensor.slot_path(node, PERIOD, generator)
 
-    def several(self, path: Any, ks: Sequence[int], x: FloatArray) -> Readings:
+    def several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
         """Read a path at increasing numbers ``ks``, with states x (K, n), in one call."""
         y, H = attempt(self.where, path.several, ks, x)
         y = demand_array(self.where, "y of several", y, (len(ks), self.p))
-        return Readings(y, demand_array(self.where, "H of several", H, (len(ks), self.p, self.n)))
+        return ReadingSeries(
+            y, demand_array(self.where, "H of several", H, (len(ks), self.p, self.n))
+        )
 
-    def one(self, path: Any, k: int, x: FloatArray) -> Readings:
+    def one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
         """Read a path once, with state x (n,): y (1, p) and H (1, p, n)."""
         with user_code(self.where):
             y, H = self._one(path, k, x)
         y = demand_array(self.where, "a reading", y, (self.p,))
-        return Readings(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
+        return ReadingSeries(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
 
     def _one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         # As the engines do: first the reading, then its matrix.
         return path.reading(k, x), path.matrix(k)
 
 
-class SampleReader(Reader):
+class SampleReader(SensorReader):
     """Samples of a sensor over a diffusion."""
 
     method = "samples"
@@ -78,13 +80,13 @@ class SampleReader(Reader):
         return y, H
 
 
-def readers(sensor: Sensor, name: str) -> list[Reader]:
+def readers(sensor: Sensor, name: str) -> list[SensorReader]:
     """Return the readers of the kinds of readings that a class gives."""
     sampled = getattr(sensor, "sampling", None) is not None
     own = type(sensor).samples not in (Sensor.samples, LinearSensor.samples)
     if sampled or (own and not sensor.varying):
         return [SampleReader(sensor, name)]
-    return [Reader(sensor, name)]
+    return [SensorReader(sensor, name)]
 
 
 def gives_increments(sensor: Sensor) -> bool:

@@ -22,8 +22,8 @@ from netkf.testing.noise import (
 from netkf.testing.readings import (
     STEP,
     IncrementReader,
-    Reader,
-    Readings,
+    ReadingSeries,
+    SensorReader,
     demand_matrices,
     gives_increments,
     readers,
@@ -81,7 +81,7 @@ def check_made_sensor(part: Any, seed: int) -> None:
         if gives_increments(part):
             _check_increments(IncrementReader(part, watched.name), nodes[0], seed)
         if isinstance(part, RegressorSensor):
-            _check_regressors(part, Reader(part, watched.name), nodes, seed)
+            _check_regressors(part, SensorReader(part, watched.name), nodes, seed)
         if getattr(part, "sampling", None) is not None:
             _check_times(part, watched.name, nodes, seed)
     watched.demand_unchanged(before)
@@ -92,7 +92,9 @@ def _states(seed: int, count: int, n: int, which: int = 0) -> FloatArray:
     return 3.0 * Streams(seed, which).generator("testing").normal(size=(count, n))
 
 
-def _check_same_readings(reader: Reader, copy: Reader, nodes: tuple[int, ...], seed: int) -> None:
+def _check_same_readings(
+    reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
+) -> None:
     """Readings must depend on streams, numbers and states alone."""
     node, streams, x = nodes[0], Streams(seed), _states(seed, SHORT, reader.n)
     numbers = list(range(SHORT))
@@ -120,7 +122,9 @@ def _check_same_readings(reader: Reader, copy: Reader, nodes: tuple[int, ...], s
     )
 
 
-def _demand_equal(reader: Reader, one: Readings, other: Readings, when: str) -> None:
+def _demand_equal(
+    reader: SensorReader, one: ReadingSeries, other: ReadingSeries, when: str
+) -> None:
     for name, a, b in zip(("readings", "matrices H"), one, other, strict=True):
         apart = distance(a, b)
         demand(
@@ -132,15 +136,15 @@ def _demand_equal(reader: Reader, one: Readings, other: Readings, when: str) -> 
         )
 
 
-def _joined(parts: list[Readings]) -> Readings:
-    return Readings(*(np.concatenate(some) for some in zip(*parts, strict=True)))
+def _joined(parts: list[ReadingSeries]) -> ReadingSeries:
+    return ReadingSeries(*(np.concatenate(some) for some in zip(*parts, strict=True)))
 
 
-def _chosen(whole: Readings, ks: list[int]) -> Readings:
-    return Readings(whole.y[ks], whole.H[ks])
+def _chosen(whole: ReadingSeries, ks: list[int]) -> ReadingSeries:
+    return ReadingSeries(whole.y[ks], whole.H[ks])
 
 
-def _check_linear(reader: Reader, node: int, seed: int) -> None:
+def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
     """Check that another state changes a reading by H times the difference, and H not at all."""
     streams, numbers = Streams(seed), list(range(LENGTH))
     x, other = (_states(seed, LENGTH, reader.n, which) for which in (0, 1))
@@ -167,7 +171,7 @@ def _check_linear(reader: Reader, node: int, seed: int) -> None:
         )
 
 
-def _check_laws(reader: Reader, nodes: tuple[int, ...], seed: int) -> None:
+def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None:
     """Check the noise of all nodes, all together and each by itself."""
     stated = Stated(reader.where, "the noise y - H x", "R")
     runs = max(2, READINGS // (LENGTH * len(nodes)))
@@ -240,7 +244,7 @@ def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, se
 
 
 def _check_regressors(
-    sensor: RegressorSensor, reader: Reader, nodes: tuple[int, ...], seed: int
+    sensor: RegressorSensor, reader: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
     """Check that H is C s, with s[k+1] = A s[k] + B xi from ``start`` on."""
     numbers, x = list(range(REGRESSOR_SLOTS)), np.zeros((REGRESSOR_SLOTS, reader.n))

@@ -30,7 +30,7 @@ LEAST = 1e-10
 MIN_COUNT = 20
 
 
-class Moments(NamedTuple):
+class NoiseMoments(NamedTuple):
     """Sums over whitened noises z of d entries, some of which may be missing: how often two entries
     were there ``together`` (d, d), sums of z (d,), of z z' (d, d), and of z z' with the z
     before it (d, d), of which there are ``pairs`` (d, d).
@@ -43,28 +43,28 @@ class Moments(NamedTuple):
     pairs: FloatArray
 
 
-def moments(z: FloatArray) -> Moments:
+def moments(z: FloatArray) -> NoiseMoments:
     """Return the sums over a series z (S, d), in which missing entries are nan."""
     there = np.isfinite(z).astype(float)
     z = np.where(there > 0.0, z, 0.0)
-    return Moments(
+    return NoiseMoments(
         there.T @ there, z.sum(axis=0), z.T @ z, z[1:].T @ z[:-1], there[1:].T @ there[:-1]
     )
 
 
-def total(many: Moments) -> Moments:
+def total(many: NoiseMoments) -> NoiseMoments:
     """Return the sums over all runs, from stacked ones."""
-    return Moments(*(part.sum(axis=0) for part in many))
+    return NoiseMoments(*(part.sum(axis=0) for part in many))
 
 
-def whitening(covariance: FloatArray) -> FloatArray:
+def whitening_matrix(covariance: FloatArray) -> FloatArray:
     """Return a matrix (d, n) that makes a noise with this covariance white; d is its rank."""
     values, vectors = np.linalg.eigh(covariance)
     used = values > LEAST * max(values[-1], 0.0)
     return np.asarray((vectors[:, used] / np.sqrt(values[used])).T)
 
 
-def compare_variances(found: Moments, labels: list[str], level: float, what: str) -> Finding:
+def compare_variances(found: NoiseMoments, labels: list[str], level: float, what: str) -> Finding:
     """Test that all entries together, and each of them, have the variance 1."""
     counts, squares = np.diagonal(found.together), np.diagonal(found.second)
     if counts.max() < MIN_COUNT:
@@ -79,7 +79,7 @@ def compare_variances(found: Moments, labels: list[str], level: float, what: str
     return with_best(intervals, VARIANCE_TOLERANCE, message)
 
 
-def compare_means(found: Moments, labels: list[str], level: float) -> Finding:
+def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Finding:
     """Test that every entry has the mean 0."""
     counts = np.diagonal(found.together)
     if counts.max() < MIN_COUNT:
@@ -96,7 +96,7 @@ def compare_means(found: Moments, labels: list[str], level: float) -> Finding:
     return find_largest(intervals, MEAN_TOLERANCE, "largest mean in standard deviations")
 
 
-def compare_correlations(found: Moments, labels: list[str], level: float) -> Finding:
+def compare_correlations(found: NoiseMoments, labels: list[str], level: float) -> Finding:
     """Test that different entries are not correlated, and none with any entry just before."""
     entries = [*_between(found, labels), *_in_time(found, labels)]
     entries = [entry for entry in entries if entry[1] >= MIN_COUNT]
@@ -121,7 +121,7 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
     return Interval(value, low, high, math.tanh(detectable_shift(spread, level)))
 
 
-def _between(found: Moments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
+def _between(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
     """Yield correlation, count and label of all pairs of entries."""
     related = _correlations(found, found.second, found.together)
     for i in range(len(labels)):
@@ -129,7 +129,7 @@ def _between(found: Moments, labels: list[str]) -> Iterator[tuple[float, float, 
             yield float(related[i, j]), float(found.together[i, j]), f"{labels[j]} and {labels[i]}"
 
 
-def _in_time(found: Moments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
+def _in_time(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
     """Yield correlation, count and label of all entries with all entries just before."""
     related = _correlations(found, found.lagged, found.pairs)
     for i, label in enumerate(labels):
@@ -138,7 +138,7 @@ def _in_time(found: Moments, labels: list[str]) -> Iterator[tuple[float, float, 
             yield float(related[i, j]), pairs, f"{label} and {before} just before"
 
 
-def _correlations(found: Moments, products: FloatArray, counts: FloatArray) -> FloatArray:
+def _correlations(found: NoiseMoments, products: FloatArray, counts: FloatArray) -> FloatArray:
     """Return correlations (d, d) from sums of products of so many pairs; 0 without any."""
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.sqrt(np.diagonal(found.second) / np.diagonal(found.together))

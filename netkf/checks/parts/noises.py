@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.checks.parts.moments import Moments, moments, whitening
+from netkf.checks.parts.moments import NoiseMoments, moments, whitening_matrix
 from netkf.checks.parts.sources import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.linear import LinearPlant
@@ -57,7 +57,7 @@ def path_law(scenario: Scenario) -> PathLaw | None:
         times = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
         Phi, W = _discretised(stated.A, stated.B, float(times[1]))
     size = float(np.sqrt(np.diagonal(W).max()))
-    return PathLaw(times, Phi, whitening(W), size)
+    return PathLaw(times, Phi, whitening_matrix(W), size)
 
 
 def _discretised(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
@@ -70,7 +70,7 @@ def _discretised(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, 
     return Phi, 0.5 * (W + W.T)
 
 
-def plant_moments(scenario: Scenario, streams: Streams) -> Moments | None:
+def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
     """Return the moments of what the steps of one path add; None without noise or path."""
     law = path_law(scenario)
     if law is None or not len(law.white):
@@ -157,7 +157,7 @@ def reading_labels(scenario: Scenario) -> list[str]:
     ]
 
 
-def reading_moments(scenario: Scenario, streams: Streams) -> Moments | None:
+def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
     """Return the moments of the noises of all readings; None if no sensor is drawn.
 
     Sensors are shown states of a usual size that are drawn here, because a sensor has no say in
@@ -244,4 +244,4 @@ def _increment_noises(
 def whitened_starts(scenario: Scenario, x: FloatArray) -> FloatArray:
     """Return x(0) (R, n) of many runs, whitened by the stated mean and covariance, (R, d)."""
     plant: Any = scenario.plant
-    return np.asarray((x - plant.start_mean) @ whitening(plant.start_cov).T)
+    return np.asarray((x - plant.start_mean) @ whitening_matrix(plant.start_cov).T)

@@ -8,7 +8,7 @@ import numpy as np
 
 from netkf.checks.evidence import Finding, Promise
 from netkf.checks.parts.moments import (
-    Moments,
+    NoiseMoments,
     compare_correlations,
     compare_means,
     compare_variances,
@@ -29,7 +29,7 @@ def _labels(what: str, count: int) -> list[str]:
 
 
 @lru_cache(maxsize=4)
-def _starts(scenario: Scenario, seed: int) -> Moments:
+def _starts(scenario: Scenario, seed: int) -> NoiseMoments:
     return moments(whitened_starts(scenario, start_states(scenario, seed, STARTS)))
 
 
@@ -44,7 +44,7 @@ def _start_mean(samples: PartSamples, level: float) -> Finding:
     return compare_means(found, _labels("direction", len(found.first)), level)
 
 
-def _steps(samples: PartSamples) -> tuple[Moments, list[str]]:
+def _steps(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
     found = total(samples.steps)
     return found, _labels("direction", len(found.first))
 

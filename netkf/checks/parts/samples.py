@@ -16,7 +16,7 @@ from netkf.checks.parts.events import (
     count_pairs,
     count_ticks,
 )
-from netkf.checks.parts.moments import Moments
+from netkf.checks.parts.moments import NoiseMoments
 from netkf.checks.parts.noises import plant_moments, reading_moments
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -29,16 +29,16 @@ class PartSummary(NamedTuple):
     ticks: TickCounts | None
     fates: FateCounts | None
     pairs: PairCounts | None
-    steps: Moments | None
-    readings: Moments | None
+    steps: NoiseMoments | None
+    readings: NoiseMoments | None
 
 
 PART_TYPES: dict[str, type[Any]] = {
     "ticks": TickCounts,
     "fates": FateCounts,
     "pairs": PairCounts,
-    "steps": Moments,
-    "readings": Moments,
+    "steps": NoiseMoments,
+    "readings": NoiseMoments,
 }
 """The classes of the fields of :class:`PartSummary`."""
 

@@ -16,7 +16,7 @@ from netkf.checks.parts.moments import (
     compare_means,
     compare_variances,
     moments,
-    whitening,
+    whitening_matrix,
 )
 from netkf.checks.parts.network_rows import _correlation_of_runs, _neighbours_variance
 from netkf.checks.parts.rows import part_promises
@@ -178,7 +178,7 @@ def test_uniform_gaps_are_uniform_however_short_the_run():
 
 def test_whitening_gives_the_identity_and_drops_certain_directions():
     root = np.random.default_rng(1).standard_normal((4, 2))
-    white = whitening(root @ root.T)
+    white = whitening_matrix(root @ root.T)
     assert white.shape == (2, 4)
     assert np.allclose(white @ root @ root.T @ white.T, np.eye(2))
 
