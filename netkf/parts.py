@@ -32,6 +32,7 @@ from netkf.algorithms.kalman_consensus import Kcf
 from netkf.algorithms.one_bit import OneBit
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import SlotFilter
+from netkf.algorithms.track_fusion import BarShalomCampo, InverseIntersection, OptimisedIntersection
 from netkf.core.clock import Clock
 from netkf.core.fields import (
     boolean,
@@ -107,6 +108,7 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "BarShalomCampo",
     "Belief",
     "Bernoulli",
     "Broadcast",
@@ -141,6 +143,7 @@ __all__ = [
     "Icf",
     "Increments",
     "Intermittent",
+    "InverseIntersection",
     "Kcf",
     "LinearPlant",
     "LinearSensor",
@@ -157,6 +160,7 @@ __all__ = [
     "NodeInfo",
     "OnReadings",
     "OneBit",
+    "OptimisedIntersection",
     "PathGraph",
     "PerLink",
     "Periodic",

@@ -28,6 +28,12 @@ SOUND = {
     "hcmci": [parts.Hcmci(consensus="information", steps=2)],
     "icf": [parts.Icf()],
     "one-bit": [parts.OneBit()],
+    "optimised-covariance-intersection": [
+        parts.OptimisedIntersection(),
+        parts.OptimisedIntersection(minimise="determinant"),
+    ],
+    "inverse-covariance-intersection": [parts.InverseIntersection()],
+    "bar-shalom-campo": [parts.BarShalomCampo()],
     "kcf": [parts.Kcf(epsilon=0.2)],
     "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [

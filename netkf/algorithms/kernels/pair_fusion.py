@@ -1,0 +1,209 @@
+"""Fusion of two estimates whose correlation is not known, with the best weight, in kernels.
+
+With ``P_a = W W'`` and ``P_b = W diag(b) W'`` both covariances are diagonal in one basis W, and so
+is what becomes of them. The weight w minimises trace or determinant of
+
+* covariance intersection (Julier and Uhlmann, ACC 1997): ``P^-1 = w P_a^-1 + (1 - w) P_b^-1``;
+* inverse covariance intersection (Noack, Sijs, Reinhardt and Hanebeck, Automatica 79, 2017):
+  ``P^-1 = P_a^-1 + P_b^-1 - (w P_a + (1 - w) P_b)^-1``.
+
+Each entry of P in that basis is convex in w, its logarithm too, so that the minimum is where the
+derivative changes its sign: found by bisection, to the last digits and not to their square root.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netkf.algorithms.kernels.square_root import reflect
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+
+SWEEPS, BISECTIONS = 40, 60
+ORTHOGONAL = 1e-15
+"""Cosine of columns that count as orthogonal."""
+EQUAL = 1e-9
+"""Relative difference of all variances below which both covariances are the same: w is then 1/2,
+which nothing else would decide but rounding.
+"""
+
+
+@kernel
+def common_basis(
+    own: FloatArray, other: FloatArray, U: FloatArray, W: FloatArray, b: FloatArray
+) -> None:
+    """Write an orthogonal U, ``W = own U`` (n, n each) and b (n,) with ``own own' = W W'`` and
+    ``other other' = W diag(b) W'``, for lower triangular, regular roots (n, n).
+    """
+    n = len(b)
+    # T = own^-1 other, by forward substitution.
+    for j in range(n):
+        for i in range(n):
+            value = other[i, j] if j <= i else 0.0
+            for m in range(j, i):
+                value -= own[i, m] * U[m, j]
+            U[i, j] = value / own[i, i] if j <= i else 0.0
+    # One-sided Jacobi rotations make the columns of T orthogonal: T V = U diag(b)^1/2.
+    for _ in range(SWEEPS):
+        if orthogonalise(U) <= ORTHOGONAL:
+            break
+    for j in range(n):
+        b[j] = 0.0
+        for i in range(n):
+            b[j] += U[i, j] * U[i, j]
+        for i in range(n):
+            U[i, j] /= math.sqrt(b[j])
+        for i in range(n):
+            W[i, j] = 0.0
+            for m in range(i + 1):
+                W[i, j] += own[i, m] * U[m, j]
+
+
+@kernel
+def orthogonalise(T: FloatArray) -> float:
+    """Rotate each pair of columns of T (n, n) once; return the largest cosine found between two."""
+    n, largest = len(T), 0.0
+    for p in range(n - 1):
+        for q in range(p + 1, n):
+            pp = qq = pq = 0.0
+            for i in range(n):
+                pp += T[i, p] * T[i, p]
+                qq += T[i, q] * T[i, q]
+                pq += T[i, p] * T[i, q]
+            cosine = abs(pq) / math.sqrt(pp * qq)
+            largest = max(largest, cosine)
+            if cosine <= ORTHOGONAL:
+                continue
+            half = 0.5 * (qq - pp) / pq
+            tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(1.0 + half * half))
+            c = 1.0 / math.sqrt(1.0 + tangent * tangent)
+            s = c * tangent
+            for i in range(n):
+                first, second = T[i, p], T[i, q]
+                T[i, p] = c * first - s * second
+                T[i, q] = s * first + c * second
+    return largest
+
+
+@kernel(inlined=True)
+def fused_variance(w: float, b: float, inverse: bool) -> float:
+    """Return the variance that weight ``w`` of 1 and ``1 - w`` of ``b`` makes of both."""
+    if inverse:
+        mixed = w + (1.0 - w) * b
+        return b * mixed / ((1.0 + b) * mixed - b)
+    return b / (w * b + 1.0 - w)
+
+
+@kernel
+def slope(w: float, W: FloatArray, b: FloatArray, inverse: bool, trace: bool) -> float:
+    """Return the derivative of the criterion (trace, or logarithm of the determinant) by w."""
+    total = 0.0
+    for k in range(len(b)):
+        p = fused_variance(w, b[k], inverse)
+        if inverse:
+            # p = b m / ((1 + b) m - b) with m = w + (1 - w) b, so that dp/dm = -(p / m)^2.
+            ratio = p / (w + (1.0 - w) * b[k])
+            rate = -ratio * ratio * (1.0 - b[k])
+        else:
+            rate = p * p * (1.0 - b[k]) / b[k]
+        if trace:
+            length = 0.0
+            for i in range(len(b)):
+                length += W[i, k] * W[i, k]
+            total += length * rate
+        else:
+            total += rate / p
+    return total
+
+
+@kernel
+def best_weight(W: FloatArray, b: FloatArray, inverse: bool, trace: bool) -> float:
+    """Return the weight of the first covariance that minimises the criterion."""
+    apart = 0.0
+    for k in range(len(b)):
+        apart = max(apart, abs(b[k] - 1.0))
+    if apart <= EQUAL:
+        return 0.5
+    # The criterion is convex: its minimum is at an end where the slope does not change its sign.
+    if slope(0.0, W, b, inverse, trace) >= 0.0:
+        return 0.0
+    if slope(1.0, W, b, inverse, trace) <= 0.0:
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        w = 0.5 * (low + high)
+        if slope(w, W, b, inverse, trace) < 0.0:
+            low = w
+        else:
+            high = w
+    return 0.5 * (low + high)
+
+
+@kernel
+def fuse_pair(
+    x: FloatArray,
+    root: FloatArray,
+    other_x: FloatArray,
+    other: FloatArray,
+    inverse: bool,
+    trace: bool,
+    work: FloatArray,
+) -> None:
+    """Fuse an estimate x (n,) with lower triangular root (n, n), in place, with another one.
+
+    ``inverse``: inverse covariance intersection, else covariance intersection; ``trace``: the
+    weight minimises the trace of P, else its determinant. ``work`` (2 n + 2, n) is scratch.
+    """
+    n = len(x)
+    U, W, b, moved = work[:n], work[n : 2 * n], work[2 * n], work[2 * n + 1]
+    common_basis(root, other, U, W, b)
+    w = best_weight(W, b, inverse, trace)
+    # moved = root^-1 (other_x - x)
+    for i in range(n):
+        value = other_x[i] - x[i]
+        for m in range(i):
+            value -= root[i, m] * moved[m]
+        moved[i] = value / root[i, i]
+    # x + W diag(gain) U' moved, since W^-1 = U' root^-1
+    for k in range(n):
+        along = 0.0
+        for i in range(n):
+            along += U[i, k] * moved[i]
+        p = fused_variance(w, b[k], inverse)
+        along *= other_share(p, w, b[k], inverse)
+        for i in range(n):
+            x[i] += W[i, k] * along
+            W[i, k] *= math.sqrt(p)
+    # W diag(p)^1/2 is a root of P: reflections make it lower triangular, with a diagonal >= 0.
+    for i in range(n):
+        reflect(W, i, n, n)
+    for j in range(n):
+        for i in range(n):
+            entry = -W[i, j] if W[j, j] < 0.0 else W[i, j]
+            root[i, j] = entry if i > j else abs(entry) if i == j else 0.0
+
+
+@kernel(inlined=True)
+def other_share(p: float, w: float, b: float, inverse: bool) -> float:
+    """Return the gain of the other estimate in a direction where the variances are 1 and ``b``, and
+    ``p`` after both are fused.
+    """
+    if inverse:
+        return p * (1.0 / b - (1.0 - w) / (w + (1.0 - w) * b))
+    return p * (1.0 - w) / b
+
+
+def fused_pair(
+    first: tuple[FloatArray, FloatArray],
+    second: tuple[FloatArray, FloatArray],
+    inverse: bool,
+    trace: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Return estimate (n,) and lower triangular root (n, n) of two estimates with their roots."""
+    x, root = (np.array(part, dtype=np.float64) for part in first)
+    n = len(x)
+    other_x, other = (np.ascontiguousarray(part) for part in second)
+    fuse_pair(x, root, other_x, other, inverse, trace, np.empty((2 * n + 2, n)))
+    return x, root

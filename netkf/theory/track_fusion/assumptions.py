@@ -1,0 +1,19 @@
+"""Assumptions under which P of track fusion is no smaller than the covariance of the error."""
+
+from __future__ import annotations
+
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import AssumptionRow, true_model_row
+from netkf.theory.common.plant_assumptions import start_rows
+
+SOURCES = {
+    "best intersection": "Julier and Uhlmann 1997",
+    "inverse intersection": "Noack et al. 2017",
+    "tracks": "Bar-Shalom and Campo 1986",
+}
+
+
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows about the model and the first covariances."""
+    source = SOURCES[scenario.hosted.combination]
+    return [true_model_row(scenario, source, "same F, Q and R"), *start_rows(scenario, source)]

@@ -1,0 +1,131 @@
+"""Exact errors of track fusion along the messages of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+
+from netkf.algorithms.kernels.pair_fusion import best_weight, common_basis
+from netkf.algorithms.track_fusion import (
+    TRACE,
+    BarShalomCampo,
+    PairFusion,
+    best_combination,
+    predicted_joint,
+    updated_joint,
+)
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors, Term
+from netkf.theory.numerics.prediction import triangular_root
+from netkf.theory.numerics.updates import intersect_covariances
+from netkf.trace.run import Run
+
+
+def fusion_weight(own: FloatArray, other: FloatArray, inverse: bool, trace: bool) -> float:
+    """Return the weight of the first of two covariances given by roots (n, n), see PairFusion."""
+    n = len(own)
+    first, second = (np.ascontiguousarray(triangular_root(S)) for S in (own, other))
+    U, W, b = np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    common_basis(first, second, U, W, b)
+    return float(best_weight(W, b, inverse, trace))
+
+
+class PairRule(EstimateExchangeRule):
+    """Fusion with each estimate heard, one after the other."""
+
+    def combine(
+        self, node: int, weights: list[float], roots: list[FloatArray]
+    ) -> tuple[FloatArray, list[FloatArray]]:
+        """Fuse in the order of the senders, in which the messages are."""
+        algorithm = self.scenario.filter.algorithm
+        assert isinstance(algorithm, PairFusion)
+        root, factors = roots[0], [np.eye(len(roots[0]))]
+        for other in roots[1:]:
+            w = fusion_weight(root, other, algorithm.inverse, algorithm.minimise == TRACE)
+            fuse = fuse_inversely if algorithm.inverse else intersect_covariances
+            root, (own, heard) = fuse([w, 1.0 - w], [root, other])
+            factors = [*(own @ factor for factor in factors), heard]
+        return root, factors
+
+
+def fuse_inversely(
+    weights: list[float], roots: list[FloatArray]
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the root (n, n) of P and the factors (n, n) of both errors of inverse covariance
+    intersection.
+    """
+    P_a, P_b = (S @ S.T for S in roots)
+    inverses = [np.linalg.inv(P_a), np.linalg.inv(P_b)]
+    mixed = np.linalg.inv(weights[0] * P_a + weights[1] * P_b)
+    P = np.linalg.inv(inverses[0] + inverses[1] - mixed)
+    factors = [P @ (V - w * mixed) for w, V in zip(weights, inverses, strict=True)]
+    return triangular_root(square_root(0.5 * (P + P.T))), factors
+
+
+class TrackRule(ErrorRule):
+    """Tracks of the nodes, which nothing but readings changes, and combinations of them."""
+
+    def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        super().__init__(scenario, errors)
+        self._models = scenario.slot_models
+        self._sensors = [(model.H, model.R) for model in self._models]
+        nodes = range(errors.hosts)
+        self._joint = np.tile(scenario.start(scenario.nodes[0])[1], (len(nodes), len(nodes)))
+        for host in nodes:
+            errors.copy(host, _track(host), host)
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Update the tracks; a node that hears nothing shows its own."""
+        joint = predicted_joint(self._joint, self._models[0])
+        self._joint = updated_joint(joint, self._sensors, self.errors.n)
+        columns = self.errors.reading_noises(observations)
+        for host, observation in observations.items():
+            self.errors.update(_track(host), observation, columns[host])
+        self._show({host: [] for host in range(self.errors.hosts)})
+
+    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
+        """Combine each node's track with those that it heard."""
+        heard: dict[int, list[int]] = {}
+        for message in messages:
+            heard.setdefault(message.receiver, []).append(message.sender)
+        self._show(heard)
+
+    def _show(self, heard: dict[int, list[int]]) -> None:
+        """Set the errors of receivers to those of the combinations with what they heard."""
+        errors, n = self.errors, self.errors.n
+        changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
+        for host, senders in heard.items():
+            order = [host, *sorted(set(senders))]
+            joint = self._joint.reshape(errors.hosts, n, errors.hosts, n)
+            blocks = joint[order][:, :, order]
+            own = errors.roots[_track(host)]
+            terms: list[Term] = [(_track(host), np.eye(n))]
+            root = own
+            if len(order) > 1:
+                gain, root = best_combination(blocks, range(1, len(order)), own)
+                parts = np.split(gain, len(order) - 1, axis=1)
+                # e = e_i - sum_j G_j (e_i - e_j)
+                terms = [(_track(host), np.eye(n) - sum(parts))]
+                terms += [(_track(j), G) for j, G in zip(order[1:], parts, strict=True)]
+            changes[host] = root, terms
+        errors.combine(changes)
+
+
+def _track(host: int) -> Hashable:
+    return ("track", host)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    if scenario.slotted:
+        require_traced_exchanges(scenario, run)
+    if isinstance(scenario.filter.algorithm, BarShalomCampo):
+        return TrackRule(scenario, errors)
+    return PairRule(scenario, errors)

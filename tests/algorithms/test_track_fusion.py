@@ -1,0 +1,234 @@
+"""Track fusion: the textbook of each rule in both engines, exact errors, a Lyapunov equation."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+
+import netkf
+from netkf import theory
+from netkf.algorithms.kernels.pair_fusion import fused_pair
+from netkf.engines.compiled.engine import CompiledEngine
+from netkf.theory.common.errors import error_law
+from tests.algorithms.test_literature import clocked, heard_by_slot, scenario_of, textbook
+from tests.theory.test_replay import close, engine_covariance
+
+BEST = "optimised-covariance-intersection"
+INVERSE = "inverse-covariance-intersection"
+PAIRS = list(itertools.product((BEST, INVERSE), ("trace", "determinant")))
+TRACKS = {"kind": "bar-shalom-campo"}
+
+
+def fused(a, b, kind, minimise):
+    """Two estimates (x, P) by the formulas of the papers; the weight by Brent's method on the
+    derivative of the criterion.
+    """
+    (x, A), (y, B) = a, b
+    V, U, n = np.linalg.inv(A), np.linalg.inv(B), len(x)
+
+    def covariance(w):
+        M = np.linalg.inv(w * A + (1.0 - w) * B)
+        return np.linalg.inv(V + U - M if kind == INVERSE else w * V + (1.0 - w) * U)
+
+    def derivative(w):
+        M, P = np.linalg.inv(w * A + (1.0 - w) * B), covariance(w)
+        # dP = -P d(P^-1) P, and d log det P = -tr(P d(P^-1))
+        change = M @ (A - B) @ M if kind == INVERSE else V - U
+        return -np.trace(P @ change @ (P if minimise == "trace" else np.eye(n)))
+
+    if np.allclose(A, B, rtol=1e-9, atol=0.0):
+        w = 0.5
+    elif derivative(0.0) >= 0.0 or derivative(1.0) <= 0.0:
+        w = 0.0 if derivative(0.0) >= 0.0 else 1.0
+    else:
+        w = scipy.optimize.brentq(derivative, 0.0, 1.0, xtol=1e-16, rtol=1e-15)
+    P = covariance(w)
+    if kind == INVERSE:
+        M = np.linalg.inv(w * A + (1.0 - w) * B)
+        return P @ (V - w * M) @ x + P @ (U - (1.0 - w) * M) @ y, P
+    return P @ (w * V @ x + (1.0 - w) * U @ y), P
+
+
+def kalman(x, P, reading):
+    y, H, R = reading
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return x + K @ (y - H @ x), (np.eye(len(x)) - K @ H) @ P
+
+
+def expected_states(scenario, run, kind, minimise):
+    heard = heard_by_slot(scenario, run, 1)
+
+    def step(slot, x, P, readings):
+        for i, reading in readings.items():
+            x[i], P[i] = kalman(x[i], P[i], reading)
+        sent, up = list(zip(x, P, strict=True)), heard.get(slot, np.zeros((1, len(x), len(x))))[0]
+        for i in range(len(x)):
+            for j in np.flatnonzero(up[i]):
+                x[i], P[i] = fused((x[i], P[i]), sent[j], kind, minimise)
+        return x, P
+
+    found = list(textbook(scenario, run, step))
+    return np.stack([x for x, _ in found]), np.stack([P for _, P in found])
+
+
+@pytest.mark.parametrize(("kind", "minimise"), PAIRS)
+def test_the_textbook(kind, minimise, tmp_path):
+    for n in (1, 2, 4):
+        scenario = scenario_of({"kind": kind, "minimise": minimise}, tmp_path, 1, n)
+        for engine in ("simpy", "compiled"):
+            run = netkf.simulate(scenario, engine=engine)
+            xhat, P = expected_states(scenario, run, kind, minimise)
+            np.testing.assert_allclose(run.P, P, rtol=1e-9, atol=1e-11)
+            np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [BEST, INVERSE, "bar-shalom-campo"])
+def test_both_engines_make_the_same_run_and_theory_follows_it(kind, tmp_path):
+    settings = {"horizon": 4.0, "probe": [0.0, 1.0, 2.0, 3.0]}
+    scenario = scenario_of({"kind": kind}, tmp_path, 1, **settings)
+    fast, slow = (netkf.simulate(scenario, engine=engine) for engine in ("auto", "simpy"))
+    assert netkf.first_difference(fast, slow) is None
+    np.testing.assert_allclose(fast.P, slow.P, rtol=1e-10, atol=1e-12)
+    exact, _ = engine_covariance(scenario)
+    close(theory.error_covariance(scenario, fast), exact, 1e-9)
+    close(error_law(scenario, fast).P, fast.P, 1e-9)
+
+
+def test_many_runs_side_by_side_are_the_single_ones(tmp_path):
+    scenario = scenario_of({"kind": BEST}, tmp_path)
+    (batch,) = CompiledEngine().run_many(scenario, 7, range(11))
+    for replica in (0, 10):
+        run = netkf.simulate(scenario, seed=7, replica=replica, engine="compiled")
+        np.testing.assert_array_equal(batch.P[replica], run.P)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_known_correlations_beat_inverse_intersection_which_beats_intersection(seed):
+    """Tracks with common information: P_BC <= P_ICI <= P_CI in the order of traces."""
+    random, n = np.random.default_rng(seed), 3
+    common, own, other = (M @ M.T + 0.2 * np.eye(n) for M in random.standard_normal((3, n, n)))
+    # x_a has the information of a common estimate and of its own: P^-1 = C^-1 + E^-1.
+    A, B = (np.linalg.inv(np.linalg.inv(common) + np.linalg.inv(E)) for E in (own, other))
+    cross = A @ np.linalg.inv(common) @ B
+    x, y = random.standard_normal((2, n))
+    roots = [np.linalg.cholesky(P) for P in (A, B)]
+    S_ci, S_ici = (
+        fused_pair((x, roots[0]), (y, roots[1]), inverse, True)[1] for inverse in (False, True)
+    )
+    G = (A - cross) @ np.linalg.inv(A + B - cross - cross.T)
+    known = A - G @ (A - cross).T
+    assert np.trace(known) < np.trace(S_ici @ S_ici.T) < np.trace(S_ci @ S_ci.T)
+    # And the claim of inverse intersection holds for such tracks.
+    joint = np.block([[A, cross], [cross.T, B]])
+    w_x = np.stack([fused_pair((e, roots[0]), (0 * e, roots[1]), True, True)[0] for e in np.eye(n)])
+    K = w_x.T
+    error = np.hstack([K, np.eye(n) - K])
+    gap = S_ici @ S_ici.T - error @ joint @ error.T
+    assert np.linalg.eigvalsh(gap)[0] > -1e-12
+
+
+def test_weights_at_equal_covariances_are_one_half():
+    """Nothing but rounding would decide: equal nodes must not differ between engines."""
+    S = np.linalg.cholesky(np.array([[2.0, 0.3], [0.3, 1.0]]))
+    x, y = np.array([1.0, 2.0]), np.array([3.0, -1.0])
+    for inverse in (False, True):
+        mean, root = fused_pair((x, S), (y, S * (1.0 + 1e-15)), inverse, True)
+        np.testing.assert_allclose(mean, (x + y) / 2.0, rtol=1e-12)
+        np.testing.assert_allclose(root, S, rtol=1e-12)
+
+
+PAIR = {
+    "graph": {"kind": "edges", "edges": [[0, 1]]},
+    "activation": {"kind": "broadcast"},
+}
+
+
+def test_two_tracks_have_the_cross_covariance_of_a_lyapunov_equation(tmp_path):
+    """Bar-Shalom and Campo (1986): P12 of steady filters, and the fused covariance."""
+    sensors = [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.3]]},
+        {"nodes": [1], "H": [[0.4, 1.0]], "R": [[0.6]]},
+    ]
+    times = {"horizon": 121.0, "probe": [120.0]}
+    scenario = scenario_of(TRACKS, tmp_path, 3, sensors=sensors, network=PAIR, **times)
+    F, Q, n = scenario.plant.F, scenario.plant.Q, 2
+    closed, filtered = [], []
+    for sensor in scenario.sensors:
+        H, R = sensor.H, sensor.R
+        M = scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)
+        K = M @ H.T @ np.linalg.inv(H @ M @ H.T + R)
+        closed.append(np.eye(n) - K @ H)
+        filtered.append(closed[-1] @ M)
+    # P12 = C_1 (F P12 F' + Q) C_2', a Sylvester equation for one vector.
+    C, D = closed
+    P12 = np.linalg.solve(np.eye(n * n) - np.kron(C @ F, D @ F), (C @ Q @ D.T).reshape(-1)).reshape(
+        n, n
+    )
+    A, B = filtered
+    G = (A - P12) @ np.linalg.inv(A + B - P12 - P12.T)
+    expected = A - G @ (A - P12).T
+    run = netkf.simulate(scenario)
+    np.testing.assert_allclose(run.P[0], [expected, expected], rtol=1e-9)
+    # Without the common process noise tracks would be taken for independent: too sure.
+    naive = np.linalg.inv(np.linalg.inv(A) + np.linalg.inv(B))
+    assert np.trace(naive) < 0.97 * np.trace(expected)
+
+
+def test_tracks_know_their_errors_and_checks_say_so(tmp_path):
+    """Messages that come late in the run, lost ones and equal tracks of blind nodes included."""
+    scenario = scenario_of(TRACKS, tmp_path, 2, horizon=9.0)
+    table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+    assert table.loc["P is the covariance of the error, given the events", "verdict"] == "holds"
+    assert table.loc["errors have the covariance that the equations give them", "verdict"] in (
+        "holds",
+        "undecided",
+    )
+
+
+@pytest.mark.parametrize(("kind", "promised"), [(BEST, True), (INVERSE, False)])
+def test_intersection_never_claims_too_much(kind, promised, tmp_path):
+    scenario = scenario_of({"kind": kind}, tmp_path, 2, horizon=9.0)
+    table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+    bound = "P is at least the covariance of the error, given the events"
+    assert (bound in table.index) == promised
+    assert set(table["verdict"]) <= {"holds", "undecided"}
+
+
+def test_inverse_intersection_is_surer_and_right_in_a_network(tmp_path):
+    """No proof covers it, but its P is below that of covariance intersection, and no error is
+    found to be above.
+    """
+    for seed in range(2):
+        ours, other = (
+            netkf.simulate(scenario_of({"kind": kind}, tmp_path, seed, 3))
+            for kind in (INVERSE, BEST)
+        )
+        sizes = [np.trace(run.P[-1], axis1=-2, axis2=-1) for run in (ours, other)]
+        assert (sizes[0] < sizes[1] + 1e-12).all()
+        scenario = scenario_of({"kind": INVERSE}, tmp_path, seed, 3)
+        gap = ours.P - theory.error_covariance(scenario, ours)
+        assert np.linalg.eigvalsh(gap)[..., 0].min() > -1e-12
+
+
+@pytest.mark.parametrize("at", ["links", "nodes"])
+def test_under_clocks(at, tmp_path):
+    """Delayed and lost messages: P is at least the exact covariance."""
+    sampling = {"kind": "poisson", "rate": 2.0}
+    network = {
+        "graph": {"kind": "cycle", "nodes": 4},
+        "activation": {"kind": "poisson", "rate": 2.0, "at": at},
+        "channel": {"delay": {"kind": "constant", "seconds": 0.3}},
+    }
+    scenario = clocked({"kind": BEST}, tmp_path, {}, sampling, probe=0.5, network=network)
+    run = netkf.simulate(scenario)
+    gap = run.P - theory.error_covariance(scenario, run)
+    assert np.linalg.eigvalsh(gap)[..., 0].min() > -1e-10
+    close(error_law(scenario, run).P, run.P, 1e-9)
+
+
+def test_tracks_that_start_apart_are_refused(tmp_path):
+    mean = [[float(k), 0.0] for k in range(5)]
+    with pytest.raises(netkf.ScenarioError, match="must be that of all nodes"):
+        scenario_of({**TRACKS, "mean": mean}, tmp_path)
