@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from netkf.core.errors import NetkfError
 from netkf.figures.panels import draw_nees
@@ -23,12 +22,16 @@ from netkf.figures.style import (
 )
 from netkf.figures.subject import LEVEL, Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.innovations import Innovations, innovations
+from netkf.runs.innovations import (
+    MIN_READINGS,
+    Innovations,
+    autocorrelations,
+    chi_square_means,
+    innovations,
+)
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 
 BINS = 40
-MAX_LAG = 20
-MIN_READINGS = 30
 
 
 def nees_figure(subject: Subject) -> Picture:
@@ -106,7 +109,7 @@ def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
     )
     full = freedom > 0.0
     centres = 0.5 * (edges[1:] + edges[:-1])[full]
-    low, high = _chi_square(freedom[full])
+    low, high = chi_square_means(freedom[full], CONFIDENCE)
     axes.fill_between(
         centres,
         low,
@@ -123,36 +126,20 @@ def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3))
     axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
     draw_legend(axes)
-    ends = _chi_square(rows)
+    ends = chi_square_means(rows, CONFIDENCE)
     share = float(((nis / rows >= ends[0]) & (nis / rows <= ends[1])).mean())
     return share, float(nis.sum() / rows.sum())
 
 
-def _chi_square(freedom: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the interval of chi-square over its degrees of freedom with probability CONFIDENCE."""
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    ends = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
-    low, high = (np.asarray(end) for end in ends)
-    return low, high
-
-
-def autocorrelation(values: FloatArray, lags: int) -> FloatArray:
-    """Return the autocorrelation at lags 1 .. ``lags`` of a series (M,) of mean 0 by model."""
-    total = float(values @ values)
-    return np.array([values[k:] @ values[:-k] for k in range(1, lags + 1)]) / max(total, 1e-300)
-
-
 def whiteness_figure(subject: Subject) -> Picture:
     """Draw the autocorrelation of the whitened innovations: the mean node and the worst one."""
-    found = innovations_of(subject)
-    series = _series(found)
-    if not series:
+    curves, counts = autocorrelations(innovations_of(subject))
+    if not curves:
         raise UnavailableError(f"No node has {MIN_READINGS} readings of one kind.")
-    lags = min(MAX_LAG, min(map(len, series.values())) - 2)
-    curves = {node: autocorrelation(values, lags) for node, values in series.items()}
-    band = LEVEL / np.sqrt(min(map(len, series.values())))
+    smallest, lags = min(counts.values()), len(next(iter(curves.values())))
+    band = LEVEL / np.sqrt(smallest)
     outside = sum(
-        int((np.abs(c) > LEVEL / np.sqrt(len(series[n]))).sum()) for n, c in curves.items()
+        int((np.abs(c) > LEVEL / np.sqrt(counts[node])).sum()) for node, c in curves.items()
     )
     worst = max(curves, key=lambda node: float(np.abs(curves[node]).max()))
     figure = new_figure(7.4, 4.2)
@@ -161,23 +148,11 @@ def whiteness_figure(subject: Subject) -> Picture:
     share = outside / (lags * len(curves))
     white = "as white noise would" if share <= 0.1 else "so innovations are not white"
     claim = f"{share:.0%} of autocorrelations are outside their 95% band, {white}"
-    smallest = min(map(len, series.values()))
     words = (
         f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
     )
     finish_figure(figure, subject.claim(claim), subject.caption(words))
     return figure
-
-
-def _series(found: Innovations) -> dict[int, FloatArray]:
-    """Return the first whitened component of the innovations of each node with enough of them."""
-    first = np.array([values[0] for values in found.whitened])
-    series = {}
-    for node in np.unique(found.nodes).tolist():
-        values = first[(found.nodes == node) & np.isfinite(first)]
-        if len(values) >= MIN_READINGS:
-            series[node] = values
-    return series
 
 
 def _draw_correlations(

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.special
 
+from netkf.checks.report import PAPERS
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import Opened
+from netkf.report.innovations import innovation_claim
 from netkf.report.messages import DELIVERED, LATE, LOST, information_age
+from netkf.report.worst import StartUp, Worst, WorstSample, samples_averaged
+from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
-from netkf.runs.summary import SampleIndices, averaged_samples
 from netkf.runs.tables import format_number
 from netkf.studies.compare import Comparison
 from netkf.trace.run import first_difference
@@ -25,100 +28,17 @@ MAX_LISTED = 4
 MAX_COMPARED = 500_000
 """Events of a run up to which two runs are compared event by event."""
 LABELS = {"rms_error": "RMS error", "mean_trace": "mean trace P", "mean_nees": "mean NEES"}
+PAPER = f". H is the paper {PAPERS['H']}"
 CERTAIN = 0.01
 """Probability that, where P is exact, the NEES of any sample of a run is called too large."""
-COME_DOWN, SETTLED = 0.8, 0.25
-"""Trace P has a start-up if its mean over the last quarter of the samples is below this share of
-its first value."""
 
 
-class Worst(NamedTuple):
-    """The node that was worst over time and its worst sample.
-
-    value, peak : with truth the RMS error over time and the error at ``time``; without it the
-    square roots of the mean trace of P and of the trace at ``time``
+def findings(
+    source: Opened, messages: np.ndarray, readings: Innovations | str | None = None
+) -> list[str]:
+    """Return sentences about a source with these MESSAGE rows and innovations of its ``readings``,
+    the most important first.
     """
-
-    node: int
-    time: float
-    value: float
-    peak: float
-    by_error: bool
-
-
-def node_most_off(source: Opened) -> Worst | None:
-    """Return the worst node of the trace of a source: the one with the largest RMS error over time,
-    or, without ground truth, with the largest mean trace of P. None without a finite number.
-    """
-    run = source.run
-    if run is None or not len(run.times) or not run.nodes:
-        return None
-    by_error = run.truth_known
-    traces = np.trace(run.P, axis1=2, axis2=3)
-    square = run.sq_error if by_error else traces
-    used = _averaged(source, run)
-    chosen = used.errors if by_error else used.covariances
-    if not len(chosen):
-        return None
-    with np.errstate(all="ignore"):
-        means = square[chosen].mean(axis=0)
-    if not np.isfinite(means).any():
-        return None
-    k = int(np.nanargmax(np.where(np.isfinite(means), means, -np.inf)))
-    at = int(chosen[np.argmax(square[chosen, k])])
-    return Worst(
-        run.nodes[k],
-        float(run.times[at]),
-        math.sqrt(max(0.0, float(means[k]))),
-        math.sqrt(max(0.0, float(square[at, k]))),
-        by_error,
-    )
-
-
-class StartUp(NamedTuple):
-    """Trace P of a node at its first sample, ``now``, and its mean over its last samples."""
-
-    first: float
-    now: float
-    last: float
-
-
-def after_start_up(source: Opened, worst: Worst) -> tuple[Worst, StartUp | None]:
-    """Return the worst sample of the worst node after its start-up, and, if its worst sample of all
-    was in the start-up, its trace P then.
-
-    The start-up lasts until trace P has come down halfway from its first value to its last ones.
-    """
-    run = source.run
-    assert run is not None
-    k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
-    traces = np.trace(run.P[:, k], axis1=1, axis2=2)
-    first, now = float(traces[0]), float(traces[at])
-    last = float(traces[-max(1, int(SETTLED * len(traces))) :].mean())
-    low = np.flatnonzero(traces <= 0.5 * (first + last))
-    if not last < COME_DOWN * first or not len(low) or low[0] <= at:
-        return worst, None
-    used = _averaged(source, run)
-    chosen = used.errors if worst.by_error else used.covariances
-    rest = chosen[chosen >= low[0]]
-    start = StartUp(first, now, last)
-    if not len(rest):
-        return worst, start
-    square = run.sq_error[:, k] if worst.by_error else traces
-    then = int(rest[np.argmax(square[rest])])
-    peak = math.sqrt(max(0.0, float(square[then])))
-    return worst._replace(time=float(run.times[then]), peak=peak), start
-
-
-def _averaged(source: Opened, run: StoredRun) -> SampleIndices:
-    """Return the indices of the samples that the summary averages over."""
-    found = source.summary.get("rounding_from")
-    blurred = math.inf if found is None else float(found)
-    return averaged_samples(run.times, blurred, run.count("diverged") > 0)
-
-
-def findings(source: Opened, messages: np.ndarray) -> list[str]:
-    """Return sentences about a source with these MESSAGE rows, the most important first."""
     if source.kind == "sweep":
         return [*_ending(source), *_of_sweep(source)]
     if source.kind == "verdict":
@@ -127,7 +47,9 @@ def findings(source: Opened, messages: np.ndarray) -> list[str]:
     if source.kind == "ensemble":
         found += [*_of_ensemble(source), *_of_bound(source)]
     elif source.run is not None and len(source.run.times):
-        found += [*_of_trace(source, source.run, messages), *_of_bound(source)]
+        found += _of_trace(source, source.run, messages)
+        found += [innovation_claim(readings)] if isinstance(readings, Innovations) else []
+        found += _of_bound(source)
     elif source.status == "complete":
         found.append("No samples were recorded, so nothing moves here: run again with --trace full")
     if source.verdict is not None:
@@ -203,9 +125,10 @@ def _last(run: StoredRun | None) -> float:
 
 
 def _of_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]:
-    worst = node_most_off(source)
-    if worst is None:
+    sample = source.worst
+    if sample is None:
         return []
+    worst = sample.overall
     count = len(run.nodes)
     if not worst.by_error:
         return [
@@ -213,7 +136,7 @@ def _of_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]
             f"its own covariance was node {worst.node}: square root of mean trace P "
             f"{format_number(worst.value)}, the largest of {count} nodes; {_since(run, worst)}it "
             f"peaked at {_time(worst.time)} with {format_number(worst.peak)}",
-            *_why(source, run, messages, worst),
+            *_why(source, run, messages, sample),
         ]
     overall = source.summary.get("overall", {}).get("rms_error")
     rank = f", the largest of {count} nodes (all nodes {format_number(overall)})"
@@ -221,7 +144,7 @@ def _of_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]
         f"Node {worst.node} was worst: RMS error {format_number(worst.value)} over time"
         f"{rank if count > 1 else ''}. {_since(run, worst).capitalize()}its error was largest at "
         f"{_time(worst.time)}: {format_number(worst.peak)}",
-        *_why(source, run, messages, worst),
+        *_why(source, run, messages, sample),
     ]
 
 
@@ -230,16 +153,15 @@ def _since(run: StoredRun, worst: Worst) -> str:
     return "after time 0 " if run.times[0] <= 0.0 < worst.time else ""
 
 
-def _why(source: Opened, run: StoredRun, messages: np.ndarray, worst: Worst) -> list[str]:
+def _why(source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSample) -> list[str]:
     """Return what the worst node had heard by its worst instant after its start-up, and what its P
     said.
     """
+    worst = sample.explained
     into = messages[messages["receiver"] == worst.node]
     found = []
-    later, start = after_start_up(source, worst)
-    if start is not None:
-        found.append(_started(worst, later, start))
-        worst = later
+    if sample.start is not None:
+        found.append(_started(sample.overall, worst, sample.start))
     if len(into):
         cut = float(source.cuts(np.array([worst.time]))[0])
         found.append(_heard(into, worst, cut) + _unusual(source, run, into, worst))
@@ -272,7 +194,7 @@ def _judged(source: Opened, run: StoredRun, worst: Worst) -> list[str]:
         return []
     # NEES is chi-square with n degrees of freedom where P is exact. Bonferroni: the samples of all
     # nodes were looked at, dependent as they are.
-    looked = len(_averaged(source, run).errors) * len(run.nodes)
+    looked = len(samples_averaged(run, source.summary).errors) * len(run.nodes)
     limit = float(scipy.special.chdtri(n, CERTAIN / looked))
     judged = (
         f"far more than its P says: NEES {format_number(nees)}, above"
@@ -304,7 +226,8 @@ def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:
     silent = len(links) - len(heard)
     if parts and silent:
         listed += f" and had not heard {silent} other node{'s' if silent > 1 else ''} yet"
-    lost = f"{missing:,} message{'s' if missing != 1 else ''} to it had been lost or late since"
+    lost = f"{missing:,} message{'s' if missing != 1 else ''} to it had been lost or late "
+    lost += "since" if parts else "by then"
     return f"Why: {listed}; {lost}"
 
 
@@ -325,7 +248,7 @@ def _unusual(source: Opened, run: StoredRun, into: np.ndarray, worst: Worst) -> 
         )
     return (
         f". That is not unusual: {format_number(float(now))} s on average over its links, mean "
-        f"over the run {mean} s. Losses alone do not explain this"
+        f"over the run {mean} s"
     )
 
 
@@ -356,7 +279,7 @@ def _of_bound(source: Opened) -> list[str]:
         return []
     rows = [row for row in summary["nodes"] if row["bound"] and row["mean_trace"] is not None]
     if not rows:
-        return [f"No bound: {summary.get('bound', 'unknown')}"]
+        return [f"No bound: {summary.get('bound', 'unknown')}{PAPER}"]
     top = max(rows, key=lambda row: float(row["mean_trace"]) / float(row["bound"]))
     ratio = float(top["mean_trace"]) / float(top["bound"])
     numbers = (
@@ -367,11 +290,11 @@ def _of_bound(source: Opened) -> list[str]:
         sure = float(top.get("mean_trace_se") or 0.0)
         above = float(top["mean_trace"]) - 2.0 * sure > float(top["bound"])
         held = "is exceeded by more than two standard errors" if above else "holds"
-        return [f"The bound {summary['bound'].split(',')[0]} {held}; closest: {numbers}"]
+        return [f"The bound {summary['bound'].split(',')[0]} {held}; closest: {numbers}{PAPER}"]
     side = "below" if ratio <= 1.0 else "above"
     return [
         f"The bound {summary['bound'].split(',')[0]} is about the mean over runs. In this one run "
-        f"P was {side} it: largest {numbers}. netkf check decides if it holds"
+        f"P was {side} it: largest {numbers}. netkf check decides if it holds{PAPER}"
     ]
 
 

@@ -10,8 +10,8 @@ import networkx
 import numpy as np
 import scipy.special
 
-from netkf.report.claims import Worst, after_start_up, node_most_off
 from netkf.report.directories import Opened
+from netkf.report.innovations import innovation_columns
 from netkf.report.messages import (
     Kept,
     information_age,
@@ -19,6 +19,8 @@ from netkf.report.messages import (
     traffic,
 )
 from netkf.report.packing import Packer
+from netkf.report.worst import Worst
+from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import nees_bounds
 from netkf.trace.schema import CODES
@@ -46,14 +48,17 @@ class Budget(NamedTuple):
 
 
 def run_data(
-    source: Opened, run: StoredRun, messages: np.ndarray, budget: Budget, packer: Packer
+    source: Opened,
+    run: StoredRun,
+    messages: np.ndarray,
+    readings: Innovations | str | None,
+    budget: Budget,
+    packer: Packer,
 ) -> dict[str, Any]:
-    """Return what the views show of the trace of a source with these MESSAGE rows; columns go to
-    ``packer``.
+    """Return what the views show of the trace of a source with these MESSAGE rows and innovations
+    of its ``readings``; columns go to ``packer``.
     """
-    worst = node_most_off(source)
-    if worst is not None:
-        worst, _ = after_start_up(source, worst)
+    worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)
     instant = worst.time if worst is not None else horizon
     times = sample_indices(run, budget.values, instant)
@@ -82,6 +87,7 @@ def run_data(
         "messages": _message_columns(kept, run, packer),
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
         "marks": _event_columns(run, MARKS, MAX_MARKS, packer),
+        "innovations": innovation_columns(readings, run.nodes, budget.messages // 4, packer),
         "traffic": traffic(messages, horizon, BINS),
         "totals": {
             "events": len(run.log),
@@ -114,11 +120,14 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
         rules.append(
             f"of {totals['links']:,} directed links the first {len(data['links']):,} are drawn"
         )
-    for name, label in (("senses", "sensor readings"), ("marks", "other events of nodes")):
-        if data[name]["step"] > 1:
-            rules.append(
-                f"of {data[name]['total']:,} {label} the page holds every {data[name]['step']}th"
-            )
+    for name, label in (
+        ("senses", "sensor readings"),
+        ("marks", "other events of nodes"),
+        ("innovations", "innovations"),
+    ):
+        part = data[name]
+        if part is not None and part["step"] > 1:
+            rules.append(f"of {part['total']:,} {label} the page holds every {part['step']}th")
     return rules
 
 

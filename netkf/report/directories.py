@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
+from netkf.report.worst import WorstSample, worst_sample
 from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, check_files, require
 from netkf.runs.stored import StoredRun, read_form
 from netkf.runs.summary import PromisedTraces
@@ -85,6 +87,11 @@ class Opened:
         """Bounds and limits at the sample times."""
         found = self.ensemble if self.ensemble is not None else self.run
         return None if found is None or not len(found.times) else found.promised
+
+    @cached_property
+    def worst(self) -> WorstSample | None:
+        """The worst sample of the run, None without one."""
+        return None if self.run is None else worst_sample(self.run, self.summary)
 
     @property
     def runs(self) -> int:

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from netkf.core.errors import NetkfError
-from netkf.report.claims import Worst, after_start_up, node_most_off
 from netkf.report.directories import Opened
 from netkf.report.markup import bullets, paragraph, table_box
+from netkf.report.worst import Worst
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
@@ -27,9 +27,10 @@ def explain_worst(source: Opened) -> Explanation | str | None:
     """Return why the worst sample of a single run after the start-up was what it was, by replays;
     or the reason why it cannot be said here, or None where there is nothing to explain.
     """
-    worst, run = _explained(source), source.run
-    if worst is None or run is None or source.kind != "run":
+    run = source.run
+    if source.worst is None or run is None or source.kind != "run":
         return None
+    worst = source.worst.explained
     if len(run.nodes) == 1 or not run.count("send"):
         return None
     events = int(np.searchsorted(run.log["t"], worst.time, side="right"))
@@ -42,11 +43,6 @@ def explain_worst(source: Opened) -> Explanation | str | None:
         return str(error)
 
 
-def _explained(source: Opened) -> Worst | None:
-    worst = node_most_off(source)
-    return None if worst is None else after_start_up(source, worst)[0]
-
-
 def _command(source: Opened, worst: Worst) -> str:
     return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
 
@@ -57,21 +53,40 @@ def mending_claim(found: Explanation) -> str:
     same = math.isclose(was.trace, best.trace, rel_tol=SAME) or math.isnan(was.trace)
     if same and not abs(best.error - was.error) > SAME * was.error:
         return "Messages would not have mended it: a replay in which none is missing is no better"
-    change = f"trace P {format_number(best.trace)} in place of {format_number(was.trace)}"
-    if math.isfinite(best.error):
-        change += f" and error {format_number(best.error)} in place of {format_number(was.error)}"
-    some = ""
-    if found.smallest is not None and found.smallest.messages:
-        count = len(found.smallest.messages)
-        many = f"{count} message{'s' if count > 1 else ''}"
-        some = f"; {many} alone would have brought trace P to {format_number(found.smallest.trace)}"
-    return f"To mend it: with no message missing, a replay gives {change}{some}"
+    error = _change("error", was.error, best.error)
+    if same:
+        change = f"{error} at the same trace P, {format_number(was.trace)}"
+    else:
+        change = _change("trace P", was.trace, best.trace)
+        change += f" and {error}" if math.isfinite(best.error) else ""
+        change += _cost(found)
+    return f"To mend it: with no message missing, a replay gives {change}"
+
+
+def _change(name: str, was: float, now: float) -> str:
+    change = f"{name} {format_number(now)} in place of {format_number(was)}"
+    return f"{change} ({relative_change(now, was)})" if was > 0.0 else change
+
+
+def _cost(found: Explanation) -> str:
+    """Return how few messages would have done it, or the best that was tried."""
+    smallest = found.smallest
+    if smallest is None or smallest.messages == ():
+        return ""
+    chosen = smallest.best if smallest.messages is None else smallest.messages
+    if not chosen:
+        return f"; none of the {smallest.considered:,} messages alone that were tried helps"
+    value = smallest.best_trace if smallest.messages is None else smallest.trace
+    count = f"{len(chosen)} message{'s' if len(chosen) > 1 else ''}"
+    return (
+        f"; {count} alone, of {smallest.candidates:,} that could have mattered, would have brought "
+        f"trace P to {format_number(value)}"
+    )
 
 
 def mending_section(source: Opened, found: Explanation | str) -> str:
     """Return the answer of ``netkf why`` about the worst sample: sentences, and a row a replay."""
-    worst = _explained(source)
-    if isinstance(found, str) or worst is None:
+    if isinstance(found, str) or source.worst is None:
         return paragraph(f"The worst sample is not explained here: {found}", "note")
     rows = [
         (
@@ -85,5 +100,6 @@ def mending_section(source: Opened, found: Explanation | str) -> str:
     ]
     caption = f"Node {found.node} at {found.at:.10g} s, replayed with messages that did not come"
     replays = table_box(caption, ("replayed with", "messages", "trace P", "change", "error"), rows)
-    more = f"By replays of the run, nothing is guessed: {_command(source, worst)} says more"
+    command = _command(source, source.worst.explained)
+    more = f"By replays of the run, nothing is guessed: {command} says more"
     return bullets(sentences(found)) + replays + paragraph(more, "note")

@@ -18,12 +18,14 @@ from netkf.report import tables
 from netkf.report.claims import difference_findings, findings
 from netkf.report.data import Budget, run_data, thinning_rules
 from netkf.report.directories import Opened, read_source
+from netkf.report.innovations import read_innovations
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
 from netkf.report.mending import explain_worst, mending_claim, mending_section
 from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
 from netkf.runs.documents import ENDED, DamagedError
 from netkf.runs.files import write_text
+from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.studies.explanation import Explanation
@@ -59,13 +61,14 @@ HEAD = 4096
 
 
 class _Entry(NamedTuple):
-    """A source with its MESSAGE rows, and why its worst sample was what it was (or why that is not
-    said).
+    """A source with its MESSAGE rows, why its worst sample was what it was, and the innovations of
+    its readings (or why these are not said).
     """
 
     source: Opened
     messages: np.ndarray
     worst: Explanation | str | None = None
+    readings: Innovations | str | None = None
 
     @property
     def moves(self) -> bool:
@@ -138,7 +141,7 @@ def _entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
             messages = join_messages(source.run.log)
         except ValueError as error:
             raise DamagedError(f"events.parquet: {error}") from None
-    return _Entry(source, messages, explain_worst(source))
+    return _Entry(source, messages, explain_worst(source), read_innovations(source))
 
 
 def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
@@ -179,7 +182,7 @@ def _assemble(
     packer = Packer()
     moving = [entry for entry in entries if entry.moves]
     runs = [
-        run_data(entry.source, entry.source.run, entry.messages, budget, packer)
+        run_data(entry.source, entry.source.run, entry.messages, entry.readings, budget, packer)
         for entry in moving
         if entry.source.run is not None
     ]
@@ -215,7 +218,7 @@ def _assemble(
 def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
     """Return the head of the page: names, claims, and what the data say."""
     parts = []
-    for letter, (source, messages, worst) in zip("AB", entries, strict=False):
+    for letter, (source, messages, worst, readings) in zip("AB", entries, strict=False):
         mark = f"{letter}: " if len(entries) > 1 else ""
         level = "h2" if len(entries) > 1 else "h1"
         title = f"{mark}{source.scenario.name}"
@@ -223,7 +226,7 @@ def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
         parts.append(f"<{level}>{text(title + status)}</{level}>")
         if source.scenario.claim:
             parts.append(paragraph(f"Claim of the scenario: {source.scenario.claim}", "claim"))
-        lines = findings(source, messages)
+        lines = findings(source, messages, readings)
         if isinstance(worst, Explanation):
             why = (k for k, line in enumerate(lines, 1) if line.startswith("Why: "))
             lines.insert(next(why, len(lines)), mending_claim(worst))
@@ -250,11 +253,18 @@ def _main(
         parts.append(section("mending", "What would have mended the worst sample", "".join(mended)))
     if comparison is not None:
         parts.append(section("comparison", "What differs", _differences(comparison)))
-    parts.append(section("figures", "Figures", '<div id="curves" class="curves"></div>'))
+    parts.append(section("figures", "Figures", _figures(entries)))
     parts.append(section("verdicts", "Verdicts and averages", "".join(map(_results, sources))))
     parts.append(section("scenario", "Scenario", "".join(map(_scenario, sources))))
     parts.append(section("origin", "Versions and command", _origin(sources, command, rules)))
     return "<main>" + "".join(parts) + "</main>"
+
+
+def _figures(entries: list[_Entry]) -> str:
+    """Return the place of the curves, and why there are none of innovations."""
+    reasons = dict.fromkeys(entry.readings for entry in entries if isinstance(entry.readings, str))
+    notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
+    return '<div id="curves" class="curves"></div>' + "".join(notes)
 
 
 def _differences(comparison: Comparison | str) -> str:

@@ -1,4 +1,4 @@
-"""Innovations of a run: what each reading was against what the node expected.
+"""Innovations of a run: what each reading was against what the node expected, and tests of them.
 
 Traces keep no readings. A replay in the SimPy engine, whose events and states are those of the run,
 hands every reading to the filter again, and this time it is noted.
@@ -10,17 +10,21 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from netkf.algorithms.filter import Filter, Reading
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
-from netkf.trace.run import Run
+from netkf.trace.run import Run, first_difference
 from netkf.trace.schema import CODES
 
 MAX_EVENTS = 400_000
 """Events of a run up to which it is replayed: half a minute."""
+MAX_LAG = 20
+MIN_READINGS = 30
+"""Readings of a node from which on its autocorrelations say something."""
 
 
 class Innovations(NamedTuple):
@@ -37,15 +41,16 @@ class Innovations(NamedTuple):
     whitened: list[FloatArray]
 
 
-def innovations(run: Run) -> Innovations:
+def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
     """Return the innovations of the samples of a run, by a replay.
 
     Raises NetkfError with a sentence if there are none: readings are increments, the filter has its
-    own form of readings or gives no covariance, or the run is too long to be replayed.
+    own form of readings or gives no covariance, the run has more than ``most`` events, or a replay
+    makes other events, as another version may.
     """
     scenario: Scenario = run.scenario
-    if len(run.log) > MAX_EVENTS:
-        raise NetkfError(f"a run of more than {MAX_EVENTS:,} events is not replayed")
+    if len(run.log) > most:
+        raise NetkfError(f"a run of more than {most:,} events is not replayed")
     if not isinstance(scenario.filter.algorithm, Filter):
         raise NetkfError("filters of the former contracts keep their readings to themselves")
     if not scenario.slotted and not scenario.sampled_sensors:
@@ -55,6 +60,8 @@ def innovations(run: Run) -> Innovations:
         scenario.filter, algorithm=_noting(scenario.filter.algorithm, noted)
     )
     again = simulate(_with_filter(scenario, filtering), run.seed, run.replica, "simpy")
+    if len(run.log) and first_difference(run, again) is not None:
+        raise NetkfError("a replay makes other events than the run: it is of another version")
     return _collect(again, noted)
 
 
@@ -121,3 +128,40 @@ def _whiten(reading: Reading, xhat: FloatArray, P: FloatArray | None) -> FloatAr
     S = reading.H @ P @ reading.H.T + reading.R
     v = reading.y - reading.H @ xhat
     return np.asarray(np.linalg.solve(np.linalg.cholesky(S), v))
+
+
+def chi_square_means(freedom: FloatArray, probability: float) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of the intervals that hold chi-square over its degrees of ``freedom`` (M,)
+    with a probability, each end missed with half of the rest.
+    """
+    tail = 0.5 * (1.0 - probability)
+    ends = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
+    low, high = (np.asarray(end) for end in ends)
+    return low, high
+
+
+def innovation_series(found: Innovations) -> dict[int, FloatArray]:
+    """Return the first whitened component of the innovations of each node that has MIN_READINGS."""
+    first = np.array([values[0] for values in found.whitened])
+    series = {}
+    for node in np.unique(found.nodes).tolist():
+        values = first[(found.nodes == node) & np.isfinite(first)]
+        if len(values) >= MIN_READINGS:
+            series[node] = values
+    return series
+
+
+def autocorrelation(values: FloatArray, lags: int) -> FloatArray:
+    """Return the autocorrelation at lags 1 .. ``lags`` of a series (M,) of mean 0 by model."""
+    total = float(values @ values)
+    return np.array([values[k:] @ values[:-k] for k in range(1, lags + 1)]) / max(total, 1e-300)
+
+
+def autocorrelations(found: Innovations) -> tuple[dict[int, FloatArray], dict[int, int]]:
+    """Return the autocorrelations of the innovations of each node that has MIN_READINGS, at lags 1
+    .. MAX_LAG, and how many readings each has.
+    """
+    series = innovation_series(found)
+    counts = {node: len(values) for node, values in series.items()}
+    lags = min([MAX_LAG, *(count - 2 for count in counts.values())])
+    return {node: autocorrelation(values, lags) for node, values in series.items()}, counts

@@ -5,9 +5,8 @@ import pytest
 import scipy.stats
 
 import netkf
-from netkf.figures.consistency import autocorrelation
 from netkf.figures.traffic import age_at, directions_of, freshest, wilson
-from netkf.runs.innovations import innovations
+from netkf.runs.innovations import autocorrelation, innovations
 from netkf.studies.consistency import run_consistency
 from tests.conftest import SCENARIOS
 from tests.figures.conftest import one_node

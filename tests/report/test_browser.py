@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.report.claims import node_most_off
 from netkf.report.directories import read_source
 from netkf.report.page import write_report
 from netkf.runs.run import run_to_directory
@@ -29,6 +28,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
 AXE = os.environ.get("NETKF_AXE", "")
 TIMES = 20
+PLACES = 67  # of each of three runs: 201 nodes and times to explain
 BOUND = 3000  # milliseconds until a page is ready
 
 
@@ -147,18 +147,22 @@ def test_why_is_an_independent_backward_search(files, look, request, kind):
     messages = plain_messages(run.events)
     chance = random.Random(1)
     senses = run.events[run.events["kind"] == "sense"]
-    for _ in range(TIMES):
-        node, t = chance.choice(run.nodes), chance.uniform(0.0, run.scenario.horizon)
-        found = page.evaluate("([i, t]) => window.netkf.why(i, t)", [node, t])
+    places = [
+        [chance.choice(run.nodes), chance.uniform(0.0, run.scenario.horizon)] for _ in range(PLACES)
+    ]
+    told = page.evaluate(
+        """(places) => places.map(([node, t]) => {
+          const found = window.netkf.why(node, t), { outcome } = window.netkf.app.run.messages;
+          const bad = (link) => link.missing.filter((row) => [1, 2].includes(outcome[row])).length;
+          return { ...found, bad: found.links.map(bad) };
+        })""",
+        places,
+    )
+    for (node, t), found in zip(places, told, strict=True):
         expected = last_heard(messages, node, t)
-        bad = page.evaluate(
-            "([i, t]) => window.netkf.why(i, t).links.map((link) => link.missing.filter("
-            "(row) => [1, 2].includes(window.netkf.app.run.messages.outcome[row])).length)",
-            [node, t],
-        )
         links = {
             run.nodes[link["sender"]]: (link["sent"] if link["newest"] >= 0 else None, count)
-            for link, count in zip(found["links"], bad, strict=True)
+            for link, count in zip(found["links"], found["bad"], strict=True)
         }
         assert links == expected
         moments = reachable(messages, node, t)
@@ -171,6 +175,16 @@ def test_why_is_an_independent_backward_search(files, look, request, kind):
                 expected = until if sensor in moments else None
             shown = reading["at"] if reading["way"] else None
             assert shown == expected
+
+
+def test_innovations_are_drawn_with_their_mean_and_interval(files, look):
+    page = look(files["library"])
+    told = page.evaluate("window.netkf.app.run.innovations.means")
+    node = page.evaluate("window.netkf.app.run.index.get(window.netkf.app.nodeId)")
+    mean, low, high = map(format_number, told[str(node)])
+    shown = page.inner_text("#curves")
+    assert f"mean of all (where P is exact {low} .. {high}): {mean}" in " ".join(shown.split())
+    assert "Are innovations white?" not in shown  # too few readings
 
 
 def test_numbers_are_written_as_on_the_command_line(files, look):
@@ -228,7 +242,7 @@ def test_it_plays_scrubs_and_filters_by_keyboard_alone(files, look):
 
 
 def test_the_first_sight_is_the_worst_instant(files, look, ring):
-    worst = node_most_off(read_source(ring))
+    worst = read_source(ring).worst.overall
     page = look(files["ring"])
     assert page.evaluate("window.netkf.time()") == worst.time
     assert page.inner_text("#why-title") == f"Why: node {worst.node} at {worst.time:g} s"

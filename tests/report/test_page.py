@@ -18,7 +18,7 @@ from netkf.core.errors import ScenarioError
 from netkf.ensembles.directory import runs_to_directory
 from netkf.figures.style import SEQUENTIAL
 from netkf.report import page as pages
-from netkf.report.claims import after_start_up, findings, node_most_off
+from netkf.report.claims import findings
 from netkf.report.data import Budget
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
@@ -27,6 +27,7 @@ from netkf.report.messages import MESSAGE, information_age, join_messages, keep_
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
 from netkf.runs.documents import file_digests, write_sealed
+from netkf.runs.innovations import innovations
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
 from tests.conftest import SCENARIOS
@@ -135,7 +136,7 @@ def test_tables_show_the_numbers_of_the_command_line(ring, ensembles):
 def test_the_claim_names_the_worst_node_of_the_tables(ring, slots, library):
     for directory in (ring, slots):
         source = read_source(directory)
-        worst, rows = node_most_off(source), source.summary["nodes"]
+        worst, rows = source.worst.overall, source.summary["nodes"]
         top = max(rows, key=lambda row: row["rms_error"])
         assert worst.node == top["node"]
         assert worst.value == pytest.approx(top["rms_error"], rel=1e-12)
@@ -150,7 +151,7 @@ def test_the_claim_names_the_worst_node_of_the_tables(ring, slots, library):
 
 
 def test_why_counts_what_was_lost_since_the_worst_node_last_heard(ring):
-    worst = node_most_off(read_source(ring))
+    worst = read_source(ring).worst.overall
     messages = plain_messages(netkf.open(ring).events)
     lost = 0
     for sender in {key[0] for key in messages if key[1] == worst.node}:
@@ -176,7 +177,7 @@ def test_the_worst_of_many_samples_is_judged_as_that(ring, tmp_path):
         states = netkf.open(directory).states
         looked = states[states["t"] > 0]
         limit = scipy.stats.chi2(2).isf(0.01 / len(looked))
-        worst, _ = after_start_up(source, node_most_off(source))
+        worst = source.worst.explained
         at = looked[(looked["node"] == worst.node) & (looked["t"] == worst.time)]
         nees = at["nees"].item()
         assert (nees > limit) == words.startswith("far")
@@ -189,7 +190,7 @@ def test_errors_of_the_start_up_are_called_so(tmp_path):
     far = {key: [[25.0, 0.0], [0.0, 25.0]] for key in ("plant.cov", "filter.cov")}
     directory = hybrid_ring(tmp_path, "far", {**far, "network.activation.rate": 4.0})
     source, run = read_source(directory), netkf.open(directory)
-    worst = node_most_off(source)
+    worst = source.worst.overall
     k = run.nodes.index(worst.node)
     traces = run.P[:, k, 0, 0] + run.P[:, k, 1, 1]
     halfway = (50.0 + traces[-5:].mean()) / 2  # of 21 samples the last quarter
@@ -248,7 +249,7 @@ def test_thinned_pages_keep_what_they_say(ring, monkeypatch):
     sent = run.log["t"][run.log["kind"] == 2]
     assert inside.sum() == ((sent >= kept["start"]) & (sent <= kept["end"])).sum() > 0
     assert (numbers[~inside] % kept["step"] == 0).all()
-    worst = node_most_off(read_source(ring))
+    worst = read_source(ring).worst.overall
     times = page.column(samples["columns"]["t"])
     assert worst.time in times
     assert run.times[-1] in times
@@ -290,6 +291,37 @@ def test_larger_pages_are_thinned_until_they_fit(ring, monkeypatch):
     text = make_page([ring])
     assert len(text.encode()) <= whole - 5_000
     assert "Left out: of" in text
+
+
+@pytest.mark.parametrize("name", ["library", "slots"])
+def test_innovations_are_those_of_the_run(name, request):
+    """With and without truth; means and their intervals again with scipy."""
+    directory = request.getfixturevalue(name)
+    page, run = Page(make_page([directory])), netkf.open(directory)
+    shown, found = page.data["runs"][0]["innovations"], innovations(run)
+    columns = {key: page.column(c) for key, c in shown["columns"].items()}
+    assert shown["step"] == 1
+    np.testing.assert_array_equal(columns["t"], found.times)
+    np.testing.assert_array_equal(columns["nis"], found.nis / found.rows)
+    nodes = np.unique(found.nodes)
+    too_sure = 0
+    for node in nodes.tolist():
+        mine = found.nis[found.nodes == node]
+        rows = int(found.rows[found.nodes == node].sum())
+        ends = scipy.stats.chi2(rows).ppf([0.005 / len(nodes), 1.0 - 0.005 / len(nodes)]) / rows
+        place = str(run.nodes.index(node))
+        np.testing.assert_allclose(shown["means"][place], [mine.sum() / rows, *ends], rtol=1e-9)
+        too_sure += mine.sum() / rows > ends[1]
+    assert f"Over {len(found.nis):,} readings the squared innovation" in page.shown
+    assert (f"P is too sure at {too_sure} of {len(nodes)} nodes" in page.shown) == (too_sure > 0)
+
+
+def test_what_stands_against_innovations_is_said(ring, slots, monkeypatch):
+    shown = Page(make_page([ring])).shown
+    assert "No innovations are shown: sensors give increments and no samples." in shown
+    monkeypatch.setattr("netkf.report.innovations.MAX_EVENTS", 10)
+    shown = Page(make_page([slots])).shown
+    assert "No innovations are shown: a run of more than 10 events is not replayed." in shown
 
 
 def test_two_runs_show_their_differences(ensembles):

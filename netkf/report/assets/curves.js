@@ -1,10 +1,10 @@
 // Curves with uPlot: one look, a line at the time of the clock, a click that sets it.
 const Curves = (() => {
-  const HEIGHT = 240;
+  const HEIGHT = 240, WHOLE = ["node", "lag (readings)"]; // labels of axes with whole numbers
   const DASHES = { solid: [], dashed: [7, 4], dotted: [2, 3] };
 
-  // series: { label, x, y, low, high, colour, dash, width }, all over the same x where there is a
-  // band. `timed` curves follow the clock.
+  // series: { label, x, y, low, high, colour, dash, width, points, dots }, all over the same x where
+  // there is a band; `dots` has no line. `timed` curves follow the clock.
   function figure(app, { title, note, unit, xlabel, series, lines, band, timed }) {
     const box = Format.element("div", { class: "plot" });
     const whole = Format.element("figure", { class: "curve" },
@@ -28,7 +28,7 @@ const Curves = (() => {
         cursor: { drag: { x: false, y: false }, y: false },
         scales: { x: { time: false }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
         axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
-          ...(xlabel === "node" ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
+          ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],
         bands: bandsOf(series),
         hooks: { drawClear: [(u) => drawBand(u, band, steep)], draw: [(u) => overlay(u, lines, timed ? app.time : null, steep)] },
@@ -61,7 +61,7 @@ const Curves = (() => {
 
   function expanded(series) {
     return series.flatMap((s) => {
-      const line = { label: s.label, stroke: () => colour(s.colour), width: s.width || 1.5, dash: DASHES[s.dash || "solid"], points: { show: Boolean(s.points), size: 7 }, spanGaps: false };
+      const line = { label: s.label, stroke: () => colour(s.colour), width: s.width || 1.5, dash: DASHES[s.dash || "solid"], points: { show: Boolean(s.points || s.dots), size: s.dots ? 4 : 7 }, spanGaps: false, ...(s.dots ? { paths: () => null } : {}) };
       const edge = { ...line, width: 0, stroke: "transparent", points: { show: false } };
       return s.low ? [line, edge, edge] : [line];
     });
@@ -136,7 +136,7 @@ const Curves = (() => {
     const list = Format.element("ul", { class: "series" });
     for (const s of [...series, ...(lines || [])]) {
       const sample = Format.element("svg", { width: 34, height: 10, "aria-hidden": "true" },
-        Format.element("line", { x1: 0, x2: 34, y1: 5, y2: 5, class: "swatch " + s.colour, "stroke-width": Math.max(2, s.width || 1.5),
+        s.dots ? Format.element("circle", { cx: 17, cy: 5, r: 2.5, class: "swatch " + s.colour, "stroke-width": 2 }) : Format.element("line", { x1: 0, x2: 34, y1: 5, y2: 5, class: "swatch " + s.colour, "stroke-width": Math.max(2, s.width || 1.5),
           "stroke-dasharray": DASHES[s.dash || "solid"].join(" ") || null }));
       list.append(Format.element("li", {}, sample, " " + s.label + (s.y && s.y.length === undefined ? " " + Format.number(s.y) : "")));
     }

@@ -34,6 +34,7 @@ const Decode = (() => {
     const made = { ...data, samples, messages };
     made.senses = { ...data.senses, ...arrays(data.senses.columns, bytesOf) };
     made.marks = { ...data.marks, ...arrays(data.marks.columns, bytesOf) };
+    if (data.innovations) made.innovations = { ...data.innovations, ...arrays(data.innovations.columns, bytesOf) };
     made.N = data.nodes.length;
     const sensors = new Set(data.sensors);
     made.sensing = data.nodes.map((node) => sensors.has(node));

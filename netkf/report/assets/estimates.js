@@ -38,7 +38,7 @@ const Estimates = (() => {
     function draw(t) {
       const { context, width, height } = Theme.canvas(canvas, HEIGHT);
       const k = State.sampleAt(run, t);
-      if (k < 0) return words(context, "no sample before this time", 12, 30);
+      if (k < 0) return Theme.write(context, "no sample before this time", 12, 30);
       const nodes = run.nodes.map((_, i) => State.sampleOf(run, k, i));
       const x = State.truthAt(run, k), [a, b] = app.axes;
       if (a === b) drawIntervals(context, width, height, nodes, x, a);
@@ -52,7 +52,7 @@ const Estimates = (() => {
       nodes.forEach((s, i) => { if (i !== app.nodeOf(run)) ellipse(context, axes, s, a, b, false); });
       if (app.nodeOf(run) >= 0) ellipse(context, axes, nodes[app.nodeOf(run)], a, b, true);
       if (x) truth(context, axes.x(x[a]), axes.y(x[b]));
-      if (x) words(context, "truth", axes.x(x[a]) + 10, axes.y(x[b]) + 10);
+      if (x) Theme.write(context, "truth", axes.x(x[a]) + 10, axes.y(x[b]) + 10);
       finish(context);
     }
 
@@ -65,7 +65,7 @@ const Estimates = (() => {
       for (const [u, v] of curve) context.lineTo(axes.x(s.xhat[a] + u), axes.y(s.xhat[b] + v));
       context.stroke();
       dot(context, axes.x(s.xhat[a]), axes.y(s.xhat[b]), chosen ? 4 : 2.5);
-      if (chosen) words(context, "node " + s.node, axes.x(s.xhat[a]) + 7, axes.y(s.xhat[b]) - 8);
+      if (chosen) Theme.write(context, "node " + s.node, axes.x(s.xhat[a]) + 7, axes.y(s.xhat[b]) - 8);
     }
 
     function drawIntervals(context, width, height, nodes, x, a) {
@@ -97,7 +97,7 @@ const Estimates = (() => {
     // Words on the frame are drawn last: the frame clips what is outside of it.
     function finish(context) {
       context.restore();
-      words(context, (app.axes[0] === app.axes[1] ? "bars: 95 %; " + (run.truth ? "line: truth" : "no truth is known")
+      Theme.write(context, (app.axes[0] === app.axes[1] ? "bars: 95 %; " + (run.truth ? "line: truth" : "no truth is known")
         : "ellipses: 95 %" + (run.truth ? "" : "; no truth is known")), LEFT + 6, TOP + 10);
     }
 
@@ -118,17 +118,6 @@ const Estimates = (() => {
     context.beginPath();
     context.arc(x, y, radius, 0, 2 * Math.PI);
     context.fill();
-  }
-
-  function words(context, text, x, y) {
-    context.font = "12px system-ui, sans-serif";
-    context.textBaseline = "middle";
-    context.textAlign = "left";
-    context.lineWidth = 3;
-    context.strokeStyle = Theme.colours.panel;
-    context.strokeText(text, x, y);
-    context.fillStyle = Theme.colours.ink;
-    context.fillText(text, x, y);
   }
 
   function pad([low, high]) {

@@ -65,8 +65,9 @@ const Figures = (() => {
     });
     for (const [label, value] of Object.entries(runs[0].limits)) lines.push({ label: label + ", square root:", y: Math.sqrt(value), colour: "purple", dash: lines.length ? "dotted" : "dashed" });
     const truth = runs.some((run) => run.truth);
-    return { title: truth ? "Error and bound" : "Uncertainty and disagreement", unit: truth ? "|x - xhat|" : "units of the state", timed: true, series, lines,
-      note: truth ? "One run: the bound is about the mean over runs." : "Without truth there is no error." };
+    const bound = runs.some((run) => run.samples.bound);
+    return { title: truth ? (bound ? "Error and bound" : "Error and uncertainty") : "Uncertainty and disagreement", unit: truth ? "|x - xhat|" : "units of the state", timed: true, series, lines,
+      note: bound ? "One run: the bound is about the mean over runs." : truth ? "P is the covariance that the filter claims." : "Without truth there is no error." };
   }
 
   function nees(app, runs) {
@@ -79,6 +80,49 @@ const Figures = (() => {
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
     return { title: "Does P fit the error?", unit: "NEES", timed: true, series, band: runs[0].samples.nees_interval,
       lines: [{ label: "expected where P is exact:", y: runs[0].n, colour: "green", dash: "dashed" }], note: "Squared error in units of P." };
+  }
+
+  const PARTS = 30; // parts of a run over which squared innovations are averaged
+
+  // The readings that count for a node: its own, or those that one filter uses together.
+  function readingsOf(run, i) {
+    const v = run.innovations;
+    return !v ? null : v.means[i] ? i : v.means[-1] ? -1 : null;
+  }
+
+  function innovations(app, runs) {
+    const series = [], lines = [];
+    runs.forEach((run, r) => {
+      const i = readingsOf(run, app.nodeOf(run)), v = run.innovations;
+      if (i === null) return;
+      const rows = Array.from(v.t.keys()).filter((k) => v.node[k] === i), x = rows.map((k) => v.t[k]);
+      const wide = run.horizon / PARTS, parts = new Map();
+      rows.forEach((k) => {
+        const at = Math.min(PARTS - 1, Math.floor(v.t[k] / wide)), [sum, count] = parts.get(at) || [0, 0];
+        parts.set(at, [sum + v.nis[k], count + 1]);
+      });
+      const at = [...parts.keys()].sort((a, b) => a - b), name = letter(runs, r), [mean, low, high] = v.means[i];
+      const whose = i < 0 ? "of all nodes together" : "of node " + run.nodes[i];
+      series.push({ label: name + "each reading " + whose, x, y: rows.map((k) => v.nis[k]), colour: COLOURS[r], dots: true });
+      series.push({ label: name + "mean of each " + Format.number(wide) + " s", x: at.map((k) => (k + 0.5) * wide), y: at.map((k) => parts.get(k)[0] / parts.get(k)[1]), colour: r ? "orange" : "ink", width: 2 });
+      lines.push({ label: name + "mean of all (where P is exact " + Format.number(low) + " .. " + Format.number(high) + "):", y: mean, colour: r ? "orange" : "purple", dash: "dotted" });
+    });
+    if (!series.length) return null;
+    lines.push({ label: "expected where P is exact:", y: 1, colour: "green", dash: "dashed" });
+    return { title: "Do readings fit their predictions?", unit: "NIS / rows of a reading", timed: true, series, lines,
+      note: "Squared innovations, readings minus predictions, in units of their covariance; by a replay of the run." };
+  }
+
+  function whiteness(app, runs) {
+    const series = [];
+    let band = null;
+    runs.forEach((run, r) => {
+      const i = readingsOf(run, app.nodeOf(run)), found = i === null ? null : run.innovations.correlations[i];
+      if (!found) return;
+      band = band || [-found.band, found.band];
+      series.push({ label: letter(runs, r) + (i < 0 ? "all readings" : "readings of node " + run.nodes[i]), x: found.values.map((_, k) => k + 1), y: found.values, colour: COLOURS[r], points: true, dash: r ? "dashed" : "solid" });
+    });
+    return series.length ? { title: "Are innovations white?", unit: "autocorrelation", xlabel: "lag (readings)", series, band, note: "Beyond the band a prediction misses what earlier readings said." } : null;
   }
 
   function ages(app, runs) {
@@ -181,7 +225,7 @@ const Figures = (() => {
     const live = page.runs.length > 0;
     return [
       difference(app, page.difference), ensemble(app, page.ensembles), ensembleNees(app, page.ensembles),
-      live && errors(app, page.runs), live && nees(app, page.runs), live && ages(app, page.runs),
+      live && errors(app, page.runs), live && nees(app, page.runs), live && innovations(app, page.runs), live && whiteness(app, page.runs), live && ages(app, page.runs),
       live && traffic(app, page.runs), averages(app, page.summaries), sweep(app, page.sweep),
     ].filter(Boolean);
   }

@@ -2,11 +2,12 @@
 const Network = (() => {
   const MAX_DRAWN = 600; // messages drawn at once; the state in words counts all of them
   const MAX_GLYPHS = 80; // nodes up to which each has its ellipse
+  const MOST_SHRUNK = 20;
   const HEIGHT = 420, CAPTION = 36; // pixels; the scale of colours has the lowest of them
 
   function view(run, canvas, app) {
     const shades = shadeRange(run);
-    let places = [], radius = 8, spacing = 40, laid = "", named = true;
+    let places = [], radius = 8, spacing = 40, laid = "", named = true, shrunk = [1, 1];
 
     function layout(width, whole) {
       const height = whole - CAPTION;
@@ -29,7 +30,8 @@ const Network = (() => {
       layout(width, height);
       const k = State.sampleAt(run, t);
       drawLinks(context);
-      if (run.N <= MAX_GLYPHS && k >= 0) drawEllipses(context, k);
+      shrunk = [1, 1];
+      if (run.N <= MAX_GLYPHS && k >= 0) drawEllipses(context, k, width, height - CAPTION);
       drawMessages(context, t);
       drawNodes(context, k);
       drawCaption(context, width, height);
@@ -48,9 +50,13 @@ const Network = (() => {
       context.stroke();
     }
 
-    // Each node stands for the truth; its ellipse lies where the error puts it.
-    function drawEllipses(context, k) {
-      const scale = glyphScale(run, app.axes, spacing), x = State.truthAt(run, k);
+    // Each node stands for the truth; its ellipse lies where the error puts it. Where one would
+    // leave the canvas, as after the start, all are drawn smaller, and the caption says so.
+    function drawEllipses(context, k, width, height) {
+      const x = State.truthAt(run, k), usual = glyphScale(run, app.axes, spacing);
+      const room = [places.map(([px]) => Math.min(px, width - px)), places.map(([, py]) => Math.min(py, height - py))];
+      shrunk = usual.map((scale, d) => shrinking(run, k, x, app.axes[d], scale, room[d]));
+      const scale = usual.map((size, d) => size * shrunk[d]);
       for (let i = 0; i < run.N; i++) {
         const chosen = i === app.nodeOf(run), s = State.sampleOf(run, k, i);
         context.strokeStyle = chosen ? Theme.colours.ink : Theme.colours.purple;
@@ -71,7 +77,7 @@ const Network = (() => {
         context.strokeStyle = Theme.colours.ink;
         context.stroke();
         if (chosen) mark(context, x, y);
-        if (named || chosen) label(context, String(run.nodes[i]), x + radius + 3, y - radius - 2);
+        if (named || chosen) Theme.write(context, String(run.nodes[i]), x + radius + 3, y - radius - 2);
       }
     }
 
@@ -158,7 +164,7 @@ const Network = (() => {
       context.moveTo(x, y - 7); context.lineTo(x + 7, y + 5); context.lineTo(x - 7, y + 5);
       context.closePath();
       context.fill();
-      label(context, Format.number(age) + " s", x + 9, y);
+      Theme.write(context, Format.number(age) + " s", x + 9, y);
     }
 
     function drawCaption(context, width, height) {
@@ -174,6 +180,11 @@ const Network = (() => {
       }
       context.fillStyle = Theme.colours.ink;
       context.fillText(what + ": 0 to " + Format.number(shades) + " or more", left, top - 10);
+      const smaller = [...new Set(app.axes)].map((c, d) => [c, shrunk[d]]).filter(([, part]) => part < 1);
+      if (!smaller.length) return;
+      context.textAlign = "right";
+      context.fillText("ellipses drawn smaller: " + smaller.map(([c, part]) => "x" + c + " " + Math.round(1 / part) + " times").join(", "), width - 8, height - 6);
+      context.textAlign = "left";
     }
 
     function hit(x, y) {
@@ -186,16 +197,6 @@ const Network = (() => {
     }
 
     return { draw, hit };
-  }
-
-  function label(context, words, x, y) {
-    context.font = "12px system-ui, sans-serif";
-    context.textBaseline = "middle";
-    context.lineWidth = 3;
-    context.strokeStyle = Theme.colours.panel;
-    context.strokeText(words, x, y);
-    context.fillStyle = Theme.colours.ink;
-    context.fillText(words, x, y);
   }
 
   function colour(outcome) {
@@ -222,6 +223,18 @@ const Network = (() => {
   // compare, and one for each component, which may have different units.
   function glyphScale(run, axes, spacing) {
     return axes.map((c) => (0.4 * spacing) / usualSize(run, c));
+  }
+
+  // The part of its usual size at which every ellipse stays on the canvas: 1, or one over a whole
+  // number. Not beyond MOST_SHRUNK times: a wild node would make all others invisible.
+  function shrinking(run, k, x, c, scale, room) {
+    let most = 1;
+    for (let i = 0; i < run.N; i++) {
+      const s = State.sampleOf(run, k, i), off = x ? Math.abs(s.xhat[c] - x[c]) : 0;
+      const reach = (off + run.scale.ellipse * Math.sqrt(State.variance(s.P, run.n, c, c))) * scale;
+      if (Number.isFinite(reach)) most = Math.max(most, reach / Math.max(1, room[i] - 2));
+    }
+    return 1 / Math.min(MOST_SHRUNK, Math.ceil(most));
   }
 
   function usualSize(run, c) {

@@ -33,6 +33,18 @@ const Theme = (() => {
     return { context, width, height };
   }
 
+  // Words on a canvas, with an edge that parts them from what lies below.
+  function write(context, text, x, y) {
+    context.font = "12px system-ui, sans-serif";
+    context.textBaseline = "middle";
+    context.textAlign = "left";
+    context.lineWidth = 3;
+    context.strokeStyle = found.panel;
+    context.strokeText(text, x, y);
+    context.fillStyle = found.ink;
+    context.fillText(text, x, y);
+  }
+
   function calm() {
     return matchMedia("(prefers-reduced-motion: reduce)").matches;
   }
@@ -42,5 +54,5 @@ const Theme = (() => {
     window.addEventListener("resize", redraw);
   }
 
-  return { read, scale, canvas, calm, watch, get colours() { return found; } };
+  return { read, scale, canvas, write, calm, watch, get colours() { return found; } };
 })();

@@ -179,6 +179,7 @@ const Why = (() => {
         : "Oldest link: node " + run.nodes[oldest.sender] + ", heard as of " + Format.number(Math.max(0, t - oldest.sent)) + " s before.");
       parts.push(lost + (lost === 1 ? " message" : " messages") + " to it lost or late since it last heard each sender.");
     } else parts.push("No message was ever sent to it.");
+    if (run.knowledge === "slot") parts.push("A sample knows of all rounds of the slot that begins with it.");
     return Format.element("p", { class: "state" }, parts.join(" "));
   }
 
