@@ -1,21 +1,38 @@
-"""What the statistics of an ensemble need of each run of a batch, computed for all runs at once."""
+"""What the statistics of an ensemble need of each run of a batch, computed for all runs at once.
+
+Runs are taken L at a time, as lanes (``netkf.linalg.lanes``): their samples of some times are
+turned into lanes, columns are computed, turned back and merged, all in the nearest cache.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.ensembles.moments import Moments, merge_row
+from netkf.ensembles.moments import Moments, merge_pair, merge_row
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY, Lanes, aligned, load, select, spread, store
+from netkf.linalg.lanes import (
+    LANES,
+    MANY,
+    Lanes,
+    aligned,
+    any_lane,
+    load,
+    magnitude,
+    scatter,
+    select,
+    spread,
+    store,
+    turn,
+)
 from netkf.trace.batch import RunBatch
 from netkf.trace.nees import errors, fill_nees
 from netkf.trace.run import BLUR, ROUNDING
 
-TOGETHER = 128
+TOGETHER = 256
 """Numbers of a run that are looked at together: some lines of the cache."""
 
 
@@ -36,7 +53,8 @@ class Reduced(NamedTuple):
 
 class Batch(NamedTuple):
     """The arrays of a RunBatch, with the samples of each run that are ``kept`` (R,), and NEES
-    ``given`` (R, T, F) of the runs that are ``known`` (R,).
+    ``given`` (R, T, F) of the runs that are ``known`` (R,). Averages begin with sample ``start``.
+    Once more with a row a run: ``x_rows`` (R, T n), ``P_rows`` and ``error_rows``.
     """
 
     times: FloatArray
@@ -49,6 +67,10 @@ class Batch(NamedTuple):
     kept: np.ndarray
     known: np.ndarray
     given: FloatArray
+    start: int
+    x_rows: FloatArray
+    P_rows: FloatArray
+    error_rows: FloatArray
 
 
 class Sums(NamedTuple):
@@ -66,24 +88,79 @@ class Sums(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Scratch: of L samples the error (n, L), P and its factor (n, n, L), NEES, square errors,
-    traces and whether P is ``broken`` (L,); of one sample ``factor`` (n, n), ``solved`` (n, 1) and
-    NEES ``alone`` (1,); of S times of the runs of a piece ``size`` (R, S), ``values``
-    (R, S, F (2 u + 1)) and ``work`` (R, 1, F (2 u + 1)).
+    """Scratch for S times and C = F (2 u + 1) columns of L runs, with some memory behind.
+
+    ``lines`` (L, S F n n) as they are in a batch; in lanes ``error`` (S F n, L), ``P``
+    (S F n n, L), ``x`` (S n, L), ``columns`` (S C, L) and ``totals`` (F, 3, L), the sums for the
+    averages; of one sample the error ``z`` (n, L), ``factor`` of P (n, n, L), NEES and whether P is
+    ``broken`` (L,), whether the sample counts as ``clear`` or as ``traced`` (L,); ``rows``
+    (L, S, C) by run and their M2 ``work`` (L, S, C), ``size`` (L, S). Of nodes of the tree over
+    runs, those that wait for a neighbour, ``node_size`` (D, S), ``mean`` and ``M2`` (D, S, C). Of a
+    sample alone ``one`` (n, n), ``solved`` (n, 1) and NEES ``alone`` (1,). ``places``: 0 .. L - 1.
     """
 
+    lines: FloatArray
     error: FloatArray
     P: FloatArray
-    nees: FloatArray
-    square: FloatArray
-    trace: FloatArray
-    broken: FloatArray
+    x: FloatArray
+    columns: FloatArray
+    totals: FloatArray
+    z: FloatArray
     factor: FloatArray
+    nees: FloatArray
+    broken: FloatArray
+    clear: FloatArray
+    traced: FloatArray
+    rows: FloatArray
+    work: FloatArray
+    size: FloatArray
+    node_size: FloatArray
+    mean: FloatArray
+    M2: FloatArray
+    one: FloatArray
     solved: FloatArray
     alone: FloatArray
-    size: FloatArray
-    values: FloatArray
-    work: FloatArray
+    places: np.ndarray
+    times: int
+
+
+def reduction_room(filters: int, n: int, largest: int) -> Room:
+    """Scratch for so many filters of n states, in pieces of at most so many runs."""
+    columns = filters * (n * (n + 1) + 1)
+    times = max(1, TOGETHER // columns)
+    # L entries are moved at a time, which goes beyond the last column.
+    wide = times + -(-LANES // columns)
+    depth = largest.bit_length() + 1
+    nodes, rows = (depth, wide, columns), (LANES, wide, columns)
+
+    def in_lanes(numbers: int) -> FloatArray:
+        return np.asarray(aligned((wide * numbers + LANES, LANES)))
+
+    return Room(
+        lines=np.empty((LANES, wide * filters * n * n + LANES)),
+        error=in_lanes(filters * n),
+        P=in_lanes(filters * n * n),
+        x=in_lanes(n),
+        columns=in_lanes(columns),
+        totals=aligned((filters, 3, LANES)),
+        z=aligned((n, LANES)),
+        factor=aligned((n, n, LANES)),
+        nees=aligned((LANES,)),
+        broken=aligned((LANES,)),
+        clear=aligned((LANES,)),
+        traced=aligned((LANES,)),
+        rows=np.zeros(rows),
+        work=np.zeros(rows),
+        size=np.empty((LANES, times)),
+        node_size=np.empty((depth, times)),
+        mean=np.empty(nodes),
+        M2=np.empty(nodes),
+        one=np.empty((n, n)),
+        solved=np.empty((n, 1)),
+        alone=np.empty(1),
+        places=np.arange(LANES),
+        times=times,
+    )
 
 
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
@@ -98,17 +175,12 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
         np.empty((len(pieces), count, columns)),
         np.zeros((runs, filters, 3)), np.full(runs, np.inf), np.ones(runs, dtype=np.bool_),
     )  # fmt: skip
-    few = max(1, TOGETHER // columns)  # times
-    of_lanes, of_piece = aligned((4, LANES)), np.empty((most, few, columns))
-    room = Room(
-        aligned((n, LANES)), aligned((n, n, LANES)), of_lanes[0], of_lanes[1], of_lanes[2],
-        of_lanes[3], np.empty((n, n)), np.empty((n, 1)), np.empty(1), np.empty((most, few)),
-        of_piece, np.empty((most, 1, columns)),
-    )  # fmt: skip
+    room = reduction_room(filters, n, most)
     given = Batch(
         batch.times, batch.x, batch.P, batch.error, batch.lengths, batch.diverged,
         batch.exact_errors, batch.lengths - batch.diverged, np.zeros(runs, dtype=np.bool_),
-        np.empty((0, 0, 0)),
+        np.empty((0, 0, 0)), int(np.searchsorted(batch.times, 0.0, side="right")),
+        *(values.reshape(runs, -1) for values in (batch.x, batch.P, batch.error)),
     )  # fmt: skip
     reduce_runs(MANY, given, bounds, sums, room)
     if not sums.regular.all():
@@ -132,149 +204,230 @@ def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
 @kernel
 def reduce_runs(lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, room: Room) -> None:
     """Find the sums of R runs, of which piece k holds ``bounds[k]`` to ``bounds[k + 1]``."""
-    start = 0
-    while start < len(b.times) and not b.times[start] > 0.0:
-        start += 1
     for k in range(len(bounds) - 1):
-        first, stop = bounds[k], bounds[k + 1]
-        values, size = room.values[: stop - first], room.size[: stop - first]
-        # Some times in all runs: what is found is merged before the next.
-        for t in range(0, len(b.times), values.shape[1]):
-            count = min(values.shape[1], len(b.times) - t)
-            for r in range(first, stop):
-                for s in range(count):
-                    size[r - first, s] = 1.0 if t + s < b.kept[r] else 0.0
-                    if t + s < b.lengths[r] and not b.times[t + s] >= sums.rounding_from[r]:
-                        find_blur(b, sums, r, t + s)
-            reduce_samples(lanes, b, sums, room, values[:, :count], start, first, t)
+        # Some times in all runs of a piece: what is found is merged before the next.
+        for t in range(0, len(b.times), room.times):
+            count, depth = min(room.times, len(b.times) - t), 0
+            for first in range(bounds[k], bounds[k + 1], len(lanes)):
+                active = min(len(lanes), bounds[k + 1] - first)
+                whole = reduce_group(lanes, b, sums, room, first, active, t, count)
+                add_node(lanes, room, active, count, depth, whole)
+                depth += 1
+                # A binary counter: as many nodes are complete as the number ends in ones.
+                number = (first - bounds[k]) // len(lanes)
+                while number & 1 == 1:
+                    depth = join_nodes(room, depth, count)
+                    number >>= 1
+            # Those at the end that have no neighbour join from right to left.
+            while depth > 1:
+                depth = join_nodes(room, depth, count)
             for s in range(count):
-                merge_row(size, values, room.work, s)
-                sums.size[k, t + s] = size[0, s]
-                for c in range(values.shape[2]):
-                    sums.mean[k, t + s, c] = values[0, s, c]
-                    sums.M2[k, t + s, c] = room.work[0, 0, c]
+                sums.size[k, t + s] = room.node_size[0, s]
+                for c in range(sums.mean.shape[2]):
+                    sums.mean[k, t + s, c] = room.mean[0, s, c]
+                    sums.M2[k, t + s, c] = room.M2[0, s, c]
     for r in range(len(b.kept)):
-        divide_averages(b, sums, start, r)
-
-
-@kernel(inlined=True)
-def find_blur(b: Batch, sums: Sums, r: int, t: int) -> None:
-    """Note the time of sample ``t`` of run ``r`` if it is blurred."""
-    if not is_clear(b, r, t) and is_blurred(b, r, t):
-        sums.rounding_from[r] = b.times[t]
+        divide_averages(b, sums, r)
 
 
 @kernel
-def reduce_samples(
+def join_nodes(room: Room, depth: int, count: int) -> int:
+    """Merge the last two of the nodes that wait; return how many there are then."""
+    for s in range(count):
+        merge_pair(room.node_size, room.mean, room.M2, depth - 2, depth - 1, s, s)
+    return depth - 1
+
+
+@kernel
+def add_node(lanes: Lanes, room: Room, active: int, count: int, node: int, whole: bool) -> None:
+    """Merge the ``active`` rows of a group of runs in the tree over them, as a new node. They are
+    ``whole`` if none lacks a sample.
+    """
+    if whole and active == len(lanes):
+        merge_whole(lanes, room, count, node)
+        return
+    for s in range(count):
+        merge_row(room.size[:active], room.rows[:active], room.work[:active], s)
+        room.node_size[node, s] = room.size[0, s]
+        for c in range(room.mean.shape[2]):
+            room.mean[node, s, c], room.M2[node, s, c] = room.rows[0, s, c], room.work[0, 0, c]
+
+
+@kernel
+def merge_whole(lanes: Lanes, room: Room, count: int, node: int) -> None:
+    """``merge_row`` of L rows where all sizes are equal, L columns at a time."""
+    rows, work = room.rows, room.work
+    for s in range(count):
+        room.node_size[node, s] = 1.0 * len(lanes)
+    for c in range(0, count * rows.shape[2], len(lanes)):
+        stride = 1
+        while stride < len(lanes):
+            # Both have ``stride`` observations: shares of 1 / 2 in the mean.
+            for a in range(0, len(lanes), 2 * stride):
+                mean = load(lanes, rows, a, 0, c)
+                delta = load(lanes, rows, a + stride, 0, c) - mean
+                store(lanes, rows, a, 0, c, mean + 0.5 * delta)
+                M2 = delta * delta * (0.5 * stride)
+                if stride > 1:
+                    M2 = load(lanes, work, a, 0, c) + (load(lanes, work, a + stride, 0, c) + M2)
+                store(lanes, work, a, 0, c, M2)
+            stride *= 2
+        store(lanes, room.mean, node, 0, c, load(lanes, rows, 0, 0, c))
+        store(lanes, room.M2, node, 0, c, load(lanes, work, 0, 0, c))
+
+
+@kernel
+def take_lines(
+    lanes: Lanes,
+    samples: FloatArray,
+    first: int,
+    active: int,
+    start: int,
+    count: int,
+    lines: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Turn ``count`` numbers of each run from ``first`` on, those from ``start`` on of ``samples``
+    (R, ...), into the lanes of ``out`` (>= count, L). Idle lanes repeat the last run.
+    """
+    for q in range(len(lanes)):
+        r = first + min(q, active - 1)
+        for c in range(count):
+            lines[q, c] = samples[r, start + c]
+    for c in range(0, count, len(lanes)):
+        turn(lanes, lines, c, out)
+
+
+@kernel
+def reduce_group(
     lanes: Lanes,
     b: Batch,
     sums: Sums,
     room: Room,
-    values: FloatArray,
-    start: int,
     first: int,
+    active: int,
     t: int,
-) -> None:
-    """Write ``values`` (R, S, F (2 u + 1)) of the samples from ``t`` on of the runs from ``first``
-    on, and add them to the averages, which begin with sample ``start``.
+    count: int,
+) -> bool:
+    """Write the ``rows`` of ``count`` samples from ``t`` on of the ``active`` runs from ``first``
+    on, and add them to the averages; return True if no run lacks one of them.
     """
     filters, n = b.error.shape[2:]
-    width, each = n * (n + 1) + 1, filters * values.shape[1]
-    # L samples at a time, over runs, times and filters alike.
-    samples = len(values) * each
-    for place in range(0, samples, len(lanes)):
-        count = min(len(lanes), samples - place)
-        run, s, f = place // each, place % each // filters, place % filters
-        begin = run, s, f
-        for q in range(count):
-            out = values[run, s, f * width : (f + 1) * width]
-            fill_sample(b, first + run, t + s, f, out, room, q)
-            run, s, f = next_sample(run, s, f, values.shape[1], filters)
-        nees_of_lanes(lanes, room)
-        run, s, f = begin
-        for q in range(count):
-            r = first + run
-            if t + s < b.kept[r]:
-                # Singular or broken: alone, with a choice of pivots.
-                if room.broken[q] > 0.0:
-                    nees_alone(b, sums, room, r, t + s, f, q)
-                values[run, s, (f + 1) * width - 1] = room.nees[q]
-                add_sample(b, sums, room, start, r, t + s, f, q)
-            run, s, f = next_sample(run, s, f, values.shape[1], filters)
+    each, whole = filters * n, True
+    take_lines(lanes, b.error_rows, first, active, t * each, count * each, room.lines, room.error)
+    take_lines(lanes, b.P_rows, first, active, t * each * n, count * each * n, room.lines, room.P)
+    if not b.exact:
+        take_lines(lanes, b.x_rows, first, active, t * n, count * n, room.lines, room.x)
+    for q in range(active):
+        whole = whole and t + count <= b.kept[first + q]
+        for f in range(filters):
+            for a in range(3):
+                room.totals[f, a, q] = sums.averages[first + q, f, a]
+    for s in range(count):
+        find_blur(lanes, b, sums, room, first, active, t + s, s)
+        choose_counted(b, sums, room, first, active, t + s)
+        for f in range(filters):
+            reduce_sample(lanes, b, sums, room, first, active, t + s, s, f)
+    for c in range(0, count * room.rows.shape[2], len(lanes)):
+        scatter(lanes, room.columns, c, room.rows, room.places, len(lanes))
+    for q in range(active):
+        for f in range(filters):
+            for a in range(3):
+                sums.averages[first + q, f, a] = room.totals[f, a, q]
+    if not whole or active < len(lanes):
+        mark_missing(b, room, first, active, t, count)
+    return whole
+
+
+@kernel
+def mark_missing(b: Batch, room: Room, first: int, active: int, t: int, count: int) -> None:
+    """Give samples that a run has size 1, and those that it lacks size 0 and zeros."""
+    for q in range(active):
+        for s in range(count):
+            exists = t + s < b.kept[first + q]
+            room.size[q, s] = 1.0 if exists else 0.0
+            for c in range(0 if exists else room.rows.shape[2]):
+                room.rows[q, s, c] = 0.0
 
 
 @kernel(inlined=True)
-def next_sample(run: int, s: int, f: int, times: int, filters: int) -> tuple[int, int, int]:
-    """The place after run, time and filter, the last of which moves first."""
-    if f + 1 < filters:
-        return run, s, f + 1
-    if s + 1 < times:
-        return run, s + 1, 0
-    return run + 1, 0, 0
-
-
-@kernel(inlined=True)
-def fill_sample(b: Batch, r: int, t: int, f: int, out: FloatArray, room: Room, q: int) -> None:
-    """Write the columns (2 u + 1,) of a sample but NEES, and put it into lane ``q``; zeros and
-    the unit matrix where the run has no such sample.
+def reduce_sample(
+    lanes: Lanes,
+    b: Batch,
+    sums: Sums,
+    room: Room,
+    first: int,
+    active: int,
+    t: int,
+    s: int,
+    f: int,
+) -> None:
+    """Fill the columns of sample ``t``, the ``s``-th of a group, of filter ``f``, and add it to the
+    averages.
     """
-    n = b.error.shape[3]
-    half, column, square, trace = n * (n + 1) // 2, 0, 0.0, 0.0
-    exists = t < b.kept[r]
-    if not exists:
-        for c in range(2 * half + 1):
-            out[c] = 0.0
+    n, filters = len(room.z), len(room.totals)
+    half, place, place_P = n * (n + 1) // 2, (s * filters + f) * n, (s * filters + f) * n * n
+    column = (s * filters + f) * (2 * half + 1)
+    last, square, trace = column + 2 * half, spread(lanes, 0.0), spread(lanes, 0.0)
     for i in range(n):
-        e = b.error[r, t, f, i] if exists else 0.0
-        room.error[i, q] = e
+        e = load(lanes, room.error, place + i)
+        store(lanes, room.z, i, e)
         square += e * e
-        trace += b.P[r, t, f, i, i]
+        trace += load(lanes, room.P, place_P + i * n + i)
         for j in range(i, n):
-            if exists:
-                entry = b.P[r, t, f, i, j]
-                room.P[j, i, q] = entry
-                out[column] = entry
-                out[half + column] = e * b.error[r, t, f, j]
-                column += 1
-            else:
-                room.P[j, i, q] = 1.0 if i == j else 0.0
-    room.square[q], room.trace[q] = square, trace
+            entry = load(lanes, room.P, place_P + i * n + j)
+            store(lanes, room.factor, j, i, entry)
+            store(lanes, room.columns, column, entry)
+            store(lanes, room.columns, half + column, e * load(lanes, room.error, place + j))
+            column += 1
+    if any_lane(nees_of_lanes(lanes, room)):
+        # Singular or broken: alone, with a choice of pivots.
+        for q in range(active):
+            if room.broken[q] > 0.0 and t < b.kept[first + q]:
+                nees_alone(b, sums, room, first + q, t, f, q)
+    nees = load(lanes, room.nees, 0)
+    store(lanes, room.columns, last, nees)
+    clear, traced = load(lanes, room.clear, 0) > 0.0, load(lanes, room.traced, 0) > 0.0
+    add_total(lanes, room.totals, f, 0, select(clear, square, 0.0))
+    add_total(lanes, room.totals, f, 1, select(traced, trace, 0.0))
+    add_total(lanes, room.totals, f, 2, select(clear, nees, 0.0))
+
+
+@kernel(inlined=True)
+def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> None:
+    """Add a number of each lane to a sum for the averages."""
+    store(lanes, totals, f, a, load(lanes, totals, f, a) + number)
 
 
 @kernel
 def nees_alone(b: Batch, sums: Sums, room: Room, r: int, t: int, f: int, q: int) -> None:
     """Write NEES of one sample into lane ``q``, and note where its P is singular."""
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
-    if not fill_nees(error, P, room.alone, room.factor, room.solved):
+    if not fill_nees(error, P, room.alone, room.one, room.solved):
         sums.regular[r] = False
     room.nees[q] = b.given[r, t, f] if b.known[r] else room.alone[0]
 
 
-@kernel(inlined=True)
-def add_sample(
-    b: Batch, sums: Sums, room: Room, start: int, r: int, t: int, f: int, q: int
-) -> None:
-    """Add the sample in lane ``q`` to the averages of run ``r``, by the rule of
-    ``runs.summary.averaged_samples``.
+@kernel
+def choose_counted(b: Batch, sums: Sums, room: Room, first: int, active: int, t: int) -> None:
+    """Note in which runs sample ``t`` counts in the averages, by the rule of
+    ``runs.summary.averaged_samples``: in those of errors (``clear``), in that of P (``traced``).
     """
-    first = start if start < b.kept[r] else 0  # no sample after time 0: all that there are
-    if t < first:
-        return
-    from_here = sums.rounding_from[r]
-    if b.times[t] < from_here:
-        sums.averages[r, f, 0] += room.square[q]
-        sums.averages[r, f, 2] += room.nees[q]
-    # Covariances have all their digits, but those of a run that diverges outgrow all bounds.
-    elif b.diverged[r] and b.times[first] < from_here:
-        return
-    sums.averages[r, f, 1] += room.trace[q]
+    for q in range(active):
+        r, from_here = first + q, sums.rounding_from[first + q]
+        begin = b.start if b.start < b.kept[r] else 0  # no sample after time 0: all there are
+        there = begin <= t < b.kept[r]
+        clear = there and b.times[t] < from_here
+        # Covariances have all their digits, but those of a run that diverges outgrow all bounds.
+        traced = clear or (there and not (b.diverged[r] and b.times[begin] < from_here))
+        room.clear[q], room.traced[q] = 1.0 if clear else 0.0, 1.0 if traced else 0.0
 
 
 @kernel
-def divide_averages(b: Batch, sums: Sums, start: int, r: int) -> None:
+def divide_averages(b: Batch, sums: Sums, r: int) -> None:
     """Divide the sums of run ``r`` by the numbers of samples in them."""
     kept = b.kept[r]
-    first = start if start < kept else 0
+    first = b.start if b.start < kept else 0
     clear = first
     while clear < kept and b.times[clear] < sums.rounding_from[r]:
         clear += 1
@@ -286,43 +439,54 @@ def divide_averages(b: Batch, sums: Sums, start: int, r: int) -> None:
 
 
 @kernel(inlined=True)
-def nees_of_lanes(lanes: Lanes, room: Room) -> None:
-    """Write ``e' P^-1 e`` of L errors, and which P are not positive definite, or nan."""
+def nees_of_lanes(lanes: Lanes, room: Room) -> Any:
+    """Write ``e' P^-1 e`` of L errors, and which P are not positive definite, or nan; return flags
+    of the latter.
+    """
     # P = L D L', and e' P^-1 e = z' D^-1 z with L z = e; P becomes L, and the error z.
-    n, total, broken = len(room.error), spread(lanes, 0.0), spread(lanes, 0.0)
+    n, total, broken = len(room.z), spread(lanes, 0.0), spread(lanes, 0.0)
     for k in range(n):
-        pivot, z = load(lanes, room.P, k, k), load(lanes, room.error, k)
+        pivot, z = load(lanes, room.factor, k, k), load(lanes, room.z, k)
         broken += select(pivot > 0.0, 0.0, 1.0)
         inverse = 1.0 / pivot
         total += z * z * inverse
         for i in range(k + 1, n):
-            factor = load(lanes, room.P, i, k) * inverse
+            factor = load(lanes, room.factor, i, k) * inverse
             for j in range(k + 1, i + 1):
-                entry = load(lanes, room.P, i, j) - factor * load(lanes, room.P, j, k)
-                store(lanes, room.P, i, j, entry)
-            store(lanes, room.error, i, load(lanes, room.error, i) - factor * z)
-    store(lanes, room.nees, total)
-    store(lanes, room.broken, broken)
+                entry = load(lanes, room.factor, i, j) - factor * load(lanes, room.factor, j, k)
+                store(lanes, room.factor, i, j, entry)
+            store(lanes, room.z, i, load(lanes, room.z, i) - factor * z)
+    store(lanes, room.nees, 0, total)
+    store(lanes, room.broken, 0, broken)
+    return broken > 0.0
 
 
 @kernel(inlined=True)
-def is_clear(b: Batch, r: int, t: int) -> bool:
-    """Return True if sample ``t`` of run ``r`` is surely not blurred, which squares tell without a
-    root.
-    """
+def find_blur(
+    lanes: Lanes, b: Batch, sums: Sums, room: Room, first: int, active: int, t: int, s: int
+) -> None:
+    """Note the time of sample ``t``, the ``s``-th of a group, in the runs where it is blurred."""
+    # Squares tell without a root where it is surely not. A nan is no number here: what is blurred
+    # is not decided by it either.
     filters, n = b.error.shape[2:]
-    largest, least = 0.0, np.inf
-    # A nan is no number here: what is blurred is not decided by it either.
-    for f in range(filters):
+    largest, least = spread(lanes, 0.0), spread(lanes, np.inf)
+    for f in range(s * filters, (s + 1) * filters):
         for i in range(n):
-            variance = b.P[r, t, f, i, i]
-            least = variance if variance < least else least
-    for f in range(filters if b.exact else 1):
-        for i in range(n):
-            value = abs(b.error[r, t, f, i]) if b.exact else abs(b.x[r, t, i])
-            largest = value if value > largest else largest
+            variance = load(lanes, room.P, f * n * n + i * n + i)
+            least = select(variance < least, variance, least)
+            if b.exact:
+                size = magnitude(load(lanes, room.error, f * n + i))
+                largest = select(size > largest, size, largest)
+    for place in range(0 if b.exact else s * n, 0 if b.exact else (s + 1) * n):
+        size = magnitude(load(lanes, room.x, place))
+        largest = select(size > largest, size, largest)
     bound = ROUNDING * BLUR * largest
-    return bool(least < np.inf and bound * bound < 0.5 * least)
+    clear = (least < np.inf) & (bound * bound < 0.5 * least)
+    if any_lane(select(clear, 0.0, 1.0) > 0.0):
+        for r in range(first, first + active):
+            known = t >= b.lengths[r] or b.times[t] >= sums.rounding_from[r]
+            if not known and is_blurred(b, r, t):
+                sums.rounding_from[r] = b.times[t]
 
 
 @kernel
