@@ -18,6 +18,9 @@ from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.runs.tables import format_number
 from netkf.studies.compare import Comparison
+from netkf.studies.compare_filters import ComparedFilter
+from netkf.studies.filter_values import Quantity
+from netkf.studies.stored import StoredComparison
 from netkf.trace.run import first_difference
 from netkf.trace.schema import CODES
 
@@ -43,6 +46,8 @@ def findings(
         return [*_ending(source), *_of_sweep(source)]
     if source.kind == "verdict":
         return _of_verdict(source)
+    if source.filters is not None:
+        return _of_filters(source.filters)
     found = [*_ending(source)]
     if source.kind == "ensemble":
         found += [*_of_ensemble(source), *_of_bound(source)]
@@ -337,6 +342,38 @@ def _of_sweep(source: Opened) -> list[str]:
         f"{format_number(float(best['worst_rms']))}; the largest is "
         f"{format_number(float(np.nanmax(column)))}"
     ]
+
+
+def _of_filters(found: StoredComparison) -> list[str]:
+    """Return which filter did best, what is certain of the others, and which could not run."""
+    ran = [row for row in found.rows if row.ran and math.isfinite(_rms(row).value)]
+    if not ran:
+        return ["No filter has a finite RMS error"]
+    best = min(ran, key=lambda row: _rms(row).value)
+    listed = ", ".join(f"{row.filter} {format_number(_rms(row).value)}" for row in ran)
+    said = [
+        f"Of {len(ran)} filters over {found.runs:,} runs of each, {best.filter} had the smallest "
+        f"RMS error ({listed})"
+    ]
+    for row in ran:
+        gap = _rms(row)
+        if gap.real:
+            side = "less" if gap.difference < 0.0 else "more"
+            said.append(
+                f"Certain: the RMS error of {row.filter} is {side} than that of {found.first}, by "
+                f"{format_number(abs(gap.difference))}; the difference lies in "
+                f"{format_number(gap.low)} .. {format_number(gap.high)}"
+            )
+    if len(said) == 1:
+        said.append(f"No difference of RMS errors from {found.first} is certain")
+    wrong = [f"{row.filter} ({row.consistency})" for row in ran if row.consistency != "consistent"]
+    said += [f"P does not describe the errors of {', '.join(wrong)}"] if wrong else []
+    noted = [row for row in found.rows if row.status != "complete"]
+    return said + [f"{row.filter}: {row.status}" for row in noted]
+
+
+def _rms(row: ComparedFilter) -> Quantity:
+    return row.quantities["rms_error"]
 
 
 def _time(seconds: float) -> str:

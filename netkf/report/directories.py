@@ -1,4 +1,4 @@
-"""What a page shows of one directory: a run, an ensemble, a sweep or a verdict."""
+"""What a page shows of one directory: a run, an ensemble, a sweep, a verdict or a comparison."""
 
 from __future__ import annotations
 
@@ -14,30 +14,20 @@ from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
 from netkf.report.worst import WorstSample, worst_sample
-from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, check_files, require
+from netkf.runs.documents import NUMBER, TEXT, TEXTS, require
 from netkf.runs.stored import StoredRun, read_form
 from netkf.runs.summary import PromisedTraces
 from netkf.runs.tables import COLUMNS
-from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare import damage_named
 from netkf.studies.opening import StoredSweep
 from netkf.studies.opening import open as open_directory
+from netkf.studies.stored import VERDICT, StoredComparison, StoredVerdict
 
 MAX_TEXT = 200_000
 """Characters of a scenario file that a page repeats."""
 SLOT_ROUNDING = 1e-6
 """Share of a slot by which the time of a sample may lie before the slot begins."""
-VERDICT_ROW: dict[str, Any] = {
-    **dict.fromkeys(("promise", "source", "verdict", "evidence", "assumptions"), TEXT),
-    **dict.fromkeys(("seen", "expected", "off", "detectable", "low", "high"), NUMBER),
-}
-VERDICT: dict[str, Any] = {
-    "scenario": TEXT,
-    "runs": COUNT,
-    "confidence": NUMBER,
-    "rows": [VERDICT_ROW],
-}
 ROW: dict[str, Any] = dict.fromkeys(COLUMNS, NUMBER)
 SUMMARY: dict[str, Any] = {
     "nodes": [ROW],
@@ -55,7 +45,7 @@ class Opened:
     """A directory as a page shows it; what it does not have is None or empty.
 
     ``label`` is the directory as the user has named it; ``run`` a recorded run with its trace, of
-    an ensemble too; ``verdict`` the contents of verdict.json.
+    an ensemble too; ``filters`` a comparison of filters; ``verdict`` the contents of verdict.json.
     """
 
     label: str
@@ -65,48 +55,52 @@ class Opened:
     run: StoredRun | None = None
     ensemble: StoredEnsemble | None = None
     sweep: StoredSweep | None = None
+    filters: StoredComparison | None = None
     verdict: dict[str, Any] | None = None
 
     @property
     def kind(self) -> str:
-        """What the directory holds: run, ensemble, sweep or verdict."""
+        """Return what the directory holds: run, ensemble, sweep, filters or verdict."""
         if self.sweep is not None:
             return "sweep"
+        if self.filters is not None:
+            return "filters"
         if self.ensemble is not None:
             return "ensemble"
         return "run" if self.run is not None else "verdict"
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The contents of summary.json, empty if there is none."""
+        """Return the contents of summary.json, empty if there is none."""
         found = self.ensemble if self.ensemble is not None else self.run
         return {} if found is None else found.summary
 
     @property
     def promised(self) -> PromisedTraces | None:
-        """Bounds and limits at the sample times."""
+        """Return bounds and limits at the sample times, None without samples."""
         found = self.ensemble if self.ensemble is not None else self.run
         return None if found is None or not len(found.times) else found.promised
 
     @cached_property
     def worst(self) -> WorstSample | None:
-        """The worst sample of the run, None without one."""
+        """Return the worst sample of the run, None without one."""
         return None if self.run is None else worst_sample(self.run, self.summary)
 
     @property
     def runs(self) -> int:
-        """Number of runs that are done."""
+        """Return the number of runs that are done."""
         return int(self.manifest["runs"]["done"])
 
     @property
     def status(self) -> str:
-        """Status of the manifest, such as ``complete`` or ``interrupted``."""
+        """Return the status of the manifest, such as ``complete`` or ``interrupted``."""
         return str(self.manifest["status"])
 
     @property
     def knowledge(self) -> str:
-        """What a sample at t knows: what arrived ``until`` t, ``before`` t (slots whose samples are
-        predictions), or in the whole ``slot`` that begins at t (slots whose samples are filtered).
+        """Return what a sample at t knows: what arrived ``until`` t, ``before`` t (slots whose
+        samples are predictions), or in the ``slot`` that begins at t (slots whose samples are
+        filtered).
         """
         if not self.scenario.slotted:
             return "until"
@@ -114,7 +108,7 @@ class Opened:
 
     @property
     def period(self) -> float:
-        """Seconds of a slot, 0 under clocks."""
+        """Return the seconds of a slot, 0 under clocks."""
         return float(self.scenario.slot_plant.period) if self.scenario.slotted else 0.0
 
     def cuts(self, times: FloatArray) -> FloatArray:
@@ -129,19 +123,14 @@ class Opened:
 
 
 def read_source(directory: Path, replica: int | None = None, trust: bool = False) -> Opened:
-    """Return what a page shows of a directory of ``netkf run``, ``sweep`` or ``check``.
+    """Return what a page shows of a directory of ``netkf run``, ``sweep``, ``check`` or
+    ``compare-filters``.
 
     ``replica`` chooses one of the recorded runs of an ensemble, by default the first. Runs that
     were interrupted or failed are read as far as they came. ``trust`` imports classes that the
     scenario names. Raises ScenarioError if the directory is not one of netkf's, or if its files
     were changed since they were written.
     """
-    verdict = None
-    if (directory / "verdict.json").exists():
-        with damage_named(directory):
-            verdict = read_form(directory, "verdict.json", VERDICT)
-        if not (directory / "manifest.json").exists():
-            return _verdict_source(directory, verdict, trust)
     found = open_directory(directory, trust=trust)
     text = _read_text(directory / "scenario.toml")
     if isinstance(found, StoredSweep):
@@ -149,6 +138,16 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
             rule = "is not the directory of a sweep: sweep.parquet lacks worst_rms_se"
             raise ScenarioError(shorten(directory), rule, None, "name what netkf sweep left")
         return Opened(str(directory), found.manifest, found.scenario, text, sweep=found)
+    if isinstance(found, StoredComparison):
+        return Opened(str(directory), found.manifest, found.base, text, filters=found)
+    if isinstance(found, StoredVerdict):
+        manifest = _verdict_manifest(found)
+        document = found.document
+        return Opened(str(directory), manifest, found.scenario, text, verdict=document)
+    verdict = None
+    if (directory / "verdict.json").exists():
+        with damage_named(directory):
+            verdict = read_form(directory, "verdict.json", VERDICT)
     if found.summary:
         with damage_named(directory):
             require(found.summary, SUMMARY, "summary.json")
@@ -172,15 +171,11 @@ def _choose_run(
     return found.replica(replica or 0), found
 
 
-def _verdict_source(directory: Path, verdict: dict[str, Any], trust: bool) -> Opened:
-    runs = {"done": verdict["runs"], "wanted": verdict["runs"]}
-    manifest = {"seed": verdict.get("seed"), "status": "complete", "runs": runs}
-    manifest |= {"versions": verdict.get("versions", {})}
-    with damage_named(directory):
-        check_files(directory, verdict, ["scenario.toml"])
-    scenario = load(directory / "scenario.toml", trust=trust)
-    text = _read_text(directory / "scenario.toml")
-    return Opened(str(directory), manifest, scenario, text, verdict=verdict)
+def _verdict_manifest(found: StoredVerdict) -> dict[str, Any]:
+    """Return what stands for the manifest of a directory that holds a verdict only."""
+    runs = {"done": found.runs, "wanted": found.runs}
+    versions = found.document.get("versions", {})
+    return {"seed": found.seed, "status": "complete", "runs": runs, "versions": versions}
 
 
 def _read_text(path: Path) -> str:

@@ -29,6 +29,7 @@ from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.studies.explanation import Explanation
+from netkf.studies.stored import StoredComparison
 from netkf.trace.schema import KINDS
 
 MAX_BYTES = 4_800_000
@@ -253,7 +254,8 @@ def _main(
         parts.append(section("mending", "What would have mended the worst sample", "".join(mended)))
     if comparison is not None:
         parts.append(section("comparison", "What differs", _differences(comparison)))
-    parts.append(section("figures", "Figures", _figures(entries)))
+    if any(source.kind not in ("filters", "verdict") for source in sources):
+        parts.append(section("figures", "Figures", _figures(entries)))
     parts.append(section("verdicts", "Verdicts and averages", "".join(map(_results, sources))))
     parts.append(section("scenario", "Scenario", "".join(map(_scenario, sources))))
     parts.append(section("origin", "Versions and command", _origin(sources, command, rules)))
@@ -274,10 +276,11 @@ def _differences(comparison: Comparison | str) -> str:
 
 
 def _nothing_moves(sources: list[Opened]) -> str:
-    if sources[0].kind in ("sweep", "verdict"):
+    kept_nothing = {"sweep": "sweep", "verdict": "verdict", "filters": "comparison of filters"}
+    if sources[0].kind in kept_nothing:
         reason = (
-            f"A {sources[0].kind} keeps no trace of single runs. To see one move: netkf run "
-            "SCENARIO --trace full --out DIR, then netkf report DIR."
+            f"A {kept_nothing[sources[0].kind]} keeps no trace of single runs. To see one move: "
+            "netkf run SCENARIO --trace full --out DIR, then netkf report DIR."
         )
     elif all(source.run is None for source in sources):
         reason = "No run was recorded here, so nothing moves: run again with --trace full."
@@ -294,6 +297,8 @@ def _results(source: Opened) -> str:
         parts.append(tables.verdict_table(source))
     if source.kind == "sweep":
         parts.append(tables.sweep_table(source))
+    elif source.filters is not None:
+        parts.append(tables.filters_table(source.filters))
     elif source.kind != "verdict":
         parts.append(tables.summary_section(source))
         if source.verdict is None:
@@ -329,22 +334,38 @@ def _origin(sources: list[Opened], command: str, rules: list[str]) -> str:
         f'<pre tabindex="0" role="group" aria-label="command">{text(command)}</pre>',
     ]
     for source in sources:
-        runs = f" --runs {source.runs}" if source.kind == "ensemble" else ""
-        verb = {"sweep": "sweep", "verdict": "check"}.get(source.kind, "run")
+        runs = f" --runs {source.runs}" if source.kind in ("ensemble", "filters") else ""
+        verbs = {"sweep": "sweep", "verdict": "check", "filters": "compare-filters"}
+        verb = verbs.get(source.kind, "run")
         again = f"netkf {verb} {shlex.quote(source.label + '/scenario.toml')}{runs}"
         if verb == "sweep":
             again += "".join(
                 f" --vary {shlex.quote(key + '=' + ','.join(map(str, values)))}"
                 for key, values in source.manifest.get("vary", {}).items()
             )
+        if source.filters is not None:
+            again += f" --filters {shlex.quote(_filter_option(source.filters))}"
         parts.append(paragraph("The results can be computed again by:"))
         parts.append(f'<pre tabindex="0" role="group" aria-label="command">{text(again)}</pre>')
         parts.append(tables.versions_table(source))
         if source.run is not None:
             parts.append(paragraph(_event_counts(source.run)))
-    whole = "Nothing was left out: the page holds every sample and every message of these runs."
-    parts.append(bullets([f"Left out: {rule}." for rule in rules]) if rules else paragraph(whole))
+    if rules:
+        parts.append(bullets(f"Left out: {rule}." for rule in rules))
+    elif any(source.run is not None for source in sources):
+        whole = "Nothing was left out: the page holds every sample and every message of these runs."
+        parts.append(paragraph(whole))
     return "".join(parts)
+
+
+def _filter_option(found: StoredComparison) -> str:
+    """Return the filters of a comparison as an option; labels are a kind and its settings."""
+    tables_of = []
+    for row in found.rows:
+        kind, *settings = row.filter.split(" ")
+        table = ", ".join([f'kind="{kind}"', *settings])
+        tables_of.append(f"{{{table}}}" if settings else kind)
+    return ",".join(tables_of)
 
 
 @cache

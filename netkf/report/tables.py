@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from netkf.runs.files import finite
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 from netkf.runs.tables import COLUMNS, format_number, standard_error
 from netkf.studies.compare import Comparison, Entry
+from netkf.studies.compare_filters import QUANTITIES
+from netkf.studies.filter_values import Quantity
+from netkf.studies.stored import StoredComparison
 
 MAX_ROWS = 2_000
 """Rows of a table on a page; what is left out is counted."""
@@ -129,6 +133,44 @@ def _difference(entry: Entry) -> list[str]:
         interval = f"{format_number(entry.low)} .. {format_number(entry.high)}"
     mark = {True: "\u25c6 certain", False: "no", None: "one run"}[entry.real]
     return [format_number(entry.difference), interval, mark]
+
+
+def filters_table(found: StoredComparison) -> str:
+    """Return the filters of a comparison, with their differences from the first one."""
+    header = ["filter"]
+    for name in ("RMS error", "worst instant", "NEES / n"):
+        header += [name, f"difference from {found.first}", "certain?"]
+    header += ["consistency", "transmissions", "kB"]
+    rows = [
+        [
+            row.filter,
+            *(cell for name in QUANTITIES for cell in _quantity(row.quantities[name])),
+            row.consistency,
+            f"{row.transmissions:,.0f}",
+            f"{row.bytes / 1000.0:,.6g}",
+        ]
+        for row in found.rows
+        if row.ran
+    ]
+    caption = f"{found.runs:,} runs of each filter on the same draws, +- one standard error"
+    notes = [
+        f"All marks are right together with probability {found.confidence:.6g}; differences are "
+        "taken run by run",
+        "Worst instant: the largest error of any node at any sample; traffic is of replica 0",
+    ]
+    ahead = [row.filter for row in found.rows if row.ran and row.predicts]
+    if ahead and len(ahead) < len(rows):
+        notes.append(f"Samples of {', '.join(ahead)} are predictions, the others are filtered")
+    return table_box(caption, header, rows) + bullets(notes)
+
+
+def _quantity(found: Quantity) -> list[str]:
+    value = format_number(found.value) + standard_error(found.se)
+    if not math.isfinite(found.difference):
+        return [value, "-", "-"]
+    interval = f"{format_number(found.low)} .. {format_number(found.high)}"
+    difference = f"{format_number(found.difference)} ({interval})"
+    return [value, difference, "\u25c6 certain" if found.real else "no"]
 
 
 def sweep_table(source: Opened) -> str:

@@ -67,6 +67,18 @@ def read_words(path: Path, column: str, run: int | None = None) -> pd.Series[str
         return pd.Series(texts.dictionary_encode().to_pandas())
 
 
+def read_flags(path: Path, column: str) -> np.ndarray:
+    """Return a column of truth values of a Parquet file; raises DamagedError for any other file."""
+    with reading_file(path, path.name), pq.ParquetFile(path) as file:
+        known = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
+        if not pa.types.is_boolean(known.get(column, pa.null())):
+            raise DamagedError(f"{path.name} has no column {column} of truth values")
+        found = _read(file, path, [column], None)[column]
+        if found.null_count:
+            raise DamagedError(f"{path.name} has missing values")
+        return np.asarray(found.to_numpy(), dtype=bool)
+
+
 def _read(file: Any, path: Path, columns: Sequence[str], run: int | None) -> Any:
     """Return an Arrow table with the columns, of those rows that are of ``run``."""
     if file.metadata.num_rows > MAX_READ_ROWS:

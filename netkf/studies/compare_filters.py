@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from netkf.algorithms.filter import Filter
 from netkf.core.errors import EngineError, ScenarioError, nearest
 from netkf.core.fields import integer, number
+from netkf.core.printable import one_line
 from netkf.core.shown import Shown
 from netkf.ensembles.pools import Pool
 from netkf.ensembles.replicas import replicate_blocks
-from netkf.runs.documents import write_sealed
+from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failures
 from netkf.runs.files import check_sources, new_directory, write_scenario, write_text
 from netkf.runs.parquet_files import write_table
@@ -116,7 +117,7 @@ class FilterComparison(Shown):
         return pd.DataFrame([row.document() for row in self.rows])
 
     def __repr__(self) -> str:
-        names = ", ".join(row.filter for row in self.rows)
+        names = one_line(", ".join(row.filter for row in self.rows))
         return f"<netkf comparison of filters on {self.scenario!r}: {names}; {self.runs:,} runs>"
 
     @property
@@ -294,6 +295,7 @@ def write_comparison(
         "confidence": comparison.confidence,
         "runs": {"wanted": comparison.runs, "done": comparison.runs},
         "status": "complete",
+        "files": file_digests(directory, ["scenario.toml", "filters.parquet"]),
     }
     write_sealed(directory / "manifest.json", manifest)
     return CompletedComparison(directory, comparison)

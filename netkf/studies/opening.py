@@ -1,4 +1,6 @@
-"""``netkf.open``: read a run, an ensemble or a sweep back from its directory."""
+"""``netkf.open``: read a run, an ensemble, a sweep, a comparison of filters or a verdict back from
+its directory.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,7 @@ from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbe
 from netkf.runs.stored import MANIFEST, StoredRun, read_form, read_run
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
+from netkf.studies.stored import StoredComparison, StoredVerdict, read_comparison, read_verdict
 from netkf.trace.run import plot_by_name
 
 if TYPE_CHECKING:
@@ -49,10 +52,16 @@ class StoredSweep(Shown):
         return f"<netkf sweep of {self.scenario.name!r}: {self.status}, {points}>"
 
 
-def open(directory: str | Path, *, trust: bool = False) -> StoredRun | StoredEnsemble | StoredSweep:
-    """Return what ``netkf run``, ``netkf run --runs``, ``netkf sweep`` or ``netkf.save`` left in a
-    directory: what ``netkf.simulate``, ``netkf.monte_carlo`` and ``netkf.sweep`` return, with the
-    scenario, the manifest and the summary. What was interrupted has what was kept.
+Stored = StoredRun | StoredEnsemble | StoredSweep | StoredComparison | StoredVerdict
+"""What ``netkf.open`` returns."""
+
+
+def open(directory: str | Path, *, trust: bool = False) -> Stored:
+    """Return what ``netkf run``, ``netkf run --runs``, ``netkf sweep``, ``netkf.save``, ``netkf
+    compare-filters`` or ``netkf check`` left in a directory: what ``netkf.simulate``,
+    ``netkf.monte_carlo``, ``netkf.sweep``, ``netkf.compare_filters`` and ``netkf.check`` return,
+    with the scenario, the manifest and the summary. What was interrupted has what was kept. Where a
+    verdict lies beside a run, the run is returned.
 
     Files are read without trust: with ``trust`` classes of modules in the directory, or in the
     current folder, that its scenario names are imported, which executes them.
@@ -62,16 +71,20 @@ def open(directory: str | Path, *, trust: bool = False) -> StoredRun | StoredEns
     folder = Path(directory)
     where = shorten(directory)
     try:
+        if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():
+            return read_verdict(folder, trust)
         manifest = _read_manifest(folder)
         check_files(folder, manifest, ["scenario.toml"])
         scenario = load(folder / "scenario.toml", trust=trust)
         if "vary" in manifest:
             return _read_sweep(folder, scenario, manifest)
+        if "filters" in manifest:
+            return read_comparison(folder, scenario, manifest)
         if manifest["runs"]["wanted"] > 1:
             return read_ensemble(folder, scenario, manifest)
         return read_run(folder, scenario, manifest)
     except DamagedError as error:
-        remedy = "name a directory that netkf run or netkf sweep left"
+        remedy = "name a directory that netkf run, sweep, check or compare-filters left"
         raise ScenarioError(where, f"cannot be opened: {error}", None, remedy) from None
 
 
@@ -79,8 +92,6 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a directory; raises DamagedError."""
     if not folder.is_dir():
         raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
-    if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():
-        raise DamagedError("it holds a verdict, not runs: see verdict.txt and verdict.csv in it")
     return read_form(folder, "manifest.json", MANIFEST)
 
 

@@ -158,8 +158,8 @@ def _opened(directory: str | Path, replica: int | None, trust: bool) -> Run:
         return found
     if isinstance(found, StoredEnsemble):
         return found.replica(replica or 0)
-    rule = "holds a sweep, which keeps no events"
-    raise ScenarioError(shorten(directory), rule, None, "run one of its points with netkf run")
+    rule = f"holds no run with events, but {found!r}"
+    raise ScenarioError(shorten(directory), rule, None, "name what netkf run left")
 
 
 def _default_replays(events: int) -> int:

@@ -276,7 +276,8 @@ def relative_change(trace: float, base: float) -> str:
     """Return by how many percent a trace differs from another."""
     if not (math.isfinite(trace) and base > 0.0):
         return "-"
-    return f"{100.0 * (trace / base - 1.0):+.1f} %"
+    percent = round(100.0 * (trace / base - 1.0), 1) + 0.0  # no -0.0
+    return f"{percent:+.1f} %"
 
 
 def _time(seconds: float) -> str:

@@ -30,6 +30,7 @@ from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.innovations import innovations
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
+from netkf.studies.compare_filters import compare_filters, write_comparison
 from tests.conftest import SCENARIOS
 from tests.report.conftest import EVIL, write_verdict
 from tests.report.decoding import Page
@@ -370,6 +371,27 @@ def test_every_kind_of_directory_has_a_page(ring, ensembles, sweep, tmp_path):
         page.data["ensembles"][0]["times"], netkf.open(ensembles[0]).times
     )
     assert "Over 12 runs node" in page.shown
+
+
+def test_a_comparison_of_filters_has_a_page(tmp_path):
+    scenario = netkf.load(SCENARIOS / "push_sum_planar.toml", {"horizon": 2.0})
+    filters = ["push-sum", {"kind": "hcmci", "steps": 2}, "local", "hybrid"]
+    found = compare_filters(scenario, filters, 8, workers=1)
+    folder = write_comparison(scenario, found, tmp_path / "filters").directory
+    page = Page(make_page([folder]))
+    ran = [row for row in found.rows if row.ran]
+    best = min(ran, key=lambda row: row.quantities["rms_error"].value)
+    assert f"{best.filter} had the smallest RMS error" in page.shown
+    assert "hybrid: cannot run here" in page.shown
+    marks = [q.real for row in ran for q in row.quantities.values()]
+    assert page.shown.count("\u25c6 certain") == sum(marks) > 0
+    for row in ran:
+        q = row.quantities["rms_error"]
+        certain = f"Certain: the RMS error of {row.filter} is "
+        assert (certain in page.shown) == q.real
+        assert f"{q.value:.4g}" in page.shown
+    assert """--filters 'push-sum,{kind="hcmci", steps=2},local,hybrid'""" in page.shown
+    assert page.data["runs"] == []
 
 
 def test_an_interrupted_a_diverged_and_a_lonely_run_say_so(ring, build, tmp_path):

@@ -8,11 +8,14 @@ import pandas as pd
 import pytest
 
 import netkf
+from netkf.checks.storage import save_verdict
 from netkf.ensembles.directory import runs_to_directory
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.run import run_to_directory
 from netkf.scenario.writing import resolved, to_toml
+from netkf.studies.compare_filters import compare_filters, write_comparison
 from netkf.studies.sweep import sweep_to_directory
+from netkf.studies.tables import filters_text
 from tests.conftest import SCENARIOS
 
 SHORT = {"horizon": 3.0, "probe": 0.5}
@@ -105,6 +108,59 @@ def test_a_sweep_comes_back_as_it_was(short, tmp_path):
     )
 
 
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A comparison of which one filter cannot run there, and its directory."""
+    slots = netkf.load(SCENARIOS / "push_sum_planar.toml", {"horizon": 2.0})
+    filters = ["push-sum", {"kind": "hcmci", "steps": 2}, "central", "hybrid"]
+    comparison = compare_filters(slots, filters, 4, workers=1)
+    folder = tmp_path_factory.mktemp("compared") / "filters"
+    return comparison, write_comparison(slots, comparison, folder).directory
+
+
+def test_a_comparison_of_filters_comes_back_as_it_was(compared):
+    comparison, folder = compared
+    found = netkf.open(folder)
+    pd.testing.assert_frame_equal(found.table, comparison.table)
+    assert (found.runs, found.seed, found.confidence) == (4, comparison.seed, 0.95)
+    assert repr(found) == repr(comparison)
+    assert filters_text(found) == filters_text(comparison)
+    assert found.base.name == "push-sum-planar"
+    assert "hcmci steps=2" in found._repr_html_()
+
+
+def test_a_comparison_that_was_changed_is_refused(compared, tmp_path):
+    _, folder = compared
+    for name, words in (
+        ("filters.parquet", "filters.parquet was changed since"),
+        ("manifest.json", "manifest.json"),
+    ):
+        copy = shutil.copytree(folder, tmp_path / name)
+        (copy / name).write_bytes((folder / name).read_bytes()[:-40])
+        assert words in refused(copy)
+    copy = shutil.copytree(folder, tmp_path / "other")
+    manifest = json.loads((copy / "manifest.json").read_text())
+    del manifest["sha256"]
+    write_sealed(copy / "manifest.json", {**manifest, "filters": ["kcf"]})
+    assert "does not have the filters of the manifest" in refused(copy)
+    write_sealed(copy / "manifest.json", {**manifest, "confidence": None})
+    assert "needs a number at confidence" in refused(copy)
+
+
+def test_a_verdict_comes_back_as_it_was(short, tmp_path):
+    verdict = netkf.check(short, runs=10, workers=1)
+    save_verdict(tmp_path, short, verdict)
+    found = netkf.open(tmp_path)
+    assert (found.runs, found.seed, found.confidence) == (10, verdict.seed, verdict.confidence)
+    assert bool(found) == bool(verdict)
+    assert len(repr(found)) < 120
+    assert repr(found).startswith("<netkf verdict on 'poisson-ring': ")
+    for name in ("promise", "verdict", "seen", "low"):
+        expected = verdict.table[name].replace([np.inf, -np.inf], np.nan)
+        pd.testing.assert_series_equal(found.table[name], expected, check_dtype=False)
+    assert "E[P_i(t)]" in found._repr_html_() or "promise" in found._repr_html_()
+
+
 def interrupt(*_):
     raise KeyboardInterrupt
 
@@ -156,7 +212,7 @@ def test_what_is_no_directory_of_netkf_is_one_line(tmp_path):
     (tmp_path / "file").touch()
     assert "it is no directory" in refused(tmp_path / "file")
     (tmp_path / "verdict.json").touch()
-    assert "it holds a verdict, not runs" in refused(tmp_path)
+    assert "verdict.json cannot be read" in refused(tmp_path)
 
 
 def reseal(folder):

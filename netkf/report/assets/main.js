@@ -220,6 +220,7 @@ function buildPicks(run) {
 }
 
 function buildFigures() {
+  if (!find("curves")) return;
   app.figures = Figures.all(app, page).map((figure) => Curves.figure(app, figure));
   find("curves").replaceChildren(...app.figures.map((figure) => figure.whole));
   app.figures.forEach((figure) => figure.build());

@@ -1,0 +1,155 @@
+"""Comparisons of filters and verdicts of ``netkf check``, read back from their directories."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from netkf.core.printable import one_line
+from netkf.core.shown import Shown
+from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, DamagedError, check_files, require
+from netkf.runs.parquet_files import read_flags, read_numbers, read_words
+from netkf.runs.stored import read_form
+from netkf.scenario.reading import load
+from netkf.scenario.scenario import Scenario
+from netkf.studies.compare_filters import QUANTITIES, ComparedFilter, FilterComparison
+from netkf.studies.filter_values import Quantity
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+VERDICT_ROW: dict[str, Any] = {
+    **dict.fromkeys(("promise", "source", "verdict", "evidence", "assumptions"), TEXT),
+    **dict.fromkeys(("seen", "expected", "off", "detectable", "low", "high"), NUMBER),
+}
+VERDICT: dict[str, Any] = {
+    "scenario": TEXT,
+    "runs": COUNT,
+    "seed?": COUNT,
+    "confidence": NUMBER,
+    "rows": [VERDICT_ROW],
+}
+COMPARISON: dict[str, Any] = {"filters": TEXTS, "confidence": NUMBER}
+"""What the manifest of a comparison has beside that of a run."""
+WORDS = ("filter", "consistency", "status")
+FILTERS = "filters.parquet"
+TRAFFIC = ("transmissions", "bytes")
+PARTS = ("se", "difference", "low", "high", "real")
+"""Parts of a quantity beside its value, each in a column of its own."""
+FLAGS = (*(f"{key}_real" for key in QUANTITIES), "predicts")
+
+
+@dataclass(frozen=True, repr=False)
+class StoredComparison(FilterComparison):
+    """A comparison of filters that is read back from ``directory``; ``base`` is the scenario that
+    all of them ran in, with its own filter.
+    """
+
+    directory: Path
+    manifest: dict[str, Any]
+    base: Scenario
+
+
+def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -> StoredComparison:
+    """Return the comparison of filters in a directory, whose manifest has passed that of runs;
+    raises DamagedError.
+    """
+    require(manifest, COMPARISON)
+    _require_confidence(manifest)
+    check_files(directory, manifest, [FILTERS])
+    path = directory / FILTERS
+    parts = [f"{key}_{part}" for key in QUANTITIES for part in PARTS[:-1]]
+    numbers = read_numbers(path, [*QUANTITIES, *parts, *TRAFFIC], missing=True)
+    columns: dict[str, Any] = {str(name): values.tolist() for name, values in numbers.items()}
+    columns |= {name: read_flags(path, name).tolist() for name in FLAGS}
+    columns |= {name: read_words(path, name).astype(str).tolist() for name in WORDS}
+    rows = [
+        _compared({name: values[k] for name, values in columns.items()})
+        for k in range(len(numbers))
+    ]
+    if [row.filter for row in rows] != manifest["filters"] or not any(row.ran for row in rows):
+        raise DamagedError(f"{FILTERS} does not have the filters of the manifest")
+    return StoredComparison(
+        base.name,
+        manifest["runs"]["done"],
+        manifest["seed"],
+        manifest["confidence"],
+        tuple(rows),
+        directory,
+        manifest,
+        base,
+    )
+
+
+def _compared(row: dict[str, Any]) -> ComparedFilter:
+    """Return a filter of a comparison from its row in the table."""
+    quantities = {
+        key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in QUANTITIES
+    }
+    return ComparedFilter(
+        row["filter"],
+        # A filter that cannot run there has no quantities, and no consistency.
+        quantities if row["consistency"] != "-" else {},
+        row["consistency"],
+        *(int(row[name]) if math.isfinite(row[name]) else math.nan for name in TRAFFIC),
+        row["status"],
+        row["predicts"],
+    )
+
+
+def _require_confidence(document: dict[str, Any]) -> None:
+    """Raise DamagedError if the confidence is null, which other numbers may be."""
+    if document["confidence"] is None:
+        raise DamagedError("needs a number at confidence")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredVerdict(Shown):
+    """A verdict of ``netkf check`` that is read back from ``directory``; true if no promise is
+    broken. ``document`` is the contents of verdict.json.
+    """
+
+    directory: Path
+    scenario: Scenario
+    document: dict[str, Any]
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return int(self.document["runs"])
+
+    @property
+    def seed(self) -> int | None:
+        """The root seed, None if it was not written."""
+        return self.document.get("seed")
+
+    @property
+    def confidence(self) -> float:
+        """All intervals of all rows hold together with at least this probability."""
+        return float(self.document["confidence"])
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """One row per promise, as in the table of ``netkf.check``."""
+        import pandas as pd
+
+        return pd.DataFrame(self.document["rows"])
+
+    def __bool__(self) -> bool:
+        return all(row["verdict"] != "broken" for row in self.document["rows"])
+
+    def __repr__(self) -> str:
+        counts = Counter(row["verdict"] for row in self.document["rows"])
+        told = one_line(", ".join(f"{count} {name}" for name, count in sorted(counts.items())))
+        return f"<netkf verdict on {self.scenario.name!r}: {told or 'no row'}; {self.runs:,} runs>"
+
+
+def read_verdict(directory: Path, trust: bool = False) -> StoredVerdict:
+    """Return the verdict in a directory; raises DamagedError, or ScenarioError for its scenario."""
+    document = read_form(directory, "verdict.json", VERDICT)
+    _require_confidence(document)
+    check_files(directory, document, ["scenario.toml"])
+    return StoredVerdict(directory, load(directory / "scenario.toml", trust=trust), document)
