@@ -14,8 +14,8 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="DIR",
-        help="directory of a run, an ensemble, a sweep, a verdict or compared filters; a second one "
-        "to compare with, or the verdict of the first",
+        help="directory of a run, an ensemble, a sweep, a verdict or compared filters; a second "
+        "one to compare with, or the verdict of the first",
     )
     parser.add_argument("--out", type=Path, help="file of the page (default: DIR/report.html)")
     parser.add_argument(

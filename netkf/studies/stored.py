@@ -89,12 +89,14 @@ def _compared(row: dict[str, Any]) -> ComparedFilter:
     quantities = {
         key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in QUANTITIES
     }
+    sent, size = (int(row[k]) if math.isfinite(row[k]) else math.nan for k in TRAFFIC)
     return ComparedFilter(
         row["filter"],
         # A filter that cannot run there has no quantities, and no consistency.
         quantities if row["consistency"] != "-" else {},
         row["consistency"],
-        *(int(row[name]) if math.isfinite(row[name]) else math.nan for name in TRAFFIC),
+        sent,
+        size,
         row["status"],
         row["predicts"],
     )
