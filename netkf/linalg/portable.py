@@ -13,10 +13,10 @@ from functools import cache
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
+from netkf.linalg.jacobi import diagonalise
 
 LARGEST = 40
 """States up to which eigenvectors are refined here; above, they are those of LAPACK."""
-SWEEPS = 30
 SAME = 0.9
 """Least cosine between an eigenvector and that of LAPACK which it stands for."""
 
@@ -63,39 +63,13 @@ def solve_lower(L: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def eigenvectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return eigenvalues (n,), increasing, and eigenvectors (n, n) of a symmetric matrix.
-
-    Jacobi's method with cyclic sweeps (Golub and Van Loan, section 8.5).
-    """
-    A, V = symmetric(matrix), np.eye(len(matrix))
-    for _ in range(SWEEPS):
-        rotated = False
-        for p in range(len(A) - 1):
-            for q in range(p + 1, len(A)):
-                # What does not change the diagonal any more is rounding.
-                if abs(A[p, q]) <= 2.0**-54 * np.sqrt(abs(A[p, p]) * abs(A[q, q])):
-                    A[p, q] = A[q, p] = 0.0
-                    continue
-                rotated = True
-                _rotate(A, V, p, q)
-        if not rotated:
-            break
+    """Return eigenvalues (n,), increasing, and eigenvectors (n, n) of a symmetric matrix."""
+    A, V = np.ascontiguousarray(symmetric(matrix)), np.eye(len(matrix))
+    # Diagonal ones, which are frequent, compile nothing.
+    if np.count_nonzero(A - np.diag(A.diagonal())):
+        diagonalise(A, V)
     order = np.argsort(np.diag(A), kind="stable")
     return np.diag(A)[order], V[:, order]
-
-
-def _rotate(A: FloatArray, V: FloatArray, p: int, q: int) -> None:
-    """Make entry (p, q) of ``A`` zero by a rotation of both, which V collects."""
-    with np.errstate(over="ignore"):
-        tau = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
-        t = np.copysign(1.0, tau) / (abs(tau) + np.sqrt(1.0 + tau * tau))
-    c = 1.0 / np.sqrt(1.0 + t * t)
-    s = t * c
-    for matrix in (A.T, A, V):
-        columns = matrix[:, p].copy(), matrix[:, q].copy()
-        matrix[:, p] = c * columns[0] - s * columns[1]
-        matrix[:, q] = s * columns[0] + c * columns[1]
-    A[p, q] = A[q, p] = 0.0
 
 
 def _spectral(matrix: FloatArray, function: Callable[[FloatArray], FloatArray]) -> FloatArray:

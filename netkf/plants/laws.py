@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.compiling import kernel
 from netkf.linalg.legendre import forward_coefficients
 from netkf.linalg.portable import (
     apply,
@@ -15,6 +18,7 @@ from netkf.linalg.portable import (
     symmetric_root,
 )
 from netkf.linalg.series import polynomial, with_reach
+from netkf.linalg.small import matmul
 
 MAX_LAWS = 256  # laws of states inside a step that are kept
 MAX_GRIDS = 256  # parts of the sensing grid that are kept
@@ -58,25 +62,15 @@ class GridLaws:
 
     def _noise(self, gap: float) -> FloatArray:
         """(3 n, 20 m): responses of the end and the moments to noise at the quadrature nodes."""
-        columns = [
-            self._impulse(gap, 0.0, gap, s) * np.sqrt(w * gap)
-            for s, w in zip(_NODES * gap, _WEIGHTS, strict=True)
-        ]
-        return np.concatenate(columns, axis=1)
+        out = np.empty((3 * self.n, len(_NODES) * self.B.shape[1]))
+        self._fill_impulses(out, 0, gap, _NODES * gap, _WEIGHTS * gap)
+        return out
 
-    def _impulse(self, gap: float, start: float, end: float, s: float) -> FloatArray:
-        """(3 n, m): what dw at time s adds to x(end) and to the moments over [start, end] of
-        length ``gap``.
-        """
-        if s >= end:
-            return np.zeros((3 * self.n, self.B.shape[1]))
-        since = max(s, start)
-        entry = product(self.responses(since - s)[0], self.B)
-        rest = end - since
-        to_end, plain, tilted = self.responses(rest)
-        share = rest / gap  # P_1 of the whole interval is (1 - share) + share P_1 of the rest
-        response = np.concatenate([to_end, plain, (1.0 - share) * plain + share * tilted])
-        return product(response, entry)
+    def _fill_impulses(
+        self, out: FloatArray, row: int, end: float, places: FloatArray, weights: FloatArray
+    ) -> None:
+        tables = self.to_end, self.to_moments, self.B
+        fill_impulses(out, row, *tables, end, places, weights)
 
     def conditional_law(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
         """Return the conditional law of state and moments at ``left`` seconds of a step.
@@ -93,19 +87,51 @@ class GridLaws:
         return law
 
     def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
-        n = self.n
+        size = 3 * self.n
         places = np.concatenate([_NODES * left, left + _NODES * (length - left)])
         weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])
-        columns = [
-            np.concatenate([self._impulse(length, 0, length, s), self._impulse(left, 0, left, s)])
-            * np.sqrt(w)
-            for s, w in zip(places, weights, strict=True)
-        ]
-        factor = np.concatenate(columns, axis=1)
-        C = product(factor, factor.T)
-        known, asked, cross = C[: 3 * n, : 3 * n], C[3 * n :, 3 * n :], C[3 * n :, : 3 * n]
+        factor = np.empty((2 * size, len(places) * self.B.shape[1]))
+        self._fill_impulses(factor, 0, length, places, weights)
+        self._fill_impulses(factor, size, left, places, weights)
+        C = matmul(factor, np.ascontiguousarray(factor.T))
+        known, asked, cross = C[:size, :size], C[size:, size:], C[size:, :size]
         gain = product(cross, pseudo_inverse(known, 1e-13))
         return gain, symmetric_root(symmetric(asked - product(gain, cross.T)))
+
+
+@kernel(allocates=True)
+def fill_impulses(
+    out: FloatArray,
+    row: int,
+    to_end: FloatArray,
+    to_moments: FloatArray,
+    B: FloatArray,
+    end: float,
+    places: FloatArray,
+    weights: FloatArray,
+) -> None:
+    """Write what noise of unit density at each of K ``places``, times the root of its weight, adds
+    to x(end) and to the moments over [0, end] into 3 n rows of ``out`` (., K m) from ``row`` on.
+    Noise after ``end`` adds nothing. ``B`` is (n, m), the series are those of GridLaws.
+    """
+    n, m = B.shape
+    for k in range(len(places)):
+        # In an interval that begins with the noise it is a state, B dw.
+        rest = max(end - places[k], 0.0)
+        moved, means = polynomial(to_end, rest), polynomial(to_moments, rest)
+        share = rest / end  # P_1 of the whole interval is (1 - share) + share P_1 of the rest
+        scale = math.sqrt(weights[k]) if rest > 0.0 else 0.0
+        for i in range(n):
+            for j in range(m):
+                last = plain = tilted = 0.0
+                for c in range(n):
+                    mean, slope = means[i * n + c], means[(n + i) * n + c]
+                    last += moved[i * n + c] * B[c, j]
+                    plain += mean * B[c, j]
+                    tilted += ((1.0 - share) * mean + share * slope) * B[c, j]
+                out[row + i, k * m + j] = last * scale
+                out[row + n + i, k * m + j] = plain * scale
+                out[row + 2 * n + i, k * m + j] = tilted * scale
 
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:

@@ -15,11 +15,11 @@ from netkf.engines.compiled.late_readings import use_instant
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.jacobi import diagonalise
 from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Struct
 
 TERMS = 18  # of the exponential, for a norm of at most 1/2
-SWEEPS, SMALL = 30, 1e-32  # of Jacobi's method; squares of what is left, relative
 
 
 class Totals(Struct):
@@ -303,50 +303,6 @@ def move_by_gain(
     for i in range(n):
         for j in range(i + 1):
             xhat[h, i] += root[h, i, j] * news[j]
-
-
-@kernel
-def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
-    """Jacobi's method: the eigenvalues of a symmetric (n, n) come on its diagonal, the eigenvectors
-    are the columns of ``vectors``.
-    """
-    n = len(a)
-    for i in range(n):
-        for j in range(n):
-            vectors[i, j] = 1.0 if i == j else 0.0
-    # Cyclic sweeps converge quadratically: few are needed.
-    for _ in range(SWEEPS):
-        turned = False
-        for p in range(n):
-            for q in range(p + 1, n):
-                # Relative to both diagonal entries, so that small eigenvalues are accurate too.
-                if a[p, q] * a[p, q] > SMALL * abs(a[p, p] * a[q, q]):
-                    turned = True
-                    rotate(a, vectors, p, q)
-        if not turned:
-            return
-
-
-@kernel
-def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
-    """Turn rows and columns p and q so that ``a[p, q]`` becomes 0."""
-    # The smaller of both angles: |t| <= 1.
-    n, tilt = len(a), 0.5 * (a[q, q] - a[p, p]) / a[p, q]
-    t = 1.0 / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))
-    if tilt < 0.0:
-        t = -t
-    c = 1.0 / math.sqrt(1.0 + t * t)
-    s = t * c
-    for k in range(n):
-        one, other = a[k, p], a[k, q]
-        a[k, p], a[k, q] = c * one - s * other, s * one + c * other
-    # Then the rows: a <- J' a J.
-    for k in range(n):
-        one, other = a[p, k], a[q, k]
-        a[p, k], a[q, k] = c * one - s * other, s * one + c * other
-        one, other = vectors[k, p], vectors[k, q]
-        vectors[k, p], vectors[k, q] = c * one - s * other, s * one + c * other
-    a[p, q] = a[q, p] = 0.0
 
 
 @kernel

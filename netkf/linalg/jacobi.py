@@ -1,0 +1,56 @@
+"""Jacobi's method for the eigenvalues and eigenvectors of small symmetric matrices."""
+
+from __future__ import annotations
+
+import math
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+
+SWEEPS = 30
+ROUNDING = 2.0**-54
+
+
+@kernel
+def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
+    """Leave the eigenvalues of a symmetric ``a`` (n, n) on its diagonal and write its eigenvectors
+    into the columns of ``vectors`` (n, n). Cyclic sweeps (Golub and Van Loan, section 8.5).
+    """
+    n = len(a)
+    for i in range(n):
+        for j in range(n):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    # Cyclic sweeps converge quadratically: few are needed.
+    for _ in range(SWEEPS):
+        turned = False
+        for p in range(n):
+            for q in range(p + 1, n):
+                # What does not change the diagonal any more is rounding. Relative to both diagonal
+                # entries, so that small eigenvalues are accurate too.
+                if abs(a[p, q]) <= ROUNDING * math.sqrt(abs(a[p, p]) * abs(a[q, q])):
+                    a[p, q] = a[q, p] = 0.0
+                else:
+                    turned = True
+                    rotate(a, vectors, p, q)
+        if not turned:
+            return
+
+
+@kernel
+def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
+    """Turn rows and columns p and q so that ``a[p, q]`` becomes 0."""
+    # The smaller of both angles: |t| <= 1. A tilt beyond all bounds is an angle of 0.
+    n, tilt = len(a), (a[q, q] - a[p, p]) / (2.0 * a[p, q])
+    t = math.copysign(1.0, tilt) / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))
+    c = 1.0 / math.sqrt(1.0 + t * t)
+    s = t * c
+    for k in range(n):
+        one, other = a[p, k], a[q, k]
+        a[p, k], a[q, k] = c * one - s * other, s * one + c * other
+    # Then the columns: a <- J' a J.
+    for k in range(n):
+        one, other = a[k, p], a[k, q]
+        a[k, p], a[k, q] = c * one - s * other, s * one + c * other
+        one, other = vectors[k, p], vectors[k, q]
+        vectors[k, p], vectors[k, q] = c * one - s * other, s * one + c * other
+    a[p, q] = a[q, p] = 0.0
