@@ -18,6 +18,7 @@ from netkf.checks.parts.samples import PART_TYPES, PartSummary
 from netkf.checks.report import verdict_json, verdict_text
 from netkf.core.errors import ScenarioError
 from netkf.core.interrupts import defer_signals
+from netkf.ensembles.resume import remove_unfinished
 from netkf.runs.documents import (
     DamagedError,
     check_files,
@@ -27,7 +28,9 @@ from netkf.runs.documents import (
     write_sealed,
 )
 from netkf.runs.files import (
-    own_names,
+    BLOCKS,
+    copied_names,
+    only_own,
     scenario_digest,
     write_atomically,
     write_scenario,
@@ -73,15 +76,16 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
 def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
     """Return True if a directory holds no verdict yet; remove what a check left that was stopped
     while it wrote its first one.
+
+    Raises ScenarioError if that was a check of another scenario.
     """
-    if not directory.is_dir():
+    if not directory.is_dir() or not any(directory.iterdir()):
         return True
-    found = list(directory.iterdir())
-    own = {*FILES, *own_names(scenario)}
-    if any(file.name.removesuffix(".part") not in own or not file.is_file() for file in found):
-        return not found
-    for file in found:
-        file.unlink()
+    # Without the files of a run: those of a finished one are not to be removed.
+    names = ["scenario.toml", *FILES, *copied_names(scenario)]
+    if (directory / BLOCKS).exists() or not only_own(directory, [*names, f"{VERDICT}.part"]):
+        return False
+    remove_unfinished(directory, scenario, [*names, f"{VERDICT}.part"])
     return True
 
 

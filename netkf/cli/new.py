@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 
 from netkf.cli.options import Command
@@ -20,7 +21,8 @@ def _run(options: argparse.Namespace) -> int:
 
     scenario, tests = write_template(options.name, options.folder)
     print(f"written: {scenario} and {tests}")
-    print(f"next: netkf run {scenario}; pytest {tests}")
+    first = "" if find_spec("pytest") else "pip install pytest; "
+    print(f"next: netkf run {scenario}; {first}pytest {tests}")
     return 0
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from netkf.core.errors import quote
+from netkf.core.errors import nearest, quote
 from netkf.core.printable import one_line
 
 if TYPE_CHECKING:
@@ -34,6 +34,12 @@ class Parser(argparse.ArgumentParser):
         """Print the line and end with SystemExit."""
         print(f"{self.prog}: {one_line(message)}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            known = [str(choice) for choice in action.choices]
+            remedy = f"{nearest(value, known)}choose from {', '.join(known)}"
+            raise argparse.ArgumentError(action, f"invalid choice: {quote(value)} ({remedy})")
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,7 @@ def _run(options: argparse.Namespace) -> int:
         raise ScenarioError("plot", rule, None, remedy) from None
     from netkf.studies.opening import open as open_directory
 
-    names = tuple(
-        name.strip() for text in options.figure for name in text.split(",") if name.strip()
-    )
+    names = tuple(name for text in options.figure for name in _figure_names(text))
     several = len(options.directories) > 1
     if several and options.out is not None and options.out.suffix.removeprefix(".") in FORMATS:
         rule, remedy = "is one file for several directories", "name a directory"
@@ -51,6 +49,14 @@ def _run(options: argparse.Namespace) -> int:
         for path in plot_to_files(result, names, out, options.format or "png"):
             print(path)
     return 0
+
+
+def _figure_names(text: str) -> list[str]:
+    """Return the names in a text with commas; raises ScenarioError if there is none."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise ScenarioError("--figure", "must name figures", text, "leave it out to draw all")
+    return names
 
 
 COMMAND = Command(

@@ -13,7 +13,10 @@ from netkf.cli.options import (
     parse_count,
     parse_replica,
     print_json,
+    print_notes,
 )
+from netkf.core.errors import ScenarioError
+from netkf.core.printable import shorten
 
 if TYPE_CHECKING:
     from netkf.studies.why import Why
@@ -21,9 +24,14 @@ if TYPE_CHECKING:
 
 def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directory", type=Path, metavar="DIR", help="run directory")
-    parser.add_argument("--node", type=int, required=True, metavar="I", help="id of the node")
     parser.add_argument(
-        "--at", type=float, required=True, metavar="T", help="simulated time in seconds"
+        "--node", type=int, metavar="I", help="id of the node (default: the one that is most off)"
+    )
+    parser.add_argument(
+        "--at",
+        type=float,
+        metavar="T",
+        help="simulated time in seconds (default: when that node is most off)",
     )
     parser.add_argument(
         "--replica", type=parse_replica, help="run of an ensemble with all traces (default: 0)"
@@ -51,10 +59,16 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     from netkf.studies.why import why
 
+    if (options.node is None) != (options.at is None):
+        remedy = "give both, or neither for the worst sample"
+        raise ScenarioError("why", "takes --node and --at together", None, remedy)
+    node, at = options.node, options.at
+    if node is None:
+        node, at = _worst_sample(options)
     found = why(
         options.directory,
-        options.node,
-        options.at,
+        node,
+        at,
         replica=options.replica,
         below=options.below,
         most=options.most,
@@ -68,6 +82,29 @@ def _run(options: argparse.Namespace) -> int:
     else:
         print(found)
     return 0
+
+
+def _worst_sample(options: argparse.Namespace) -> tuple[int, float]:
+    """Return the node and the time of the worst sample after the start-up, and print a note.
+
+    Raises ScenarioError if the directory has no samples of one run.
+    """
+    from netkf.report.directories import read_source
+
+    found = read_source(options.directory, options.replica, options.trust).worst
+    if found is None:
+        rule = "has no samples of a run, of which the worst could be explained"
+        remedy = "name a run, or an ensemble with --trace full"
+        raise ScenarioError(shorten(options.directory), rule, None, remedy)
+    worst = found.explained
+    largest = "error" if worst.by_error else "trace of P"
+    print_notes(
+        [
+            f"node {worst.node} at {worst.time:.10g} s: the largest {largest} after the start-up "
+            f"of the node that is most off; --node and --at ask about another"
+        ]
+    )
+    return worst.node, worst.time
 
 
 def _keep(found: Why, directory: Path) -> None:

@@ -477,6 +477,19 @@ def _source_file(value: Any) -> SourceFile:
     return SourceFile(name, source.folder)
 
 
+def as_path(name: str, value: object, remedy: str = "give it as text or a pathlib.Path") -> Path:
+    """Return a path that a script gives as a text or a path; raises ScenarioError for other types.
+
+    ``name`` is the argument.
+    """
+    if not isinstance(value, (str, os.PathLike)):
+        raise ScenarioError(name, "must be a path", value, remedy)
+    try:
+        return Path(value)
+    except TypeError:  # a path of bytes
+        raise ScenarioError(name, "must be a path of text", value, remedy) from None
+
+
 source_file = Rule(
     "must be the path of a file",
     _source_file,

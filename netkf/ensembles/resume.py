@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from netkf.runs.documents import (
     read_document,
     require,
 )
-from netkf.runs.files import new_directory, only_own, remove_own
+from netkf.runs.files import new_directory, only_own, own_names, remove_own
 from netkf.runs.provenance import machine, versions
 from netkf.scenario.plugins import module_files
 from netkf.scenario.scenario import Scenario
@@ -115,9 +115,7 @@ def clear_unfinished(
     """
     if not (directory / "manifest.json").exists():
         if _has_own_files(directory, scenario):
-            _check_scenario(directory, scenario)
-            _check_sources_elsewhere(directory, scenario)
-            remove_own(directory, scenario)
+            remove_unfinished(directory, scenario, own_names(scenario))
         return True
     found = read_manifest(directory)
     if found["replica"] != replica:
@@ -136,9 +134,18 @@ def clear_unfinished(
                 note(f"the run in {directory} is done again: its record {error}")
         else:
             return False
-    _check_sources_elsewhere(directory, scenario)
-    remove_own(directory, scenario)
+    remove_unfinished(directory, scenario, own_names(scenario))
     return True
+
+
+def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str]) -> None:
+    """Remove files of these names, which were left by a command that was stopped.
+
+    Raises ScenarioError if they are of another scenario, or the only copies of what this one reads.
+    """
+    _check_scenario(directory, scenario)
+    _check_sources_elsewhere(directory, scenario)
+    remove_own(directory, names)
 
 
 def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
@@ -161,7 +168,7 @@ def _has_own_files(directory: Path, scenario: Scenario) -> bool:
     """
     if not directory.is_dir() or not any(directory.iterdir()):
         return False
-    if not only_own(directory, scenario):
+    if not only_own(directory, own_names(scenario)):
         new_directory(directory, scenario.name)  # says that it is not empty
     return True
 

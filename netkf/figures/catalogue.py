@@ -15,6 +15,7 @@ from netkf.figures.stability import law_figure, stability_figure, sweep_figure
 from netkf.figures.style import FORMATS, Picture, look, message_figure, write
 from netkf.figures.subject import Subject, UnavailableError, subject_of
 from netkf.figures.traffic import age_figure, delivery_figure, links_figure
+from netkf.runs.files import make_directory
 
 FIGURES: Mapping[str, Callable[[Subject], Picture]] = {
     "overview": overview,
@@ -93,6 +94,6 @@ def plot_to_files(result: Any, names: tuple[str, ...], out: Path, kind: str) -> 
     figures = {name: drawing.draw(name) for name in wanted}
     paths = {name: out if single else out / f"{name}.{kind}" for name in wanted}
     for name, figure in figures.items():
-        paths[name].parent.mkdir(parents=True, exist_ok=True)
+        make_directory(paths[name].parent)
         write(figure, paths[name])
     return list(paths.values())

@@ -8,7 +8,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -163,13 +163,19 @@ OWN_FILES = (
 
 def own_names(scenario: Scenario) -> list[str]:
     """Return the names of all files that a run of this scenario may leave in its directory."""
+    return [*OWN_FILES, *copied_names(scenario)]
+
+
+def copied_names(scenario: Scenario) -> list[str]:
+    """Return the names of the modules and tables that :func:`write_scenario` copies."""
     modules = [file.name for file in module_files(scenario).values() if file is not None]
-    return [*OWN_FILES, *modules, *(source.name for source in source_files(scenario))]
+    return [*modules, *(source.name for source in source_files(scenario))]
 
 
-def only_own(directory: Path, scenario: Scenario) -> bool:
-    """Return True if a directory holds nothing but what a run of this scenario leaves there."""
-    names = own_names(scenario)
+def only_own(directory: Path, names: Collection[str]) -> bool:
+    """Return True if a directory holds nothing but files of these names, their unfinished versions
+    and blocks of an ensemble.
+    """
     known = {*names, *(f"{name}.part" for name in names)}
     folders = {str(folder) for name in names for folder in Path(name).parents} | {BLOCKS}
     found = (path.relative_to(directory).as_posix() for path in directory.rglob("*"))
@@ -182,9 +188,9 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def remove_own(directory: Path, scenario: Scenario) -> None:
-    """Remove the files that a run of this scenario left in its directory, and no others."""
-    for name in own_names(scenario):
+def remove_own(directory: Path, names: Iterable[str]) -> None:
+    """Remove files of these names and their unfinished versions from a directory, and no others."""
+    for name in names:
         for file in (directory / name, directory / f"{name}.part"):
             file.unlink(missing_ok=True)
         for folder in Path(name).parents[:-1]:

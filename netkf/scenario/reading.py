@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import as_path
 from netkf.scenario.imports import Origin
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import MAX_DEPTH, build_scenario, explain_left_over, with_changes
@@ -36,7 +37,11 @@ def load(
 
     Raises ScenarioError with one line for the first mistake.
     """
-    path = Path(path)
+    path = as_path("path", path, "load takes the path of a scenario file")
+    given: object = changes or {}
+    if not isinstance(given, Mapping):
+        rule, remedy = "must be a table", 'give values by key: {"horizon": 10.0}'
+        raise ScenarioError("changes", rule, given, remedy)
     try:
         return from_table(with_changes(_parsed(path), changes or {}), path.parent, trust)
     except ScenarioError as error:

@@ -16,7 +16,7 @@ import pandas as pd
 import scipy.special
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import number
+from netkf.core.fields import as_path, number
 from netkf.core.printable import shorten
 from netkf.core.shown import Shown
 from netkf.runs.documents import (
@@ -277,12 +277,12 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
 
 
 def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
-    if isinstance(directories, (str, Path)):
+    if isinstance(directories, (str, Path)) or not isinstance(directories, Sequence):
         remedy = "give all of them in one list: netkf.compare([one, other])"
-        raise ScenarioError("directories", "must be a list", str(directories), remedy)
+        raise ScenarioError("directories", "must be a list", directories, remedy)
     if not directories:
         raise ScenarioError("compare", "needs run directories", None, "name at least one")
-    return [read_directory(Path(directory)) for directory in directories]
+    return [read_directory(as_path("directories", directory)) for directory in directories]
 
 
 def _entry(

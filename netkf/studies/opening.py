@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import as_path
 from netkf.core.printable import shorten
 from netkf.core.shown import Shown
 from netkf.ensembles.stored import StoredEnsemble, read_ensemble
@@ -68,7 +69,7 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
 
     Raises ScenarioError for whatever is not as netkf writes it.
     """
-    folder = Path(directory)
+    folder = as_path("directory", directory, "name what netkf run or netkf sweep left")
     where = shorten(directory)
     try:
         if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():

@@ -17,6 +17,7 @@ from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import runs_to_directory
 from netkf.runs import provenance
 from netkf.runs.documents import write_sealed
+from netkf.runs.files import write_scenario
 from netkf.runs.parquet_files import TraceTables
 from tests.conftest import SCENARIOS
 
@@ -291,6 +292,29 @@ def test_a_single_run_that_was_changed_is_done_again(tmp_path, capsys):
         path.rename(path.with_name(f"{path.name}.part"))
     assert main([*line, "--resume"]) == 0
     assert files(tmp_path / "out") == before
+
+
+def test_a_check_removes_what_a_check_left_and_nothing_else(tmp_path, capsys):
+    short = ["--set", "horizon=1.0", "--no-plot"]
+    out = tmp_path / "run"
+    assert main(["run", RING, *short, "--out", str(out)]) == 0
+    before = files(out)
+    check = ["check", RING, *short, "--runs", "10", "--workers", "1", "--resume", "--out"]
+    assert main([*check, str(out)]) == 2
+    assert "has no verdict that can be read" in capsys.readouterr().err
+    assert files(out) == before
+    # Killed before its verdict was there.
+    left = tmp_path / "check"
+    left.mkdir()
+    write_scenario(left, netkf.load(RING, {"horizon": 1.0, "probe": [0.0]}))
+    (left / "results.npz.part").write_bytes(b"half")
+    capsys.readouterr()
+    assert main([*check, str(left), "--set", "seed=7"]) == 2
+    assert "holds a run of another scenario" in capsys.readouterr().err
+    assert sorted(map(str, files(left))) == ["results.npz.part", "scenario.toml"]
+    assert main([*check, str(left)]) < 2
+    assert (left / "verdict.json").exists()
+    assert not (left / "results.npz.part").exists()
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])

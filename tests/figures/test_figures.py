@@ -178,7 +178,9 @@ def test_the_command_writes_files(results, tmp_path, capsys):
     for arguments, words in (
         ([str(tmp_path)], "manifest.json is missing"),
         ([str(folder), "--figure", "eror"], 'did you mean "error"'),
+        ([str(folder), "--figure", ""], "--figure: must name figures"),
         ([str(folder), "--out", str(tmp_path / "one.png")], "one file for several figures"),
+        ([str(folder), "--out", str(folder / "manifest.json")], "cannot be made (File exists)"),
     ):
         assert main(["plot", *arguments]) == 2
         line = capsys.readouterr().err

@@ -895,6 +895,9 @@ USAGE = [
     ("seed-nothing", ["run", "{file}", "--seed"], "--seed"),
     ("engine", ["run", "{file}", "--engine", "foo"], "invalid choice: 'foo'"),
     ("trace", ["run", "{file}", "--trace", "some"], "invalid choice: 'some'"),
+    ("near", ["reprot", "x"], 'did you mean "report"?'),
+    ("engine-near", ["run", "{file}", "--engine", "compile"], 'did you mean "compiled"?'),
+    ("why-half", ["why", "x", "--node", "3"], "takes --node and --at together"),
     ("set-nothing", ["run", "{file}", "--set"], "--set"),
     ("theory-out", ["theory", "{file}", "--out", "x"], "--out"),
 ]

@@ -3,9 +3,11 @@
     python -m tests.stress.soak --minutes 60 [--seed 1]
 
 Scenarios of ``scenarios/`` with short horizons and random settings go through every command, now
-and then with malformed ones between them. It fails for a traceback, a status other than 0, 1 or 2,
-a folder that holds something but results, or if the memory of the process grows by more than GROWTH
-after the first third of the time, in which caches fill and kernels are compiled or loaded.
+and then with malformed ones between them; directories that are kept are drawn, explained, compared
+and reported on. It fails for a traceback, a status other than 0, 1 or 2, a folder that holds
+something but results, or if the memory of the process grows by more than GROWTH after the first
+third of the time, and at least WARM_UP commands, in which kernels are compiled or loaded and caches
+fill: 10 minutes are the least that says something.
 """
 
 from __future__ import annotations
@@ -26,8 +28,14 @@ GROWTH = 64 << 20
 """Bytes by which the memory may grow after the first third."""
 SCENARIOS = ("poisson_ring", "blind_unstable", "delayed_links", "gossip_ring", "push_sum_planar")
 SHORT = {"gossip_ring": 30.0, "push_sum_planar": 30.0}
+WARM_UP = 60
+"""Commands after which every kernel has been needed once."""
+KEPT = ("one", "many")
+"""Directories that stay, for the commands that read them."""
+FIGURES = ("overview", "error", "quantiles", "network", "nees", "nis", "whiteness", "age", "links")
 MALFORMED = 0.2
-"""Share of commands that are malformed."""
+READING = 0.3
+"""Shares of commands that are malformed, and of the others that read directories."""
 
 
 def draw_command(draw: random.Random) -> list[str]:
@@ -46,9 +54,35 @@ def draw_command(draw: random.Random) -> list[str]:
         "check": [*seed, "--runs", "10", *alone],
         "consistency": [*seed, "--runs", "10", *alone],
         "sweep": ["--vary", "seed=1:3:3", *alone, "--no-plot", "--out", "out"],
+        "compare-filters": ["--filters", "hybrid,local", "--runs", "4", *alone],
     }
+    if name in SHORT:  # in slots other filters can be compared
+        commands["compare-filters"][1] = "gossip,local"
     command = draw.choice(list(commands))
     return [command.strip(), *short, *commands[command]]
+
+
+def draw_reading(draw: random.Random) -> list[str]:
+    """Return a command line that reads directories which are kept."""
+    directory = draw.choice(KEPT)
+    return draw.choice(
+        [
+            ["plot", directory, "--figure", draw.choice(FIGURES), "--out", "out"],
+            ["report", directory, "--out", "out/page.html"],
+            ["why", directory, "--replays", "5"],
+            ["compare", *KEPT],
+            ["schema"],
+            ["new", "lab", "--folder", "out"],
+        ]
+    )
+
+
+def keep_directories() -> None:
+    """Make the directories of KEPT in the current folder."""
+    short = ["poisson_ring.toml", "--set", "horizon=4.0", "--no-plot", "--trace", "full"]
+    for name, more in zip(KEPT, ([], ["--runs", "5", "--workers", "1"]), strict=True):
+        status, _, err = malformed.attempt(["run", *short, *more, "--out", name])
+        assert status == 0, err
 
 
 def resident() -> int:
@@ -66,6 +100,9 @@ def step(draw: random.Random, folder: Path) -> tuple[int, list[str], str | None]
         return ended.status, case.arguments, malformed.complaint(ended, folder)
     shutil.rmtree(folder / "out", ignore_errors=True)
     words = draw_command(draw)
+    if draw.random() < READING:
+        (folder / "out").mkdir()
+        words = draw_reading(draw)
     status, _, err = malformed.attempt(words)
     wrong = "traceback" if "Traceback" in err else None
     if status not in (0, 1, 2) or (status == 2 and err.count("netkf: ") != 1):
@@ -88,9 +125,11 @@ def main() -> int:
         folder = Path(name)
         malformed.prepare(folder)
         os.chdir(folder)
+        keep_directories()
         while (spent := time.monotonic() - began) < seconds:
-            if settled is None and spent > seconds / 3.0:
+            if settled is None and spent > seconds / 3.0 and sum(statuses.values()) >= WARM_UP:
                 settled = resident()
+                print(f"memory {settled >> 20} MiB after {spent:.0f} s", flush=True)
             status, words, wrong = step(draw, folder)
             statuses[status] = statuses.get(status, 0) + 1
             if wrong is not None:

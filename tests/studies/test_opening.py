@@ -43,6 +43,13 @@ def assert_same_run(found, run):
     assert repr(found) == repr(run)
 
 
+@pytest.mark.parametrize("function", [netkf.open, netkf.load, lambda x: netkf.why(x, 0, 1.0)])
+@pytest.mark.parametrize("value", [3, None, b"x", netkf.load(SCENARIOS / "poisson_ring.toml")])
+def test_what_is_no_path_is_refused(function, value):
+    with pytest.raises(netkf.ScenarioError, match="must be a path"):
+        function(value)
+
+
 @pytest.mark.parametrize(
     ("name", "changes"),
     [

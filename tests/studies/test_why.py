@@ -451,6 +451,19 @@ def test_a_directory_is_explained_as_the_run_in_memory_is(kept, capsys, tmp_path
     assert third.trace != expected.trace
 
 
+def test_the_worst_sample_is_explained_by_default(kept, capsys):
+    folder, scenario = kept
+    assert main(["why", str(folder / "one"), "--replays", "5", "--json"]) == 0
+    printed = capsys.readouterr()
+    found, run = json.loads(printed.out), netkf.simulate(scenario)
+    worst = run.nodes[int(run.sq_error[run.times > 0].mean(axis=0).argmax())]
+    assert found["node"] == worst
+    assert found["at"] in run.times[1:].tolist()
+    assert printed.err.startswith(f"note: node {worst} at {found['at']:.10g} s: the largest error")
+    assert main(["why", str(folder / "none")]) == 2
+    assert "has no samples of a run" in capsys.readouterr().err
+
+
 def test_a_directory_that_cannot_be_explained_is_refused_in_one_line(kept, capsys):
     folder, _ = kept
     refused = {

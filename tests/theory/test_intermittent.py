@@ -65,6 +65,11 @@ def test_two_decoupled_plants_are_as_critical_as_the_worse():
     assert both[1] == pytest.approx(max(upper for _, upper in alone), abs=1e-9)
 
 
+def test_critical_probability_of_a_system_as_large_as_numbers_go():
+    lower, upper = theory.critical_probability([[2.0**0.5 * 1e20]], [[1e20]])
+    assert lower == upper == 1.0
+
+
 def test_lower_bound_is_not_sufficient():
     lower, upper = theory.critical_probability(np.diag([2.0**0.5, -(2.0**0.5)]), [[1.0, 1.0]])
     assert lower == pytest.approx(0.5, abs=1e-12)

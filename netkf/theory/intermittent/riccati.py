@@ -289,7 +289,9 @@ class _GainSearch:
     def _resolvent(
         self, probabilities: Sequence[float], gains: list[FloatArray], s: float
     ) -> FloatArray | None:
-        """Return ``(s - L)^-1 I`` (n, n), or None if it is not positive definite."""
+        """Return ``(s - L)^-1 I`` (n, n) times a power of two that brings its trace to about 1, or
+        None if it is not positive definite.
+        """
         n, operator = len(self._F), self._operator(probabilities, gains)
         identity = np.eye(n).reshape(-1)[self._pick]
         try:
@@ -298,8 +300,10 @@ class _GainSearch:
         except np.linalg.LinAlgError:
             return None
         matrix = symmetric(X.reshape(n, n))
-        positive = np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] > 0.0
-        return matrix if positive else None
+        if not np.isfinite(matrix).all() or not np.linalg.eigvalsh(matrix)[0] > 0.0:
+            return None
+        # Of gains that make L = 0 it is 1e300, whose products with H would overflow.
+        return np.asarray(np.ldexp(matrix, -np.frexp(np.trace(matrix))[1]))
 
     def _improve(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
         """Return the gains ``K = -F X H' (H X H')^-1``, which minimise L(X)."""
