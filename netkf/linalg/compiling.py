@@ -19,7 +19,17 @@ from typing import Any, TypeVar, cast, overload
 from netkf.linalg.linking import linked_once
 from netkf.linalg.shortcuts import kernel_compiler, without_collection
 
-ROOMS = ("linalg", "rng", "core", "algorithms", "plants", "trace", "engines", "ensembles")
+ROOMS = (
+    "linalg",
+    "rng",
+    "core",
+    "algorithms",
+    "plants",
+    "trace",
+    "engines",
+    "ensembles",
+    "theory/numerics",
+)
 """Whose code and numbers compiled functions may hold."""
 
 MOST_STATES = 4

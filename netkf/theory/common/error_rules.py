@@ -103,7 +103,7 @@ class EstimateExchangeRule(ErrorRule):
     @abstractmethod
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
-    ) -> tuple[FloatArray, list[FloatArray]]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the new root (n, n) and the factor (n, n) of each error.
 
         ``roots``: the node's own first, then those of the messages, which have ``weights``.

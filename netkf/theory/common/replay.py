@@ -59,10 +59,10 @@ def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
     Raises TheoryError for a filter whose equations are not known here.
     """
     errors, P = _stacked_errors(scenario), []
-    for k, _ in enumerate(_replay(scenario, run, errors)):
-        errors.keep(k)
+    for _ in _replay(scenario, run, errors):
+        errors.keep()
         P.append(errors.covariances())
-    return ErrorLaw(*errors.law(len(P)), np.array(P))
+    return ErrorLaw(*errors.law(), np.array(P))
 
 
 def _stacked_errors(scenario: Scenario) -> StackedErrors:

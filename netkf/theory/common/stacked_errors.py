@@ -17,19 +17,30 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import increment_observations
-from netkf.theory.numerics.prediction import (
-    ErrorFlow,
-    Prediction,
-    Predictor,
-    propagate_state,
-    triangular_root,
-)
+from netkf.theory.numerics.prediction import ErrorFlow, Prediction, Predictor, propagate_state
+from netkf.theory.numerics.roots import predict_estimates, update_estimate
 from netkf.theory.numerics.stack import GaussianStack
-from netkf.theory.numerics.updates import Observation, update_covariance_root
+from netkf.theory.numerics.updates import Observation, plain
 
 STATE, OFFSET = "state", "offset"
 Term = tuple[Hashable, FloatArray]
 """An estimate and the matrix (n, n) by which its error is multiplied."""
+
+
+class Roots:
+    """Square roots (n, n) of P of estimates, by name; each is a copy, and is set as a whole."""
+
+    def __init__(self, stack: GaussianStack, owner: Mapping[Hashable, int | None]) -> None:
+        self._stack, self._owner = stack, owner
+
+    def __contains__(self, name: Hashable) -> bool:
+        return name in self._owner
+
+    def __getitem__(self, name: Hashable) -> FloatArray:
+        return self._stack.matrices[self._stack.place(name)].copy()
+
+    def __setitem__(self, name: Hashable, root: FloatArray) -> None:
+        self._stack.matrices[self._stack.place(name)] = root
 
 
 class StackedErrors:
@@ -44,8 +55,9 @@ class StackedErrors:
     def __init__(self, scenario: Scenario, hosts: int) -> None:
         self.n, self.hosts = scenario.plant.n, hosts
         self.stack = GaussianStack(self.n)
-        self.roots: dict[Hashable, FloatArray] = {}
         self.owner: dict[Hashable, int | None] = {}
+        self.roots = Roots(self.stack, self.owner)
+        self._kept: list[FloatArray] = []
         first = square_root(np.asarray(scenario.plant.start_cov))
         # Estimates start at known means, so that the random part of their errors is the same.
         columns = self.stack.inputs(first.shape[1])
@@ -56,8 +68,8 @@ class StackedErrors:
         for host, node in enumerate(scenario.nodes[:hosts]):
             self.stack.put(host, np.zeros((self.n, 0)))
             self.stack.add(host, columns, first)
-            self.roots[host] = square_root(np.asarray(scenario.start(node)[1]))
             self.owner[host] = host
+            self.roots[host] = square_root(np.asarray(scenario.start(node)[1]))
         self._add_offsets(scenario)
 
     def _add_offsets(self, scenario: Scenario) -> None:
@@ -80,20 +92,22 @@ class StackedErrors:
         for name, offset in offsets.items():
             self.stack.add(name, one, offset[:, None])
 
-    def keep(self, sample: int) -> None:
-        """Keep the errors of all hosts as they are now as number ``sample``, for ``law``."""
-        for host in range(self.hosts):
-            self.stack.put(("sample", sample, host), self.stack.form(host))
+    def keep(self) -> None:
+        """Keep the errors of all hosts as they are now, for ``law``."""
+        self._kept.append(self.stack.settle(range(self.hosts)))
 
-    def law(self, samples: int) -> tuple[FloatArray, FloatArray]:
+    def law(self) -> tuple[FloatArray, FloatArray]:
         """Return the mean (K M n,) and the joint covariance of the errors of the hosts that were
-        kept in K samples.
+        kept K times.
         """
-        names = [("sample", k, host) for k in range(samples) for host in range(self.hosts)]
-        return self._mean_and_covariance(names)
+        rows, width = self.hosts * self.n, self.stack.used
+        forms = np.zeros((len(self._kept), rows, width))
+        for k, kept in enumerate(self._kept):
+            forms[k, :, : kept.shape[2]] = kept.reshape(rows, -1)
+        return self._mean_and_covariance(forms.reshape(-1, width))
 
-    def _mean_and_covariance(self, names: Sequence[Hashable]) -> tuple[FloatArray, FloatArray]:
-        forms = self.stack.forms(names).reshape(len(names) * self.n, -1)
+    def _mean_and_covariance(self, forms: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the mean (K,) and the covariance (K, K) of errors with the forms (K, inputs)."""
         if OFFSET not in self.stack:
             return np.zeros(len(forms)), np.asarray(forms @ forms.T)
         one = self.stack.form(OFFSET)[0]
@@ -104,29 +118,29 @@ class StackedErrors:
 
     def covariance(self) -> FloatArray:
         """Return the joint covariance (M n, M n) of the errors of the hosts."""
-        return self._mean_and_covariance(range(self.hosts))[1]
+        forms = self.stack.forms(range(self.hosts))
+        return self._mean_and_covariance(forms.reshape(self.hosts * self.n, -1))[1]
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the hosts."""
         # P = S S'
-        S = np.stack([self.roots[host] for host in range(self.hosts)])
+        S = self.stack.matrices[self.stack.places(range(self.hosts))]
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
     def copy(self, name: Hashable, new: Hashable, owner: int | None) -> None:
         """Copy estimate ``name`` to ``new``, which from now on has the given owner."""
-        self.stack.put(new, self.stack.form(name))
-        self.roots[new], self.owner[new] = self.roots[name], owner
+        self.stack.copy(name, new)
+        self.owner[new] = owner
 
     def drop(self, names: Sequence[Hashable]) -> None:
         """Remove estimates."""
         self.stack.drop(names)
         for name in names:
-            del self.roots[name], self.owner[name]
+            del self.owner[name]
 
     def replace(self, name: Hashable, other: Hashable) -> None:
         """Move estimate ``name`` to ``other``, which keeps its owner."""
         self.stack.rename(name, other)
-        self.roots[other] = self.roots.pop(name)
         del self.owner[name]
 
     def reading_noises(self, observations: Mapping[int, Observation]) -> dict[int, slice]:
@@ -146,9 +160,9 @@ class StackedErrors:
         """Update an estimate; the noise is ``observation.root`` times the inputs in ``columns``."""
         if not len(observation.H):
             return
-        closed, K, root = update_covariance_root(self.roots[name], observation)
-        self.multiply(name, closed, root)
-        self.stack.add(name, columns, -K @ observation.root)  # e+ = (I - K H) e - K v
+        stack, (H, R, root) = self.stack, map(plain, observation)
+        place, first = stack.place(name), columns.start
+        update_estimate(stack.table, stack.matrices, place, stack.used, H, R, root, first)
 
     def multiply(self, name: Hashable, matrix: FloatArray, root: FloatArray) -> None:
         """Multiply an error by a matrix (n, n) and set the root of its P."""
@@ -158,32 +172,29 @@ class StackedErrors:
     def combine(self, changes: Mapping[Hashable, tuple[FloatArray, Sequence[Term]]]) -> None:
         """Set roots and errors ``sum W e`` of several estimates from their values before."""
         forms = {
-            name: np.asarray(sum(W @ self.stack.form(source) for source, W in terms))
+            name: self.stack.mix([source for source, _ in terms], np.array([W for _, W in terms]))
             for name, (_, terms) in changes.items()
         }
         self.stack.put_all(forms)
-        self.roots.update({name: root for name, (root, _) in changes.items()})
+        for name, (root, _) in changes.items():
+            self.roots[name] = root
 
     def predict(self, step: Prediction) -> slice:
         """Predict all estimates, and the state; return the columns of the plant's inputs."""
-        columns = self.stack.inputs(step.error_noise.shape[1])
-        names = list(self.roots)
+        stack, noise = self.stack, step.error_noise
+        columns = stack.inputs(noise.shape[1])
+        places = stack.places(self.owner)
+        x = stack.form(STATE) if self.follows else None
         # e+ = F e + D x + w for all estimates, and x+ = F x + w for the state
-        moved = step.error @ self.stack.forms(names)
-        if self.follows:
-            x = self.stack.form(STATE)
-            moved += step.follow @ x
-            self.stack.put(STATE, step.state @ x)
-            self.stack.add(STATE, columns, step.state_noise)
-        moved[:, :, columns] += step.error_noise
-        self.stack.put_all(dict(zip(names, moved, strict=True)))
-        # Copies share the array of their root, which is then predicted once.
-        known: dict[int, FloatArray] = {}
-        for name in names:
-            S = self.roots[name]
-            if id(S) not in known:
-                known[id(S)] = _predict_root(S, step)
-        self.roots = {name: known[id(S)] for name, S in self.roots.items()}
+        predict_estimates(
+            *(stack.table, stack.matrices, places, stack.used),
+            *(plain(part) for part in (step.error, noise, step.root)),
+            columns.start,
+        )
+        if x is not None:
+            stack.table[places, :, : stack.used] += step.follow @ x
+            stack.put(STATE, step.state @ x)
+            stack.add(STATE, columns, step.state_noise)
         return columns
 
 
@@ -192,11 +203,6 @@ def _errors_follow_state(scenario: Scenario) -> bool:
     if scenario.slotted:
         return not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F)
     return not np.array_equal(scenario.belief[0], scenario.truth.A)
-
-
-def _predict_root(S: FloatArray, step: Prediction) -> FloatArray:
-    # F P F' + Q = [F S, Q^1/2] [F S, Q^1/2]'
-    return triangular_root(np.concatenate([step.error @ S, step.root], axis=1))
 
 
 class IncrementFlows(NamedTuple):
@@ -258,28 +264,46 @@ class ErrorPropagator:
         """Propagate all estimates, and the state, over ``gap`` seconds, at most one unit."""
         flows, errors = self._flows, self._errors
         assert flows is not None
+        groups = self._estimates_by_flow()
         # The plant's noise at the 8 nodes of the quadrature enters all errors; the noises of the
-        # increments take n inputs for each estimate.
+        # increments take n inputs for each estimate that uses some.
         n, common = errors.n, 8 * flows.plant[1].shape[1]
-        columns = errors.stack.inputs(common + n * len(errors.roots))
-        shared = slice(columns.start, columns.start + common)
-        x = errors.stack.form(STATE) if errors.follows else None
-        place = shared.stop
-        for flow, names in self._estimates_by_flow():
-            moved = flow.transition(np.stack([errors.roots[name] for name in names]), gap)
-            forms = moved.transition @ errors.stack.forms(names)
-            if x is not None:
-                forms += moved.follow @ x
-            forms[:, :, shared] += moved.response
-            for k, name in enumerate(names):
+        own = [n * len(names) if flow.observes else 0 for flow, names in groups]
+        columns = errors.stack.inputs(common + sum(own))
+        first = columns.start + common
+        if not errors.follows:
+            for (flow, names), count in zip(groups, own, strict=True):
+                flow.move(errors.stack, names, gap, (columns.start, first))
+                first += count
+            return
+        x = errors.stack.form(STATE)
+        shared = slice(columns.start, first)
+        for (flow, names), count in zip(groups, own, strict=True):
+            self._step_with_state(flow, names, x, gap, (shared, first))
+            first += count
+        F, response = propagate_state(flows.plant, gap)
+        errors.stack.put(STATE, F @ x)
+        errors.stack.add(STATE, shared, response)
+
+    def _step_with_state(
+        self,
+        flow: ErrorFlow,
+        names: list[Hashable],
+        x: FloatArray,
+        gap: float,
+        columns: tuple[slice, int],
+    ) -> None:
+        """Propagate estimates with one flow whose errors depend on the state's form x."""
+        errors, (shared, place) = self._errors, columns
+        moved = flow.transition(np.stack([errors.roots[name] for name in names]), gap)
+        forms = moved.transition @ errors.stack.forms(names) + moved.follow @ x
+        forms[:, :, shared] += moved.response
+        for k, name in enumerate(names):
+            if flow.observes:
                 forms[k, :, place : place + moved.own.shape[2]] += moved.own[k]
-                place += n
-                errors.roots[name] = moved.root[k]
-            errors.stack.put_all(dict(zip(names, forms, strict=True)))
-        if x is not None:
-            F, response = propagate_state(flows.plant, gap)
-            errors.stack.put(STATE, F @ x)
-            errors.stack.add(STATE, shared, response)
+                place += errors.n
+            errors.roots[name] = moved.root[k]
+        errors.stack.put_all(dict(zip(names, forms, strict=True)))
 
 
 def integration_steps(scenario: Scenario) -> int:

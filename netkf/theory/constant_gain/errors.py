@@ -37,7 +37,7 @@ class ConstantGainRule(EstimateExchangeRule):
 
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
-    ) -> tuple[FloatArray, list[FloatArray]]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Give the node's own estimate the weight that the messages leave."""
         return average_covariances([1.0 - sum(weights), *weights], roots)
 

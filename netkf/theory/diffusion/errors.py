@@ -18,7 +18,7 @@ class DiffusionRule(EstimateExchangeRule):
 
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
-    ) -> tuple[FloatArray, list[FloatArray]]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Share the weight of lost messages as the filter does, so that weights sum to 1."""
         algorithm = self.scenario.filter.algorithm
         assert isinstance(algorithm, DiffusionFilter)

@@ -18,10 +18,10 @@ class SwapRule(EstimateExchangeRule):
 
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
-    ) -> tuple[FloatArray, list[FloatArray]]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Multiply the last error by the identity and all others by zero."""
         n, others = self.errors.n, len(roots) - 1
-        return roots[-1], [np.zeros((n, n))] * others + [np.eye(n)]
+        return roots[-1], np.concatenate([np.zeros((others, n, n)), np.eye(n)[None]])
 
 
 def rule(

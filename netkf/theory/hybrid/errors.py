@@ -17,7 +17,7 @@ class ResetRule(EstimateExchangeRule):
 
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
-    ) -> tuple[FloatArray, list[FloatArray]]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Give the node's own estimate the weight that the messages leave."""
         all_weights = [1.0 - sum(weights), *weights]
         if self.scenario.hosted.combination == "intersection":

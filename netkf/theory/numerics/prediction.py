@@ -14,11 +14,14 @@ Z U``, it is ``I - (S Z_1)(Z_2' Gamma)``.
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.theory.numerics.roots import flow_estimates
+from netkf.theory.numerics.stack import GaussianStack
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
@@ -53,12 +56,12 @@ class ShortExponential:
         terms = [np.eye(len(M))]
         for k in range(1, TERMS):
             terms.append(terms[-1] @ (M * self.unit) / k)
-        self._terms = np.array(terms)
+        self.terms = np.array(terms)
 
     def __call__(self, times: FloatArray) -> FloatArray:
         """Return the exponentials (K, d, d) at K times, each at most ``unit``."""
         powers = (np.asarray(times)[:, None] / self.unit) ** np.arange(TERMS)
-        return np.asarray(np.tensordot(powers, self._terms, 1))
+        return np.asarray(np.tensordot(powers, self.terms, 1))
 
 
 def triangular_root(parts: FloatArray) -> FloatArray:
@@ -167,11 +170,14 @@ class ErrorFlow:
         self._whitened = np.linalg.solve(self._root_R, H)
         self._weight = np.linalg.solve(R, H).T
         self._noise = self._weight @ noise
+        self.observes = len(H) > 0
         # The Hamiltonian of dP = A P + P A' + Q - P G P, scaled to balance its off-diagonal blocks.
         G, Q = self._whitened.T @ self._whitened, B @ B.T
         self._scale = _balancing_scale(A, Q, G)
         M = np.block([[-A.T, G * self._scale], [Q / self._scale, A]])
         self._exp = ShortExponential(M)
+        parts = (self._whitened, self._weight @ self._root_R, self._noise, B, plant[1])
+        self._tables = tuple(np.array(part, order="C") for part in parts)
         self._difference = plant[0] - A
         self._state = ShortExponential(plant[0]) if self._difference.any() else None
         self.unit = self._exp.unit
@@ -209,6 +215,18 @@ class ErrorFlow:
         # P at the end: the start through the closed loop, and the noise on the way.
         root = self._root(F, F @ SZ, T11[:-1], T21[:-1], at)
         return FlowTransition(FJ, follow, _side_by_side(at * response), own, root)
+
+    def move(
+        self, stack: GaussianStack, names: Sequence[Hashable], gap: float, columns: tuple[int, int]
+    ) -> None:
+        """Move errors, which do not depend on the state, and the roots of P over ``gap`` seconds.
+
+        ``columns``: the first of the plant's 8 m inputs, and the first of n inputs of each error.
+        """
+        flow_estimates(
+            *(stack.table, stack.matrices, stack.places(names), stack.used, columns),
+            *(self._tables, (self._exp.terms, self._exp.unit, self._scale), gap, (NODES, WEIGHTS)),
+        )
 
     def _update_gramian(
         self, roots: FloatArray, pieces: FloatArray

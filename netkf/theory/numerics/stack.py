@@ -3,7 +3,8 @@
 With ``T`` (rows, inputs) the matrix of the stacked forms, the joint covariance is ``T T'``: it
 stays positive semidefinite, and a small error keeps its digits where it is the difference of large
 ones. T has a column for each input that was drawn; once there are many, an orthogonal matrix
-reduces them to as many as there are rows.
+reduces them to as many as there are rows. Columns of forms that somebody keeps are settled: they
+are never rotated again.
 """
 
 from __future__ import annotations
@@ -12,20 +13,28 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.theory.numerics.roots import mixed_form
 
 SPARE_INPUTS = 192  # columns kept beyond the number of rows between two reductions
 
 
 class GaussianStack:
-    """Named Gaussian vectors of n entries; a name is any hashable value."""
+    """Named Gaussian vectors of n entries; a name is any hashable value.
+
+    table    : (places, n, width), the forms; kernels work on it
+    matrices : (places, n, n), a matrix that belongs to each vector, such as a root of P
+    used     : number of columns that count
+    """
 
     def __init__(self, n: int) -> None:
         self._n = n
         self._place: dict[Hashable, int] = {}
         self._free: list[int] = []
-        self._used = 0
-        self._forms: FloatArray = np.zeros((0, n, SPARE_INPUTS))
+        self._settled = 0
+        self.used = 0
+        self.table: FloatArray = np.zeros((0, n, SPARE_INPUTS))
+        self.matrices: FloatArray = np.zeros((0, n, n))
 
     def __contains__(self, name: Hashable) -> bool:
         return name in self._place
@@ -35,49 +44,72 @@ class GaussianStack:
         """Names of the vectors, in the order in which they were added."""
         return tuple(self._place)
 
+    def place(self, name: Hashable) -> int:
+        """Return the place of a vector in the tables."""
+        return self._place[name]
+
+    def places(self, names: Iterable[Hashable]) -> IntArray:
+        """Return the places (K,) of K vectors."""
+        return np.array([self._place[name] for name in names], dtype=np.int64)
+
     def inputs(self, count: int) -> slice:
         """Add ``count`` inputs, independent of all before, and return their columns.
 
         The columns are valid until the next call.
         """
-        if self._used + count > self._forms.shape[2]:
-            self._reduce(count)
-        columns = slice(self._used, self._used + count)
-        self._used += count
+        if self.used + count > self.table.shape[2]:
+            self._reduce(self._place, count)
+        columns = slice(self.used, self.used + count)
+        self.used += count
         return columns
 
-    def _reduce(self, count: int) -> None:
-        """Rotate the inputs so that few are left, and make space for ``count`` more."""
-        # Only T T' matters, so that T may be multiplied by any orthogonal matrix from the right.
-        rows = sorted(self._place.values())
-        stacked = self._forms[rows, :, : self._used].reshape(len(rows) * self._n, self._used)
-        if stacked.shape[1] > stacked.shape[0]:
-            # T' = Q R, so T T' = R' R: R' replaces T and has no more columns than rows.
-            stacked = np.asarray(np.linalg.qr(stacked.T, mode="r")).T
-        self._used = stacked.shape[1]
-        width = max(
-            self._used + count + SPARE_INPUTS, len(self._forms) * self._n + count + SPARE_INPUTS
-        )
-        forms = np.zeros((len(self._forms), self._n, width))
-        forms[rows, :, : self._used] = stacked.reshape(len(rows), self._n, -1)
-        self._forms = forms
+    def settle(self, names: Sequence[Hashable]) -> FloatArray:
+        """Return the forms (K, n, inputs) of K vectors, which stay valid: later forms have these
+        inputs in the same columns, and the vectors do not depend on any others.
+        """
+        first = set(names)
+        others = [name for name in self._place if name not in first]
+        self._reduce([*names, *others], 0)
+        # Below a triangle of zeros, the first rows end within as many columns.
+        self._settled = min(self.used, self._settled + len(names) * self._n)
+        return self.table[self.places(names), :, : self._settled]
+
+    def _reduce(self, names: Iterable[Hashable], count: int) -> None:
+        """Rotate the inputs that are not settled so that few are left, the first ones for the first
+        names, and make space for ``count`` more.
+        """
+        rows = self.places(names)
+        stacked = self.table[rows, :, self._settled : self.used].reshape(len(rows) * self._n, -1)
+        # Only T T' matters, so that T may be multiplied by any orthogonal matrix from the right:
+        # T' = Q R, so T T' = R' R, and R' replaces T and has no more columns than rows.
+        stacked = np.asarray(np.linalg.qr(stacked.T, mode="r")).T
+        settled, used = self._settled, self._settled + stacked.shape[1]
+        width = settled + len(self.table) * self._n + count + SPARE_INPUTS
+        table = np.zeros((len(self.table), self._n, max(width, used + count + SPARE_INPUTS)))
+        table[rows, :, :settled] = self.table[rows, :, :settled]
+        table[rows, :, settled:used] = stacked.reshape(len(rows), self._n, -1)
+        self.table, self.used = table, used
 
     def form(self, name: Hashable) -> FloatArray:
         """Return a copy (n, inputs) of the form of one vector."""
-        return self._forms[self._place[name], :, : self._used].copy()
+        return self.table[self._place[name], :, : self.used].copy()
 
     def forms(self, names: Sequence[Hashable]) -> FloatArray:
         """Return a copy (K, n, inputs) of the forms of K vectors."""
-        return self._forms[[self._place[name] for name in names], :, : self._used]
+        return self.table[[self._place[name] for name in names], :, : self.used]
 
     def put(self, name: Hashable, form: FloatArray) -> None:
         """Add or overwrite a vector; inputs newer than ``form`` (n, inputs) get zero columns."""
+        place = self._place_for(name)
+        self.table[place, :, : form.shape[1]] = form
+        # The place may hold columns of an earlier vector.
+        self.table[place, :, form.shape[1] : self.used] = 0.0
+
+    def _place_for(self, name: Hashable) -> int:
         place = self._place.get(name)
         if place is None:
             place = self._place[name] = self._free.pop() if self._free else self._grow()
-        self._forms[place, :, : form.shape[1]] = form
-        # The place may hold columns of an earlier vector.
-        self._forms[place, :, form.shape[1] :] = 0.0
+        return place
 
     def put_all(self, forms: Mapping[Hashable, FloatArray]) -> None:
         """Add or overwrite several vectors."""
@@ -86,20 +118,32 @@ class GaussianStack:
 
     def add(self, name: Hashable, columns: slice, matrix: FloatArray) -> None:
         """Add ``matrix`` (n, k) times the inputs in ``columns`` to a vector."""
-        self._forms[self._place[name], :, columns] += matrix
+        self.table[self._place[name], :, columns] += matrix
+
+    def mix(self, sources: Sequence[Hashable], factors: FloatArray) -> FloatArray:
+        """Return the form (n, inputs) of the sum of vectors times ``factors`` (K, n, n)."""
+        return mixed_form(self.table, self.places(sources), factors, self.used)
+
+    def copy(self, name: Hashable, new: Hashable) -> None:
+        """Copy a vector and its matrix to another name."""
+        target = self._place_for(new)
+        source = self._place[name]
+        self.table[target, :, : self.used] = self.table[source, :, : self.used]
+        self.matrices[target] = self.matrices[source]
 
     def drop(self, names: Iterable[Hashable]) -> None:
         """Remove vectors; their storage is reused."""
         for name in names:
             place = self._place.pop(name)
-            self._forms[place] = 0.0
+            # All columns: what is stored here next finds no rest in inputs that are newer.
+            self.table[place, :, : self.used] = 0.0
             self._free.append(place)
 
     def rename(self, name: Hashable, other: Hashable) -> None:
         """Store the vector ``name`` under the name ``other``, overwriting what was there."""
-        form = self.form(name)
-        self.drop([name])
-        self.put(other, form)
+        if other in self._place:
+            self.drop([other])
+        self._place[other] = self._place.pop(name)
 
     def covariance(self, names: Sequence[Hashable]) -> FloatArray:
         """Return the joint covariance (K n, K n) of K vectors."""
@@ -108,9 +152,11 @@ class GaussianStack:
 
     def _grow(self) -> int:
         """Double the storage and return a free place."""
-        count = len(self._forms)
-        larger = np.zeros((max(4, 2 * count), *self._forms.shape[1:]))
-        larger[:count] = self._forms
-        self._forms = larger
-        self._free = list(range(len(larger) - 1, count, -1))
+        count = len(self.table)
+        more = max(4, 2 * count) - count
+        self.table, self.matrices = (
+            np.concatenate([part, np.zeros((more, *part.shape[1:]))])
+            for part in (self.table, self.matrices)
+        )
+        self._free = list(range(count + more - 1, count, -1))
         return count

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -26,7 +25,8 @@ from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchan
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import HostObservations
 from netkf.theory.common.stacked_errors import StackedErrors
-from netkf.theory.numerics.updates import add_information_to_root
+from netkf.theory.numerics.roots import fade_totals
+from netkf.theory.numerics.updates import add_information_to_root, plain
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -91,9 +91,10 @@ class AveragingRule(ErrorRule):
             # z <- (I - L / delta) z with the Laplacian L of the links that are up in this step.
             laplacian = np.diag(received.sum(axis=1)) - received
             mixing = mixing - laplacian @ mixing / self._delta
-        forms = self.errors.stack.forms(hosts)
-        mixed = np.tensordot(mixing, forms, 1)
-        self.errors.stack.put_all(dict(zip(hosts, mixed, strict=True)))
+        stack = self.errors.stack
+        places = stack.places(hosts)
+        forms = stack.table[places, :, : stack.used].reshape(self._N, -1)
+        stack.table[places, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
 
     def _received(self, slot: int, phase: int, step: int) -> FloatArray:
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
@@ -118,13 +119,6 @@ class AveragingRule(ErrorRule):
             errors.stack.add(host, columns[host], -K @ one.root)
 
 
-class Total(NamedTuple):
-    """Weight and information matrix U (n, n) of a total; its error is a vector of the stack."""
-
-    weight: float
-    U: FloatArray
-
-
 class RunningTotalsRule(ErrorRule):
     """Rule under clocks.
 
@@ -142,17 +136,25 @@ class RunningTotalsRule(ErrorRule):
         self._A, self._rounds = plant.A, rounds
         self._rate = max(0.0, -float(np.linalg.eigvals(plant.A).real.min()))
         self._weights = [1.0] * errors.hosts
-        self._totals: dict[Hashable, Total] = {}
+        # The weight of each total; the stack has their information and errors.
+        self._totals: dict[Hashable, float] = {}
         self._number: dict[tuple[int, int], int] = {}
         self._receivers = [0] * errors.hosts
         for sender, _ in scenario.topology.directions:
             self._receivers[scenario.topology.index[sender]] += 1
         for host in range(errors.hosts):
-            self._put(("sent", host), Total(0.0, np.zeros((n, n))), np.zeros((n, 0)))
+            self._put(("sent", host), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
 
-    def _put(self, name: Hashable, total: Total, form: FloatArray) -> None:
-        self._totals[name] = total
-        self.errors.stack.put(name, form)
+    def _put(self, name: Hashable, weight: float, U: FloatArray, form: FloatArray) -> None:
+        """Set a total: its weight, its information U (n, n) and the form of its error."""
+        stack, self._totals[name] = self.errors.stack, weight
+        stack.put(name, form)
+        stack.matrices[stack.place(name)] = U
+
+    def _information(self, name: Hashable) -> FloatArray:
+        """Return a copy of the information U (n, n) of a total."""
+        stack = self.errors.stack
+        return stack.matrices[stack.place(name)].copy()
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Predict all totals by ``gap`` seconds; the plant's noise is in the inputs ``columns``."""
@@ -160,15 +162,12 @@ class RunningTotalsRule(ErrorRule):
             return
         # F^-1 with F = exp(A gap), and s = exp(-2 r gap), r the rate of the fastest decaying mode,
         # so that old totals never grow.
-        inverse = np.asarray(scipy.linalg.expm(-gap * self._A))
-        fading = math.exp(-2.0 * self._rate * gap)
-        for name, total in self._totals.items():
-            # U -> s F^-T U F^-1, and the error u - U x -> s F^-T (u - U x) - U w.
-            U = fading * (inverse.T @ total.U @ inverse)
-            self._totals[name] = Total(total.weight, U)
-            if U.any():
-                self.errors.stack.put(name, fading * inverse.T @ self.errors.stack.form(name))
-                self.errors.stack.add(name, columns, -U @ noise)
+        inverse = np.asarray(scipy.linalg.expm(-gap * self._A), order="C")
+        fading, stack = math.exp(-2.0 * self._rate * gap), self.errors.stack
+        fade_totals(
+            *(stack.table, stack.matrices, stack.places(self._totals), stack.used),
+            *(inverse, fading, plain(noise), columns.start),
+        )
 
     def sense(self, time: float, observations: HostObservations) -> None:
         """Update by samples, each N / w times, then add the shares of nodes that broadcast now."""
@@ -191,16 +190,17 @@ class RunningTotalsRule(ErrorRule):
         inverse = np.linalg.inv(self.errors.roots[host])
         U = (share * weight / self.errors.hosts) * (inverse.T @ inverse)
         before = self._totals[name]
-        sent = Total(before.weight + share * weight, before.U + U)
-        self._put(name, sent, stack.form(name) - U @ stack.form(host))
+        sent, form = before + share * weight, stack.form(name) - U @ stack.form(host)
+        self._put(name, sent, self._information(name) + U, form)
         # One share stays with the node, the others are on their way to its receivers.
-        self._weights[host] = weight - count * (sent.weight - before.weight)
+        self._weights[host] = weight - count * (sent - before)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Store the sender's total for each message, as it is when the message leaves."""
         for message in messages:
             name = ("sent", message.sender)
-            self._put(message, self._totals[name], self.errors.stack.form(name))
+            self.errors.stack.copy(name, message)
+            self._totals[message] = self._totals[name]
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Add to each receiver the growth of its senders' totals since the last that it got."""
@@ -221,12 +221,12 @@ class RunningTotalsRule(ErrorRule):
             if message.number <= self._number.get(link, -1):
                 continue
             self._number[link] = message.number
-            total, news = self._totals[message], errors.stack.form(message)
-            last = self._totals.get(heard, Total(0.0, np.zeros((n, n))))
-            before = errors.stack.form(heard) if heard in errors.stack else 0.0 * news
-            weight, U = weight + total.weight - last.weight, U + total.U - last.U
-            form = form + news - before
-            self._put(heard, total, news)
+            weight += self._totals[message] - self._totals.get(heard, 0.0)
+            U, form = U + self._information(message), form + errors.stack.form(message)
+            if heard in self._totals:
+                U, form = U - self._information(heard), form - errors.stack.form(heard)
+            errors.stack.copy(message, heard)
+            self._totals[heard] = self._totals[message]
         if not weight > 0.0:
             return
         after = self._weights[host] + weight

@@ -1,0 +1,515 @@
+"""Kernels for square roots of covariances, ``P = S S'``, and for the linear forms of errors.
+
+Errors are rows of ``forms`` (places, n, width): linear forms of independent standard normal inputs,
+of which the first ``used`` columns count. ``matrices`` (places, n, n) holds the root of P that
+belongs to each error. An update of one is an orthogonal triangularisation, so that no subtraction
+loses digits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.small import solve_inplace
+
+
+@kernel
+def triangularise(parts: FloatArray, n: int, columns: int) -> None:
+    """Write lower triangular S (n, n) with ``S S' = parts parts'`` over the first n columns of
+    ``parts`` (n, at least n), of which ``columns`` count; the others become rubbish.
+    """
+    # Householder reflections of columns, from the right: they leave parts parts' as it is.
+    for i in range(min(n, columns)):
+        square = 0.0
+        for c in range(i, columns):
+            square += parts[i, c] * parts[i, c]
+        size = math.sqrt(square)
+        if size == 0.0:
+            continue
+        # The sign for which the difference loses no digits.
+        diagonal = -size if parts[i, i] > 0.0 else size
+        head = parts[i, i] - diagonal
+        for r in range(i + 1, n):
+            dot = head * parts[r, i]
+            for c in range(i + 1, columns):
+                dot += parts[r, c] * parts[i, c]
+            dot /= size * abs(head)
+            parts[r, i] -= dot * head
+            for c in range(i + 1, columns):
+                parts[r, c] -= dot * parts[i, c]
+        parts[i, i] = diagonal
+        for c in range(i + 1, columns):
+            parts[i, c] = 0.0
+    for i in range(columns, n):
+        for c in range(columns, n):
+            parts[i, c] = 0.0
+
+
+@kernel
+def cholesky_into(L: FloatArray, matrix: FloatArray, n: int) -> None:
+    """Write the lower triangular root of a positive definite matrix over the first n rows and
+    columns of L.
+    """
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(total) if i == j else total / L[j, j]
+        for j in range(i + 1, n):
+            L[i, j] = 0.0
+
+
+@kernel
+def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> None:
+    """Write ``rows L^-T`` over ``rows`` (count, n), for lower triangular L (n, n)."""
+    for r in range(count):
+        for j in range(n):
+            total = rows[r, j]
+            for k in range(j):
+                total -= rows[r, k] * L[j, k]
+            rows[r, j] = total / L[j, j]
+
+
+@kernel
+def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: FloatArray) -> None:
+    """Write ``matrix form`` over a form (n, width); ``scratch`` is as large."""
+    n = matrix.shape[0]
+    for i in range(n):
+        for c in range(used):
+            scratch[i, c] = 0.0
+        for j in range(n):
+            factor = matrix[i, j]
+            if factor == 0.0:
+                continue
+            for c in range(used):
+                scratch[i, c] += factor * form[j, c]
+    for i in range(n):
+        for c in range(used):
+            form[i, c] = scratch[i, c]
+
+
+@kernel
+def add_columns(form: FloatArray, first: int, matrix: FloatArray, sign: float) -> None:
+    """Add ``sign matrix`` (n, k) to the columns of a form from ``first`` on."""
+    for i in range(matrix.shape[0]):
+        for k in range(matrix.shape[1]):
+            form[i, first + k] += sign * matrix[i, k]
+
+
+@kernel(allocates=True)
+def predict_estimates(
+    forms: FloatArray,
+    matrices: FloatArray,
+    places: IntArray,
+    used: int,
+    error: FloatArray,
+    noise: FloatArray,
+    root: FloatArray,
+    first: int,
+) -> None:
+    """Predict errors and roots: ``e+ = F e + noise w``, ``P+ = F P F' + root root'``.
+
+    ``error`` is F (n, n), ``noise`` (n, k) belongs to the inputs from column ``first`` on, ``root``
+    is (n, r).
+    """
+    n, r = error.shape[0], root.shape[1]
+    scratch, parts = np.empty((n, used)), np.empty((n, n + r))
+    for place in places:
+        multiply_form(forms[place], error, used, scratch)
+        add_columns(forms[place], first, noise, 1.0)
+        _multiply_into(parts, error, matrices[place])
+        for i in range(n):
+            for k in range(r):
+                parts[i, n + k] = root[i, k]
+        triangularise(parts, n, n + r)
+        _keep_root(matrices[place], parts)
+
+
+@kernel
+def _multiply_into(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """Write ``a b`` over the first columns of ``out``."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            total = 0.0
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+
+
+@kernel
+def _keep_root(root: FloatArray, parts: FloatArray) -> None:
+    n = root.shape[0]
+    for i in range(n):
+        for j in range(n):
+            root[i, j] = parts[i, j] if j <= i else 0.0
+
+
+@kernel(allocates=True)
+def update_root(
+    root: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``I - K H`` (n, n), the Kalman gain K (n, p) and the root (n, n) of P after a reading
+    ``y = H x + v``, R the covariance of v that the filter assumes.
+    """
+    p, n = H.shape
+    array = np.zeros((p + n, p + n))
+    # L = [[V^1/2, 0], [K V^1/2, P+^1/2]] of [[R^1/2, H S], [0, S]], with V = H P H' + R.
+    cholesky_into(array, R, p)
+    _multiply_into(array[:, p:], H, root)
+    for i in range(n):
+        for j in range(n):
+            array[p + i, p + j] = root[i, j]
+    triangularise(array, p + n, p + n)
+    K, after, closed = np.empty((n, p)), np.zeros((n, n)), np.zeros((n, n))
+    for i in range(n):
+        for j in range(p - 1, -1, -1):
+            total = array[p + i, j]
+            for k in range(j + 1, p):
+                total -= K[i, k] * array[k, j]
+            K[i, j] = total / array[j, j]
+        for j in range(i + 1):
+            after[i, j] = array[p + i, p + j]
+    for i in range(n):
+        closed[i, i] = 1.0
+        for j in range(n):
+            for k in range(p):
+                closed[i, j] -= K[i, k] * H[k, j]
+    return closed, K, after
+
+
+@kernel(allocates=True)
+def update_estimate(
+    forms: FloatArray,
+    matrices: FloatArray,
+    place: int,
+    used: int,
+    H: FloatArray,
+    R: FloatArray,
+    noise: FloatArray,
+    first: int,
+) -> None:
+    """Update an error and its root by a reading: ``e+ = (I - K H) e - K noise w``.
+
+    ``noise`` (p, p) is a root of the true covariance, and belongs to the inputs from column
+    ``first`` on.
+    """
+    n, p = H.shape[1], H.shape[0]
+    closed, K, root = update_root(matrices[place], H, R)
+    multiply_form(forms[place], closed, used, np.empty((n, used)))
+    moved = np.empty((n, p))
+    _multiply_into(moved, K, noise)
+    add_columns(forms[place], first, moved, -1.0)
+    _keep_root(matrices[place], root)
+
+
+@kernel(allocates=True)
+def average_roots(weights: FloatArray, roots: FloatArray) -> FloatArray:
+    """Return a root (n, n) of ``sum_j w_j P_j`` from roots (J, n, n)."""
+    count, n = roots.shape[0], roots.shape[1]
+    parts = np.empty((n, count * n))
+    for k in range(count):
+        # sum w P = [w^1/2 S, ...] [w^1/2 S, ...]', a triangular root of which has n columns
+        scale = math.sqrt(max(weights[k], 0.0))
+        for i in range(n):
+            for j in range(n):
+                parts[i, k * n + j] = scale * roots[k, i, j]
+    triangularise(parts, n, count * n)
+    out = np.empty((n, n))
+    _keep_root(out, parts)
+    return out
+
+
+@kernel(allocates=True)
+def mixed_form(
+    forms: FloatArray, sources: IntArray, factors: FloatArray, used: int
+) -> FloatArray:
+    """Return ``sum_j W_j e_j`` (n, used) for factors W (J, n, n)."""
+    n = factors.shape[1]
+    out = np.zeros((n, used))
+    for k in range(len(sources)):
+        form = forms[sources[k]]
+        for i in range(n):
+            for j in range(n):
+                factor = factors[k, i, j]
+                if factor == 0.0:
+                    continue
+                for c in range(used):
+                    out[i, c] += factor * form[j, c]
+    return out
+
+
+@kernel(allocates=True)
+def add_information(root: FloatArray, U: FloatArray) -> FloatArray:
+    """Return a root (n, n) of ``(P^-1 + U)^-1`` for a positive semidefinite U (n, n)."""
+    n = root.shape[0]
+    half, inner = np.zeros((n, n)), np.zeros((n, n))
+    # (P^-1 + U)^-1 = S (I + S' U S)^-1 S' with P = S S'; P itself is never inverted.
+    for i in range(n):
+        for j in range(n):
+            for k in range(n):
+                half[i, j] += 0.5 * (U[i, k] + U[k, i]) * root[k, j]
+    for i in range(n):
+        for j in range(i + 1):
+            total = 1.0 if i == j else 0.0
+            for k in range(n):
+                total += root[k, i] * half[k, j]
+            inner[i, j] = total
+    L, out = np.empty((n, n)), root.copy()
+    cholesky_into(L, inner, n)
+    divide_by_transpose(out, L, n, n)
+    return out
+
+
+@kernel(allocates=True)
+def fade_totals(
+    forms: FloatArray,
+    matrices: FloatArray,
+    places: IntArray,
+    used: int,
+    inverse: FloatArray,
+    fading: float,
+    noise: FloatArray,
+    first: int,
+) -> None:
+    """Predict totals of information U, which are their ``matrices``, and the errors ``u - U x``.
+
+    ``U+ = s F^-T U F^-1`` and the error becomes ``s F^-T`` times itself less ``U+ w``, with
+    ``inverse`` F^-1 (n, n), s = ``fading`` and the plant's noise w, ``noise`` (n, k) times the
+    inputs from column ``first`` on.
+    """
+    n = inverse.shape[0]
+    moved, half, lost = np.empty((n, n)), np.empty((n, n)), np.empty(noise.shape)
+    scratch = np.empty((n, used))
+    for i in range(n):
+        for j in range(n):
+            moved[i, j] = fading * inverse[j, i]
+    for place in places:
+        empty = True
+        for i in range(n):
+            for j in range(n):
+                empty = empty and matrices[place, i, j] == 0.0
+        if empty:
+            continue
+        _multiply_into(half, moved, matrices[place])
+        _multiply_into(matrices[place], half, inverse)
+        multiply_form(forms[place], moved, used, scratch)
+        _multiply_into(lost, matrices[place], noise)
+        add_columns(forms[place], first, lost, -1.0)
+
+
+@kernel(allocates=True)
+def intersect_roots(weights: FloatArray, roots: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the root (n, n) of P and the factors (J, n, n) ``w_j P P_j^-1`` of the errors, where
+    ``P^-1 = sum_j w_j P_j^-1``; nan if one of the roots (J, n, n) is singular.
+    """
+    count, n = roots.shape[0], roots.shape[1]
+    parts, inverses = np.empty((n, count * n)), np.zeros((count, n, n))
+    for k in range(count):
+        for i in range(n):
+            inverses[k, i, i] = 1.0
+        solve_inplace(roots[k].copy(), inverses[k], n)
+        scale = math.sqrt(max(weights[k], 0.0))
+        for i in range(n):
+            for j in range(n):
+                parts[i, k * n + j] = scale * inverses[k, j, i]
+    # L L' = P^-1, so L^-T is a root of P.
+    triangularise(parts, n, count * n)
+    root, P, factors = np.zeros((n, n)), np.empty((n, n)), np.empty((count, n, n))
+    for i in range(n):
+        root[i, i] = 1.0
+    divide_by_transpose(root, parts, n, n)
+    _multiply_into(P, root, root.T)
+    half = np.empty((n, n))
+    for k in range(count):
+        _multiply_into(half, P, inverses[k].T)
+        _multiply_into(factors[k], half, inverses[k])
+        for i in range(n):
+            for j in range(n):
+                factors[k, i, j] *= max(weights[k], 0.0)
+    triangularise(root, n, n)
+    return root, factors
+
+
+@kernel(allocates=True)
+def flow_blocks(
+    series: FloatArray, unit: float, scale: float, gap: float, nodes: FloatArray
+) -> FloatArray:
+    """Return the transposed blocks (K + 1, 4, n, n) of exp(M s), without the scale, at the nodes
+    (K,) of a gap and at its end.
+
+    ``series`` (T, 2 n, 2 n) are the terms of the power series in s / unit.
+    """
+    n, count = series.shape[1] // 2, len(nodes)
+    out, E = np.empty((count + 1, 4, n, n)), np.empty((2 * n, 2 * n))
+    for k in range(count + 1):
+        share = (nodes[k] if k < count else 1.0) * gap / unit
+        for i in range(2 * n):
+            for j in range(2 * n):
+                total = 0.0
+                for term in range(len(series) - 1, -1, -1):
+                    total = total * share + series[term, i, j]
+                E[i, j] = total
+        for i in range(n):
+            for j in range(n):
+                out[k, 0, i, j] = E[j, i]
+                out[k, 1, i, j] = E[j, n + i] / scale
+                out[k, 2, i, j] = E[n + j, i] * scale
+                out[k, 3, i, j] = E[n + j, n + i]
+    return out
+
+
+@kernel(allocates=True)
+def flow_gramian(
+    blocks: FloatArray, whitened: FloatArray, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return F (n, n) and Gamma (K p, n) of a gap, see :mod:`netkf.theory.numerics.prediction`."""
+    count, n, p = len(at), whitened.shape[1], whitened.shape[0]
+    F, Gamma, inverse = np.zeros((n, n)), np.empty((count * p, n)), np.empty((n, n))
+    for i in range(n):
+        F[i, i] = 1.0
+    solve_inplace(blocks[count, 0].copy(), F, n)
+    for k in range(count):
+        for i in range(n):
+            for j in range(n):
+                inverse[i, j] = 1.0 if i == j else 0.0
+        solve_inplace(blocks[k, 0].copy(), inverse, n)
+        for i in range(p):
+            for j in range(n):
+                total = 0.0
+                for m in range(n):
+                    total += whitened[i, m] * inverse[m, j]
+                Gamma[k * p + i, j] = at[k] * total
+    return F, Gamma
+
+
+@kernel(allocates=True)
+def flow_start(
+    F: FloatArray, blocks: FloatArray, B: FloatArray, gain: FloatArray, at: FloatArray
+) -> FloatArray:
+    """Return the root (n, n) at the end of a gap of the covariance that is 0 at its start.
+
+    ``gain`` is ``H' R^-1/2`` (n, p).
+    """
+    count, n, m, p = len(at), B.shape[0], B.shape[1], gain.shape[1]
+    parts, moved = np.zeros((n, max(n, count * (m + p)))), np.empty((n, n))
+    for k in range(count):
+        first = k * (m + p)
+        _multiply_into(moved, F, blocks[k, 0])
+        _add_product(parts, first, moved, B, at[k])
+        _multiply_into(moved, F, blocks[k, 2])
+        _add_product(parts, first + m, moved, gain, at[k])
+    triangularise(parts, n, count * (m + p))
+    root = np.empty((n, n))
+    _keep_root(root, parts)
+    return root
+
+
+@kernel
+def _add_product(
+    out: FloatArray, first: int, a: FloatArray, b: FloatArray, scale: float
+) -> None:
+    """Add ``scale a b`` to the columns of ``out`` from ``first`` on."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            total = 0.0
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[k, j]
+            out[i, first + j] += scale * total
+
+
+@kernel(allocates=True)
+def closed_flow(
+    F: FloatArray, Gamma: FloatArray, start: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``F J`` and ``F J P`` (n, n) with ``J = (I + P G)^-1``, ``G = Gamma' Gamma``, and the
+    root of P at the end of the gap, whose ``start`` is that from P = 0.
+    """
+    n, rows = F.shape[0], Gamma.shape[0]
+    GS, moved = np.empty((rows, n)), root.copy()
+    _multiply_into(GS, Gamma, root)
+    parts = np.zeros((n, n + rows))
+    for i in range(n):
+        parts[i, i] = 1.0
+        for k in range(rows):
+            parts[i, n + k] = GS[k, i]
+    # L L' = I + S' G S, so that J = I - S (L L')^-1 S' G and S L^-T is a root of J P.
+    triangularise(parts, n, n + rows)
+    divide_by_transpose(moved, parts, n, n)
+    divide_by_transpose(GS, parts, rows, n)
+    J, half, FJ = np.zeros((n, n)), np.zeros((n, n)), np.empty((n, n))
+    for i in range(n):
+        J[i, i] = 1.0
+        for j in range(n):
+            for k in range(rows):
+                half[i, j] += GS[k, i] * Gamma[k, j]
+    for i in range(n):
+        for j in range(n):
+            for k in range(n):
+                J[i, j] -= moved[i, k] * half[k, j]
+    _multiply_into(FJ, F, J)
+    both, FSZ, FC = np.empty((n, 2 * n)), np.empty((n, n)), np.empty((n, n))
+    _multiply_into(FSZ, F, moved)
+    _multiply_into(FC, FSZ, moved.T)
+    for i in range(n):
+        for j in range(n):
+            both[i, j], both[i, n + j] = FSZ[i, j], start[i, j]
+    triangularise(both, n, 2 * n)
+    after = np.empty((n, n))
+    _keep_root(after, both)
+    return FJ, FC, after
+
+
+@kernel(allocates=True)
+def flow_estimates(
+    forms: FloatArray,
+    matrices: FloatArray,
+    places: IntArray,
+    used: int,
+    columns: tuple[int, int],
+    flow: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
+    exponential: tuple[FloatArray, float, float],
+    gap: float,
+    quadrature: tuple[FloatArray, FloatArray],
+) -> None:
+    """Move errors with the same continuous readings, and their roots, over a gap of at most a unit.
+
+    flow        : R^-1/2 H (p, n), the filters' gain factors H' R^-1/2 and H' R^-1 times a root of
+                  the true noise (n, p), the filters' B and the plant's B
+    exponential : terms of the series of exp(M s), its unit and the scale of covariances
+    quadrature  : nodes and weights (K,) on [0, 1]
+    columns     : the first of the K m inputs of the plant, and the first of the n inputs of each
+                  error's own noise, which are there if p > 0
+    """
+    whitened, gain, noise, B, plant = flow
+    nodes, weights = quadrature
+    at = np.sqrt(weights * gap)
+    blocks = flow_blocks(exponential[0], exponential[1], exponential[2], gap, nodes)
+    F, Gamma = flow_gramian(blocks, whitened, at)
+    start = flow_start(F, blocks, B, gain, at)
+    count, n, p = len(nodes), F.shape[0], whitened.shape[0]
+    scratch, phi = np.empty((n, used)), np.empty((n, n))
+    own = np.zeros((n, max(n, count * p)))
+    for e in range(len(places)):
+        form = forms[places[e]]
+        FJ, FC, root = closed_flow(F, Gamma, start, matrices[places[e]])
+        multiply_form(form, FJ, used, scratch)
+        own[:, :] = 0.0
+        for k in range(count):
+            # Phi(g, s) = X(g)^-T X(s)^T, and Phi(g, s) L(s) with the gain L of the filter at s.
+            _multiply_into(phi, FJ, blocks[k, 0])
+            _add_product(phi, 0, FC, blocks[k, 1], 1.0)
+            _add_product(form, columns[0] + k * plant.shape[1], phi, plant, at[k])
+            _multiply_into(phi, FJ, blocks[k, 2])
+            _add_product(phi, 0, FC, blocks[k, 3], 1.0)
+            _add_product(own, k * p, phi, noise, at[k])
+        if p > 0:
+            triangularise(own, n, max(n, count * p))
+            for i in range(n):
+                for j in range(i + 1):
+                    form[i, columns[1] + e * n + j] += own[i, j]
+        _keep_root(matrices[places[e]], root)
