@@ -17,6 +17,7 @@ __all__ = [
     "block_diagonal",
     "readonly_array",
     "is_semidefinite",
+    "plain",
     "square_root",
     "symmetric",
 ]
@@ -61,3 +62,10 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
         whole[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
     return whole
+
+
+def plain(matrix: FloatArray) -> FloatArray:
+    """Return a matrix of the one layout for which kernels are compiled."""
+    if matrix.flags.c_contiguous and matrix.flags.writeable:
+        return matrix
+    return np.array(matrix, order="C")

@@ -7,8 +7,8 @@ instant, ``send`` when messages leave, ``arrive`` when they arrive.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Hashable, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Hashable, Iterable, Sequence
+from typing import ClassVar, NamedTuple
 
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -34,8 +34,11 @@ class SentMessage(NamedTuple):
 class ErrorRule:
     """Rule of filters that use their own readings only; rules of other filters derive from it.
 
-    ``times`` are instants (seconds) of events other than samples and arrivals.
+    ``times`` are instants (seconds) of events other than samples and arrivals. In slots,
+    ``takes_messages`` says that ``exchange`` looks at the messages that it is given.
     """
+
+    takes_messages: ClassVar[bool] = True
 
     def __init__(
         self, scenario: Scenario, errors: StackedErrors, times: Collection[float] = ()
@@ -103,7 +106,7 @@ class EstimateExchangeRule(ErrorRule):
     @abstractmethod
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, Iterable[FloatArray]]:
         """Return the new root (n, n) and the factor (n, n) of each error.
 
         ``roots``: the node's own first, then those of the messages, which have ``weights``.

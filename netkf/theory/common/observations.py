@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, plain
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import (
     sample_path,
@@ -31,10 +31,13 @@ def nodes_by_host(scenario: Scenario) -> list[tuple[int, ...]]:
     return [(node,) for node in scenario.nodes]
 
 
-def _observation(scenario: Scenario, entry: int, H: FloatArray) -> Observation:
-    R, true = (scenario.noise(entry, believed) for believed in (True, False))
+def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the assumed R (p, p) of each ``[[sensors]]`` entry and a root of the true one."""
     # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
-    return Observation(H, R, np.asarray(np.linalg.cholesky(true), dtype=np.float64))
+    return [
+        (plain(scenario.noise(k, True)), np.asarray(np.linalg.cholesky(scenario.noise(k, False))))
+        for k in range(len(scenario.sensors))
+    ]
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
@@ -44,7 +47,8 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
     """
     placed, n = scenario.increment_sensors, scenario.plant.n
     used = {sensor.entry for sensors in placed.values() for sensor in sensors}
-    single = {k: _observation(scenario, k, scenario.sensors[k].H) for k in used}
+    noises = _noises(scenario)
+    single = {k: Observation(scenario.sensors[k].H, *noises[k]) for k in used}
     stacked: dict[tuple[int, ...], Observation] = {}
     found = []
     for nodes in nodes_by_host(scenario):
@@ -58,6 +62,7 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
 def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], HostObservations]:
     """Return a function from a slot to its readings by host; call it with increasing slots."""
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
+    noises = _noises(scenario)
     hosts = [
         [
             (sensor, scenario.slot_path(streams, node, sensor))
@@ -74,7 +79,7 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], HostObser
                 continue
             rows = [(sensor, path.matrix(slot)) for sensor, path in paths]
             # A sensor without a reading in this slot has a matrix without rows.
-            readings = [_observation(scenario, sensor.entry, H) for sensor, H in rows if len(H)]
+            readings = [Observation(H, *noises[sensor.entry]) for sensor, H in rows if len(H)]
             found[host] = stack_observations(readings, n)
         return found
 
@@ -87,7 +92,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservat
     Samples that one filter gets at one instant are one observation.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
-    by_node = scenario.sampled_sensors
+    by_node, noises = scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)
     found: dict[float, dict[int, list[Observation]]] = {}
     for host, nodes in enumerate(nodes_by_host(scenario)):
@@ -100,7 +105,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservat
                 for k, time in enumerate(times[node, place.ordinal].tolist()):
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
                     at_time = found.setdefault(time, {})
-                    at_time.setdefault(host, []).append(_observation(scenario, place.entry, H))
+                    at_time.setdefault(host, []).append(Observation(H, *noises[place.entry]))
     return {
         time: {host: stack_observations(readings, n) for host, readings in at_time.items()}
         for time, at_time in found.items()

@@ -173,7 +173,8 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
     noise = square_root(plant.Q)
     prediction = Prediction(plant.F, F, plant.F - F, noise, noise, square_root(Q))
     rule = _rule(scenario, errors, run, [])
-    observe, arrivals = slot_observations(scenario, run), _exchanged_messages(scenario, run)
+    observe = slot_observations(scenario, run)
+    arrivals = _exchanged_messages(scenario, run) if rule.takes_messages else {}
     done = 0
     for until in np.round(run.times / plant.period).astype(int).tolist():
         while done < until:

@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray, plain, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.numerics.prediction import ErrorFlow, Prediction, Predictor, propagate_state
 from netkf.theory.numerics.roots import predict_estimates, update_estimate
 from netkf.theory.numerics.stack import GaussianStack
-from netkf.theory.numerics.updates import Observation, plain
+from netkf.theory.numerics.updates import Observation
 
 STATE, OFFSET = "state", "offset"
 Term = tuple[Hashable, FloatArray]
@@ -37,7 +37,8 @@ class Roots:
         return name in self._owner
 
     def __getitem__(self, name: Hashable) -> FloatArray:
-        return self._stack.matrices[self._stack.place(name)].copy()
+        root: FloatArray = self._stack.matrices[self._stack.place(name)].copy()
+        return root
 
     def __setitem__(self, name: Hashable, root: FloatArray) -> None:
         self._stack.matrices[self._stack.place(name)] = root
@@ -187,8 +188,13 @@ class StackedErrors:
         x = stack.form(STATE) if self.follows else None
         # e+ = F e + D x + w for all estimates, and x+ = F x + w for the state
         predict_estimates(
-            *(stack.table, stack.matrices, places, stack.used),
-            *(plain(part) for part in (step.error, noise, step.root)),
+            stack.table,
+            stack.matrices,
+            places,
+            stack.used,
+            plain(step.error),
+            plain(noise),
+            plain(step.root),
             columns.start,
         )
         if x is not None:

@@ -52,6 +52,8 @@ def effective_weights(
 class ConsensusRule(ErrorRule):
     """Consensus on the pairs of predictions and of readings, in slots."""
 
+    takes_messages = False
+
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
         super().__init__(scenario, errors)
         self._arrivals, self._weights = arrivals_by_step(scenario, run), step_weights(scenario)

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
-from netkf.theory.numerics.roots import flow_estimates
+from netkf.linalg.arrays import FloatArray, plain
+from netkf.theory.numerics.roots import discretise, flow_estimates, triangular
 from netkf.theory.numerics.stack import GaussianStack
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -72,6 +72,8 @@ def triangular_root(parts: FloatArray) -> FloatArray:
     if k < n:
         widths = [(0, 0)] * (parts.ndim - 1) + [(0, n - k)]
         parts = np.pad(parts, widths)
+    if parts.ndim == 2:
+        return triangular(parts)
     # parts' = Z U, so parts parts' = U' U: U' is the root, with arbitrary signs of its columns.
     return np.swapaxes(np.linalg.qr(np.swapaxes(parts, -1, -2), mode="r"), -1, -2)
 
@@ -80,54 +82,46 @@ class Predictor:
     """Predictions without increments: plant dx = A x dt + B dw, filters that assume A_f, B_f."""
 
     def __init__(self, A: FloatArray, B: FloatArray, A_f: FloatArray, B_f: FloatArray) -> None:
-        n = len(A)
-        self._n = n
+        self._n = n = len(A)
+        self._belief = _LinearSDE(A_f, B_f)
         # State and error together, driven by the same noise: de = (A_f e + (A - A_f) x) dt + B dw.
-        self._truth = _LinearSDE(
-            np.block([[A, np.zeros((n, n))], [A - A_f, A_f]]), np.concatenate([B, B], axis=0)
-        )
-        same = np.array_equal(A, A_f) and np.array_equal(B, B_f)
-        self._belief = None if same else _LinearSDE(A_f, B_f)
+        self._truth = None
+        if not (np.array_equal(A, A_f) and np.array_equal(B, B_f)):
+            both = np.block([[A, np.zeros((n, n))], [A - A_f, A_f]])
+            self._truth = _LinearSDE(both, np.concatenate([B, B], axis=0))
         self._known: dict[float, Prediction] = {}
 
     def __call__(self, gap: float) -> Prediction:
         """Return the prediction over ``gap`` seconds."""
         found = self._known.get(gap)
         if found is None:
-            n = self._n
-            F, noise = self._truth.discretise(gap)
-            root = noise[n:] if self._belief is None else self._belief.discretise(gap)[1]
-            found = Prediction(
-                F[:n, :n], F[n:, n:], F[n:, :n], noise[:n], noise[n:], triangular_root(root)
-            )
+            found = self._discretise(gap)
             if len(self._known) >= MAX_CACHED:
                 self._known.clear()
             self._known[gap] = found
         return found
+
+    def _discretise(self, gap: float) -> Prediction:
+        F_f, root = self._belief.discretise(gap)
+        if self._truth is None:
+            return Prediction(F_f, F_f, np.zeros_like(F_f), root, root, root)
+        F, noise = self._truth.discretise(gap)
+        n = self._n
+        return Prediction(F[:n, :n], F[n:, n:], F[n:, :n], noise[:n], noise[n:], root)
 
 
 class _LinearSDE:
     """The equation dz = A z dt + B dw, discretised over any gap by doubling."""
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
-        self._exp, self._B = ShortExponential(A), B
+        self._exp, self._B = ShortExponential(A), plain(B)
 
     def discretise(self, gap: float) -> tuple[FloatArray, FloatArray]:
         """Return ``exp(A gap)`` (d, d) and a root (d, d) of the covariance that the noise adds."""
-        # The series holds up to one unit: discretise a short step, then double it.
-        doublings = max(0, math.ceil(math.log2(max(gap / self._exp.unit, 1e-300))))
-        short = gap / 2.0**doublings
-        E = self._exp(np.append(short * (1.0 - NODES), short))
-        # The noise covariance is the integral of exp(A s) B B' exp(A s)': its root has a block for
-        # each node of the quadrature.
-        parts = np.sqrt(WEIGHTS * short)[:, None, None] * (E[:-1] @ self._B)
-        F, root = E[-1], parts.transpose(1, 0, 2).reshape(len(self._B), -1)
-        for _ in range(doublings):
-            root = np.concatenate([F @ root, root], axis=1)  # Q(2 s) = F Q(s) F' + Q(s)
-            if root.shape[1] > 2 * len(root):
-                root = triangular_root(root)
-            F = F @ F
-        return F, triangular_root(root)
+        found: tuple[FloatArray, FloatArray] = discretise(
+            self._exp.terms, self._exp.unit, self._B, gap, (NODES, WEIGHTS)
+        )
+        return found
 
 
 class FlowTransition(NamedTuple):
@@ -176,8 +170,14 @@ class ErrorFlow:
         self._scale = _balancing_scale(A, Q, G)
         M = np.block([[-A.T, G * self._scale], [Q / self._scale, A]])
         self._exp = ShortExponential(M)
-        parts = (self._whitened, self._weight @ self._root_R, self._noise, B, plant[1])
-        self._tables = tuple(np.array(part, order="C") for part in parts)
+        gain = self._weight @ self._root_R
+        self._tables = (
+            plain(self._whitened),
+            plain(gain),
+            plain(self._noise),
+            plain(B),
+            plain(plant[1]),
+        )
         self._difference = plant[0] - A
         self._state = ShortExponential(plant[0]) if self._difference.any() else None
         self.unit = self._exp.unit
@@ -224,8 +224,15 @@ class ErrorFlow:
         ``columns``: the first of the plant's 8 m inputs, and the first of n inputs of each error.
         """
         flow_estimates(
-            *(stack.table, stack.matrices, stack.places(names), stack.used, columns),
-            *(self._tables, (self._exp.terms, self._exp.unit, self._scale), gap, (NODES, WEIGHTS)),
+            stack.table,
+            stack.matrices,
+            stack.places(names),
+            stack.used,
+            columns,
+            self._tables,
+            (self._exp.terms, self._exp.unit, self._scale),
+            gap,
+            (NODES, WEIGHTS),
         )
 
     def _update_gramian(

@@ -14,7 +14,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.small import solve_inplace
+from netkf.linalg.small import copy_matrix, solve_inplace
 
 
 @kernel
@@ -47,6 +47,16 @@ def triangularise(parts: FloatArray, n: int, columns: int) -> None:
     for i in range(columns, n):
         for c in range(columns, n):
             parts[i, c] = 0.0
+
+
+@kernel(allocates=True)
+def triangular(parts: FloatArray) -> FloatArray:
+    """Return lower triangular S (n, n) with ``S S' = parts parts'``, parts (n, at least n)."""
+    n, scratch = parts.shape[0], parts.copy()
+    triangularise(scratch, n, parts.shape[1])
+    root = np.empty((n, n))
+    _keep_root(root, scratch)
+    return root
 
 
 @kernel
@@ -225,9 +235,7 @@ def average_roots(weights: FloatArray, roots: FloatArray) -> FloatArray:
 
 
 @kernel(allocates=True)
-def mixed_form(
-    forms: FloatArray, sources: IntArray, factors: FloatArray, used: int
-) -> FloatArray:
+def mixed_form(forms: FloatArray, sources: IntArray, factors: FloatArray, used: int) -> FloatArray:
     """Return ``sum_j W_j e_j`` (n, used) for factors W (J, n, n)."""
     n = factors.shape[1]
     out = np.zeros((n, used))
@@ -336,6 +344,62 @@ def intersect_roots(weights: FloatArray, roots: FloatArray) -> tuple[FloatArray,
 
 
 @kernel(allocates=True)
+def exponential(series: FloatArray, share: float) -> FloatArray:
+    """Return the sum (d, d) of a power series (T, d, d) at ``share``."""
+    d = series.shape[1]
+    E = np.empty((d, d))
+    for i in range(d):
+        for j in range(d):
+            total = 0.0
+            for term in range(len(series) - 1, -1, -1):
+                total = total * share + series[term, i, j]
+            E[i, j] = total
+    return E
+
+
+@kernel(allocates=True)
+def discretise(
+    series: FloatArray,
+    unit: float,
+    B: FloatArray,
+    gap: float,
+    quadrature: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``exp(A gap)`` (d, d) and the root (d, d) of the covariance that B dw adds.
+
+    ``series`` (T, d, d) are the terms of exp(A s) in s / unit, ``quadrature`` the nodes and weights
+    on [0, 1].
+    """
+    # The series holds up to one unit: discretise a short step, then double it.
+    short, doublings = gap, 0
+    while short > unit:
+        short, doublings = 0.5 * short, doublings + 1
+    nodes, weights = quadrature
+    d, m = B.shape
+    columns = max(len(nodes) * m, 2 * d)
+    parts = np.zeros((d, columns))
+    for k in range(len(nodes)):
+        # The noise covariance is the integral of exp(A s) B B' exp(A s)': its root has a block for
+        # each node of the quadrature.
+        E = exponential(series, (1.0 - nodes[k]) * short / unit)
+        _add_product(parts, k * m, E, B, math.sqrt(weights[k] * short))
+    F, root, moved = exponential(series, short / unit), np.empty((d, d)), np.empty((d, d))
+    triangularise(parts, d, columns)
+    _keep_root(root, parts)
+    for _ in range(doublings):
+        # Q(2 s) = F Q(s) F' + Q(s)
+        _multiply_into(parts, F, root)
+        for i in range(d):
+            for j in range(d):
+                parts[i, d + j] = root[i, j]
+        triangularise(parts, d, 2 * d)
+        _keep_root(root, parts)
+        _multiply_into(moved, F, F)
+        copy_matrix(F, moved)
+    return F, root
+
+
+@kernel(allocates=True)
 def flow_blocks(
     series: FloatArray, unit: float, scale: float, gap: float, nodes: FloatArray
 ) -> FloatArray:
@@ -345,15 +409,9 @@ def flow_blocks(
     ``series`` (T, 2 n, 2 n) are the terms of the power series in s / unit.
     """
     n, count = series.shape[1] // 2, len(nodes)
-    out, E = np.empty((count + 1, 4, n, n)), np.empty((2 * n, 2 * n))
+    out = np.empty((count + 1, 4, n, n))
     for k in range(count + 1):
-        share = (nodes[k] if k < count else 1.0) * gap / unit
-        for i in range(2 * n):
-            for j in range(2 * n):
-                total = 0.0
-                for term in range(len(series) - 1, -1, -1):
-                    total = total * share + series[term, i, j]
-                E[i, j] = total
+        E = exponential(series, (nodes[k] if k < count else 1.0) * gap / unit)
         for i in range(n):
             for j in range(n):
                 out[k, 0, i, j] = E[j, i]
@@ -410,9 +468,7 @@ def flow_start(
 
 
 @kernel
-def _add_product(
-    out: FloatArray, first: int, a: FloatArray, b: FloatArray, scale: float
-) -> None:
+def _add_product(out: FloatArray, first: int, a: FloatArray, b: FloatArray, scale: float) -> None:
     """Add ``scale a b`` to the columns of ``out`` from ``first`` on."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
@@ -498,7 +554,9 @@ def flow_estimates(
         form = forms[places[e]]
         FJ, FC, root = closed_flow(F, Gamma, start, matrices[places[e]])
         multiply_form(form, FJ, used, scratch)
-        own[:, :] = 0.0
+        for i in range(n):
+            for j in range(own.shape[1]):
+                own[i, j] = 0.0
         for k in range(count):
             # Phi(g, s) = X(g)^-T X(s)^T, and Phi(g, s) L(s) with the gain L of the filter at s.
             _multiply_into(phi, FJ, blocks[k, 0])

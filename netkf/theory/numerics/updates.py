@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.linalg.arrays import FloatArray, block_diagonal, plain
 from netkf.theory.numerics.roots import (
     add_information,
     average_roots,
@@ -84,10 +84,3 @@ def add_information_to_root(root: FloatArray, U: FloatArray) -> FloatArray:
     """Return a root (n, n) of ``(P^-1 + U)^-1`` for a positive semidefinite U (n, n)."""
     found: FloatArray = add_information(root, U)
     return found
-
-
-def plain(matrix: FloatArray) -> FloatArray:
-    """Return a matrix of the one layout for which kernels are compiled."""
-    if matrix.flags.c_contiguous and matrix.flags.writeable:
-        return matrix
-    return np.array(matrix, order="C")

@@ -19,14 +19,14 @@ import scipy.linalg
 
 from netkf.algorithms.push_sum import PushSum
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, plain
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import HostObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.theory.numerics.roots import fade_totals
-from netkf.theory.numerics.updates import add_information_to_root, plain
+from netkf.theory.numerics.updates import add_information_to_root
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -51,6 +51,8 @@ def require_known_errors(scenario: Scenario, run: Run) -> None:
 
 class AveragingRule(ErrorRule):
     """Rule in slots: masses are exchanged once, estimates averaged in gamma steps."""
+
+    takes_messages = False
 
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
         super().__init__(scenario, errors)
@@ -154,7 +156,8 @@ class RunningTotalsRule(ErrorRule):
     def _information(self, name: Hashable) -> FloatArray:
         """Return a copy of the information U (n, n) of a total."""
         stack = self.errors.stack
-        return stack.matrices[stack.place(name)].copy()
+        U: FloatArray = stack.matrices[stack.place(name)].copy()
+        return U
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Predict all totals by ``gap`` seconds; the plant's noise is in the inputs ``columns``."""
