@@ -170,7 +170,7 @@ class GilbertElliott(Loss):
                 raise ScenarioError(
                     name, "is missing", None, "give to_bad and to_good, or mean_loss and mean_burst"
                 )
-        if self._steps[0] > 1.0:
+        if self.transitions[0] > 1.0:
             raise ScenarioError(
                 "mean_burst",
                 "is too short for that mean_loss",
@@ -179,7 +179,8 @@ class GilbertElliott(Loss):
             )
 
     @property
-    def _steps(self) -> tuple[float, float]:
+    def transitions(self) -> tuple[float, float]:
+        """The probabilities that an activation turns a good state bad, and a bad one good."""
         if self.mean_loss is not None and self.mean_burst is not None:
             to_good = 1.0 / self.mean_burst
             return to_good * self.mean_loss / (1.0 - self.mean_loss), to_good
@@ -194,7 +195,7 @@ class GilbertElliott(Loss):
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Make one step of the chain; the first state is drawn from the stationary law."""
-        to_bad, to_good = self._steps
+        to_bad, to_good = self.transitions
         u = random.random()
         if bad is None:
             return bool(u < to_bad / (to_bad + to_good))
@@ -210,7 +211,7 @@ class GilbertElliott(Loss):
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
         """Return the mean delivery probability under the stationary law."""
-        to_bad, to_good = self._steps
+        to_bad, to_good = self.transitions
         bad = to_bad / (to_bad + to_good)
         return bad * self.delivery_probability(link, 0, True, 1.0) + (
             1.0 - bad
@@ -220,7 +221,7 @@ class GilbertElliott(Loss):
     def independent(self) -> bool:
         """True only if the next state does not depend on the present one."""
         # Then both rows of the transition matrix are equal.
-        return sum(self._steps) == 1.0
+        return sum(self.transitions) == 1.0
 
 
 @dataclass(frozen=True, eq=False)

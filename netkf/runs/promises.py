@@ -21,10 +21,13 @@ from netkf.theory import (
     covariance_bound,
     limit_covariance,
     link_rate_for,
+    mean_square_radius,
     steady_covariance,
     steady_covariance_bound,
+    steady_error_covariance,
     true_limit_covariance,
 )
+from netkf.theory.common.mean_square import has_linear_errors, is_quickly_solved
 from netkf.theory.common.papers import paper_function
 from netkf.theory.hybrid.steady import steady_by_node
 
@@ -60,6 +63,8 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
         found[scenario.hosted.paper] = own(scenario)
     elif scenario.slotted:
         found["slot_central_covariance"] = _value(lambda: _slot_central(scenario))
+    if has_linear_errors(scenario) and scenario.hosted.talks:
+        found["steady_error"] = _steady_error(scenario)
     if scenario.slotted:
         plain: dict[str, Any] = finite(found)
         return plain
@@ -86,6 +91,21 @@ def _link_rate(scenario: Scenario) -> dict[str, Any]:
     except TheoryError as error:
         return {"value": None, "factor": None, "delta": None, "reason": str(error)}
     return {"value": rate, "factor": factor, "delta": delta, "reason": None}
+
+
+def _steady_error(scenario: Scenario) -> dict[str, Any]:
+    """Return the exact steady mean squares of the errors and their radius."""
+
+    def covariance() -> FloatArray:
+        if not is_quickly_solved(scenario):
+            raise TheoryError(
+                "left out, because it takes more than seconds; "
+                "netkf.theory.steady_error_covariance computes it however long it takes"
+            )
+        return steady_error_covariance(scenario)
+
+    found = _value(covariance)
+    return {**found, "radius": None if found["reason"] else mean_square_radius(scenario)}
 
 
 def _slot_central(scenario: Scenario) -> FloatArray:
@@ -137,8 +157,23 @@ def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
         central = found["slot_central_covariance"]
         trace = central["reason"] or format_number(central["trace"])
         lines += ["", f"trace of P*, the prediction covariance with all readings: {trace}"]
-        return "\n".join(lines)
-    return "\n".join([*lines, *_bound_lines(scenario, found), *_limit_lines(scenario, found)])
+        return "\n".join([*lines, *_error_lines(scenario, found)])
+    lines += [*_bound_lines(scenario, found), *_limit_lines(scenario, found)]
+    return "\n".join([*lines, *_error_lines(scenario, found)])
+
+
+def _error_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
+    """Return the lines on exact steady mean squares, where the filter has constant gains."""
+    if "steady_error" not in found:
+        return []
+    value, title = found["steady_error"], "trace of the steady error covariance, exact"
+    if value["reason"]:
+        return textwrap.wrap(f"{title}: {value['reason']}", 98, subsequent_indent="    ")
+    traces, nodes = np.array(value["trace"]), scenario.nodes
+    low, high = int(np.argmin(traces)), int(np.argmax(traces))
+    ends = [f"{format_number(float(traces[k]))} at node {nodes[k]}" for k in (low, high)]
+    mean, radius = (format_number(float(one)) for one in (traces.mean(), value["radius"]))
+    return [f"{title}: mean {mean}, from {ends[0]} to {ends[1]}; mean-square radius {radius}"]
 
 
 def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from netkf.theory.assumptions import assumptions
 from netkf.theory.common.errors import error_covariance
+from netkf.theory.common.mean_square import mean_square_radius, steady_error_covariance
 from netkf.theory.common.requirements import require_scenario
 from netkf.theory.diffusion.information import information_level
 from netkf.theory.diffusion.tracking import TrackingLevel, tracking_level
@@ -81,6 +82,7 @@ __all__ = [
     "mass_totals",
     "mean_covariance_bounds",
     "mean_matching",
+    "mean_square_radius",
     "minimum_gamma",
     "path_average",
     "push_sum_covariances",
@@ -94,6 +96,7 @@ __all__ = [
     "scalar_law",
     "steady_covariance",
     "steady_covariance_bound",
+    "steady_error_covariance",
     "support",
     "switched_samples",
     "tracking_level",

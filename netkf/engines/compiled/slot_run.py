@@ -140,7 +140,7 @@ class SlotRuns:
         loss = drawn and not setup.loss.deterministic
         shape = self._blocks, len(setup.entities), LANES
         chain: Any = setup.loss if setup.is_chain else None
-        to_bad, to_good = chain._steps if chain is not None else (0.0, 1.0)
+        to_bad, to_good = chain.transitions if chain is not None else (0.0, 1.0)
         entities = setup.entities
         self._channels = Channels(
             setup.ends,

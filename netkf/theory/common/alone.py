@@ -1,0 +1,37 @@
+"""Errors of filters that hear nothing in slots, in their steady state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.jumps import SlotJumps
+from netkf.theory.intermittent.riccati import steady_covariance
+
+
+def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the Kalman gain (n, p) at the steady prediction covariance of sensors H (p, n), R.
+
+    Raises TheoryError if that covariance does not exist.
+    """
+    if not len(H):
+        return np.zeros((len(F), 0))
+    P = steady_covariance(F, Q, H, R)
+    return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P).T)
+
+
+def slot_jumps(scenario: Scenario) -> SlotJumps:
+    """Return the errors of each node by itself, or those of one filter that every node shows."""
+    F, Q = scenario.slot_belief
+    if scenario.hosted.pooled:
+        model = scenario.pooled_slot_model
+        sensors = [(model.H, model.R)]
+        true = [block_diagonal([scenario.observation(node)[1] for node in scenario.nodes])]
+    else:
+        sensors = [scenario.observation(node, believed=True) for node in scenario.nodes]
+        true = [scenario.observation(node)[1] for node in scenario.nodes]
+    gains = [steady_gain(F, Q, *sensor) for sensor in sensors]
+    closed = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in zip(gains, sensors, strict=True)])
+    noise = block_diagonal([K @ R @ K.T for K, R in zip(gains, true, strict=True)])
+    return SlotJumps(scenario.slot_plant.F, scenario.slot_plant.Q, closed, noise, None)

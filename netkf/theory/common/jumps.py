@@ -1,0 +1,212 @@
+"""Second moments of errors with constant gains, over random losses and clocks.
+
+The stacked error e (M,), M = N n, of such a filter is a linear system that jumps when something
+happens, and jumps do not depend on it: its second moment obeys a linear recursion (slots) or a
+linear differential equation (Poisson clocks), a generalised Lyapunov equation. With bursty links
+the moments are those in each joint state (mode) of the links.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from netkf.linalg.arrays import FloatArray, IntArray, block_diagonal, symmetric
+from netkf.theory.common.random_links import Ways
+
+
+@dataclass(frozen=True, eq=False)
+class SlotJumps:
+    """A filter in slots: all nodes predict, use readings, and exchange once.
+
+    F, Q     : (n, n) of the plant, which the filters know
+    closed   : (N, n, n) what readings make of the errors of predictions, I - K_i H_i
+    noise    : (M, M) covariance that they add
+    ways     : the links, None where nothing is sent
+    on_predictions : the exchange moves errors along differences of predictions, else along those of
+                     the estimates after readings
+    """
+
+    F: FloatArray
+    Q: FloatArray
+    closed: FloatArray
+    noise: FloatArray
+    ways: Ways | None
+    on_predictions: bool = False
+
+    @property
+    def nodes(self) -> int:
+        """N."""
+        return len(self.closed)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(S, M, M) of second moments by mode."""
+        M = self.nodes * len(self.F)
+        return (self.ways.modes if self.ways else 1, M, M)
+
+    @cached_property
+    def _all(self) -> IntArray:
+        return np.arange(len(self.ways.sender) if self.ways else 0)
+
+    @cached_property
+    def _pairs(self) -> tuple[IntArray, IntArray]:
+        """Pairs of ways that one draw decides on, each with itself too: others are independent."""
+        assert self.ways is not None
+        same = self.ways.source[:, None] == self.ways.source
+        first, second = np.nonzero(same)
+        return first, second
+
+    @cached_property
+    def _mean(self) -> FloatArray:
+        assert self.ways is not None
+        return self.ways.mean(self.nodes, self._all)
+
+    def step(self, X: FloatArray, noise: bool = False) -> FloatArray:
+        """Return the second moments (S, M, M) one slot later, with or without the noises' part."""
+        N = self.nodes
+        weight = self.ways.stationary if self.ways else np.ones(1)
+        share = (weight if noise else 0.0 * weight)[:, None, None]
+        predicted = _times(self.F[None], X, N) + share * np.tile(self.Q, (N, N))
+        if self.ways is not None:
+            predicted = self.ways.advance(predicted, np.unique(self.ways.source))
+        updated = _times(self.closed, predicted, N) + share * self.noise
+        return updated if self.ways is None else self._exchange(predicted, updated)
+
+    def _exchange(self, predicted: FloatArray, updated: FloatArray) -> FloatArray:
+        """Return the second moments (S, M, M) after the exchange."""
+        ways, mean = self.ways, self._mean
+        assert ways is not None
+        moved, cross = updated, updated
+        if self.on_predictions:
+            moved = predicted
+            cross = block_diagonal(list(self.closed)) @ predicted
+        first, second = self._pairs
+        spread = ways.joint(first, second) - ways.delivery[:, first] * ways.delivery[:, second]
+        # E[(u + D s)(u + D s)'] with E[D] and the covariances of who hears whom.
+        along = cross @ np.swapaxes(mean, 1, 2)
+        fluctuation = ways.products(first, second, spread, moved)
+        both = mean @ moved @ np.swapaxes(mean, 1, 2)
+        return symmetric(updated + 2.0 * symmetric(along) + both + fluctuation)
+
+
+@dataclass(frozen=True, eq=False)
+class ClockJumps:
+    """A filter in continuous time whose clocks are all Poisson processes.
+
+    drift   : (M, M) of the errors between events
+    noise   : (M, M) covariance per second, of readings too
+    samples : (node, rate per second, I - closed) of nodes that take samples
+    ways    : the links, None where nothing is sent
+    ticks   : (rate per second, its ways) of each clock that makes nodes transmit
+    """
+
+    nodes: int
+    drift: FloatArray
+    noise: FloatArray
+    samples: tuple[tuple[int, float, FloatArray], ...]
+    ways: Ways | None
+    ticks: tuple[tuple[float, IntArray], ...] = field(default=())
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(S, M, M) of second moments by mode."""
+        return (self.ways.modes if self.ways else 1, *self.drift.shape)
+
+    @cached_property
+    def _chains(self) -> list[IntArray]:
+        assert self.ways is not None
+        return [np.unique(self.ways.source[among]) for _, among in self.ticks]
+
+    @cached_property
+    def flows(self) -> FloatArray:
+        """The mean drift (S, M, M) of errors while the mode stays, see ``inflow``."""
+        found, eye = np.tile(self.drift, (self.shape[0], 1, 1)), np.eye(len(self.drift))
+        for node, rate, lost in self.samples:
+            _block(found, self.nodes, node)[...] -= rate * lost
+        for k, (rate, among) in enumerate(self.ticks):
+            assert self.ways is not None
+            stay = self.ways.stay(self._chains[k])[:, None, None]
+            found += (
+                rate * stay * self.ways.mean(self.nodes, among) - 0.5 * rate * (1.0 - stay) * eye
+            )
+        return found
+
+    @cached_property
+    def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
+        """For each tick pairs of its ways, and the rates (S, P) at which both messages arrive."""
+        assert self.ways is not None
+        found = []
+        for rate, among in self.ticks:
+            first, second = (part.ravel() for part in np.meshgrid(among, among))
+            found.append((first, second, rate * self.ways.joint(first, second)))
+        return found
+
+    @cached_property
+    def _all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """The pairs of all ticks together."""
+        first, second = (np.concatenate([pair[k] for pair in self._pairs]) for k in (0, 1))
+        return first, second, np.concatenate([rates for *_, rates in self._pairs], axis=1)
+
+    @cached_property
+    def _means(self) -> list[FloatArray]:
+        """The mean change (S, M, M) by each tick."""
+        assert self.ways is not None
+        return [self.ways.mean(self.nodes, among) for _, among in self.ticks]
+
+    def inflow(self, X: FloatArray) -> FloatArray:
+        """Return what jumps add to the second moments (S, M, M) per second beyond the mean drift
+        ``flows``, a positive map: ``dX/dt = B X + X B' + inflow(X) + noise``.
+        """
+        found = np.zeros_like(X)
+        for node, rate, lost in self.samples:
+            own = _block(X, self.nodes, node)
+            _block(found, self.nodes, node)[...] += rate * lost @ own @ lost.T
+        if self.ways is None or not self.ticks:
+            return found
+        if self.ways.steps is None:
+            return np.asarray(found + self.ways.products(*self._all_pairs, X))
+        for k, (rate, _) in enumerate(self.ticks):
+            chains, (first, second, rates) = self._chains[k], self._pairs[k]
+            stepped = self.ways.advance(X, chains)
+            # The part in which the mode stays and errors move by their mean is in ``flows``.
+            rest = rate * (stepped - self.ways.stay(chains)[:, None, None] * X)
+            found += rest + 2.0 * symmetric(self._means[k] @ rest)
+            found += self.ways.products(first, second, rates, stepped)
+        return found
+
+
+def _block(X: FloatArray, nodes: int, i: int) -> FloatArray:
+    """Return the block (S, n, n) of node i of X (S, N n, N n), which may be written to."""
+    n = X.shape[1] // nodes
+    return X[:, i * n : (i + 1) * n, i * n : (i + 1) * n]
+
+
+def _times(maps: FloatArray, X: FloatArray, nodes: int) -> FloatArray:
+    """Return ``C X C'`` (S, M, M) for the block diagonal C of N ``maps`` (N, n, n), or of one."""
+    S, M, _ = X.shape
+    n = M // nodes
+    left = (maps @ X.reshape(S, nodes, n, M)).reshape(S, M, M)
+    turned = np.ascontiguousarray(np.swapaxes(left, 1, 2)).reshape(S, nodes, n, M)
+    return np.asarray((maps @ turned).reshape(S, M, M))
+
+
+class LyapunovInverse:
+    """The inverse of ``X -> -(B X + X B')`` for stable matrices B (S, M, M), by Schur forms."""
+
+    def __init__(self, B: FloatArray) -> None:
+        self._forms = [scipy.linalg.schur(one)[:2] for one in B]
+
+    def __call__(self, Y: FloatArray) -> FloatArray:
+        """Return X (S, M, M) with ``B X + X B' + Y = 0``."""
+        return np.stack(
+            [self._solve(T, U, one) for (T, U), one in zip(self._forms, Y, strict=True)]
+        )
+
+    @staticmethod
+    def _solve(T: FloatArray, U: FloatArray, Y: FloatArray) -> FloatArray:
+        X, scale, _ = scipy.linalg.lapack.dtrsyl(T, T, -(U.T @ Y @ U), trana="N", tranb="T")
+        return symmetric(np.asarray(U @ (X / scale) @ U.T))

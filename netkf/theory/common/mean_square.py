@@ -1,0 +1,154 @@
+"""Exact steady mean squares of errors over random losses, bursts and clocks.
+
+Where the gains of a filter do not depend on data or on what happens in the network, its errors are
+a linear system with jumps (theory/common/jumps.py). A paper's folder makes that system in a module
+``linear_errors``: ``slot_jumps(scenario)`` and ``clock_jumps(scenario)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.registry import spoken
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.alone import slot_jumps as silent_jumps
+from netkf.theory.common.errors import diagonal_blocks
+from netkf.theory.common.jumps import ClockJumps, LyapunovInverse, SlotJumps
+from netkf.theory.common.papers import paper_function
+from netkf.theory.common.replay import require_known_filter
+from netkf.theory.numerics.positive_maps import PositiveMap, fixed_point, spectral_radius
+
+MAX_ERRORS = 200
+"""Errors of all nodes together: a step takes some milliseconds then, and a solution seconds."""
+MAX_NUMBERS, QUICK_NUMBERS = 4_000_000, 40_000
+"""Numbers of second moments in all modes together: at most, and up to which they take seconds."""
+
+
+def mean_square_radius(scenario: Scenario) -> float:
+    """Return the spectral radius that decides if errors stay bounded in the mean square: they do if
+    it is below 1.
+
+    In slots the second moments grow by it from slot to slot. In continuous time it is that of the
+    map from second moments to those that their jumps maintain, which says no more than the side of
+    1 that it is on; inf where errors already grow between jumps, or in their mean. Raises
+    TheoryError where the scenario's filter has no constant gains or its network no such law.
+    """
+    return _solved(scenario)[0]
+
+
+def steady_error_covariance(scenario: Scenario) -> FloatArray:
+    """Return the exact steady mean (N, n, n) of ``(x - xhat_i)(x - xhat_i)'``, over noises, losses
+    and clocks, in the order of the nodes; in slots as samples show it.
+
+    By one generalised Lyapunov equation, for filters whose gains are constant: ``constant-gain``,
+    ``kcf`` in slots with its own readings or without losses, ``local`` and ``central`` in slots.
+    Losses may be independent, by link or bursty (Gilbert-Elliott, few links), delays fixed (in
+    slots) or none, clocks Poisson; at most 200 errors of all nodes together. Raises TheoryError
+    with the reason where there is no such mean, or it is not known.
+    """
+    radius, covariance = _solved(scenario)
+    if covariance is None:
+        raise TheoryError(
+            f"no steady mean square: its radius is {radius:.6g}, not below 1, and errors grow in "
+            "the mean square"
+        )
+    return covariance.copy()
+
+
+@lru_cache(maxsize=8)
+def _solved(scenario: Scenario) -> tuple[float, FloatArray | None]:
+    """Return the radius, and the covariances (N, n, n) if it is below 1."""
+    system = linear_errors(scenario)
+    _require_size(system.shape)
+    T, Q = _slots(system) if isinstance(system, SlotJumps) else _clocks(system)
+    radius = spectral_radius(T, system.shape) if Q is not None else np.inf
+    if Q is None or not radius < 1.0:
+        return float(radius), None
+    X = fixed_point(T, Q, radius).sum(axis=0)
+    found = diagonal_blocks(X[None], system.nodes)[0]
+    # Nodes that share one filter share its error.
+    return radius, np.repeat(found, len(scenario.nodes) // system.nodes, axis=0)
+
+
+def linear_errors(scenario: Scenario) -> SlotJumps | ClockJumps:
+    """Return the errors of a scenario's filter as a linear system with jumps; raises TheoryError
+    where they are not.
+    """
+    require_known_filter(scenario)
+    if not scenario.is_random:
+        raise TheoryError("the state or readings are recorded: their law is not known")
+    believed, true = (
+        (scenario.slot_belief[0], scenario.slot_plant.F)
+        if scenario.slotted
+        else (scenario.belief[0], scenario.truth.A)
+    )
+    if not np.array_equal(believed, true):
+        raise TheoryError("the filters' plant is not the true one: errors follow the state")
+    make = _maker(scenario)
+    if make is None:
+        raise TheoryError(
+            f"exact steady mean squares are not known for the {spoken(scenario.filter.algorithm)} "
+            f"filter {'in slots' if scenario.slotted else 'under clocks'}, whose gains follow what "
+            "happens"
+        )
+    made: SlotJumps | ClockJumps = make(scenario)
+    return made
+
+
+def has_linear_errors(scenario: Scenario) -> bool:
+    """Return True if the class of the filter is one whose gains are constant in some scenarios."""
+    return _maker(scenario) is not None
+
+
+def is_quickly_solved(scenario: Scenario) -> bool:
+    """Return True if the mean squares of a scenario with constant gains take a second or so."""
+    S, M, _ = linear_errors(scenario).shape
+    return S * M * M <= QUICK_NUMBERS
+
+
+def _maker(scenario: Scenario) -> Callable[[Scenario], SlotJumps | ClockJumps] | None:
+    """Return the function that makes the linear system of a scenario, if there is one."""
+    if scenario.hosted.combination == "none":
+        return silent_jumps if scenario.slotted else None
+    name = "slot_jumps" if scenario.slotted else "clock_jumps"
+    made: Callable[[Scenario], SlotJumps | ClockJumps] | None = paper_function(
+        scenario, "linear_errors", name
+    )
+    return made
+
+
+def _require_size(shape: tuple[int, int, int]) -> None:
+    S, M, _ = shape
+    if M > MAX_ERRORS:
+        raise TheoryError(
+            f"{M} errors of all nodes together; exact mean squares are computed for at most "
+            f"{MAX_ERRORS}"
+        )
+    if S * M * M > MAX_NUMBERS:
+        raise TheoryError(
+            f"{S} joint states of the links with {M} errors are {S * M * M:,} numbers; at most "
+            f"{MAX_NUMBERS:,} are computed"
+        )
+
+
+def _slots(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
+    return system.step, system.step(np.zeros(system.shape), noise=True)
+
+
+def _clocks(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
+    """Return the map ``X -> S^-1(inflow(X))`` with ``S X = -(B X + X B')``, and ``S^-1(noise)``, or
+    None if some B is not stable: errors then grow even without what jumps add.
+    """
+    if max(np.linalg.eigvals(B).real.max() for B in system.flows) >= 0.0:
+        return system.inflow, None
+    inverse = LyapunovInverse(system.flows)
+    stationary = system.ways.stationary if system.ways else np.ones(1)
+    return (
+        lambda X: inverse(system.inflow(X)),
+        inverse(stationary[:, None, None] * system.noise),
+    )

@@ -1,0 +1,221 @@
+"""The law of who hears whom: directed links with their weights, and the moments of one exchange.
+
+A message on way k moves the error of its receiver i towards that of its sender j by a matrix W_k,
+``e_i + W_k (s_j - s_i)``, where s are estimates or predictions. With delta_k = 1 if it arrives an
+exchange is ``D = sum_k delta_k E_i W_k (E_j - E_i)'``, and only means and covariances of delta
+enter second moments.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.network.channels import GilbertElliott
+from netkf.network.clocks import LinkClock
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import is_recorded
+
+MAX_CHAINS = 10
+"""Independent chains of bursty links whose joint states are enumerated."""
+
+
+class Ways(NamedTuple):
+    """K directed links and S joint states (modes) of their channels.
+
+    sender, receiver : (K,) indices of nodes
+    weight           : (K, n, n) the matrices W_k
+    source           : (K,) number of the draw, and of the chain, that decides on a way; ways with
+                       one source share it
+    delivery         : (S, K) probability that a message arrives, by mode
+    steps            : (to_bad, to_good) of a chain that makes a step at each activation; None if
+                       there is one mode only. Bit c of a mode says if chain c is bad.
+    """
+
+    sender: IntArray
+    receiver: IntArray
+    weight: FloatArray
+    source: IntArray
+    delivery: FloatArray
+    steps: tuple[float, float] | None
+
+    @property
+    def modes(self) -> int:
+        """S."""
+        return len(self.delivery)
+
+    @property
+    def stationary(self) -> FloatArray:
+        """The probabilities (S,) of the modes in the long run."""
+        if self.steps is None:
+            return np.ones(1)
+        to_bad, to_good = self.steps
+        bad = to_bad / (to_bad + to_good)
+        found = np.ones(1)
+        for _ in range(int(np.log2(self.modes))):
+            found = np.concatenate([found * (1.0 - bad), found * bad])
+        return found
+
+    def advance(self, X: FloatArray, chains: IntArray) -> FloatArray:
+        """Return second moments (S, M, M) by mode after the given ``chains`` made a step."""
+        if self.steps is None:
+            return X
+        to_bad, to_good = self.steps
+        transition = np.array([[1.0 - to_bad, to_bad], [to_good, 1.0 - to_good]])
+        for chain in chains.tolist():
+            # Modes as (higher chains, this one, lower chains).
+            split = X.reshape(-1, 2, 1 << chain, *X.shape[1:])
+            X = np.einsum("st,asbij->atbij", transition, split).reshape(X.shape)
+        return X
+
+    def stay(self, chains: IntArray) -> FloatArray:
+        """Return the probability (S,) that a step of the given ``chains`` leaves the mode."""
+        if self.steps is None:
+            return np.ones(1)
+        to_bad, to_good = self.steps
+        modes, found = np.arange(self.modes), np.ones(self.modes)
+        for chain in chains.tolist():
+            found *= np.where(modes >> chain & 1, 1.0 - to_good, 1.0 - to_bad)
+        return found
+
+    def mean(self, nodes: int, among: IntArray) -> FloatArray:
+        """Return E[D] (S, N n, N n) of the ways ``among``, by mode."""
+        n = self.weight.shape[-1]
+        found = np.zeros((self.modes, nodes, nodes, n, n))
+        parts = self.delivery[:, among, None, None] * self.weight[among]
+        receiver, sender = self.receiver[among], self.sender[among]
+        _add_blocks(found, receiver, sender, parts)
+        _add_blocks(found, receiver, receiver, -parts)
+        return _joined(found)
+
+    def products(
+        self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
+    ) -> FloatArray:
+        """Return ``sum c D_a Z D_b'`` (S, N n, N n) over pairs (a, b) of ways, factors c
+        (S, P) of P pairs, for second moments Z (S, N n, N n).
+        """
+        n = self.weight.shape[-1]
+        S, N = len(Z), Z.shape[1] // n
+        blocks = np.swapaxes(Z.reshape(S, N, n, N, n), 2, 3)
+        i, j = self.receiver[first], self.sender[first]
+        k, m = self.receiver[second], self.sender[second]
+        gap = blocks[:, j, m] - blocks[:, j, k] - blocks[:, i, m] + blocks[:, i, k]
+        turned = np.swapaxes(self.weight[second], 1, 2)
+        terms = factor[:, :, None, None] * (self.weight[first] @ gap @ turned)
+        found = np.zeros_like(blocks)
+        _add_blocks(found, i, k, terms)
+        return _joined(found)
+
+    def joint(self, first: IntArray, second: IntArray) -> FloatArray:
+        """Return the probability (S, P) that messages on both of two ways arrive in one activation,
+        by mode, for P pairs of ways.
+        """
+        p, q = self.delivery[:, first], self.delivery[:, second]
+        # Ways of one source are decided by one uniform number, which is below both.
+        same = self.source[first] == self.source[second]
+        return np.asarray(np.where(same, np.minimum(p, q), p * q))
+
+
+def _add_blocks(blocks: FloatArray, rows: IntArray, columns: IntArray, terms: FloatArray) -> None:
+    """Add terms (S, P, n, n) to ``blocks`` (S, N, N, n, n) at P places, which may repeat."""
+    place: Any = (slice(None), rows, columns)
+    np.add.at(blocks, place, terms)
+
+
+def _joined(blocks: FloatArray) -> FloatArray:
+    """Return matrices (S, N n, N n) of blocks (S, N, N, n, n)."""
+    S, N, _, n, _ = blocks.shape
+    return np.asarray(np.swapaxes(blocks, 2, 3).reshape(S, N * n, N * n))
+
+
+def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait: float) -> Ways:
+    """Return the ways of a scenario, on which (sender, receiver) has ``weights`` (n, n); messages
+    of more than ``wait`` seconds are late, and lost.
+
+    Raises TheoryError where losses or delays have no law that can be used here.
+    """
+    topology, channel = scenario.topology, scenario.network.channel
+    loss, delay = channel.loss, channel.delay.fixed
+    if is_recorded(channel):
+        raise TheoryError("losses or delays are recorded: their law is not known")
+    if delay is None:
+        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
+    bursts = isinstance(loss, GilbertElliott)
+    if not (bursts or loss.independent):
+        raise TheoryError("losses depend on earlier ones in a way that is not known here")
+    links = list(weights)
+    at = {link: k for k, link in enumerate(_sources(scenario, links))}
+    source = np.array([at[_source(scenario, link)] for link in links], dtype=np.int64)
+    chained = bursts and not loss.independent
+    if chained and len(at) > MAX_CHAINS:
+        raise TheoryError(
+            f"bursts on {len(at)} links have 2^{len(at)} joint states; exact mean squares are "
+            f"computed for at most {MAX_CHAINS} links with bursts"
+        )
+    tables = [scenario.table_probability(link) for link in links]
+    good, bad = (
+        np.array(
+            [
+                loss.delivery_probability(link, 0, state, table)
+                for link, table in zip(links, tables, strict=True)
+            ]
+        )
+        for state in (False, True)
+    )
+    modes = np.arange(1 << len(at) if chained else 1)
+    delivery = np.where(modes[:, None] >> source & 1, bad, good) if chained else good[None]
+    if bursts and not chained:
+        delivery = np.array([[loss.mean_delivery(link, 1.0) for link in links]])
+    if delay > wait:
+        delivery = np.zeros_like(delivery)
+    index = topology.index
+    return Ways(
+        np.array([index[i] for i, _ in links], dtype=np.int64),
+        np.array([index[j] for _, j in links], dtype=np.int64),
+        np.stack(list(weights.values())),
+        source,
+        delivery,
+        loss.transitions if isinstance(loss, GilbertElliott) and chained else None,
+    )
+
+
+def _source(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
+    """Return the link whose draw decides on a direction: both share it if they are symmetric."""
+    return min(link, link[::-1]) if _shared(scenario) else link
+
+
+def _sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    return list(dict.fromkeys(_source(scenario, link) for link in links))
+
+
+def _shared(scenario: Scenario) -> bool:
+    """Return True if both directions of a link are activated, and lost, together."""
+    at = getattr(scenario.network.activation, "at", "links")
+    return scenario.network.channel.symmetric and at == "links"
+
+
+def poisson_ticks(
+    scenario: Scenario, links: list[tuple[int, int]]
+) -> tuple[tuple[float, IntArray], ...]:
+    """Return the rate per second and the ways (places in ``links``) of each clock that makes nodes
+    transmit; raises TheoryError unless they are Poisson processes.
+    """
+    clock = scenario.network.activation
+    assert isinstance(clock, LinkClock)
+    if clock.at == "readings" or not clock.memoryless:
+        raise TheoryError("nodes do not transmit by Poisson clocks of their own")
+    entities, place = clock.entities(scenario.topology), {one: k for k, one in enumerate(links)}
+    found = []
+    for entity in entities:
+        if clock.at == "nodes":
+            among = [k for link, k in place.items() if link[0] == entity[0]]
+        else:
+            ends = (entity[0], entity[1])
+            both = (ends, ends[::-1]) if clock.at == "links" else (ends,)
+            among = [place[link] for link in both if link in place]
+        if among:
+            found.append((float(clock.mean_rate(entity)), np.array(among, dtype=np.int64)))
+    return tuple(found)

@@ -1,0 +1,69 @@
+"""The errors of the Kalman-consensus filter in its steady state, as a linear system with jumps.
+
+Its P counts readings and no consensus term. With its own readings alone, or where every message
+arrives, P and all gains settle whatever is lost: a node then has the readings of its neighbourhood
+in each slot, and the consensus term is ``epsilon / (1 + |P|) P`` times differences of predictions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.algorithms.kalman_consensus import Kcf
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.network.matchings import Broadcast
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.jumps import SlotJumps
+from netkf.theory.common.random_links import ways_of
+from netkf.theory.intermittent.riccati import steady_covariance
+
+
+def slot_jumps(scenario: Scenario) -> SlotJumps:
+    """Return the system in slots."""
+    algorithm, nodes = scenario.filter.algorithm, scenario.nodes
+    assert isinstance(algorithm, Kcf)
+    if not isinstance(scenario.network.activation, Broadcast):
+        raise TheoryError("the exchanges are recorded: one outcome, not a law")
+    (F, Q), index = scenario.slot_belief, scenario.topology.index
+    heard: list[list[int]] = [[k] for k in range(len(nodes))]
+    if algorithm.share_readings:
+        _require_sure_links(scenario)
+        for sender, receiver in scenario.topology.directions:
+            heard[index[receiver]].append(index[sender])
+    sensors = [scenario.observation(node, believed=True) for node in nodes]
+    # All readings of the network, and the columns of each node in them.
+    rows = np.cumsum([0, *(len(H) for H, _ in sensors)])
+    true = block_diagonal([scenario.observation(node)[1] for node in nodes])
+    closed, gains, terms = [], np.zeros((len(nodes), len(F), rows[-1])), []
+    for k, senders in enumerate(heard):
+        H = np.concatenate([sensors[j][0] for j in senders])
+        R = block_diagonal([sensors[j][1] for j in senders])
+        P = steady_covariance(F, Q, H, R)
+        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T if len(H) else np.zeros((len(F), 0))
+        columns = [np.arange(rows[j], rows[j + 1]) for j in senders]
+        gains[k][:, np.concatenate(columns)] = K
+        closed.append(np.eye(len(F)) - K @ H)
+        terms.append(algorithm.epsilon / (1.0 + np.linalg.norm(P)) * P)
+    weights: dict[tuple[int, int], FloatArray] = {
+        (i, j): terms[index[j]] for i, j in scenario.topology.directions
+    }
+    ways = ways_of(scenario, weights, scenario.phase_length) if weights else None
+    whole = gains.reshape(-1, rows[-1])
+    plant, noise = scenario.slot_plant, whole @ true @ whole.T
+    return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, ways, on_predictions=True)
+
+
+def _require_sure_links(scenario: Scenario) -> None:
+    """Raise TheoryError unless every message arrives in its slot."""
+    channel = scenario.network.channel
+    delay = channel.delay.fixed
+    sure = delay is not None and delay <= scenario.phase_length
+    for link in scenario.topology.directions:
+        table = scenario.table_probability(link)
+        sure = sure and channel.loss.mean_delivery(link, table) == 1.0
+    if not sure:
+        raise TheoryError(
+            "gains follow the readings that arrive; exact steady mean squares of kcf are known "
+            "with share_readings = false, or where nothing is lost"
+        )
