@@ -463,3 +463,35 @@ def test_a_constant_parameter_has_no_steady_state_that_can_be_solved_for(build):
     still = {"kind": "diffusion", "A": [[0.0]], "B": [[0.0]], "cov": [[1.0]]}
     with pytest.raises(netkf.TheoryError, match="neither driven by noise nor damped"):
         theory.steady_covariance_bound(build(plant=still))
+
+
+def test_a_node_that_nobody_can_follow_takes_seconds_or_is_refused(build):
+    """A precise node beside one whose covariance grows by 1e13: implicit steps did not end."""
+    A, B, C = np.array([[0.0, 1.0], [0.0, 6.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+    scenario = build(
+        horizon=8.0,
+        plant={"kind": "diffusion", "A": A.tolist(), "B": B.tolist(), "cov": np.eye(2).tolist()},
+        sensors=[{"nodes": [0], "H": C.tolist(), "R": [[0.25]]}],
+        network={
+            "graph": {"kind": "path", "nodes": 2},
+            "activation": {"kind": "poisson", "rate": 1.0},
+        },
+        filter={"kind": "hybrid", "epsilon": 0.4},
+    )
+    gains = [C.T @ C / 0.25, np.zeros((2, 2))]
+    coupling = 0.4
+
+    def slope(_, y):
+        P = y.reshape(2, 2, 2)
+        own = [A @ p + p @ A.T + B @ B.T - p @ G @ p for p, G in zip(P, gains, strict=True)]
+        return (np.array(own) + coupling * (P[::-1] - P)).ravel()
+
+    start = np.tile(np.eye(2), (2, 1, 1)).ravel()
+    plain = scipy.integrate.solve_ivp(slope, (0, 1.6), start, "LSODA", rtol=1e-9, atol=1e-7)
+    found = theory.covariance_bound(scenario, [1.6])[0]
+    expected = plain.y[:, -1].reshape(2, 2, 2)
+    assert expected[1].max() > 1e3 * expected[0].max()
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+    with pytest.raises(netkf.TheoryError, match=r"cannot be integrated beyond 3\.\d+ s: the covar"):
+        theory.covariance_bound(scenario, [8.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +26,8 @@ MAX_CHECKED_STEPS = 200
 MAX_EXPLICIT_EVALUATIONS = 20_000
 OVERFLOW = 1e150
 MAX_ROUNDS, ROUND_TOLERANCE = 40, 1e-8  # of Picard iteration
+ROUNDING = 4e-16  # of the largest entry of all nodes: what arrives at a node is rounded to that
+GROWTH = 10.0  # factor by which a solution may grow before tolerances are chosen anew
 PARTS = (1, 40, 400)  # the solver's steps are at most this fraction of a piece, try after try
 Slope = Callable[[float, FloatArray], FloatArray]
 """dy/dt of the flat packed solution y, from t (seconds) and y."""
@@ -138,7 +141,8 @@ class _PiecewiseSolution:
             end = self._jumps.before(begin, self._piece_end(begin, last))
             slope = self._slope(begin)
             if delay == 0.0 or end - begin <= delay * (1.0 + 1e-12):
-                self._append(end, self._integrate(begin, end, slope))
+                output, end = self._integrate(begin, end, slope, math.inf if delay else GROWTH)
+                self._append(end, output)
             else:
                 self._iterate(begin, end, slope)
             if self._jumps.happen_at(end):
@@ -167,7 +171,7 @@ class _PiecewiseSolution:
         for _ in range(MAX_ROUNDS):
             before = np.array([self(t).reshape(-1) for t in probes])
             self._first = start
-            self._outputs[-1] = self._integrate(begin, end, slope)
+            self._outputs[-1], _ = self._integrate(begin, end, slope)
             self._first = self._outputs[-1](end).reshape(start.shape)
             after = np.array([self(t).reshape(-1) for t in probes])
             change = float(np.abs(after - before).max() / np.abs(after).max())
@@ -193,12 +197,16 @@ class _PiecewiseSolution:
 
         return slope
 
-    def _integrate(self, begin: float, end: float, slope: Slope) -> Callable[[float], FloatArray]:
-        """Return a dense output over a piece; raises TheoryError if its defect is too large."""
+    def _integrate(
+        self, begin: float, end: float, slope: Slope, growth: float = math.inf
+    ) -> tuple[Callable[[float], FloatArray], float]:
+        """Return a dense output over a piece and where it ends, which is before ``end`` if the
+        solution has grown by a factor ``growth``; raises TheoryError if its defect is too large.
+        """
         refused: TheoryError | None = None
         for parts in PARTS:  # shorter steps reduce the error of the dense output between them
             max_step = (end - begin) / parts if parts > 1 else np.inf
-            solved = self._choose_method(begin, end, slope, max_step)
+            solved = self._choose_method(begin, end, slope, max_step, growth)
             if not solved.success:
                 raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
             assert solved.sol is not None
@@ -208,11 +216,13 @@ class _PiecewiseSolution:
                 refused = refused or error
                 continue
             output: Callable[[float], FloatArray] = solved.sol
-            return output
+            return output, float(solved.t[-1])
         assert refused is not None
         raise refused
 
-    def _choose_method(self, begin: float, end: float, slope: Slope, max_step: float) -> Any:
+    def _choose_method(
+        self, begin: float, end: float, slope: Slope, max_step: float, growth: float
+    ) -> Any:
         """Solve by an explicit method unless the equations are stiff, else by an implicit one."""
         equations = self._packed.equations
         with np.errstate(over="ignore", invalid="ignore"):
@@ -224,7 +234,13 @@ class _PiecewiseSolution:
                     return self._solve(begin, end, limited, method="DOP853", max_step=max_step)
             # A large covariance that reaches a node with precise sensors decays at the rate P G.
             return self._solve(
-                begin, end, slope, method="Radau", jac=self._jacobian, max_step=max_step
+                begin,
+                end,
+                slope,
+                method="Radau",
+                jac=self._jacobian,
+                max_step=max_step,
+                events=_grown(growth * float(np.abs(self._first).max())),
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
@@ -234,15 +250,43 @@ class _PiecewiseSolution:
             self._first.reshape(-1),
             dense_output=True,
             rtol=TOLERANCE,
-            atol=1e-3 * TOLERANCE * _scale(self._packed),
+            atol=self._absolute_tolerance(begin),
             **method,
         )
+
+    def _absolute_tolerance(self, begin: float) -> FloatArray:
+        """Return the absolute tolerance (N m,) of a piece, relative to the covariance of each node.
+
+        A node with precise sensors next to one that nobody can follow has a covariance of the order
+        of the root of the other's, whose inflow is rounded: a solver that is asked for more makes
+        ever smaller steps. Raises TheoryError where rounding exceeds DEFECT_TOLERANCE.
+        """
+        sizes = np.maximum(np.abs(self._first).max(axis=1), _scale(self._packed))
+        rounding = ROUNDING * sizes.max()
+        if rounding > DEFECT_TOLERANCE * sizes.min():
+            raise TheoryError(
+                f"H(12) cannot be integrated beyond {begin:.3g} s: the covariances of two nodes "
+                f"differ by a factor of {sizes.max() / sizes.min():.1g}, so that rounding hides "
+                "the smaller one"
+            )
+        tolerance = 1e-3 * TOLERANCE * sizes + rounding
+        return np.repeat(tolerance, self._first.shape[1])
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
         """Return the sparse Jacobian (N m, N m) of the right-hand side at ``y``."""
         linear = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
         # With a delay the arrivals are known from earlier pieces and do not depend on y.
         return linear.matrix(arriving=self._packed.equations.delay == 0.0)
+
+
+def _grown(limit: float) -> Callable[[float, FloatArray], float]:
+    """Return an event of the solver that ends it where an entry exceeds ``limit``."""
+
+    def below(_: float, y: FloatArray) -> float:
+        return limit - float(np.abs(y).max()) if math.isfinite(limit) else 1.0
+
+    below.terminal = True  # type: ignore[attr-defined]
+    return below
 
 
 class _SampleJumps:
