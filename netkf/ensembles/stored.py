@@ -60,6 +60,9 @@ class StoredEnsemble(Ensemble):
         assert self.scenario is not None
         where = shorten(self.directory)
         number = integer(low=0)("replica", number)
+        if not self.summary:
+            remedy = "finish it with netkf run --resume"
+            raise ScenarioError(where, "has no traces before it is finished", None, remedy)
         try:
             run = read_run(self.directory, self.scenario, self.manifest, number)
         except DamagedError as error:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from pathlib import Path
 
-from netkf.core.errors import ScenarioError, WriteError
+from netkf.core.errors import ScenarioError
+from netkf.runs.files import writing
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,60}")
 
@@ -85,7 +87,8 @@ def test_the_mean_covariance_stays_below_the_bound():
 def write_template(name: str, folder: Path) -> tuple[Path, Path]:
     """Write NAME.toml and test_NAME.py into a folder and return their paths.
 
-    Raises ScenarioError for a name that is none and where one of the files is there already.
+    Raises ScenarioError for a name that is none and where one of the files is there already, and
+    WriteError, which leaves neither.
     """
     if not NAME.fullmatch(name):
         rule = "must be a letter, then letters, digits, - and _"
@@ -95,11 +98,16 @@ def write_template(name: str, folder: Path) -> tuple[Path, Path]:
         if path.exists():
             rule = "is there already, and nothing is overwritten"
             raise ScenarioError(str(path), rule, None, "choose another name or remove it")
-    for path, text in zip(paths, (SCENARIO, TESTS), strict=True):
-        try:
+    made: list[Path] = []
+    try:
+        for path, text in zip(paths, (SCENARIO, TESTS), strict=True):
             # Exclusively: another process may have written it meanwhile.
-            with path.open("x", encoding="utf-8") as file:
+            with writing(path), path.open("x", encoding="utf-8") as file:
+                made.append(path)
                 file.write(text.format(name=name, file=paths[1].name))
-        except OSError as error:
-            raise WriteError(error, path) from error
+    except BaseException:
+        for path in made:
+            with contextlib.suppress(OSError):
+                path.unlink()
+        raise
     return paths

@@ -1,6 +1,7 @@
 """``netkf new`` writes a scenario and tests that run at once, and overwrites nothing."""
 
 import importlib.util
+from pathlib import Path
 
 import pytest
 
@@ -50,6 +51,19 @@ def test_nothing_is_overwritten_and_bad_names_are_refused(written, capsys):
     assert main(["new", "other", "--folder", str(written / "absent")]) == 2
     assert "No such file" in capsys.readouterr().err
     assert (written / "my-ring.toml").read_text() == before
+
+
+def test_a_full_disk_leaves_neither_file(capsys, monkeypatch, tmp_path):
+    def fail(self, *args, **kwargs):
+        if self.suffix == ".py":
+            raise OSError(28, "No space left on device")
+        return before(self, *args, **kwargs)
+
+    before = Path.open
+    monkeypatch.setattr(Path, "open", fail)
+    assert main(["new", "ring", "--folder", str(tmp_path)]) == 2
+    assert "cannot write: No space left on device" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

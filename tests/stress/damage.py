@@ -5,9 +5,10 @@
 Bytes are flipped, inserted, cut and swapped between files; values of JSON documents are replaced by
 others of every kind, some with control characters, with the digests as they were or made right
 again; columns of Parquet tables are renamed, retyped, emptied and repeated. Each case runs one of
-``compare``, ``run --resume`` (one run and many) and ``check --resume`` in this process. It fails
-unless the status is 0, 1 or 2, status 2 prints one line, nothing prints a traceback or a control
-character, and results of status 0 after --resume are those of a run that was left alone.
+``compare``, ``plot``, ``report``, ``why``, ``netkf.open``, ``run --resume`` (one run and many) and
+``check --resume`` in this process. It fails unless the status is 0, 1 or 2, status 2 prints one
+line, nothing prints a traceback or a control character, a page executes nothing of a file, and
+results of status 0 after --resume are those of a run that was left alone.
 """
 
 from __future__ import annotations
@@ -30,17 +31,23 @@ import numpy as np
 import pandas as pd
 
 from netkf.cli.main import main as netkf
+from netkf.core.errors import ScenarioError
+from netkf.core.printable import printable
 from netkf.ensembles import checkpoints
+from netkf.ensembles.stored import StoredEnsemble
 from netkf.runs.documents import file_digests, write_sealed
+from netkf.studies.opening import open as open_result
 
 RING = str(Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml")
 SHORT = ["--set", "horizon=1.0", "--no-plot"]
 MANY = [*SHORT, "--runs", "6", "--trace", "full", "--workers", "1"]
-HOSTILE = "x\x1b[31m\x9b2J\u202e\u2066\n\r\x00y"
+SCRIPT = "<script>stranger()</script>"
+HOSTILE = SCRIPT + "x\x1b[31m\x9b2J\u202e\u2066\n\r\x00y"
 VALUES: list[Any] = [
     None, True, 0, -1, 3, 2**70, 10**400, 1e308, -0.0, 1e-320, "", "1", HOSTILE, "x" * 100_000,
     [], {}, [None], {"a": None}, [[[[]]]], "complete", "diverged", "interrupted",
 ]  # fmt: skip
+SWEEP = ["--vary", "filter.epsilon=0.1,0.3", "--runs", "2", "--workers", "1"]
 TEXTS = [
     "",
     "null",
@@ -72,6 +79,21 @@ def prepare(folder: Path) -> dict[str, tuple[Path, list[str]]]:
     commands["one"] = folder / "one", ["run", RING, *SHORT, "--resume", "--out"]
     more = ["check", gossip, "--runs", "12", "--workers", "1", "--no-plot"]
     commands["verdict"] = folder / "verdict", [*more, "--resume", "--out"]
+    netkf(["sweep", RING, *SHORT, *SWEEP, "--out", str(folder / "sweep")])
+    netkf(["run", RING, *SHORT, "--trace", "none", "--out", str(folder / "none")])
+    drawn = ["--figure", "error,network,nees", "--out", str(folder / "drawn")]
+    page = ["--out", str(folder / "page.html")]
+    for name in ("one", "many", "cut", "sweep"):
+        commands[f"open {name}"] = folder / name, ["open"]
+        commands[f"report {name}"] = folder / name, ["report", *page]
+    for name in ("one", "many", "cut"):
+        commands[f"plot {name}"] = folder / name, ["plot", *drawn]
+        commands[f"why {name}"] = folder / name, ["why", "--replays", "3"]
+    commands["plot sweep"] = folder / "sweep", ["plot", "--out", str(folder / "drawn")]
+    commands["open none"] = folder / "none", ["open"]
+    commands["why at many"] = folder / "many", ["why", "--node=2", "--at=0.5", "--replays=3"]
+    commands["report verdict"] = folder / "verdict", ["report", *page]
+    commands["report two"] = folder / "one", ["report", *page, str(folder / "one")]
     commands["compare many"] = folder / "many", ["compare", str(folder / "other")]
     commands["compare one"] = folder / "one", ["compare", str(folder / "one")]
     return commands
@@ -231,10 +253,23 @@ def run(command: list[str]) -> tuple[Any, str, str]:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            status: Any = netkf(command)
+            status: Any = (open_directory if command[0] == "open" else netkf)(command)
         except BaseException as error:
             status = repr(error)
     return status, out.getvalue(), err.getvalue()
+
+
+def open_directory(command: list[str]) -> int:
+    """Read a directory back from Python; return 2 if it is refused, as a command does."""
+    try:
+        found = open_result(command[1])
+        if isinstance(found, StoredEnsemble):
+            found.replica(0)
+        print(printable(repr(found)))
+    except ScenarioError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -265,6 +300,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=400)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="commands with this in their names")
     options = parser.parse_args()
     failed, statuses = 0, {}
     with tempfile.TemporaryDirectory() as top, contextlib.redirect_stdout(sys.stdout):
@@ -274,7 +310,7 @@ def main() -> int:
             commands = prepare(folder)
         for k in range(options.cases):
             draw = random.Random(options.seed * 1_000_000 + k)
-            name = draw.choice(list(commands))
+            name = draw.choice([name for name in commands if options.only in name])
             source, command = commands[name]
             copy = Path(top) / "copy"
             shutil.copytree(source, copy)
@@ -284,6 +320,9 @@ def main() -> int:
             status, out, err = run([*command, str(copy)])
             wrong = look(status, out, err, time.monotonic() - began)
             whole = folder / ("many" if name == "cut" else name.split()[-1])
+            page = folder / "page.html"
+            if page.exists() and SCRIPT in page.read_text(encoding="utf-8"):
+                wrong.append("a script of a file is on the page")
             resumed = status == 0 and name in ("cut", "many", "one") and not forged
             if resumed and contents(copy) != contents(whole):
                 wrong.append("other files")

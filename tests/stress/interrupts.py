@@ -192,14 +192,16 @@ def look(
 def resume(name: str, out: Path, kept: Path) -> list[str]:
     """Finish a run; return how its files differ from those of a run that was left alone."""
     parts = [str(file) for file in out.rglob("*.part")]
-    process = begin([*COMMANDS[name], "--resume"], out)
+    return ([f"left {parts}"] if parts else []) + finish(COMMANDS[name], out, kept)
+
+
+def finish(command: list[str], out: Path, kept: Path) -> list[str]:
+    """Finish a run with ``--resume``; return what is wrong with how it ends and with its files."""
+    process = begin([*command, "--resume"], out)
     _, printed = process.communicate(timeout=300)
-    wrong = [f"left {parts}"] if parts else []
     if process.returncode != 0 or printed:
-        return [*wrong, f"--resume: status {process.returncode}, printed {printed!r}"]
-    if contents(out) != contents(kept):
-        wrong.append("--resume: other files")
-    return wrong
+        return [f"--resume: status {process.returncode}, printed {printed!r}"]
+    return [] if contents(out) == contents(kept) else ["--resume: other files"]
 
 
 def takes_out(name: str) -> bool:
