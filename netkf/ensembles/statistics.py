@@ -102,6 +102,13 @@ def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
 ) -> Iterator[tuple[RunBatch, str, tuple[Trace, ...]]]:
     """Batches with the fingerprint and the traces of those that are a single recorded run."""
+    if traces == 0 and replicas.start == 0 and 1 < engine.together(scenario) <= len(replicas):
+        # Runs are side by side: one more costs nothing, and the batch is a whole node of the tree.
+        recorder = Recorder([])
+        engine.run(scenario, Streams(seed, 0), recorder, silent)
+        for batch in engine.run_many(scenario, seed, replicas):
+            yield batch, recorder.fingerprint, ()
+        return
     recorded = min(max(traces, 1), replicas.stop)  # replica 0 always has a fingerprint
     for replica in range(replicas.start, recorded):
         yield _recorded_run(scenario, seed, replica, engine, replica < traces)

@@ -237,12 +237,17 @@ def _place_of(context: Any, builder: Any, sig: Any, args: Any, which: int, k: in
 
 
 class _Matrix:
-    """An array as a matrix, of the first axis and all others together."""
+    """An array as a matrix, of the first axis and all others together, which are contiguous."""
 
     def __init__(self, context: Any, builder: Any, kind: Any, value: Any) -> None:
         array = context.make_array(kind)(context, builder, value)
         shape = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
         self._data, self._builder, self._columns = array.data, builder, ir.Constant(I64, 1)
+        if kind.layout != "C":
+            # A part of each row of an array: as far apart as these rows.
+            step = builder.extract_value(array.strides, 0)
+            self._columns = builder.sdiv(step, ir.Constant(I64, 8))
+            return
         for size in shape[1:]:
             self._columns = builder.mul(self._columns, size)
 

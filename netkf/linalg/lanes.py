@@ -38,6 +38,13 @@ def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
     return memory[start : start + size].view(dtype).reshape(shape)
 
 
+def unset(shape: tuple[int, ...]) -> Any:
+    """Memory as ``aligned``, with anything in it: for large arrays that are filled at once."""
+    memory = np.empty(math.prod(shape) + ALIGNMENT // 8)
+    start = -memory.__array_interface__["data"][0] % ALIGNMENT // 8
+    return memory[start : start + math.prod(shape)].reshape(shape)
+
+
 def with_spare(shape: tuple[int, ...]) -> Any:
     """Zeros as ``aligned``, with memory for a block of L by L behind them."""
     entries = math.prod(shape)
@@ -86,7 +93,9 @@ def gather(
 def scatter(
     lanes: Lanes, rows: FloatArray, first: int, array: FloatArray, places: np.ndarray, count: int
 ) -> None:
-    """Write them back, the ``count`` first of them, where the place is not negative."""
+    """Write them back, the ``count`` first of them, where the place is not negative. The array may
+    be a part ``whole[:, k]`` of another.
+    """
     raise _only_in_kernels()
 
 

@@ -113,16 +113,24 @@ def test_the_gain_of_push_sum(seed, n):
     assert (corrected(x, root, 3.5, y[:0], H[:0], R[:0, :0]) == x).all()
 
 
+@pytest.mark.parametrize("framed", [False, True])
 @pytest.mark.parametrize(("seed", "n"), CASES)
-def test_samples_show_the_covariance_and_frames_move_estimates(seed, n):
+def test_samples_show_the_covariance_and_frames_move_estimates(seed, n, framed):
     random = np.random.default_rng(seed)
     nodes, readings = filters(random, n, 1)
     runs = LANES - 1  # the last lane is idle
+    absolute = 100.0 + random.standard_normal((1, 1, n, LANES))
     samples = slots.SlotSamples(
+        np.empty((runs, 1, n)),
         np.empty((runs, 1, 2, n)),
         np.empty((runs, 1, 2, n, n)),
+        np.empty((runs, 1, 2, n)),
         np.zeros((1, 2, LANES), int),
         np.zeros((1, 2, 2, LANES)),
+        absolute,
+        readings.local,
+        framed,
+        np.zeros((1, LANES)),
     )
     flags, up = np.array([True]), np.zeros((1, 1, 1, 0, LANES), dtype=np.uint8)
     plan, room = slots.SlotPlan(0, flags, flags, np.array([0]), up), slots.slot_room(2, n)
@@ -133,6 +141,12 @@ def test_samples_show_the_covariance_and_frames_move_estimates(seed, n):
         for h in range(2):
             cov = estimates(nodes, h, q)[1]
             np.testing.assert_allclose(samples.P[q, 0, h], cov, rtol=1e-10, atol=1e-12)
-            np.testing.assert_array_equal(samples.xhat[q, 0, h], before[0, h, :, q])
+            local = readings.local[0, 0, :, q]
+            mine = before[0, h, :, q] + framed * (absolute[0, 0, :, q] - local)
+            np.testing.assert_allclose(samples.xhat[q, 0, h], mine, rtol=1e-13)
+            np.testing.assert_array_equal(samples.error[q, 0, h], local - before[0, h, :, q])
+        np.testing.assert_array_equal(samples.x[q, 0], absolute[0, 0, :, q])
+        shown = samples.xhat[q].sum() + sum(np.tril(P).sum() for P in samples.P[q, 0])
+        np.testing.assert_allclose(samples.total[0, q], shown, rtol=1e-10)
     moved = before - readings.local[0, 0]
     np.testing.assert_array_equal(nodes.xhat, moved)

@@ -30,6 +30,7 @@ from netkf.linalg.lanes import (
     load,
     magnitude,
     root_of,
+    scatter,
     select,
     spread,
     store,
@@ -88,21 +89,33 @@ class SlotLinks(NamedTuple):
 
 
 class SlotSamples(NamedTuple):
-    """xhat (R, T, H, n) and P (R, T, H, n, n); the slot in which each filter stopped learning for
-    good, ``stopped`` (B, H, L), and what it holds of K conserved sums at the last sample,
-    ``conserved`` (B, H, K, L).
+    """States x (R, T, n), xhat (R, T, H, n) and P (R, T, H, n, n) in the coordinates of the plant,
+    and errors (R, T, H, n); the slot in which each filter stopped learning for good, ``stopped``
+    (B, H, L), and what it holds of K conserved sums at the last sample, ``conserved`` (B, H, K, L).
+
+    Of the slots, the states ``absolute`` and ``local`` (B, S, n, L), the latter in the coordinates
+    of the estimates, which are the plant's unless they are ``framed``. ``total`` (B, L): the sum of
+    all that was shown of xhat and P so far, finite where all of it is.
     """
 
+    x: FloatArray
     xhat: FloatArray
     P: FloatArray
+    error: FloatArray
     stopped: np.ndarray
     conserved: FloatArray
+    absolute: FloatArray
+    local: FloatArray
+    framed: bool
+    total: FloatArray
 
 
 class SlotRoom(NamedTuple):
     """The ``lanes`` and scratch: ``row``, ``gains`` and ``moved_mean`` (n, L) of a reading and a
     mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened`` and ``total``
-    (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n, n, L).
+    (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n, n, L). Of a
+    sample ``shown_xhat`` and ``shown_error`` (>= H n, L), ``shown_P`` (>= H n n, L) and the
+    ``places`` (L,) of its runs.
     """
 
     lanes: Lanes
@@ -115,13 +128,21 @@ class SlotRoom(NamedTuple):
     total: FloatArray
     xhat: FloatArray
     root: FloatArray
+    shown_xhat: FloatArray
+    shown_error: FloatArray
+    shown_P: FloatArray
+    places: np.ndarray
 
 
 def slot_room(H: int, n: int, lanes: Lanes = MANY) -> SlotRoom:
     """Scratch for H filters of n states."""
     L = len(lanes)
     shapes: list[tuple[int, ...]] = [*[(n, L)] * 3, *[(n, n, L)] * 2, *[(n, n + 1, L)] * 2]
-    return SlotRoom(lanes, *(aligned(shape) for shape in [*shapes, (H, n, L), (H, n, n, L)]))
+    shapes += [(H, n, L), (H, n, n, L)]
+    # L entries are moved at a time, which goes beyond the last one.
+    shapes += [(H * n + L, L), (H * n + L, L), (H * n * n + L, L)]
+    scratch: list[Any] = [aligned(shape) for shape in shapes]
+    return SlotRoom._make([lanes, *scratch, np.zeros(L, dtype=np.int64)])
 
 
 def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -140,23 +161,45 @@ def show(
     if k < 0:
         return
     n, first = nodes.xhat.shape[2], b * len(lanes)
+    sum_of_all = load(lanes, samples.total, b)
     for h in range(len(nodes.rows)):
-        # P = S S', lower triangle and its mirror image, because samples hold covariances.
         for i in range(n):
+            x = load(lanes, nodes.xhat, b, h, i)
+            # In the coordinates of the estimates: a difference of large states loses digits.
+            local = load(lanes, samples.local, b, s, i)
+            store(lanes, room.shown_error, h * n + i, local - x)
+            if samples.framed:
+                x += load(lanes, samples.absolute, b, s, i) - local
+            store(lanes, room.shown_xhat, h * n + i, x)
+            sum_of_all += x
+            # P = S S', lower triangle and its mirror image, because samples hold covariances.
             for j in range(i + 1):
                 total = spread(lanes, 0.0)
                 for m in range(j + 1):
                     total += load(lanes, nodes.root, b, h, i, m) * load(
                         lanes, nodes.root, b, h, j, m
                     )
-                store(lanes, room.moved, i, j, total)
-                store(lanes, room.moved, j, i, total)
-        # From lanes to runs; idle lanes have none.
-        for q in range(min(len(lanes), len(samples.xhat) - first)):
-            for i in range(n):
-                samples.xhat[first + q, k, h, i] = nodes.xhat[b, h, i, q]
-                for j in range(n):
-                    samples.P[first + q, k, h, i, j] = room.moved[i, j, q]
+                store(lanes, room.shown_P, (h * n + i) * n + j, total)
+                store(lanes, room.shown_P, (h * n + j) * n + i, total)
+                sum_of_all += total
+    store(lanes, samples.total, b, sum_of_all)
+    for q in range(len(lanes)):
+        # Idle lanes are not shown.
+        shown = first + q < len(samples.x)
+        room.places[q] = first + q if shown else -1
+        for i in range(n if shown else 0):
+            samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
+    hand_out(room, room.shown_xhat, samples.xhat[:, k], len(nodes.rows) * n)
+    hand_out(room, room.shown_error, samples.error[:, k], len(nodes.rows) * n)
+    hand_out(room, room.shown_P, samples.P[:, k], len(nodes.rows) * n * n)
+
+
+@kernel(inlined=True)
+def hand_out(room: SlotRoom, lines: FloatArray, samples: FloatArray, count: int) -> None:
+    """Write ``count`` lines (>= count, L) of a block into the ``samples`` (R, ...) of its runs."""
+    for c in range(0, count, len(room.lanes)):
+        most = min(count - c, len(room.lanes))
+        scatter(room.lanes, lines, c, samples, room.places, most)
 
 
 @kernel

@@ -91,7 +91,9 @@ class CompiledEngine(Engine):
 
     def together(self, scenario: Scenario) -> int:
         """Runs in slots are side by side: few of them take as long as several."""
-        return slot_setup(scenario).quick_runs() if scenario.slotted else 1
+        if not scenario.slotted or not slot_setup(scenario).is_drawn:
+            return 1
+        return slot_setup(scenario).quick_runs()
 
     def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
         """Yield the runs of consecutive replicas in order."""

@@ -407,18 +407,14 @@ class FlowRun:
             # Rows up to that sample, and no row after it.
             self._pass_rows_on(int(shown.rows[0, k]), shown.counts[0, k])
 
-        fine = recorded(
-            self._scenario,
-            self._recorder,
-            self._progress,
-            times,
-            x,
-            local,
-            # Copies: the loop writes the next samples into the same space.
-            shown.xhat[0, :count].copy(),
-            shown.P[0, :count].copy(),
-            pass_rows_on,
-        )
+        # Copies: the loop writes the next samples into the same space.
+        xhat, P = shown.xhat[0, :count].copy(), shown.P[0, :count].copy()
+        # In local coordinates: the difference of absolute states would lose digits.
+        error = local[:, None] - xhat
+        if local is not x:
+            xhat += (x - local)[:, None]
+        parts = self._scenario, self._recorder, self._progress
+        fine = recorded(*parts, times, x, xhat, P, error, pass_rows_on)
         if self._totals is not None:
             self._recorder.sums = _sums(shown.terms[lost[0]], self._totals.receivers)
         return fine

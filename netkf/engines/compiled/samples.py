@@ -22,15 +22,14 @@ def recorded(
     progress: Progress,
     times: FloatArray,
     x: FloatArray,
-    local: FloatArray,
     xhat: FloatArray,
     P: FloatArray,
+    error: FloatArray,
     pass_rows_on: Callable[[int], None],
 ) -> bool:
-    """Record the states x (T, n), which are ``local`` (T, n) in the coordinates of the estimates,
-    xhat (T, H, n) and P (T, H, n, n) of H hosts at these times up to the first that is not sound;
-    whether there is none. ``pass_rows_on`` is given the place of that
-    one: what happened after it did not happen.
+    """Record the states x (T, n), xhat (T, H, n), P (T, H, n, n) and errors (T, H, n) of H hosts at
+    these times up to the first that is not sound; return True if there is none. ``pass_rows_on``
+    is given the place of that one: what happened after it did not happen.
     """
     # The loop may stop for other reasons than samples.
     if not len(times):
@@ -39,15 +38,11 @@ def recorded(
     # The trace shows a row for each node, though all of them share a pooled filter.
     if scenario.filter.algorithm.pooled:
         nodes = len(scenario.nodes)
-        xhat, P = np.repeat(xhat, nodes, axis=1), np.repeat(P, nodes, axis=1)
+        xhat, P, error = (np.repeat(values, nodes, axis=1) for values in (xhat, P, error))
     # argmin finds the first False.
     last = len(times) - 1 if intact.all() else int(np.argmin(intact))
     after, time = last + 1, float(times[last])
-    # In local coordinates: the difference of absolute states would lose digits.
-    error = local[:after, None] - xhat[:after]
-    # Absolute estimates, for the trace only.
-    far = xhat[:after] if local is x else xhat[:after] + (x - local)[:after, None]
-    recorder.samples(times[:after], x[:after], far, P[:after], error)
+    recorder.samples(times[:after], x[:after], xhat[:after], P[:after], error[:after])
     progress(time)
     if intact.all():
         return True

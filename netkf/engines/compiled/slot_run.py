@@ -36,8 +36,7 @@ from netkf.engines.compiled.slot_messages import (
 )
 from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes
+from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.linalg.portable import solve_lower
 from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
@@ -53,16 +52,25 @@ NEVER = np.iinfo(np.int64).max
 
 
 class SlotBlock(NamedTuple):
-    """Results of S slots of R runs: states absolute and local (R, T, n) in the slots that are
-    ``sampled`` (T,), and what the filters had then.
+    """Results of S slots of R runs: the slots that are ``sampled`` (T,), and what the filters had
+    then.
     """
 
-    absolute: FloatArray
-    local: FloatArray
     sampled: np.ndarray
     samples: SlotSamples
     times: SlotTimes
     drawn: Drawn
+
+
+class Shown(NamedTuple):
+    """Samples of R runs as ``SlotSamples`` has them: x (R, T, n), xhat (R, T, H, n), P
+    (R, T, H, n, n), errors (R, T, H, n).
+    """
+
+    x: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+    error: FloatArray
 
 
 class SlotRuns:
@@ -79,8 +87,9 @@ class SlotRuns:
         self._slot = 0
         setup, runs = self.setup, self.runs
         # Samples of the whole runs if so many are wanted at once, else those of a block.
-        self.samples = self._empty_samples(len(setup.samples)) if whole else None
+        self.shown = self._space(len(setup.samples)) if whole else None
         self._blocks = blocks = blocks_of(runs)
+        self._total = aligned((blocks, LANES))
         self._nodes = SlotNodes(
             in_lanes(setup.xhat, blocks),
             in_lanes(setup.root, blocks),
@@ -191,19 +200,32 @@ class SlotRuns:
         local, absolute, rebased = self._states(count)
         readings = self._readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
-        kept = self.samples if self.samples is not None else self._empty_samples(len(sampled))
-        samples = SlotSamples(*kept, self._stopped, self._conserved)
+        shown = self.shown if self.shown is not None else self._space(len(sampled))
+        samples = SlotSamples(
+            *shown, self._stopped, self._conserved, absolute, local, setup.frame > 0, self._total
+        )
         plan = SlotPlan(self._slot, times.sensed, times.exchanged, times.sample, drawn.up)
         kernel = type(setup.algorithm).slot_kernel
         kernel(self._nodes, readings, plan, setup.links, samples, self._room, *self._extra)
         self._slot += count
-        absolute, local = (by_run(x[:, sampled], self.runs) for x in (absolute, local))
-        return SlotBlock(absolute, local, sampled, samples, times, drawn)
+        return SlotBlock(sampled, samples, times, drawn)
 
-    def _empty_samples(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Space for so many samples, xhat (R, T, H, n) and P (R, T, H, n, n)."""
-        shape = self.runs, count, self.setup.hosts, self.setup.n
-        return np.empty(shape), np.empty((*shape, self.setup.n))
+    def _space(self, count: int) -> Shown:
+        """Space for so many samples."""
+        runs, hosts, n = self.runs, self.setup.hosts, self.setup.n
+        shape = runs, count, hosts, n
+        shapes = (runs, count, n), shape, (*shape, n), shape
+        ends = np.cumsum([math.prod(each) for each in shapes])
+        # One piece of memory: numpy asks for huge pages for large ones, which cost little to get.
+        parts = np.split(np.empty(int(ends[-1])), ends[:-1])
+        return Shown(*(part.reshape(each) for part, each in zip(parts, shapes, strict=True)))
+
+    @property
+    def broken(self) -> np.ndarray:
+        """(R,) bool: runs whose estimates or covariances have grown beyond all numbers, or whose
+        sum has.
+        """
+        return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
     def _times(self, count: int, wanted: bool) -> SlotTimes:
         """Flags, samples and, if ``wanted``, start times of the next slots."""
@@ -218,7 +240,7 @@ class SlotRuns:
         sample = np.full(count, -1, dtype=np.int64)
         first, last = np.searchsorted(setup.samples, (self._slot, self._slot + count))
         # Counted from the first sample of the run, or of these slots.
-        here = np.arange(first, last) - (first if self.samples is None else 0)
+        here = np.arange(first, last) - (first if self.shown is None else 0)
         sample[setup.samples[first:last] - self._slot] = here
         start = np.zeros(count)
         # Times are computed only if rows are wanted: a batch has none.
@@ -229,10 +251,12 @@ class SlotRuns:
     def _draw_messages(self, times: SlotTimes) -> Drawn:
         setup = self.setup
         steps, pairs = (len(times.start), len(setup.fresh)), setup.most_pairs
+        # Without matchings nobody looks at pairs.
+        matched = self.runs if setup.matching[0] >= 0 else 0
         drawn = Drawn(
             np.zeros((self._blocks, *steps, len(setup.directions), LANES), dtype=np.uint8),
-            np.zeros((self.runs, *steps, pairs), dtype=np.int64),
-            np.zeros((self.runs, *steps), dtype=np.int64),
+            np.empty((matched, *steps, pairs), dtype=np.int64),
+            np.zeros((matched, *steps), dtype=np.int64),
         )
         if len(setup.directions):
             draw_messages(
@@ -254,9 +278,9 @@ class SlotRuns:
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
         shape = self._blocks, count, setup.n, LANES
-        local: FloatArray = aligned(shape)
+        local: FloatArray = unset(shape)
         # Without frames both are the same array.
-        absolute: FloatArray = aligned(shape) if setup.frame else local
+        absolute: FloatArray = unset(shape) if setup.frame else local
         self._draw_path(self._path, self._plant_states, local, absolute)
         return local, absolute, rebased
 
@@ -269,17 +293,17 @@ class SlotRuns:
     def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> SlotReadings:
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.hosts, setup.p
-        y: FloatArray = aligned((*shape, LANES))
+        y: FloatArray = unset((*shape, LANES))
         H: FloatArray = setup.H
         if setup.varies:
-            H = aligned((*shape, setup.n, LANES))
+            H = unset((*shape, setup.n, LANES))
             H[:] = setup.H
         x = local
         if rebased.any() and setup.algorithm.predicts:  # read in the frame that begins there
             x = local.copy()
             x[:, rebased] = 0.0
         k = setup.sensors.C.shape[2]
-        driven: FloatArray = aligned((len(self._regressors), self._blocks, count, k, LANES))
+        driven: FloatArray = unset((len(self._regressors), self._blocks, count, k, LANES))
         for path, (steps, states) in zip(driven, self._regressors, strict=True):
             self._draw_path(steps, states, path, path)
         noise, room = self._noise, np.zeros((setup.p, LANES))
@@ -374,16 +398,16 @@ def _record_block(
     if len(block.sampled):
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
-    x = block.absolute[0]
+    samples = block.samples
     fine = recorded(
         scenario,
         recorder,
         progress,
         block.times.start[block.sampled],
-        x,
-        block.local[0] if runs.setup.frame else x,
-        block.samples.xhat[0],
-        block.samples.P[0],
+        samples.x[0],
+        samples.xhat[0],
+        samples.P[0],
+        samples.error[0],
         # The rows up to the first broken sample, if there is one.
         lambda k: recorder.extend(rows[: before[k]]),
     )
@@ -394,16 +418,6 @@ def _record_block(
 
 MOST_ROWS = 1 << 15
 """Rows of events that are made at once."""
-
-
-@kernel
-def fill_errors(x: FloatArray, xhat: FloatArray, error: FloatArray) -> None:
-    """Write ``x - xhat`` (R, T, H, n) of states x (R, T, n)."""
-    for r in range(xhat.shape[0]):
-        for t in range(xhat.shape[1]):
-            for h in range(xhat.shape[2]):
-                for i in range(xhat.shape[3]):
-                    error[r, t, h, i] = x[r, t, i] - xhat[r, t, h, i]
 
 
 def slot_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
@@ -421,23 +435,11 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
     it has (``with_ends`` mends that).
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), whole=True)
-    assert runs.samples is not None
-    xhat, P = runs.samples
-    x = np.empty((len(replicas), *xhat.shape[1::2]))
-    local = np.empty(x.shape) if runs.setup.frame else x
-    first = 0
+    assert runs.shown is not None
     while not runs.over:
         with np.errstate(over="ignore", invalid="ignore"):
-            block = runs.following(0)
-        runs.count_events(block)
-        some = slice(first, first + len(block.sampled))
-        x[:, some], local[:, some] = block.absolute, block.local
-        first = some.stop
-    error = np.empty(xhat.shape)
-    fill_errors(local, xhat, error)
-    # Estimates in absolute coordinates for the batch; errors stay local.
-    if runs.setup.frame:
-        xhat = xhat + (x - local)[:, :, None]
+            runs.count_events(runs.following(0))
+    x, xhat, P, error = runs.shown
     return RunBatch(
         replicas=replicas,
         times=runs.setup.sample_times,
@@ -447,7 +449,7 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
         error=error,
         lengths=np.full(len(replicas), x.shape[1]),
         counts=runs.counts,
-        status=np.full(len(replicas), COMPLETE),
+        status=np.where(runs.broken, DIVERGED, COMPLETE),
         sums=runs.conserved(),
         exact_errors=scenario.exact_errors,
     )
@@ -456,11 +458,7 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
 def with_ends(batch: RunBatch, alone: Callable[[range], Iterator[RunBatch]]) -> RunBatch:
     """The batch with every run that diverges as it is ``alone``, where it ends."""
     # A run that diverges goes on in a batch; its true end is that of the run alone.
-    # A sum is finite if all its terms are; of huge ones it may overflow, which does no harm.
-    with np.errstate(over="ignore", invalid="ignore"):
-        sums = [v.reshape(len(batch), -1).sum(axis=1) for v in (batch.xhat, batch.P)]
-    fine = np.isfinite(sums).all(axis=0)
-    for r in np.flatnonzero(~fine).tolist():
+    for r in np.flatnonzero(batch.diverged).tolist():
         (one,) = alone(batch.replicas[r : r + 1])
         for name in ("x", "xhat", "P", "error", "lengths", "counts", "status"):
             getattr(batch, name)[r] = getattr(one, name)[0]

@@ -284,9 +284,9 @@ class SlotSetup:
     def batch_runs(self) -> int:
         """Runs that are simulated side by side."""
         samples = max(1, 8 * len(self.samples) * self.hosts * (2 + self.n) * self.n)
-        # Whole blocks of lanes, unless not even one fits the memory.
+        # A power of two, a node of the tree over runs, unless not even a block of lanes fits.
         together = min(BATCH_BYTES // samples, BLOCK_BYTES // (8 * self.bytes_of_slot()))
-        whole = min(together, MOST_RUNS) // LANES * LANES
+        whole = 1 << max(0, int(min(together, MOST_RUNS)).bit_length() - 1)
         return int(min(max(whole, LANES), max(1, MOST_BATCH_BYTES // samples)))
 
     def quick_runs(self) -> int:
@@ -298,7 +298,7 @@ class SlotSetup:
 
 BLOCK_BYTES = 1 << 21
 """Of what is drawn for one call of a filter's kernel: about what a core keeps close by."""
-BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 24, 1 << 29, 512
+BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 23, 1 << 29, 512
 """Of the samples of a batch, those of a block of lanes, and the largest number of runs."""
 QUICK_FLOPS = 1 << 22
 """Of runs that are worth doing together from the first one on: some milliseconds."""
