@@ -79,6 +79,12 @@ from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActi
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.nonlinear import (
+    BearingSensor,
+    NonlinearSensor,
+    RangeBearingSensor,
+    RangeSensor,
+)
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import (
     RecordedDiffusion,
@@ -109,6 +115,7 @@ def __dir__() -> list[str]:
 
 __all__ = [
     "BarShalomCampo",
+    "BearingSensor",
     "Belief",
     "Bernoulli",
     "Broadcast",
@@ -158,6 +165,7 @@ __all__ = [
     "NoDelay",
     "NoLoss",
     "NodeInfo",
+    "NonlinearSensor",
     "OnReadings",
     "OneBit",
     "OptimisedIntersection",
@@ -167,6 +175,8 @@ __all__ = [
     "Plant",
     "Poisson",
     "PushSum",
+    "RangeBearingSensor",
+    "RangeSensor",
     "Reading",
     "RecordedClock",
     "RecordedDelay",

@@ -51,6 +51,7 @@ from netkf.runs.simulate import LOAD, choose_engine, simulate
 from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
+from netkf.theory.common.evidence import NONLINEAR
 from netkf.trace.run import Run
 
 if TYPE_CHECKING:
@@ -105,6 +106,8 @@ class Verdict(Shown):
 
 def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
+    if not scenario.is_linear:
+        raise TheoryError(f"nothing is promised here: {NONLINEAR}")
     promised = promised_filter(scenario.filter.algorithm)
     if not promised.paper:
         name = spoken(promised)

@@ -194,10 +194,14 @@ class SlotReadings:
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """(p,) the reading of a slot not before the last one asked for; each has its own noise."""
+        return apply(self.matrix(slot), x) + self.noise(slot)
+
+    def noise(self, slot: int) -> FloatArray:
+        """(p,) the noise of the reading of a slot not before the last one asked for."""
         while self._slot < slot:
             self._v = apply(self._root, self._noise.draw())
             self._slot += 1
-        return apply(self.matrix(slot), x) + self._v
+        return self._v
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
         """``matrix`` (S, p, n) of slots that ascend."""

@@ -46,10 +46,18 @@ class Sensor(Component):
 
     nodes: tuple[int, ...] = field(several(integer(), "node ids"))
 
+    linear: ClassVar[bool] = True
+    """Whether readings are linear in the state."""
+
     @property
     def varying(self) -> bool:
-        """True if H differs from slot to slot; such sensors exist in slots only."""
+        """True if H differs from reading to reading."""
         return False
+
+    def matrix_of(self, n: int) -> FloatArray:
+        """Return H (p, n) of the first reading, for a state of n components."""
+        H: FloatArray = self.H  # type: ignore[attr-defined]
+        return H
 
     @abstractmethod
     def slot_path(

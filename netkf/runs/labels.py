@@ -27,7 +27,7 @@ def covariance_bias(scenario: Scenario) -> str:
     algorithm = scenario.filter.algorithm
     design = scenario.hosted.P_by_design[0 if scenario.slotted else 1]
     # The statement is about the steps of the built-in class; one without links does not combine.
-    if overridden(algorithm) or not scenario.topology.links:
+    if overridden(algorithm) or not scenario.topology.links or not scenario.is_linear:
         return ""
     return "" if design == "larger" and not scenario.filters_know_the_truth else design
 
@@ -51,6 +51,11 @@ def nees_note(scenario: Scenario) -> str:
 
 def mismatch_note(scenario: Scenario) -> str:
     """Return a note on P and its bound if the filters have a wrong model; else empty."""
+    if not scenario.is_linear:
+        return (
+            "readings are not linear: filters linearise them at their own estimates, and P need "
+            "not be, or bound, the covariance of the error"
+        )
     if scenario.filters_know_the_truth:
         return ""
     if not scenario.is_random:

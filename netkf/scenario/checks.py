@@ -12,7 +12,12 @@ from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.regressors import RegressorSensor
-from netkf.scenario.combination import check_invertible, check_regressor, check_weights
+from netkf.scenario.combination import (
+    check_invertible,
+    check_nonlinear,
+    check_regressor,
+    check_weights,
+)
 from netkf.scenario.compatibility import check_activation, check_readings, check_time
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import check_records
@@ -117,6 +122,8 @@ def _check_sensors(scenario: DerivedScenario) -> None:
         key = f"sensors[{k}]"
         if isinstance(sensor, RegressorSensor):
             check_regressor(scenario, key, sensor)
+        elif not sensor.linear:
+            check_nonlinear(scenario, key, sensor)
         else:
             demand_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
             p = len(sensor.H)
@@ -145,7 +152,8 @@ def _check_speed(scenario: DerivedScenario) -> None:
     delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.truth.A
     longest = max(scenario.horizon, delay)
     believed, Q = scenario.belief
-    gains = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in scenario.sensors]
+    linear = [sensor for sensor in scenario.sensors if sensor.linear]
+    gains = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in linear]
     size = max((float(np.abs(G).max()) for G in gains), default=0.0) * float(np.abs(Q).max())
     norm = max(float(np.abs(M).sum(axis=0).max()) for M in (A, believed))
     if (norm + np.sqrt(size)) * longest > MAX_CONSTANTS:
@@ -291,7 +299,7 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
         key, own = (
             ("filter.model.R", R) if not isinstance(R, tuple) else (f"filter.model.R[{k}]", R[k])
         )
-        p = len(sensor.H)
+        p = len(sensor.R)
         demand_shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.core.errors import ScenarioError
+from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.registry import spoken
@@ -29,6 +30,15 @@ def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor
     demand_shape(f"{key}.start", sensor.start, (m,), why)
     demand_shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
     demand_shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
+
+
+def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor) -> None:
+    """Raise ScenarioError if a nonlinear sensor cannot read the state, or has no positions."""
+    try:
+        for part in (sensor, sensor.located(scenario.topology.positions)):
+            part.check_state(scenario.plant.n)
+    except ScenarioError as error:
+        raise error.under(key) from None
 
 
 def check_weights(scenario: DerivedScenario) -> None:

@@ -22,6 +22,7 @@ from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
 from netkf.plants.sampling import Samples
+from netkf.plants.sensors import Sensor
 from netkf.plants.transitions import frame_period, frame_slots
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, ScenarioModel
@@ -147,7 +148,8 @@ class DerivedScenario(ScenarioModel):
         This needs an unstable plant whose state and readings are all drawn, and filters that have
         its A (in slots F) and commute with a shift of the state; see plants.truth.
         """
-        if not self.is_random or not commutes(self.hosted):
+        # Readings that are not linear depend on where the origin is.
+        if not self.is_random or not self.is_linear or not commutes(self.hosted):
             return False
         plant = self.plant
         if isinstance(plant, LinearPlant):
@@ -169,7 +171,7 @@ class DerivedScenario(ScenarioModel):
         """
         placed = (self.placed if self.slotted else self.increment_sensors).get(node, ())
         if any(self.sensors[place.entry].varying for place in placed):
-            raise TheoryError(f"node {node} has a regressor sensor, whose H is random")
+            raise TheoryError(f"node {node} has a sensor whose H is random, or not linear")
         return self._stacked(placed, believed)
 
     def _stacked(
@@ -180,7 +182,7 @@ class DerivedScenario(ScenarioModel):
     def _stack(self, entries: tuple[int, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
         # Thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
-            H = [self.sensors[entry].H for entry in entries]
+            H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]
             R = [self.noise(entry, believed) for entry in entries]
             empty = np.zeros((0, self.plant.n))
             self._stacks[entries, believed] = np.concatenate([empty, *H]), block_diagonal(R)
@@ -200,7 +202,8 @@ class DerivedScenario(ScenarioModel):
 
     def slot_path(self, streams: Streams, node: int, place: PlacedSensor) -> Readings:
         """Return the readings of one sensor of a node in one run in slots."""
-        sensor, period = self.sensors[place.entry], self.slot_plant.period
+        sensor: Sensor = self.located_sensors[place.entry]
+        period = self.slot_plant.period
         return sensor.slot_path(
             node, period, lambda purpose: streams.generator(purpose, node, place.ordinal)
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,9 +37,9 @@ from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
 from netkf.plants.linear import LinearPlant
+from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import RecordedSensor
-from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
 
 
@@ -115,7 +115,7 @@ class PlacedSensor(NamedTuple):
 def takes_samples(sensor: Sensor) -> bool:
     """Return True if a sensor over a diffusion samples it, False if it gives increments."""
     return isinstance(sensor, RecordedSensor) or (
-        isinstance(sensor, LinearSensor) and sensor.sampling is not None
+        isinstance(sensor, (LinearSensor, NonlinearSensor)) and sensor.sampling is not None
     )
 
 
@@ -130,14 +130,25 @@ class ScenarioModel(Component):
     name: str = field(text)
     horizon: float = field(seconds)
     plant: Plant = field(instance(Plant))
-    sensors: tuple[LinearSensor | RegressorSensor | RecordedSensor, ...] = field(
-        several(instance(Sensor), "sensors", least=0)
-    )
+    sensors: tuple[Any, ...] = field(several(instance(Sensor), "sensors", least=0))
     network: Network = field(instance(Network))
     filter: Filtering = field(instance(Filtering))
     probe: float | FloatArray = field(either(seconds, array(1, "list of times"), nested(1)))
     claim: str = field(line, default="")
     seed: int = field(integer(low=0), default=0)
+
+    @property
+    def is_linear(self) -> bool:
+        """True if all readings are linear in the state."""
+        return all(sensor.linear for sensor in self.sensors)
+
+    @cached_property
+    def located_sensors(self) -> tuple[Any, ...]:
+        """The sensors, nonlinear ones at the positions of the graph where they name no others."""
+        return tuple(
+            sensor if sensor.linear else sensor.located(self.topology.positions)
+            for sensor in self.sensors
+        )
 
     @cached_property
     def topology(self) -> Topology:
@@ -228,7 +239,8 @@ class ScenarioModel(Component):
         """Return the true or the believed R (p, p) of a ``[[sensors]]`` entry."""
         R = self.filter.model.R
         if not believed or R is None:
-            return self.sensors[entry].R
+            true: FloatArray = self.sensors[entry].R
+            return true
         return R[entry] if isinstance(R, tuple) else R
 
     def table_probability(self, link: Link) -> float:

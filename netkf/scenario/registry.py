@@ -12,6 +12,7 @@ from netkf.core.fields import Component
 from netkf.network import channels, clocks, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.nonlinear import BearingSensor, RangeBearingSensor, RangeSensor
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import (
     RecordedDiffusion,
@@ -51,7 +52,14 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "unknown": UnknownPlant,
     },
     "continuous plant": {"recorded": RecordedDiffusion, "unknown": UnknownDiffusion},
-    "sensor": {"linear": LinearSensor, "regressor": RegressorSensor, "recorded": RecordedSensor},
+    "sensor": {
+        "linear": LinearSensor,
+        "regressor": RegressorSensor,
+        "recorded": RecordedSensor,
+        "range": RangeSensor,
+        "bearing": BearingSensor,
+        "range-bearing": RangeBearingSensor,
+    },
     "sampling": {
         "periodic": clocks.Periodic,
         "poisson": clocks.Poisson,

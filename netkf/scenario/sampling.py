@@ -13,9 +13,10 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.recorded import RecordedDiffusion, RecordedSensor
 from netkf.plants.sampling import RecordedSampling, Samples
-from netkf.plants.sensors import LinearSensor
+from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 
@@ -39,7 +40,7 @@ def sample_path(
     scenario: ScenarioModel, streams: Streams, node: int, place: PlacedSensor
 ) -> Samples:
     """Return the samples of one sensor of a node in one run."""
-    sensor = scenario.sensors[place.entry]
+    sensor: Sensor = scenario.located_sensors[place.entry]
     return sensor.samples(node, _generator(streams, node, place), scenario.horizon)
 
 
@@ -61,7 +62,7 @@ def sample_rate(scenario: ScenarioModel, node: int) -> float:
     if len(places) != 1:  # several may sample at one instant
         return math.nan if places else 0.0
     sensor = scenario.sensors[places[0].entry]
-    clock = sensor.sampling if isinstance(sensor, LinearSensor) else None
+    clock = getattr(sensor, "sampling", None)
     return math.nan if clock is None else clock.mean_rate((node, 0))
 
 
@@ -101,8 +102,16 @@ def check_sampling(scenario: ScenarioModel) -> None:
     """
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
-        if isinstance(sensor, LinearSensor) and sensor.sampling is not None:
-            _check_clock(scenario, key, sensor)
+        if isinstance(sensor, (LinearSensor, NonlinearSensor)):
+            if sensor.sampling is not None:
+                _check_clock(scenario, key, sensor)
+            elif not sensor.linear and not scenario.slotted:
+                raise ScenarioError(
+                    f"{key}.sampling",
+                    "is missing, and a nonlinear sensor takes samples in continuous time",
+                    None,
+                    'write sampling = { kind = "periodic", period = ... }',
+                )
         if not scenario.slotted and not scenario.plant.is_random and not takes_samples(sensor):
             raise ScenarioError(
                 f"{key}.sampling",
@@ -120,7 +129,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
         demand_states(scenario, sample_times(scenario, Streams(scenario.seed)))
 
 
-def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor) -> None:
+def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:
     clock = sensor.sampling
     assert clock is not None
     if scenario.slotted:

@@ -164,7 +164,8 @@ class _Innovations:
     def of_node(self, i: int) -> Iterator[tuple[float, float]]:
         """Yield the NIS and its expected value (nan if unknown) in each slot of the i-th node."""
         placed = self._scenario.placed.get(self._run.nodes[i], ())
-        if not placed:
+        # A nonlinear reading has no H given the errors alone.
+        if not placed or not self._scenario.is_linear:
             return
         sensors = [self._scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
         believed_R, true_R = (

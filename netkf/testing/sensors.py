@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from netkf.core.clock import Clock
+from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
@@ -36,6 +38,9 @@ REGRESSOR_RUNS, REGRESSOR_SLOTS = 2000, 12
 SHORT = 40
 TIMES_RUNS, SAMPLES = 400, 50.0
 ROUNDING = 1e-9
+DERIVATIVE_STEP, DERIVATIVE_TOLERANCE = 1e-5, 1e-6
+MOST_STATES = 12
+"""Components of a state that a nonlinear sensor is tried with."""
 
 
 def check_sensor(sensor: Any, /, **settings: Any) -> None:
@@ -68,6 +73,9 @@ def check_made_sensor(part: Any, seed: int) -> None:
     """``check_sensor`` of an object, with streams of the given seed."""
     watched = Watched(part)
     copy = watched.pickled()
+    if isinstance(part, NonlinearSensor):
+        _check_nonlinear(part, watched.name, seed)
+        return
     if not part.is_random:
         return
     demand_matrices(part, watched.name)
@@ -351,3 +359,59 @@ def _times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> Flo
     vector = found.ndim == 1 and found.dtype == np.float64
     demand(vector, where, "must be a vector of float64", f"{found.dtype} {found.shape}")
     return found
+
+
+def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
+    """``h`` and ``jacobian`` must be functions of the state and the node alone, with shapes that
+    fit R, and the Jacobian the derivatives of ``h``.
+    """
+    places = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
+    sensor = sensor.located(places)
+    p, n = len(sensor.R), _states_read(sensor, name)
+    for node in sensor.nodes[:MAX_NODES]:
+        for x in _states(seed, SHORT, n):
+            with user_code(name):
+                value = np.asarray(sensor.h(x.copy(), node))
+                again = np.asarray(sensor.h(x.copy(), node))
+                J = np.asarray(sensor.jacobian(x.copy(), node))
+            demand(value.shape == (p,), f"{name}.h", f"must give {p} numbers, as R says", value)
+            remedy = "return what is read without noise, which netkf adds"
+            demand(
+                np.array_equal(value, again), f"{name}.h", "must be one for a state", again, remedy
+            )
+            demand(J.shape == (p, n), f"{name}.jacobian", f"must be {p} x {n}", str(J.shape))
+            apart = _derivative_error(sensor, node, x, J)
+            demand(
+                apart <= DERIVATIVE_TOLERANCE * (1.0 + float(np.abs(J).max())),
+                f"{name}.jacobian",
+                "must be the derivatives of h",
+                f"entries that are off by {apart:.2g} at x = {np.round(x, 3).tolist()}",
+                "compare it with differences of h",
+            )
+
+
+def _states_read(sensor: NonlinearSensor, name: str) -> int:
+    """Return the smallest number of components, up to MOST_STATES, of a state that h can read."""
+    for n in range(1, MOST_STATES + 1):
+        if _can_read(sensor, n):
+            return n
+    return fail(name, f"h and jacobian must read a state of at most {MOST_STATES} components")
+
+
+def _can_read(sensor: NonlinearSensor, n: int) -> bool:
+    """Return True if a sensor reads states of n components."""
+    try:
+        sensor.check_state(n)
+        sensor.h(np.ones(n), sensor.nodes[0])
+        return np.shape(sensor.jacobian(np.ones(n), sensor.nodes[0]))[-1:] == (n,)
+    except (ScenarioError, IndexError, ValueError):
+        return False
+
+
+def _derivative_error(sensor: NonlinearSensor, node: int, x: FloatArray, J: FloatArray) -> float:
+    """Return the largest difference of a Jacobian from central differences of h."""
+    found = np.empty_like(J)
+    for k, step in enumerate(np.eye(len(x)) * DERIVATIVE_STEP):
+        ends = [np.asarray(sensor.h(x + sign * step, node)) for sign in (1.0, -1.0)]
+        found[:, k] = sensor.difference(*ends) / (2.0 * DERIVATIVE_STEP)
+    return float(np.abs(found - J).max())

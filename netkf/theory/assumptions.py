@@ -11,7 +11,12 @@ from netkf.network.clocks import LinkClock, RecordedClock
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
+from netkf.theory.common.evidence import (
+    NONLINEAR,
+    AssumptionRow,
+    judge_plant,
+    true_model_row,
+)
 from netkf.theory.common.papers import paper_function
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.hybrid.coupled import has_balanced_rates
@@ -37,6 +42,8 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
     import pandas as pd
 
     rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
+    if not scenario.is_linear:
+        rows = [("readings are linear in the state", "all papers", False, NONLINEAR), *rows]
     return pd.DataFrame(rows, columns=COLUMNS)
 
 

@@ -100,7 +100,7 @@ class ClockedNode(Node):
         self._increments = increments
         self._now = 0.0
         # The samples of the present instant, until the update that uses all of them.
-        self._samples: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
+        self._samples: list[tuple[int, FloatArray, Any, FloatArray]] = []
         self.after_sample: Any = None
         """Called once the node has used its samples of an instant, with the nodes that sensed."""
 
@@ -137,7 +137,7 @@ class ClockedNode(Node):
         whole = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return np.asarray(whole.reshape(-1))
 
-    def sample(self, node: int, y: FloatArray, H: FloatArray, R: FloatArray) -> None:
+    def sample(self, node: int, y: FloatArray, H: Any, R: FloatArray) -> None:
         """Take a sample of one sensor of ``node``; one update uses all of this instant."""
         # The first sample of an instant schedules the update, which then uses all of them.
         if not self._samples:
@@ -152,7 +152,8 @@ class ClockedNode(Node):
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
-        y, H = (np.concatenate(part) for part in list(zip(*samples, strict=True))[1:3])
+        pairs = [linearised(self.algorithm, self.state, y, H) for _, y, H, _ in samples]
+        y, H = (np.concatenate(part) for part in zip(*pairs, strict=True))
         R = block_diagonal([sample[3] for sample in samples])
         self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
         # Under activation by readings the node transmits now.
@@ -185,6 +186,18 @@ class ClockedNode(Node):
         self.state = self.algorithm.absorb(self.state, messages, Exchange(time=time))
         oldest = max(message.age for message in messages)
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))
+
+
+def linearised(
+    algorithm: Filter, state: Any, y: FloatArray, H: Any
+) -> tuple[FloatArray, FloatArray]:
+    """Return a reading y (p,) and its H (p, n); one of a nonlinear sensor, which comes with a
+    function in place of H, is linearised at the estimate of the node that takes it.
+    """
+    if isinstance(H, np.ndarray):
+        return y, H
+    found: tuple[FloatArray, FloatArray] = H(y, algorithm.estimate(state)[0])
+    return found
 
 
 def distinct(nodes: dict[int, Any]) -> list[Any]:

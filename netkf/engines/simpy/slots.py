@@ -15,7 +15,7 @@ import simpy
 
 from netkf.algorithms.filter import Exchange, Reading
 from netkf.engines.base import Rank
-from netkf.engines.simpy.nodes import Envelope, Node, distinct
+from netkf.engines.simpy.nodes import Envelope, Node, distinct, linearised
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.linalg.arrays import FloatArray
@@ -134,7 +134,7 @@ class SlotNode(Node):
         # -1: no exchange is open, and every message is late.
         self._open = -1
         self._stopped = False
-        self._samples: list[tuple[FloatArray, FloatArray]] = []
+        self._samples: list[tuple[FloatArray, Any]] = []
 
     def running(self, timeline: Timeline) -> Process:
         """Run the process of the node: follow the schedule, slot after slot."""
@@ -156,13 +156,14 @@ class SlotNode(Node):
         else:
             self._close(stage, slot)
 
-    def read(self, y: FloatArray, H: FloatArray) -> None:
+    def read(self, y: FloatArray, H: Any) -> None:
         """Take the reading of one sensor."""
         self._samples.append((y, H))
 
     def _update(self, time: float) -> None:
         """Use the readings of this slot; without sensors they have no rows."""
-        model, samples = self.model, self._samples
+        model = self.model
+        samples = [linearised(self.algorithm, self.state, y, H) for y, H in self._samples]
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
         H = np.concatenate([model.H[:0], *(H for _, H in samples)])

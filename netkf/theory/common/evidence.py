@@ -13,6 +13,7 @@ AssumptionRow = tuple[str, str, bool | None, str]
 """assumption, source, holds (None: not known), evidence."""
 
 UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
+NONLINEAR = "readings are not linear in the state: gains, P and errors follow the data"
 RECORDED_CHANNEL = "losses or delays are recorded: one outcome, not a law"
 TRUE_MODEL = "the filters know the plant and the sensors"
 

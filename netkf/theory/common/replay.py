@@ -16,6 +16,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.evidence import NONLINEAR
 from netkf.theory.common.observations import (
     HostObservations,
     nodes_by_host,
@@ -79,6 +80,8 @@ def require_known_filter(scenario: Scenario) -> None:
     """Raise TheoryError if the equations of the scenario's filter are not known here."""
     algorithm = scenario.filter.algorithm
     name = type(algorithm).__name__
+    if not scenario.is_linear:
+        raise TheoryError(NONLINEAR)
     if not scenario.hosted.combination:
         raise TheoryError(f"no exact error covariance for {name}")
     own = overridden(algorithm)

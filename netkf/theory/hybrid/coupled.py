@@ -25,6 +25,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.scenario.registry import spoken
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import NONLINEAR
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
@@ -114,6 +115,8 @@ def reason_without_bound(scenario: Scenario) -> str | None:
 
 def _reason_of_samples(scenario: Scenario) -> str | None:
     """Return the reason why docs/poisson_samples.md does not apply, or None if it applies."""
+    if not scenario.is_linear:
+        return f"not promised: {NONLINEAR}"
     for node, place in randomly_sampled_sensors(scenario):
         clock = sampling_clock(scenario.sensors[place.entry])
         if clock is not None and not clock.memoryless:

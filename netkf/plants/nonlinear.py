@@ -1,0 +1,285 @@
+"""Nonlinear sensors: range, bearing, both, or a user's own h(x) with its Jacobian.
+
+A reading is ``y = h(x) + v``, cov(v) = R. Filters linearise it at their own estimate xbar of that
+instant, as the extended Kalman filter does: they are given ``y - h(xbar) + J xbar`` and J, so that
+their innovation ``y - h(xbar)`` is the true one, and any filter can use any sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+
+from netkf.core.clock import Clock, all_ticks
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import (
+    choice,
+    definite_covariance,
+    either,
+    field,
+    integer,
+    matrix,
+    nested,
+    several,
+)
+from netkf.linalg.arrays import FloatArray
+from netkf.plants.linear import SlotReadings
+from netkf.plants.sampling import Samples, sampling
+from netkf.plants.sensors import Sensor
+
+GRAPH = "graph"
+
+
+class Linearised:
+    """What a filter makes of a reading of a sensor at one of its nodes."""
+
+    def __init__(self, sensor: NonlinearSensor, node: int) -> None:
+        self._sensor, self._node = sensor, node
+
+    def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return y (p,) and H (p, n) of the reading as linearised at an estimate (n,)."""
+        J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)
+        expected = np.asarray(self._sensor.h(xhat, self._node), dtype=np.float64)
+        return self._sensor.difference(y, expected) + J @ xhat, J
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearSensor(Sensor):
+    """The contract of nonlinear sensors, ``y = h(x) + v``, cov(v) = R (p, p), in every slot or, in
+    continuous time, whenever the clock ``sampling`` ticks.
+
+    A class defines ``h`` and ``jacobian``, and ``difference`` where readings are angles.
+    """
+
+    R: FloatArray = field(definite_covariance)
+    sampling: Clock | None = field(sampling, default=None)
+
+    linear: ClassVar[bool] = False
+
+    @abstractmethod
+    def h(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the reading (p,) without noise of a node when the state is x (n,)."""
+
+    @abstractmethod
+    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the derivatives (p, n) of ``h`` at x (n,)."""
+
+    def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
+        """Return how far a reading (p,) is from an expected one."""
+        return y - expected
+
+    def check_state(self, n: int) -> None:
+        """Raise ScenarioError if the sensor cannot read a state of n components."""
+
+    def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
+        """Return the sensor with its nodes at the ``positions`` of the graph, if it needs any."""
+        return self
+
+    @property
+    def varying(self) -> bool:
+        """True: the Jacobian depends on the estimate."""
+        return True
+
+    def matrix_of(self, n: int) -> FloatArray:
+        """Return zeros (p, n): there is no H before an estimate."""
+        return np.zeros((len(self.R), n))
+
+    def slot_path(
+        self, node: int, period: float, generator: Callable[[str], np.random.Generator]
+    ) -> Any:
+        """Return readings with noise from the stream "noise"."""
+        return NonlinearReadings(self, node, generator("noise"))
+
+    def sample_times(
+        self,
+        node: int,
+        ordinal: int,
+        generator: Callable[[str], np.random.Generator],
+        horizon: float,
+    ) -> FloatArray:
+        """(K,) from the streams "sampling" and "sampling phase"."""
+        assert self.sampling is not None
+        entity, phase = (node, ordinal), partial(generator, "sampling phase")
+        return all_ticks(self.sampling, entity, phase, generator("sampling"), horizon, "sampling")
+
+    def samples(
+        self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
+    ) -> Samples:
+        """Return samples with noise from the stream "noise"."""
+        return NonlinearSamples(self, node, generator("noise"))
+
+
+class NonlinearReadings(SlotReadings):
+    """The readings of a nonlinear sensor at one node, one a slot; ``matrix`` is how a filter
+    linearises them.
+    """
+
+    def __init__(self, sensor: NonlinearSensor, node: int, random: np.random.Generator) -> None:
+        super().__init__(np.zeros((len(sensor.R), 0)), sensor.R, random)
+        self._sensor, self._node = sensor, node
+
+    def matrix(self, slot: int) -> Any:
+        """Return the function that linearises a reading at an estimate."""
+        return Linearised(self._sensor, self._node)
+
+    def reading(self, slot: int, x: FloatArray) -> FloatArray:
+        """(p,) the reading of a slot not before the last one asked for."""
+        noise = self.noise(slot)
+        found: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64) + noise
+        return found
+
+
+class NonlinearSamples:
+    """The samples of a nonlinear sensor at one node in continuous time."""
+
+    def __init__(self, sensor: NonlinearSensor, node: int, random: np.random.Generator) -> None:
+        self._readings = NonlinearReadings(sensor, node, random)
+
+    def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, Any]:
+        """``y`` (p,) of sample k, and the function that linearises it."""
+        return self._readings.reading(k, x), self._readings.matrix(k)
+
+    def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Raise TypeError: there is no H before an estimate."""
+        raise TypeError("readings of nonlinear sensors have no H before an estimate")
+
+
+@dataclass(frozen=True, eq=False)
+class PositionedSensor(NonlinearSensor):
+    """A sensor of the position of a target relative to its node, in 2 or 3 dimensions.
+
+    positions  the places of ``nodes``, in their order: rows (x, y) or (x, y, z); "graph", the
+               default, takes those of the graph
+    states     which components of the state are the target's position
+    """
+
+    positions: str | FloatArray = field(either(choice(GRAPH), matrix, nested(1)), default=GRAPH)
+    states: tuple[int, ...] = field(several(integer(low=0), "numbers of states"), default=(0, 1))
+
+    rows: ClassVar[int] = 0
+    """Length of a reading."""
+    turns: ClassVar[bool] = False
+    """Whether the last row of a reading is an angle."""
+
+    def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
+        """Return the sensor with its nodes at the positions of the graph; raises ScenarioError if
+        the graph has none.
+        """
+        if not isinstance(self.positions, str):
+            return self
+        if positions is None:
+            raise ScenarioError(
+                "positions",
+                "are missing, and this graph has none",
+                None,
+                "write positions = [[x, y], ...], one for each of nodes",
+            )
+        return replace(self, positions=np.array([positions[node] for node in self.nodes]))
+
+    def check_state(self, n: int) -> None:
+        """Raise ScenarioError if places, states or R do not fit."""
+        if max(self.states) >= n or len(set(self.states)) < len(self.states):
+            rule = f"must be different components of a state of {n}, counted from 0"
+            raise ScenarioError("states", rule, list(self.states), "name those of the position")
+        most = (2, 3) if self.rows == 1 and not self.turns else (2,)
+        if len(self.states) not in most:
+            rule = f"must be {' or '.join(map(str, most))} for this sensor"
+            raise ScenarioError("states", rule, list(self.states), "name those of the position")
+        shape = np.shape(self.positions)
+        if not isinstance(self.positions, str) and shape != (len(self.nodes), len(self.states)):
+            rule = f"must be {len(self.nodes)} rows of {len(self.states)}, one for each of nodes"
+            raise ScenarioError("positions", rule, f"{shape[0]} x {shape[1]}", "add or remove")
+        if self.R.shape != (self.rows, self.rows):
+            rule = f"must be {self.rows} x {self.rows}"
+            raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
+
+    def offset(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the target's position relative to a node."""
+        places = np.asarray(self.positions, dtype=np.float64)
+        return np.asarray(x[list(self.states)] - places[self.nodes.index(node)])
+
+    def placed_columns(self, derivatives: FloatArray, n: int) -> FloatArray:
+        """Return derivatives (p, d) by the position as those (p, n) by the state."""
+        found = np.zeros((len(derivatives), n))
+        found[:, list(self.states)] = derivatives
+        return found
+
+    def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
+        """Return the difference of readings, angles as the shorter way round, in [-pi, pi)."""
+        found = y - expected
+        if self.turns:
+            found[-1] = (found[-1] + math.pi) % (2.0 * math.pi) - math.pi
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class RangeSensor(PositionedSensor):
+    """``y = |p - q| + v``: the distance of a target at p from the node at q, in 2 or 3 dimensions.
+
+    At distance 0, where there is no derivative, a reading is taken to say nothing.
+    """
+
+    rows: ClassVar[int] = 1
+
+    def h(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the distance (1,)."""
+        return np.array([math.hypot(*self.offset(x, node))])
+
+    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the unit vector from the node to the target as a row."""
+        return self.placed_columns(toward(self.offset(x, node))[None], len(x))
+
+
+@dataclass(frozen=True, eq=False)
+class BearingSensor(PositionedSensor):
+    """``y = atan2(p_2 - q_2, p_1 - q_1) + v`` in radians: the direction from the node at q to a
+    target at p. Innovations are the shorter way round.
+    """
+
+    rows: ClassVar[int] = 1
+    turns: ClassVar[bool] = True
+
+    def h(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the angle (1,) in (-pi, pi]."""
+        first, second = self.offset(x, node).tolist()
+        return np.array([math.atan2(second, first)])
+
+    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
+        """Return ``[-d_2, d_1] / |d|^2`` for the offset d as a row."""
+        return self.placed_columns(across(self.offset(x, node))[None], len(x))
+
+
+@dataclass(frozen=True, eq=False)
+class RangeBearingSensor(PositionedSensor):
+    """The distance and the direction of a target from a node: R (2, 2)."""
+
+    rows: ClassVar[int] = 2
+    turns: ClassVar[bool] = True
+
+    def h(self, x: FloatArray, node: int) -> FloatArray:
+        """Return distance and angle (2,)."""
+        first, second = self.offset(x, node).tolist()
+        return np.array([math.hypot(first, second), math.atan2(second, first)])
+
+    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the rows of both."""
+        d = self.offset(x, node)
+        return self.placed_columns(np.stack([toward(d), across(d)]), len(x))
+
+
+def toward(d: FloatArray) -> FloatArray:
+    """Return the unit vector along d, zeros where d is 0."""
+    length = math.hypot(*d)
+    return d / length if length > 0.0 else np.zeros_like(d)
+
+
+def across(d: FloatArray) -> FloatArray:
+    """Return the derivatives (2,) of the angle of d (2,), zeros where d is 0."""
+    square = float(d @ d)
+    return np.array([-d[1], d[0]]) / square if square > 0.0 else np.zeros(2)
