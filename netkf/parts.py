@@ -12,6 +12,7 @@ from netkf.algorithms.constant_gain import ConstantGain
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.diffusion_kalman import DiffusionKalman
+from netkf.algorithms.event_triggered import EventTriggeredCi
 from netkf.algorithms.filter import (
     Estimate,
     Exchange,
@@ -32,6 +33,7 @@ from netkf.algorithms.kalman_consensus import Kcf
 from netkf.algorithms.one_bit import OneBit
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.slot import SlotFilter
+from netkf.algorithms.stochastic_trigger import StochasticTrigger
 from netkf.algorithms.track_fusion import BarShalomCampo, InverseIntersection, OptimisedIntersection
 from netkf.core.clock import Clock
 from netkf.core.fields import (
@@ -135,6 +137,7 @@ __all__ = [
     "Edges",
     "ErdosRenyi",
     "Estimate",
+    "EventTriggeredCi",
     "Exchange",
     "ExponentialDelay",
     "Filter",
@@ -197,6 +200,7 @@ __all__ = [
     "SlotLocal",
     "Star",
     "State",
+    "StochasticTrigger",
     "Topology",
     "UniformDelay",
     "UnknownDiffusion",

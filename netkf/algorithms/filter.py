@@ -77,7 +77,8 @@ class NodeInfo(NamedTuple):
 class Exchange(NamedTuple):
     """The circumstances of ``emit`` or ``absorb``: simulated ``time`` in seconds; under clocks the
     nodes that may hear (``receivers``, for ``emit``); in slots the ``slot``, the number of the
-    exchange in it (``phase``) and of its repetition (``step``), all counted from 0.
+    exchange in it (``phase``) and of its repetition (``step``), all counted from 0. For ``emit`` of
+    a ``randomised`` filter in slots a ``uniform`` number in [0, 1) of the node's own.
     """
 
     time: float = 0.0
@@ -85,6 +86,7 @@ class Exchange(NamedTuple):
     step: int = -1
     slot: int = -1
     receivers: tuple[int, ...] = ()
+    uniform: float = 0.0
 
 
 class Message(NamedTuple):
@@ -181,6 +183,8 @@ class Filter(Component):
               class only; None: it runs in the SimPy engine
     newest_only    of several messages of one sender at one instant the newest counts
     fixed_sensors  it adds up information, so the H of a sensor must not vary
+    randomised     in slots ``emit`` is given a number ``Exchange.uniform``, from the stream
+                   "trigger" of the node, which nothing else draws from
     paper        the paper whose theory and checks speak about it: rooms of that name
     combination  how it combines what it hears, for the engines and the theory that know it:
                  "convex", "intersection", "swap", "shares", "readings", "sums", "none"; "" where
@@ -201,6 +205,7 @@ class Filter(Component):
     needs_samples: ClassVar[bool] = False
     newest_only: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = False
+    randomised: ClassVar[bool] = False
     paper: ClassVar[str] = ""
     combination: ClassVar[str] = ""
     P_by_design: ClassVar[tuple[str, str]] = ("", "")

@@ -34,6 +34,8 @@ SOUND = {
     ],
     "inverse-covariance-intersection": [parts.InverseIntersection()],
     "bar-shalom-campo": [parts.BarShalomCampo()],
+    "event-triggered-ci": [parts.EventTriggeredCi()],
+    "stochastic-trigger": [parts.StochasticTrigger()],
     "kcf": [parts.Kcf(epsilon=0.2)],
     "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [

@@ -142,7 +142,8 @@ class _Simulation:
         schedule, period = Schedule(scenario), scenario.slot_plant.period
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
-            return SlotNode(recorder, schedule, period, *_identity(scenario, node, entity))
+            own = _identity(scenario, node, entity)
+            return SlotNode(recorder, schedule, period, streams, *own)
 
         nodes = _nodes(scenario, make)
         # Filters, readers and the clock are processes that meet by time and rank only.

@@ -128,8 +128,18 @@ class Schedule:
 class SlotNode(Node):
     """A node in slots, whose inbox is open for one exchange at a time."""
 
-    def __init__(self, recorder: Recorder, schedule: Schedule, period: float, *rest: Any) -> None:
+    def __init__(
+        self,
+        recorder: Recorder,
+        schedule: Schedule,
+        period: float,
+        streams: Streams,
+        *rest: Any,
+    ) -> None:
         super().__init__(*rest)
+        # Made for those who decide at random only.
+        randomised = self.algorithm.randomised
+        self._uniforms = streams.generator("trigger", self.node) if randomised else None
         self._recorder, self._schedule, self._period = recorder, schedule, period
         # -1: no exchange is open, and every message is late.
         self._open = -1
@@ -177,6 +187,8 @@ class SlotNode(Node):
 
     def emit(self, exchange: Exchange) -> Any:
         """Return the payload that the node sends in an exchange."""
+        if self._uniforms is not None:
+            exchange = exchange._replace(uniform=float(self._uniforms.random()))
         self.state, payload = self.algorithm.emit(self.state, exchange)
         return payload
 

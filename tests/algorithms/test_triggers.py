@@ -1,0 +1,186 @@
+"""Event triggers: what they send, what silence says, and streams that nothing else draws from."""
+
+import math
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.trace.schema import CODES
+from tests.algorithms.test_literature import ALL, GRAPH, scenario_of, states
+from tests.algorithms.test_track_fusion import kalman
+
+EVENT = {"kind": "event-triggered-ci", "alpha": 1.0, "delta": 3.0}
+SURE = {"graph": GRAPH, "activation": {"kind": "broadcast"}}
+STOCHASTIC = {"kind": "stochastic-trigger", "strength": 0.8}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_thresholds_it_is_consensus_on_information(seed, tmp_path):
+    """Sends in every slot, and with losses too."""
+    ours = {**EVENT, "alpha": 0.0, "delta": 0.0}
+    hcmci = {"kind": "hcmci", "consensus": "information"}
+    xhat, P = states(ours, tmp_path, seed=seed, network=SURE)
+    x, C = states(hcmci, tmp_path, seed=seed, network=SURE)
+    np.testing.assert_allclose(xhat, x, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(P, C, rtol=1e-10, atol=1e-12)
+
+
+def test_event_triggers_by_plain_formulas(tmp_path):
+    """Who is silent, and what is used in its place: the whole filter once more."""
+    alpha, delta = 1.5, 2.0
+    algorithm = {**EVENT, "alpha": alpha, "delta": delta}
+    scenario = scenario_of(algorithm, tmp_path, 1, network=SURE, horizon=12.0, probe=1.0)
+    run = netkf.simulate(scenario)
+    N, F, Q = 5, scenario.plant.F, scenario.plant.Q
+    sends = run.log[run.log["kind"] == CODES["send"]]
+    happened = {(int(t), node) for t, node in zip(sends["t"], sends["node"], strict=True)}
+    degrees, readings = scenario.topology.degrees, readings_of(scenario, run)
+    x, P = [np.zeros(2)] * N, [scenario.plant.cov] * N
+    last, silent = {}, 0
+    for slot in range(1, 12):
+        x, P = [F @ one for one in x], [F @ C @ F.T + Q for C in P]
+        last = {j: (F @ m, F @ C @ F.T + Q) for j, (m, C) in last.items()}
+        for j, reading in readings(slot).items():
+            x[j], P[j] = kalman(x[j], P[j], reading)
+        pairs = {}
+        for j in range(N):
+            if j in last:
+                d, ratios = x[j] - last[j][0], np.linalg.eigvals(np.linalg.inv(P[j]) @ last[j][1])
+                near = d @ np.linalg.inv(P[j]) @ d < alpha
+                near &= ratios.min() >= 1.0 / (1.0 + delta) and ratios.max() <= 1.0 + delta
+            if j not in last or not near:
+                last[j] = pairs[j] = x[j], P[j]
+                assert (slot, j) in happened
+            else:
+                factor = (1.0 + math.sqrt(alpha)) ** 2 * (1.0 + delta)
+                pairs[j] = last[j][0], factor * last[j][1]
+                assert (slot, j) not in happened
+                silent += 1
+        made = []
+        for i in range(N):
+            near_by = [b if a == i else a for a, b in scenario.topology.links if i in (a, b)]
+            weights = {j: 1.0 / (1.0 + max(degrees[i], degrees[j])) for j in near_by}
+            own = 1.0 - sum(weights.values())
+            inverse = own * np.linalg.inv(P[i])
+            vector = inverse @ x[i]
+            for j, weight in weights.items():
+                inverse = inverse + weight * np.linalg.inv(pairs[j][1])
+                vector = vector + weight * np.linalg.inv(pairs[j][1]) @ pairs[j][0]
+            C = np.linalg.inv(inverse)
+            made.append((C @ vector, C))
+        x, P = map(list, zip(*made, strict=True))
+        np.testing.assert_allclose(run.P[slot], P, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(run.xhat[slot], x, rtol=1e-9, atol=1e-9)
+    assert silent > 5
+
+
+def readings_of(scenario, run):
+    """A function from slots, in their order, to (y, H, R) by node."""
+    from netkf.rng.streams import Streams
+
+    streams = Streams(run.seed, run.replica)
+    paths = {
+        i: [(scenario.slot_path(streams, i, p), scenario.sensors[p.entry]) for p in places]
+        for i, places in scenario.placed.items()
+    }
+
+    def read(slot):
+        found = {}
+        for i, some in paths.items():
+            y = np.concatenate([path.reading(slot, run.x[slot]) for path, _ in some])
+            H = np.concatenate([sensor.H for _, sensor in some])
+            sizes = np.cumsum([0, *(len(sensor.R) for _, sensor in some)])
+            R = np.zeros((len(y), len(y)))
+            for a, b, (_, sensor) in zip(sizes, sizes[1:], some, strict=False):
+                R[a:b, a:b] = sensor.R
+            found[i] = y, H, R
+        return found
+
+    return read
+
+
+def test_event_triggers_send_less_and_claim_no_more(tmp_path):
+    scenario = scenario_of(EVENT, tmp_path, 1, network=SURE, horizon=31.0, probe=[10.0, 20.0, 30.0])
+    runs = [netkf.simulate(scenario, replica=k) for k in range(60)]
+    sent = np.mean([run.count("send") for run in runs])
+    assert sent < 0.8 * 30 * 2 * len(scenario.topology.links)
+    e, P = np.stack([run.error for run in runs]), np.stack([run.P for run in runs])
+    nees = np.einsum("rtia,rtiab,rtib->rti", e, np.linalg.inv(P), e).mean(axis=0)
+    # Mean 2 with 60 runs: standard error 0.26.
+    assert nees.max() < 2.0 + 4.5 * 2.0 / math.sqrt(60)
+
+
+def test_stochastic_triggers_by_plain_formulas(tmp_path):
+    scenario = scenario_of(STOCHASTIC, tmp_path, 1, network=ALL, horizon=20.0, probe=1.0)
+    run = netkf.simulate(scenario)
+    F, Q, strength = scenario.plant.F, scenario.plant.Q, STOCHASTIC["strength"]
+    sends = run.log[run.log["kind"] == CODES["send"]]
+    happened = {(int(t), node) for t, node in zip(sends["t"], sends["node"], strict=True)}
+    readings, x, P, silent = readings_of(scenario, run), np.zeros(2), scenario.plant.cov, 0
+    for slot in range(1, 20):
+        x, P = F @ x, F @ P @ F.T + Q
+        prior = x
+        for i, (y, H, R) in readings(slot).items():
+            if (slot, i) in happened:
+                x, P = kalman(x, P, (y, H, R))
+            else:
+                x, P = kalman(x, P, (H @ prior, H, R + R / strength))
+                silent += 1
+        np.testing.assert_allclose(run.P[slot], [P] * 5, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(run.xhat[slot], [x] * 5, rtol=1e-9, atol=1e-10)
+    assert silent > 15
+
+
+SCALAR = {
+    "plant": {"kind": "linear", "F": [[0.9]], "Q": [[0.5]], "cov": [[1.0]], "period": 1.0},
+    "sensors": [{"nodes": [0], "H": [[1.0]], "R": [[0.4]]}],
+    "network": {
+        "graph": {"kind": "edges", "edges": [[0, 1]]},
+        "activation": {"kind": "broadcast"},
+    },
+}
+
+
+def test_the_rate_is_that_of_han_and_errors_are_as_large_as_p_says(tmp_path):
+    """1 - det(I + Pi Y)^-1/2 given the past, summed over a long run; NEES of mean n."""
+    more = {"horizon": 4001.0, "probe": 1.0, **SCALAR}
+    scenario = scenario_of(STOCHASTIC, tmp_path, n=1, **more)
+    run = netkf.simulate(scenario)
+    # Pi from the P of the slot before, from the second slot with an exchange on.
+    P = 0.81 * run.P[1:-1, 1, 0, 0] + 0.5
+    Y = STOCHASTIC["strength"] / 0.4
+    p = 1.0 - 1.0 / np.sqrt(1.0 + (P + 0.4) * Y)
+    sends = run.log[(run.log["kind"] == CODES["send"]) & (run.log["node"] == 0)]
+    count = len(sends) - 1
+    z = (count - p.sum()) / math.sqrt((p * (1.0 - p)).sum())
+    assert 0.3 < p.mean() < 0.8
+    assert abs(z) < 4.0
+    # Errors one slot apart correlate: at most 0.9.
+    nees = run.error[1:, 1, 0] ** 2 / run.P[1:, 1, 0, 0]
+    assert abs(nees.mean() - 1.0) < 4.0 * math.sqrt(2.0 / len(nees) * (1.0 + 0.81) / (1.0 - 0.81))
+
+
+def test_triggers_move_no_other_stream(tmp_path):
+    """Truth, readings, losses are those of a filter that always sends."""
+    network = {**ALL, "channel": {"loss": {"kind": "bernoulli", "delivery": 0.7}}}
+    runs = [
+        netkf.simulate(scenario_of(filter_, tmp_path, 2, network=network), engine="simpy")
+        for filter_ in (STOCHASTIC, EVENT, {"kind": "kcf"})
+    ]
+    delivered = []
+    for run in runs:
+        rows = run.log[run.log["kind"] == CODES["deliver"]]
+        delivered.append(set(rows[["t", "node", "peer"]].tolist()))
+    for run, heard in zip(runs[:2], delivered[:2], strict=True):
+        np.testing.assert_array_equal(run.x, runs[2].x)
+        assert heard < delivered[2]
+
+
+def test_the_compiled_engine_says_that_it_has_no_code(tmp_path):
+    for algorithm in (EVENT, STOCHASTIC):
+        scenario = scenario_of(algorithm, tmp_path, network=ALL)
+        with pytest.raises(netkf.NetkfError, match="has no code for the filter"):
+            netkf.simulate(scenario, engine="compiled")
+    lossy = scenario_of(EVENT, tmp_path)
+    assert any("messages may be lost" in note for note in lossy.notes)
