@@ -19,7 +19,7 @@ from netkf.cli.process import (
     safe_streams,
 )
 from netkf.core.errors import NetkfError
-from netkf.core.printable import one_line
+from netkf.core.printable import one_line, shorten
 
 TYPE_CHECKING = False  # as in netkf/__init__.py
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def _explain(error: Exception) -> str | None:
     if isinstance(error, NetkfError):
         return str(error)
     if isinstance(error, OSError):
-        path = f" ({error.filename})" if error.filename else ""
+        path = f" ({shorten(error.filename, 1000)})" if error.filename else ""
         return f"{_reason(error)}{path}"
     if isinstance(error, MemoryError):
         return "the memory is too small; take fewer nodes, a shorter horizon or fewer probe times"

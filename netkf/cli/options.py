@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import nearest, quote
-from netkf.core.printable import one_line
+from netkf.core.printable import one_line, shorten
 
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
@@ -32,7 +32,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> Any:
         """Print the line and end with SystemExit."""
-        print(f"{self.prog}: {one_line(message)}; see {self.prog} --help", file=sys.stderr)
+        print(f"{self.prog}: {shorten(message, 1000)}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:

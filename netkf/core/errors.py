@@ -30,7 +30,7 @@ class WriteError(NetkfError, OSError):
         self.filename = str(path)
 
     def __str__(self) -> str:
-        return f"cannot write: {self.strerror} ({self.filename})"
+        return f"cannot write: {self.strerror} ({shorten(self.filename, 1000)})"
 
 
 class ScenarioError(NetkfError, ValueError):

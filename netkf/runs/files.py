@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import math
@@ -23,7 +24,9 @@ from netkf.scenario.writing import resolved, to_toml
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Raise a WriteError about ``path`` in place of the body's OSErrors."""
+    """Raise a WriteError about ``path`` in place of the body's OSErrors, and for a NUL in it."""
+    if "\0" in str(path):
+        raise WriteError(OSError(errno.EINVAL, ""), path)
     try:
         yield
     except WriteError:
@@ -61,7 +64,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
             yield part
             publish(part, path)
     except BaseException:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):
             part.unlink(missing_ok=True)
         raise
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from typing import Any
 
 from netkf.core.errors import ScenarioError
+from netkf.scenario.reading import parse_toml
 
 LONGEST_WORD = 1000
 
@@ -43,7 +43,7 @@ def typed_values(option: str, key: str, text: str) -> list[Any]:
 
 
 def _toml(text: str) -> Any:
-    found = tomllib.loads(f"value = {text}")
+    found = parse_toml(f"value = {text}")
     if list(found) != ["value"]:
         raise ValueError
     return found["value"]

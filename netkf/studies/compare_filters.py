@@ -46,6 +46,7 @@ LOAD = "load it first: netkf.compare_filters(netkf.load(path), ...)"
 CARRIED = ("mean", "cov", "model")
 """Keys of ``[filter]`` that every compared filter takes over from the scenario."""
 QUANTITIES = ("rms_error", "worst_instant", "nees_ratio")
+MAX_FILTERS = 200
 Progress = Callable[[int, int], None]
 Choice = str | Mapping[str, Any] | Filter
 """A filter: its kind, its table in a scenario file, or an object."""
@@ -214,6 +215,9 @@ def _candidates(
     if isinstance(filters, (str, Mapping, Filter)) or not filters:
         rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
         raise ScenarioError("filters", rule, filters, remedy)
+    if len(filters) > MAX_FILTERS:
+        rule = f"must be at most {MAX_FILTERS} filters"
+        raise ScenarioError("filters", rule, len(filters), "compare fewer at a time")
     found = [_candidate(scenario, choice, engine) for choice in filters]
     labels = [candidate.label for candidate in found]
     for label in labels:

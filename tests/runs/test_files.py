@@ -1,11 +1,12 @@
-"""Text of JSON files, against the standard library."""
+"""Text of JSON files, against the standard library; names that no file can have."""
 
 import json
 
 import numpy as np
 import pytest
 
-from netkf.runs.files import finite, json_text
+from netkf.core.errors import WriteError
+from netkf.runs.files import finite, json_text, write_text
 
 VALUES = [
     3,
@@ -23,3 +24,8 @@ VALUES = [
 @pytest.mark.parametrize("value", VALUES, ids=range(len(VALUES)))
 def test_json_text_is_that_of_the_standard_library(value):
     assert json_text(value) == json.dumps(finite(value), indent=2)
+
+
+def test_a_name_that_no_file_can_have_is_a_write_error(tmp_path):
+    with pytest.raises(WriteError, match="cannot write: Invalid argument"):
+        write_text(tmp_path / "a\0b", "text")

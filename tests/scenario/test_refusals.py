@@ -897,6 +897,8 @@ USAGE = [
     ("trace", ["run", "{file}", "--trace", "some"], "invalid choice: 'some'"),
     ("near", ["reprot", "x"], 'did you mean "report"?'),
     ("engine-near", ["run", "{file}", "--engine", "compile"], 'did you mean "compiled"?'),
+    ("long", ["why", "x", "--node", "9" * 5000], " ... "),
+    ("dots", ["theory", "{file}", "--set", f"filter={{a{'.b' * 50_000} = 1}}"], "not valid TOML"),
     ("why-half", ["why", "x", "--node", "3"], "takes --node and --at together"),
     ("set-nothing", ["run", "{file}", "--set"], "--set"),
     ("theory-out", ["theory", "{file}", "--out", "x"], "--out"),

@@ -145,6 +145,8 @@ def test_what_cannot_run_says_why(found, scenario):
     assert found.first == "hcmci"
     with pytest.raises(netkf.ScenarioError, match="none of them can run there; gossip: cannot run"):
         netkf.compare_filters(scenario, ["gossip"], runs=2)
+    with pytest.raises(netkf.ScenarioError, match="must be at most 200 filters; got 201"):
+        netkf.compare_filters(scenario, ["hybrid"] * 201)
     with pytest.raises(netkf.ScenarioError, match="must differ from each other"):
         netkf.compare_filters(scenario, ["icf", "icf"], runs=2)
 
