@@ -6,6 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+from docutils.nodes import SkipNode
+from latex2mathml.converter import convert
+
 from netkf import __version__
 from netkf.scenario.schema_page import schema_page
 
@@ -20,9 +23,26 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
 html_theme = "furo"
 html_title = f"netkf {release}"
 html_copy_source = False
+html_math_renderer = "mathml"  # browsers draw it, without a script from the network
 
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
+
+nitpicky = True  # every reference resolves, but for what has no page of its own:
+nitpick_ignore_regex = [
+    # types of other packages, and aliases, as signatures show them
+    (r"py:.*", r"(numpy|pd|pandas|networkx|collections|concurrent|pathlib|tuple\[).*"),
+    (
+        r"py:class",
+        r"ndarray|ArrayLike|FloatArray|IntArray|Edge|Entry|Executor|Path|Progress|dict\[.*",
+    ),
+    # parts of the inside: states of filters, paths of sensors, base classes without public members
+    (r"py:class", r"netkf\.(algorithms|core|rng|network|plants|engines|trace|scenario)\..*"),
+    (
+        r"py:class",
+        r"netkf\.theory\..*|.*\.(ReplicaResult|PromisedTraces|Probe|Target|MessageKey|Quantity)",
+    ),
+]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -33,6 +53,7 @@ CODE = re.compile(r"(``.+?``|`.+?`)", re.DOTALL)
 MARKUP = re.compile(r"([\\*|_])")
 ARRAY = re.compile(r"~?(?:numpy\.)?ndarray\[tuple\[.*?\], ~?(?:numpy\.)?dtype\[[^\]]*\]+")
 ARRAY_LIKE = re.compile(r"_Buffer \| _SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]")
+BLOCK = "overflow-x: auto; overflow-y: hidden; padding: 0.4em 0"
 INDENTED = re.compile(r"^(\s{4,})")
 
 
@@ -78,6 +99,19 @@ def short_types(
     )
 
 
+def inline_mathml(translator: Any, node: Any) -> None:
+    """Write a formula in a line as MathML."""
+    translator.body.append(convert(node.astext()))
+    raise SkipNode
+
+
+def block_mathml(translator: Any, node: Any) -> None:
+    """Write a formula of its own as MathML; what is wider than the page scrolls."""
+    formula = convert(node.astext().strip().rstrip("\\"), display="block")
+    translator.body.append(f'<div class="math" style="{BLOCK}">{formula}</div>')
+    raise SkipNode
+
+
 def write_keys(app: Any) -> None:
     """Write the page of all keys, which `netkf schema --markdown` prints."""
     page = Path(__file__).with_name("keys.md")
@@ -88,6 +122,7 @@ def write_keys(app: Any) -> None:
 
 def setup(app: Any) -> None:
     """Connect the page of keys, and the reading of docstrings and signatures."""
+    app.add_html_math_renderer("mathml", (inline_mathml, None), (block_mathml, None))
     app.connect("builder-inited", write_keys)
     app.connect("autodoc-process-signature", short_types)
     app.connect("autodoc-process-docstring", literal_text)
