@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from netkf.algorithms.filter import Filter
 from netkf.core.errors import EngineError, ScenarioError, nearest
 from netkf.core.fields import integer, number
-from netkf.core.printable import one_line
+from netkf.core.printable import one_line, shorten
 from netkf.core.shown import Shown
 from netkf.ensembles.pools import Pool
 from netkf.ensembles.replicas import replicate_blocks
@@ -26,7 +26,7 @@ from netkf.runs.provenance import versions
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.registry import KINDS, name_of
 from netkf.scenario.scenario import Scenario
-from netkf.scenario.writing import as_table
+from netkf.scenario.writing import as_table, part_as_table
 from netkf.studies.filter_values import (
     FilterValues,
     Quantity,
@@ -219,7 +219,8 @@ def _candidates(
         rule = f"must be at most {MAX_FILTERS} filters"
         raise ScenarioError("filters", rule, len(filters), "compare fewer at a time")
     found = [_candidate(scenario, choice, engine) for choice in filters]
-    labels = [candidate.label for candidate in found]
+    labels = _distinct_labels(filters, [candidate.label for candidate in found])
+    found = [one._replace(label=label) for one, label in zip(found, labels, strict=True)]
     for label in labels:
         if labels.count(label) > 1:
             raise ScenarioError("filters", "must differ from each other", label, "remove one")
@@ -247,6 +248,32 @@ def _candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
     except (ScenarioError, EngineError) as error:
         return FilterEntry(label, None, f"cannot run here: {error}")
     return FilterEntry(label, made)
+
+
+def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
+    """Return the labels of filters, of objects with the settings in which those of one label differ
+    from each other.
+    """
+    made = list(labels)
+    for label in {one for one in labels if labels.count(one) > 1}:
+        places = [k for k, one in enumerate(labels) if one == label]
+        objects = [filters[k] for k in places]
+        # A kind or a table beside an object of that kind: nothing tells what differs.
+        if not all(isinstance(one, Filter) for one in objects):
+            continue
+        settings = [_settings(one) for one in objects]
+        names = dict.fromkeys(name for one in settings for name in one)
+        differing = [name for name in names if len({one.get(name) for one in settings}) > 1]
+        for k, own in zip(places, settings, strict=True):
+            # What is left out of a table is at its default.
+            values = {name: own.get(name, str(getattr(filters[k], name))) for name in differing}
+            made[k] = _label(label, {name: shorten(value) for name, value in values.items()})
+    return made
+
+
+def _settings(algorithm: Any) -> dict[str, str]:
+    """Return the settings of a filter as a scenario file has them, in one line each."""
+    return {name: one_line(value) for name, value in part_as_table(algorithm).items()}
 
 
 def _label(kind: str, settings: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ import pytest
 import scipy.stats
 
 import netkf
+from netkf import parts
 from netkf.cli.main import main
 from tests.conftest import SCENARIOS
 
@@ -149,6 +150,17 @@ def test_what_cannot_run_says_why(found, scenario):
         netkf.compare_filters(scenario, ["hybrid"] * 201)
     with pytest.raises(netkf.ScenarioError, match="must differ from each other"):
         netkf.compare_filters(scenario, ["icf", "icf"], runs=2)
+
+
+def test_objects_of_one_kind_are_told_apart_by_the_settings_that_differ(scenario):
+    filters = [parts.Icf(), parts.Icf(steps=2), parts.Kcf(epsilon=0.2)]
+    found = netkf.compare_filters(scenario, filters, runs=2, workers=1)
+    assert [row.filter for row in found.rows] == ["icf steps=1", "icf steps=2", "kcf"]
+    same = netkf.compare_filters(scenario, ["icf", {"kind": "icf", "steps": 2}], 2, workers=1)
+    for ours, other in zip(found.rows[:2], same.rows, strict=True):
+        assert ours.quantities["rms_error"].value == other.quantities["rms_error"].value
+    with pytest.raises(netkf.ScenarioError, match="must differ from each other"):
+        netkf.compare_filters(scenario, [parts.Icf(), parts.Icf()], runs=2)
 
 
 def test_the_command_line_prints_a_table_a_document_and_a_directory(file, tmp_path, capsys):
