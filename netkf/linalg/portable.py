@@ -23,17 +23,22 @@ SAME = 0.9
 
 def product(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return ``a b`` (..., r, c) of (..., r, m) and (..., m, c)."""
-    shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
-    total = np.zeros((*shape, a.shape[-2], b.shape[-1]))
-    for k in range(a.shape[-1]):
+    if a.shape[-1] == 0:
+        shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+        return np.zeros((*shape, a.shape[-2], b.shape[-1]))
+    # A sum begins with 0, whose sign a first term of -0 must not change.
+    total: FloatArray = a[..., :, 0, None] * b[..., None, 0, :] + 0.0
+    for k in range(1, a.shape[-1]):
         total += a[..., :, k, None] * b[..., None, k, :]
     return total
 
 
 def apply(a: FloatArray, x: FloatArray) -> FloatArray:
     """Return ``a x`` (..., r) of (..., r, m) and (..., m)."""
-    total = np.zeros(np.broadcast_shapes(a.shape[:-1], (*x.shape[:-1], 1)))
-    for k in range(a.shape[-1]):
+    if a.shape[-1] == 0:
+        return np.zeros(np.broadcast_shapes(a.shape[:-1], (*x.shape[:-1], 1)))
+    total: FloatArray = a[..., 0] * x[..., 0, None] + 0.0
+    for k in range(1, a.shape[-1]):
         total += a[..., k] * x[..., k, None]
     return total
 
