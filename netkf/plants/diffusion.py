@@ -10,7 +10,6 @@ import numpy as np
 
 from netkf.core.fields import field, matrix, positive, square
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.portable import product
 from netkf.plants.laws import GridLaws
 from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
@@ -98,12 +97,6 @@ class Diffusion(Plant):
     def start(self, random: np.random.Generator) -> FloatArray:
         """Draw x(0) (n,)."""
         return np.asarray(self.starts(GeneratorNormals([random]))[0])
-
-    def starts(self, normals: Normals) -> FloatArray:
-        """(B, n) x(0) of each run, drawn."""
-        # Row by row, so that no state is rounded as its neighbours happen to be.
-        drawn = product(normals.draw((1, self.n)), self.start_root.T)
-        return np.asarray(self.start_mean + drawn[:, 0])
 
     @property
     def frame_steps(self) -> int | None:

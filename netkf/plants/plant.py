@@ -12,7 +12,8 @@ import numpy as np
 
 from netkf.core.fields import Component, covariance, field, vector
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.portable import noise_root
+from netkf.linalg.portable import noise_root, product
+from netkf.rng.normals import Normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,3 +52,9 @@ class Plant(Component):
     def start_root(self) -> FloatArray:
         """The factor (n, n) of ``start_cov`` that standard normals are multiplied with."""
         return noise_root(self.start_cov)
+
+    def starts(self, normals: Normals) -> FloatArray:
+        """(B, n) x(0) of each run, drawn."""
+        # Row by row, so that no state is rounded as its neighbours happen to be.
+        drawn = product(normals.draw((1, self.n)), self.start_root.T)
+        return np.asarray(self.start_mean + drawn[:, 0])

@@ -17,9 +17,11 @@ import scipy.linalg
 from netkf.checks.parts.moments import NoiseMoments, moments, whitening_matrix
 from netkf.checks.parts.sources import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import RecordedSensor
-from netkf.rng.streams import Streams
+from netkf.rng.normals import StreamNormals
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor, takes_samples
 from netkf.scenario.scenario import Scenario
 
@@ -103,6 +105,10 @@ def _watched(scenario: Scenario) -> Scenario:
 
 def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
     """Return x(0) (count, n) of replicas 0 to count - 1."""
+    # Ours are drawn together, with the same numbers; a class of a user draws as it does.
+    if type(scenario.plant) in (LinearPlant, Diffusion):
+        words = ReplicaStreams(seed, 0, count).seed_words("plant", [()])
+        return scenario.plant.starts(StreamNormals(words))
     drawn = []
     for replica in range(count):
         random = Streams(seed, replica).generator("plant")

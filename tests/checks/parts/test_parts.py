@@ -19,6 +19,7 @@ from netkf.checks.parts.moments import (
     whitening_matrix,
 )
 from netkf.checks.parts.network_rows import _correlation_of_runs, _neighbours_variance
+from netkf.checks.parts.noises import start_states
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
 from netkf.checks.statistics import probability_interval, scale_interval
@@ -124,6 +125,13 @@ def test_healthy_parts_are_not_accused(name):
     assert not broken(rows)
     assert sum(row.verdict == HOLDS for row in rows) >= 3
     assert all(row.detectable > 0.0 for row in rows if math.isfinite(row.low))
+
+
+@pytest.mark.parametrize("table", [SLOTS, CLOCKS], ids=["slots", "clocks"])
+def test_starts_drawn_together_are_those_of_the_runs(table):
+    scenario = from_table(table).replace({"probe": [0.0, 2.0], "plant.mean": [1.0, -1.0]})
+    runs = [netkf.simulate(scenario, 5, k).x[0] for k in range(3)]
+    np.testing.assert_array_equal(start_states(scenario, 5, 3), runs)
 
 
 NOISE = "noises of the sensors have their covariance"
