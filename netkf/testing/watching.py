@@ -7,10 +7,12 @@ import dataclasses
 import inspect
 import pickle
 import random
+import struct
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property
-from typing import Any, NoReturn
+from functools import cache, cached_property
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from netkf.scenario.plugins import in_words
 
 Leaves = dict[str, Any]
 MERSENNE_BYTES = 4 * 625
-"""Size of the state of numpy's MT19937: 624 words and the position in them."""
+"""Size of the state of a Mersenne twister: 624 words and the position in them."""
 
 
 def fail(where: str, rule: str, got: object = None, remedy: str = "") -> NoReturn:
@@ -118,11 +120,37 @@ def global_randomness() -> tuple[Any, Any]:
     """Return the states of the generators that all of a process shares."""
     shared = np.random.get_bit_generator()  # type: ignore[attr-defined]
     if not isinstance(shared, np.random.MT19937):
-        return random.getstate(), repr(shared.state)
+        return _python_randomness(), repr(shared.state)
     # Its memory: numpy takes 0.1 ms to list the state, and this is asked before and after each
     # call of a user's method.
     words = ctypes.string_at(shared.ctypes.state_address, MERSENNE_BYTES)
-    return random.getstate(), (id(shared), words)
+    return _python_randomness(), (id(shared), words)
+
+
+def _python_randomness() -> Any:
+    """Return the state of Python's shared generator."""
+    address = _python_state_address()
+    if address is None:
+        return random.getstate()
+    # To list and compare 625 numbers takes most of the time of a check.
+    return ctypes.string_at(address, MERSENNE_BYTES), _shared_random().gauss_next
+
+
+def _shared_random() -> Any:
+    return cast(Any, random.getstate).__self__
+
+
+@cache
+def _python_state_address() -> int | None:
+    """Return where the position and the 624 words of Python's shared generator are in memory; None
+    where an object's memory does not hold what ``getstate`` says.
+    """
+    head, size = object.__basicsize__, random.Random.__basicsize__
+    if sys.implementation.name != "cpython" or size < head + MERSENNE_BYTES:
+        return None
+    address = id(_shared_random()) + head
+    position, *words = struct.unpack("=625I", ctypes.string_at(address, MERSENNE_BYTES))
+    return address if random.getstate()[1] == (*words, position) else None
 
 
 def _static(cls: type, name: str) -> Any:

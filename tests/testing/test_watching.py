@@ -1,0 +1,49 @@
+"""Uses of generators that a process shares are seen, by what they change in memory."""
+
+# ruff: noqa: NPY002 - of the generators that a process shares
+
+import random
+import sys
+
+import numpy as np
+import pytest
+
+from netkf.testing import watching
+
+USES = {
+    "a number of Python": random.random,
+    "one of a pair of normals": random.gauss,
+    "a seed of Python": lambda: random.seed(1),
+    "a number of numpy": np.random.random,
+    "a seed of numpy": lambda: np.random.seed(1),
+}
+
+
+@pytest.fixture(autouse=True)
+def _as_before():
+    states = random.getstate(), np.random.get_state()
+    yield
+    random.setstate(states[0])
+    np.random.set_state(states[1])
+
+
+@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize("name", USES)
+def test_a_use_changes_the_state(monkeypatch, name, listed):
+    """Also where the memory of Python's generator is not known."""
+    if listed:
+        monkeypatch.setattr(watching, "_python_state_address", lambda: None)
+    for _ in range(2):
+        before, kept = watching.global_randomness(), (random.getstate(), np.random.get_state())
+        assert watching.global_randomness() == before
+        USES[name]()
+        assert watching.global_randomness() != before
+        random.setstate(kept[0])
+        np.random.set_state(kept[1])
+        assert watching.global_randomness() == before
+        random.gauss()  # the next one is already drawn
+
+
+@pytest.mark.skipif(sys.implementation.name != "cpython", reason="memory of CPython")
+def test_the_memory_of_pythons_generator_is_found():
+    assert watching._python_state_address() is not None
