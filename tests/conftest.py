@@ -19,13 +19,50 @@ FILTERS = netkf.parts.kinds()["filter"].values()
 ONCE = {simulate_agenda, simulate_runs, *(kind.slot_kernel for kind in FILTERS)}
 
 
+LONGEST = (
+    "checks/test_check.py",  # compiles most kernels, while the next ones need few
+    "testing/test_plants.py",
+    "engines/test_sample_path.py",
+    "checks/parts/test_parts.py",
+    "testing/test_scenarios.py",
+    "checks/test_rounding.py",
+    "checks/test_false_alarms.py",
+    "figures/test_figures.py",
+    "test_documentation.py",
+    "theory/test_replay.py",
+    "ensembles/test_cluster.py",
+    "ensembles/test_resume.py",
+    "algorithms/test_root_flow.py",
+    "studies/test_studies.py",
+    "engines/test_compiled.py",
+    "engines/test_clocked.py",
+    "engines/test_batches.py",
+    "testing/test_filters.py",
+    "benchmarks/test_by_hand.py",
+    "scenario/test_malformed.py",
+    "engines/test_visits.py",
+    "scenario/test_types.py",
+    "linalg/test_portable.py",
+    "test_process.py",
+)
+"""Files of more than ten seconds. They run first: a long one at the end would run alone."""
+
+
 def scenario_files():
     return sorted(SCENARIOS.glob("*.toml"))
 
 
-def pytest_configure():
+def pytest_configure(config):
     """A shell ignores Ctrl-C for what it runs in the background; tests send it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    # pytest-xdist would order files by the number of their tests.
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items):
+    """Long files first, then the others as they are found."""
+    places = {ROOT / "tests" / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
 
 
 @pytest.fixture(scope="session", autouse=True)

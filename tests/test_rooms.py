@@ -7,6 +7,7 @@ from pathlib import Path
 import networkx
 
 import netkf
+from tests import conftest
 
 ROOT = Path(netkf.__file__).parent
 
@@ -55,3 +56,8 @@ def test_a_room_defines_each_public_name_once():
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 defined[room, node.name].append(name)
     assert {key: where for key, where in defined.items() if len(where) > 1} == {}
+
+
+def test_files_that_run_first_are_there():
+    tests = conftest.ROOT / "tests"
+    assert [name for name in conftest.LONGEST if not (tests / name).exists()] == []
