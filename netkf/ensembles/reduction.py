@@ -176,11 +176,13 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
         np.zeros((runs, filters, 3)), np.full(runs, np.inf), np.ones(runs, dtype=np.bool_),
     )  # fmt: skip
     room = reduction_room(filters, n, most)
+    # Arrays of one kind from all engines, for which the kernel is compiled once.
+    times, x = np.array(batch.times), np.ascontiguousarray(batch.x)
     given = Batch(
-        batch.times, batch.x, batch.P, batch.error, batch.lengths, batch.diverged,
+        times, x, batch.P, batch.error, batch.lengths, batch.diverged,
         batch.exact_errors, batch.lengths - batch.diverged, np.zeros(runs, dtype=np.bool_),
-        np.empty((0, 0, 0)), int(np.searchsorted(batch.times, 0.0, side="right")),
-        *(values.reshape(runs, -1) for values in (batch.x, batch.P, batch.error)),
+        np.empty((0, 0, 0)), int(np.searchsorted(times, 0.0, side="right")),
+        *(values.reshape(runs, -1) for values in (x, batch.P, batch.error)),
     )  # fmt: skip
     reduce_runs(MANY, given, bounds, sums, room)
     if not sums.regular.all():

@@ -119,10 +119,14 @@ class SlotRuns:
             return
         self._plant_states = StreamBatch(self._streams, "plant", [()]).states
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
-        # A root of the covariance, which may be singular.
-        root, room = plant.start_root, np.zeros((setup.n, LANES))
-        draw_starts(MANY, self._plant_states, normal_ziggurat(), plant.start_mean, root, room, x)
-        self._path = Path(plant.F, plant.noise_root, setup.frame, x, origin)
+        # Arrays of one kind, whatever the plant, for which kernels are compiled once.
+        mean, F, root, noise = (
+            np.array(part, order="C")
+            for part in (plant.start_mean, plant.F, plant.start_root, plant.noise_root)
+        )
+        room = np.zeros((setup.n, LANES))
+        draw_starts(MANY, self._plant_states, normal_ziggurat(), mean, root, room, x)
+        self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
         setup, streams = self.setup, self._streams
