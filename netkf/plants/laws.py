@@ -119,7 +119,8 @@ def fill_impulses(
         # In an interval that begins with the noise it is a state, B dw.
         rest = max(end - places[k], 0.0)
         moved, means = polynomial(to_end, rest), polynomial(to_moments, rest)
-        share = rest / end  # P_1 of the whole interval is (1 - share) + share P_1 of the rest
+        # P_1 of the whole interval, which may be a point, is (1 - share) + share P_1 of the rest.
+        share = rest / end if rest > 0.0 else 0.0
         scale = math.sqrt(weights[k]) if rest > 0.0 else 0.0
         for i in range(n):
             for j in range(m):

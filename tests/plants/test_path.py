@@ -83,6 +83,16 @@ def test_no_draw_hangs_on_rounding(n):
         np.testing.assert_allclose(laws.noise_factor, plain.noise_factor, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("left", [0.0, 1e-13, 0.2 - 1e-13, 0.2])
+def test_a_state_at_an_end_of_a_step_is_that_of_the_end(left):
+    """Times of clocks fall on the sensing grid up to rounding."""
+    A, B = np.array([[-0.3, 0.5], [-0.6, 0.1]]), np.array([[0.8, 0.0], [0.1, 0.5]])
+    gain, spread = GridLaws(A, B, 0.2).conditional_law(0.2, left)
+    ends = np.eye(6) if left > 0.1 else np.zeros((6, 6))
+    np.testing.assert_allclose(gain, ends, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(spread, 0.0, rtol=0.0, atol=1e-6)
+
+
 def test_the_grid_does_not_depend_on_what_is_shown():
     seeds = lambda: (np.random.default_rng(1), np.random.default_rng(2))  # noqa: E731
     one = plant().path(*seeds(), np.array([0.4, 0.8]))
