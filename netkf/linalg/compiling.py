@@ -76,7 +76,12 @@ def _numba() -> Any:
     # Imported with the first call: importing netkf must not import numba.
     import numba
 
-    from netkf.linalg import lane_types, local_types, struct_types  # noqa: F401 - register types
+    from netkf.linalg import (  # noqa: F401 - register types
+        lane_types,
+        local_types,
+        struct_types,
+        word_types,
+    )
 
     return numba
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES
 from netkf.linalg.legendre import forward_coefficients
 from netkf.linalg.portable import (
     apply,
@@ -22,6 +23,10 @@ from netkf.linalg.small import matmul
 
 MAX_LAWS = 256  # laws of states inside a step that are kept
 MAX_GRIDS = 256  # parts of the sensing grid that are kept
+LEGENDRE = np.array(
+    [[1.0, -1.0, 1.0, -1.0], [0.0, 2.0, -6.0, 12.0], [0.0, 0.0, 6.0, -30.0], [0.0, 0.0, 0.0, 20.0]]
+)
+"""P_0 to P_3 of 2 u - 1 (columns) by powers of u."""
 DEPENDENT = 1e-9  # share of a row that is not rounding
 _NODES, _WEIGHTS = gauss_legendre(20)
 
@@ -41,6 +46,7 @@ class GridLaws:
         self.n, self.period = len(A), period
         self.A, self.B = A, B
         self.to_end, self.to_moments = _response_series(A, period)
+        self.course_table = course_table(self.to_end, self.n, period)
         self.response = self.responses(period)
         self.noise_factor = _factor(self._noise(period))
         self._conditional_laws: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
@@ -153,6 +159,32 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
         with_reach(series.reshape(len(series), -1), longest) for series in (end, moments)
     )
     return to_end, to_moments
+
+
+def course_width(n: int) -> int:
+    """Columns of ``course_table``: whole lanes for two integrals of n states."""
+    return -(-2 * n // LANES) * LANES
+
+
+def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
+    """(D, n + 4, W): what ``paths.fill_course`` multiplies with the state at the start of a piece
+    of at most so many seconds, by powers of its length, and with the four Legendre coefficients of
+    its cubic. Columns are those of the course.
+    """
+    # Terms beyond are below rounding, see linalg/series.
+    needed = int(np.searchsorted(to_end[:-1, -1], longest)) + 1
+    terms = max(needed, 4)  # those of a cubic
+    table = np.zeros((terms, n + 4, course_width(n)))
+    # Integrals of u^d and of u u^d over the share u of a piece.
+    plain, tilted = 1.0 / np.arange(1, terms + 1), 1.0 / np.arange(2, terms + 2)
+    response = np.zeros((terms, n, n))
+    response[:needed] = to_end[:needed, :-1].reshape(needed, n, n)
+    table[:, :n, :n] = np.swapaxes(response, 1, 2) * plain[:, None, None]
+    table[:, :n, n : 2 * n] = np.swapaxes(response, 1, 2) * tilted[:, None, None]
+    for i in range(n):
+        table[:4, n:, i] = LEGENDRE * plain[:4, None]
+        table[:4, n:, n + i] = LEGENDRE * tilted[:4, None]
+    return table
 
 
 def _factor(noise: FloatArray) -> FloatArray:

@@ -13,14 +13,13 @@ own, the sampled ones first. On frames see ``truth``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY, load, store
-from netkf.linalg.local import local_vector
+from netkf.linalg.lanes import LANES, MANY, ONE, Lanes, load, spread, store
 from netkf.linalg.portable import apply, product
 from netkf.linalg.structs import Size
 from netkf.plants.laws import GridLaws, grid_time
@@ -405,25 +404,18 @@ def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     if start == step.start and end == step.end:
         return step.moments
     since, gap, length = start - step.start, end - start, step.end - step.start
-    out, course = np.empty((2, n)), np.zeros(course_shape(laws.to_end, n))
-    size = np.zeros(n)
-    path, scratch = (step.x_start[None], step.cubic[None]), np.empty(2 * course.shape[1])
-    fill_course(size, course, laws.to_end, length, *path, 0, scratch)
-    fill_seen(size, out, course, since, gap, length, scratch)
+    table = laws.course_table
+    out, course = np.empty((2, n)), np.empty((len(table), table.shape[2]))
+    path, scratch = (step.x_start[None], step.cubic[None]), np.zeros(4 * course.shape[1])
+    fill_course(course, table, length, *path, 0, scratch)
+    fill_seen(np.zeros(n), out, course, since, gap, length, scratch)
     return out
-
-
-def course_shape(to_end: FloatArray, n: int) -> tuple[int, int]:
-    """The shape of what ``fill_course`` writes for responses ``to_end`` and n states."""
-    # The cubic has four terms, however few the response needs; rows are whole lanes.
-    return max(len(to_end), 4), -(-2 * n // LANES) * LANES
 
 
 @kernel(fused=True)
 def fill_course(
-    size: Size,
     out: FloatArray,
-    to_end: FloatArray,
+    table: FloatArray,
     length: float,
     x_start: FloatArray,
     cubic: FloatArray,
@@ -432,37 +424,26 @@ def fill_course(
 ) -> None:
     """Write piece ``k`` of ``length`` seconds as a polynomial in the share u of the piece:
     coefficients (D, W >= 2 n) such that ``u sum_d u^d out[d, :n]`` is the integral of x up to
-    there, and ``u^2 sum_d u^d out[d, n : 2 n]`` that of x times the share; ``scratch`` has n
-    entries.
+    there, and ``u^2 sum_d u^d out[d, n : 2 n]`` that of x times the share; ``table`` is
+    GridLaws.course_table, ``scratch`` has 4 W entries.
     """
-    n, power = len(size), length
-    x = local_vector(size, scratch[:n])
-    for i in range(n):
-        x[i] = x_start[k, i]
-    for d in range(len(out)):
-        # Integrals of u^d and of u u^d, over the share of the piece.
-        plain, tilted = power / (d + 1), power / (d + 2)
+    n, width, power = x_start.shape[1], out.shape[1], length
+    for c in range(4):
         for i in range(n):
+            scratch[c * width + i] = scratch[c * width + n + i] = length * cubic[k, c, i]
+    for d in range(len(out)):
+        for j in range(0, width, LANES):
             # The response to the state at the start: exp(A s) x by powers of s = u length.
-            total = 0.0
-            if d < len(to_end):
-                for j in range(n):
-                    total += to_end[d, i * n + j] * x[j]
-            out[d, i], out[d, n + i] = plain * total, tilted * total
+            total = spread(MANY, 0.0)
+            for i in range(n):
+                total += x_start[k, i] * load(MANY, table, d, i, j)
+            total *= power
+            # What noise adds is a cubic.
+            if d < 4:
+                for c in range(4):
+                    total += load(MANY, table, d, n + c, j) * load(MANY, scratch, c * width + j)
+            store(MANY, out, d, j, total)
         power *= length
-    for i in range(n):
-        # P_0 to P_3 of 2 u - 1, by powers of u.
-        mean, slope = length * cubic[k, 0, i], length * cubic[k, 1, i]
-        second, third = length * cubic[k, 2, i], length * cubic[k, 3, i]
-        by_power = (
-            mean - slope + second - third,
-            2.0 * slope - 6.0 * second + 12.0 * third,
-            6.0 * second - 30.0 * third,
-            20.0 * third,
-        )
-        for d in range(4):
-            out[d, i] += by_power[d] / (d + 1)
-            out[d, n + i] += by_power[d] / (d + 2)
 
 
 @kernel(fused=True)
@@ -479,23 +460,46 @@ def fill_seen(
     seconds into ``out``; ``course`` is what ``fill_course`` wrote for it, ``scratch`` has two rows
     of it.
     """
-    n, width = len(size), course.shape[1]
-    # Both integrals up to the start and up to the end of the gap, by Horner's rule.
     first, share = since / length, gap / length
-    last = first + share
+    fill_integrals(scratch, course, first, first + share)
+    fill_moments_between(ONE, size, out, scratch, course.shape[1], first, share)
+
+
+@kernel(inlined=True, fused=True)
+def fill_integrals(out: FloatArray, course: FloatArray, first: float, last: float) -> None:
+    """Write both integrals of a ``course`` (D, W) up to the share ``first`` of the piece into
+    ``out[:W]``, and up to ``last`` behind them.
+    """
+    width, top = course.shape[1], len(course) - 1
+    # Horner's rule, of both at a time: each waits for the product before.
     for j in range(0, width, LANES):
-        early = late = load(MANY, course, len(course) - 1, j)
-        for d in range(len(course) - 2, -1, -1):
+        early = late = load(MANY, course, top, j)
+        for d in range(top - 1, -1, -1):
             terms = load(MANY, course, d, j)
             early = terms + first * early
             late = terms + last * late
-        store(MANY, scratch, j, first * early)
-        store(MANY, scratch, width + j, last * late)
+        store(MANY, out, j, first * early)
+        store(MANY, out, width + j, last * late)
+
+
+@kernel(inlined=True, fused=True)
+def fill_moments_between(
+    lanes: Lanes,
+    size: Size,
+    out: FloatArray,
+    integrals: FloatArray,
+    width: int,
+    first: Any,
+    share: Any,
+) -> None:
+    """Write the moments (2, n, L) of x over a ``share`` of a piece that begins at its share
+    ``first``, from what ``fill_integrals`` wrote, (2 W, L) with W = ``width``.
+    """
+    n, last = len(size), first + share
     # P_1 of the gap is (u - middle) times 2 over its share of the piece.
     middle, scale = first + 0.5 * share, 2.0 / share
     for i in range(n):
-        plain = scratch[width + i] - scratch[i]
-        out[0, i] = plain
-        out[1, i] = scale * (
-            last * scratch[width + n + i] - first * scratch[n + i] - middle * plain
-        )
+        plain = load(lanes, integrals, width + i) - load(lanes, integrals, i)
+        late, early = load(lanes, integrals, width + n + i), load(lanes, integrals, n + i)
+        store(lanes, out, 0, i, plain)
+        store(lanes, out, 1, i, scale * (last * late - first * early - middle * plain))

@@ -13,7 +13,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from netkf.core.fields import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE, Lanes, load, root_of, spread, store
 from netkf.linalg.portable import cholesky
 from netkf.linalg.structs import Size
 from netkf.plants.linear import Readings, SlotReadings
@@ -189,12 +190,13 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
     """(2, p) moments of dy from those of x (2, n) and of unit white noise (2, p)."""
     out = np.empty(2 * len(H))
-    fill_reading(H[0], out, 0, len(H), seen, H[None], noise, root[None], 0)
+    fill_reading(ONE, H[0], out, 0, len(H), seen, H[None], noise, root[None], 0)
     return out.reshape(2, len(H))
 
 
-@kernel(fused=True)
+@kernel(inlined=True, fused=True)
 def fill_reading(
+    lanes: Lanes,
     size: Size,
     out: FloatArray,
     row: int,
@@ -205,20 +207,20 @@ def fill_reading(
     root: FloatArray,
     s: int,
 ) -> None:
-    """Write the moments of dy of sensor ``s``, ``rows`` of each, from those of x, ``seen`` (2, n),
-    and of unit white noise (2, p): the first ones from ``out[row]`` on and the second ones half of
-    ``out`` later. H is (S, p, n), root (S, p, p) and lower triangular.
+    """Write the moments of dy of sensor ``s``, ``rows`` of each, from those of x, ``seen``
+    (2, n, L), and of unit white noise (2, p, L): the first ones from ``out[row]`` on and the second
+    ones half of ``out`` (q, L) later. H is (S, p, n, L), root (S, p, p, L) and lower triangular.
     """
     half = len(out) // 2
     # Both moments are linear: dy = H x dt + dv, moment by moment.
     for m in range(2):
         for i in range(rows):
-            total = 0.0
+            total = spread(lanes, 0.0)
             for j in range(len(size)):
-                total += H[s, i, j] * seen[m, j]
+                total += load(lanes, H, s, i, j) * load(lanes, seen, m, j)
             for j in range(i + 1):
-                total += root[s, i, j] * noise[m, j]
-            out[m * half + row + i] = total
+                total += load(lanes, root, s, i, j) * load(lanes, noise, m, j)
+            store(lanes, out, m * half + row + i, total)
 
 
 def cut(
@@ -229,35 +231,36 @@ def cut(
     """
     # Copies, so that callers keep their arrays.
     first, left = np.empty(rest.shape), rest.copy()
-    divide(first, left, normals, u, length)
+    divide(ONE, first, left, normals, u, length)
     return first, left
 
 
-@kernel
+@kernel(inlined=True)
 def divide(
-    first: FloatArray, rest: FloatArray, normals: FloatArray, u: float, length: float
+    lanes: Lanes, first: FloatArray, rest: FloatArray, normals: FloatArray, u: Any, length: Any
 ) -> None:
-    """``cut`` in place: of ``rest`` (2, p) its first share goes to ``first``, and what is left
-    stays.
+    """``cut`` in place: of ``rest`` (2, p, L) its first share goes to ``first``, and what is left
+    stays. With a share of 1 that is all, and nothing.
 
     Exact conditional law of four independent moments (variances g, g/3 on each part) given their
     two sums; written so that nothing cancels when a part is short.
     """
     w = 1.0 - u
     # At least 1 / 4 for every u in [0, 1], so that the divisions below are safe.
-    spread = 1.0 - 3.0 * u * w
-    root, size = math.sqrt(spread), math.sqrt(u * w * length)
+    variance = 1.0 - 3.0 * u * w
+    root, size = root_of(variance), root_of(u * w * length)
     size_first, size_slope = size * root, size / root
     size_other = size_slope / ROOT_3
     for k in range(rest.shape[1]):
         # Given the sums the first moment has the mean u whole - 3 u w tilted; the rest gets the
         # same noise with the other sign.
-        whole, tilted = rest[0, k], rest[1, k]
+        whole, tilted = load(lanes, rest, 0, k), load(lanes, rest, 1, k)
         # The noise of the first moment also tilts both parts: one normal for both.
-        early, slope = size_first * normals[0, k], size_slope * normals[0, k]
-        other = size_other * normals[1, k]
-        first[0, k] = u * whole - 3.0 * u * w * tilted + early
-        first[1, k] = u * u * (tilted + slope) + w * other
+        normal = load(lanes, normals, 0, k)
+        early, slope = size_first * normal, size_slope * normal
+        other = size_other * load(lanes, normals, 1, k)
+        store(lanes, first, 0, k, u * whole - 3.0 * u * w * tilted + early)
+        store(lanes, first, 1, k, u * u * (tilted + slope) + w * other)
         # Subtracted from the rest: both parts add up to the whole.
-        rest[0, k] = w * whole + 3.0 * u * w * tilted - early
-        rest[1, k] = w * w * (tilted + slope) - u * other
+        store(lanes, rest, 0, k, w * whole + 3.0 * u * w * tilted - early)
+        store(lanes, rest, 1, k, w * w * (tilted + slope) - u * other)

@@ -20,6 +20,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, Lanes, aligned, blocks_of
+from netkf.linalg.words import high_word
 from netkf.rng.streams import ReplicaStreams, Streams
 
 _U = np.uint64
@@ -47,8 +48,8 @@ def ziggurat() -> Ziggurat:
 
 
 @kernel
-def high_word(a: Any, b: Any) -> Any:
-    """The upper 64 bits of the product of two words."""
+def high_word_by_halves(a: Any, b: Any) -> Any:
+    """``high_word`` as registers of several words compute it side by side."""
     a1, a0, b1, b0 = a >> S32, a & HALF, b >> S32, b & HALF
     low, cross = a0 * b0, a1 * b0
     middle = (low >> S32) + (cross & HALF) + a0 * b1
@@ -65,18 +66,21 @@ def scrambled(high: Any, low: Any) -> Any:
 
 
 @kernel
-def following(high: Any, low: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
-    """The next state, of the state and the increment of a stream."""
+def following(high: Any, low: Any, upper: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
+    """The next state, of the state and the increment of a stream; ``upper`` is
+    ``high_word(low, CHEAP)``.
+    """
     step = low * CHEAP + more_low
     carry = ONE if step < more_low else ZERO
-    return high * CHEAP + high_word(low, CHEAP) + more_high + carry, step
+    return high * CHEAP + upper + more_high + carry, step
 
 
 @kernel
 def next_word(states: np.ndarray, k: int) -> Any:
     """The next word of stream ``k`` of states (K, 4): state and increment, high words first."""
     high, low = states[k, 0], states[k, 1]
-    states[k, 0], states[k, 1] = following(high, low, states[k, 2], states[k, 3])
+    upper = high_word(low, CHEAP)
+    states[k, 0], states[k, 1] = following(high, low, upper, states[k, 2], states[k, 3])
     return scrambled(high, low)
 
 
@@ -95,8 +99,10 @@ def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArr
     for q in range(len(lanes)):
         high, low = states[b, k, 0, q], states[b, k, 1, q]
         units[b, k, q] = float(scrambled(high, low) >> S11) * TO_UNIT
-        following_high, following_low = following(high, low, states[b, k, 2, q], states[b, k, 3, q])
-        states[b, k, 0, q], states[b, k, 1, q] = following_high, following_low
+        upper = high_word_by_halves(low, CHEAP)
+        states[b, k, 0, q], states[b, k, 1, q] = following(
+            high, low, upper, states[b, k, 2, q], states[b, k, 3, q]
+        )
 
 
 @kernel
@@ -104,7 +110,7 @@ def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
     """The next uniform number of stream ``k`` of the run of lane ``q`` of block ``b``."""
     high, low = states[b, k, 0, q], states[b, k, 1, q]
     states[b, k, 0, q], states[b, k, 1, q] = following(
-        high, low, states[b, k, 2, q], states[b, k, 3, q]
+        high, low, high_word(low, CHEAP), states[b, k, 2, q], states[b, k, 3, q]
     )
     return float(scrambled(high, low) >> S11) * TO_UNIT
 

@@ -17,6 +17,7 @@ from netkf.algorithms.kernels.root_flow import (
     stack_tables,
 )
 from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
+from netkf.linalg.lanes import ONE
 from tests import reference
 from tests.algorithms.test_root_update import distance, wide_root
 
@@ -208,7 +209,7 @@ def test_models_side_by_side_are_what_they_are_alone():
             assert np.array_equal(means[m], alone[1])
             P = np.tril(roots[m]) @ np.tril(roots[m]).T
             G = table.seen[0].T @ table.seen[0]
-            rate = information_rate(scratch.size, stack, m, roots, m)
+            rate = information_rate(ONE, scratch.size, stack.seen[m], roots[m])
             assert rate == pytest.approx((P * G).sum(), rel=1e-12)
 
 

@@ -23,7 +23,7 @@ work in place on place ``k`` of root (K, n, n) (lower triangular, nothing above 
 read or written) and x (K, n), with room from :func:`flow_scratch`:
 
     move_root(table, m, root, x, k, gap, scratch)            any gap > 0
-    information_rate(table, m, root, k) -> trace(P G)     1/s, see flow.stretch
+    information_rate(lanes, size, seen, S) -> trace(P G)  1/s, see flow.stretch
     gain_root(moments, series, root, x, k, gap, values)   readings of a gap, see gains.py
 
 and for Python, one node at a time, ``flow_root(table, root, x, gap)`` and
@@ -453,7 +453,7 @@ def move_root(
         gap = move_levels(table, m, octaves, root, x, k, gap, scratch)
     if not gap > 0.0:
         return
-    if is_narrow(scratch.size, table, m, root, k, gap):
+    if is_narrow(table, m, gap, trace_of(scratch.size, table, m, root, k)):
         move_narrow(table, m, root, x, k, gap, scratch)
         return
     # Wide P: whole units by levels, and the rest row by row of Gamma.
@@ -463,29 +463,36 @@ def move_root(
 
 
 @kernel
-def is_narrow(size: Size, table: FlowTable, m: int, root: FloatArray, k: int, gap: float) -> bool:
-    """Return True if one step inside a cell suffices: rounding of G_g times P is harmless."""
+def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
+    """``trace(P)`` at place ``k`` as ``is_narrow`` asks for it, 0 where it does not."""
+    # Where nothing is observed G is 0, and any P is narrow.
+    return 0.0 if table.sizes[m, 1] == 0 else float(root_size(ONE, size, root[k]))
+
+
+@kernel(inlined=True)
+def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
+    """Return True if one step inside a cell suffices for a P of this trace: rounding of G_g times P
+    is harmless.
+    """
     # A P that is not a number is not wide.
-    if table.sizes[m, 1] == 0:
-        return True
-    return not table.size[m] * gap * root_size(size, root, k) >= NARROW
+    return not table.size[m] * gap * trace >= NARROW
 
 
-@kernel
-def is_quick(size: Size, table: FlowTable, m: int, root: FloatArray, k: int, gap: float) -> bool:
+@kernel(inlined=True)
+def is_quick(table: FlowTable, m: int, gap: float, trace: float) -> bool:
     """Return True if ``move_root`` takes one step inside a cell."""
     longest = table.unit[m] * (1 << table.sizes[m, 4])
-    return gap < longest and is_narrow(size, table, m, root, k, gap)
+    return bool(gap < longest and is_narrow(table, m, gap, trace))
 
 
-@kernel
-def root_size(size: Size, root: FloatArray, k: int) -> float:
-    """``trace(P)``."""
-    total = 0.0
+@kernel(inlined=True)
+def root_size(lanes: Lanes, size: Size, S: FloatArray) -> Any:
+    """``trace(P)`` of roots S (n, n, L)."""
+    total = spread(lanes, 0.0)
     # |S|_F^2 = trace(S S').
     for i in range(len(size)):
         for j in range(i + 1):
-            total += root[k, i, j] * root[k, i, j]
+            total += load(lanes, S, i, j) * load(lanes, S, i, j)
     return total
 
 
@@ -718,11 +725,11 @@ def use_readings(
     """Use the information Gamma' Gamma of a gap of less than a unit."""
     n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
-    spread = root_size(scratch.size, root, k)
+    trace = root_size(ONE, scratch.size, root[k])
     factor = math.sqrt(gap)
     for block in range(table.sizes[m, 1]):
         # Later blocks shrink with g^(2 j + 1): their information is below rounding from here on.
-        if table.bound[m, block] * factor * factor * spread < UNSEEN:
+        if table.bound[m, block] * factor * factor * trace < UNSEEN:
             break
         for j in range(width):
             rows[j] = gamma[m, block, 0, j + 1]
@@ -800,16 +807,16 @@ def transform(
             store(lanes, S, i, j, load(lanes, wide, i, j))
 
 
-@kernel(fused=True)
-def information_rate(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
-    """``trace(P G)`` in 1/s."""
+@kernel(inlined=True, fused=True)
+def information_rate(lanes: Lanes, size: Size, seen: FloatArray, S: FloatArray) -> Any:
+    """``trace(P G)`` in 1/s of roots S (n, n, L) and ``seen`` (q, n, L), which is R^-1/2 H."""
     # |R^-1/2 H S|_F^2 = trace(S' G S).
-    n, rate = len(size), 0.0
-    for r in range(table.sizes[m, 0]):
+    n, rate = len(size), spread(lanes, 0.0)
+    for r in range(len(seen)):
         for j in range(n):
-            total = 0.0
+            total = spread(lanes, 0.0)
             for i in range(j, n):
-                total += table.seen[m, r, i] * root[k, i, j]
+                total += load(lanes, seen, r, i) * load(lanes, S, i, j)
             rate += total * total
     return rate
 

@@ -144,7 +144,7 @@ def simulate_agenda(
         return wanted
     batch = struct_at(batch_memory, BatchArrays)
     runs = len(batch.lengths)
-    for run in range(runs):
+    for run in range(0 if batch.heard else runs):
         fill_heard(state, batch.first[run], batch.first[run + 1], batch.first_delay[run])
     for first in range(0, runs, len(progress)):
         simulate_group(

@@ -26,7 +26,7 @@ class BatchArrays(Struct):
     from ``first[r]`` up to ``first[r + 1]``, and what they send has the outcomes from
     ``first_delay[r]`` on. ``lengths`` (R,): number of samples; ``counts`` (R, len(KINDS)) of
     events; ``diverged`` (R,) is 1 where the last sample is not finite. Each filter stands for
-    ``carriers`` nodes.
+    ``carriers`` nodes. ``heard``: it is known already which messages arrive.
     """
 
     nodes: np.ndarray
@@ -38,6 +38,7 @@ class BatchArrays(Struct):
     counts: IntArray
     diverged: IntArray
     carriers: int
+    heard: int
 
 
 ALONE = -1
@@ -74,6 +75,7 @@ def no_batch() -> BatchArrays:
         counts=np.zeros((0, len(KINDS)), dtype=np.int64),
         diverged=none,
         carriers=1,
+        heard=0,
     )
 
 
@@ -119,8 +121,8 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
     state.probe_at = state.row = state.samples = 0
     for kind in range(len(state.counts)):
         state.counts[kind] = 0
-    for piece in range(state.path.known.shape[1]):
-        state.path.known[place, piece] = 0
+    for course in range(state.path.known.shape[1]):
+        state.path.known[place, course] = -1
 
 
 @kernel

@@ -17,7 +17,7 @@ import numpy as np
 from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
 from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
-from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end
+from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_shown
 from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.poisson import all_ticks, window_of
@@ -127,6 +127,7 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
         counts=np.zeros((runs, len(KINDS)), dtype=np.int64),
         diverged=np.zeros(runs, dtype=np.int64),
         carriers=len(scenario.nodes) // len(start.nodes),
+        heard=int(draws.ticks.bits),
     )
 
 
@@ -171,10 +172,12 @@ class BatchDraws:
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
         self._scenario, self.replicas, blocks = scenario, replicas, blocks_to_the_end(scenario)
-        self.ticks = all_ticks(scenario, streams)
         self.paths = Paths(scenario, streams, blocks)
+        # Runs that are simulated one by one, where origins move, look at outcomes themselves.
+        at_once = is_immediate(scenario) and not len(self.paths.frame_times)
+        self.ticks = all_ticks(scenario, streams, at_once)
         self._block = self.paths.following()
-        noise = Noise(scenario, streams, blocks * BLOCK)
+        noise = Noise(scenario, streams, steps_to_the_end(scenario))
         # One stretch of noise reaches the horizon: it is drawn once.
         noise.following()
         self.sensing = noise.sensing
@@ -185,7 +188,8 @@ class BatchDraws:
 
     def window(self) -> Window:
         """The ticks of all runs, one after the other."""
-        return Window(math.inf, *self.ticks[:4])
+        ticks = self.ticks
+        return Window(math.inf, *ticks[:4], heard=ticks.at if ticks.bits else None)
 
     def path(self, together: int = 1) -> PathBlock:
         """All steps of all runs, of which so many are simulated together."""
@@ -219,10 +223,10 @@ class RunDraws:
         self.states: States = PathStates(scenario, batch.paths.frame_times)
         shared, count = batch.sensing, len(batch.sensing.rows)
         one, streams = slice(run, run + 1), slice(run * count, (run + 1) * count)
-        mine = {name: getattr(shared, name)[one] for name in ("noise", "rest", "step")}
-        fixed = ("rows", "H", "root", "height", "width", "inside", "host", "node")
+        mine = {name: getattr(shared, name)[streams] for name in ("rest", "step", "cuts")}
+        fixed = ("rows", "kind", "H", "root", "height", "width", "inside", "host", "node")
         self.sensing = Sensing(
-            **{name: getattr(shared, name) for name in fixed}, **mine, cuts=shared.cuts[streams]
+            **{name: getattr(shared, name) for name in fixed}, **mine, noise=shared.noise[one]
         )
 
     def window(self) -> Window:

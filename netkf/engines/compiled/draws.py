@@ -12,11 +12,11 @@ from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import aligned
+from netkf.linalg.lanes import aligned, with_spare
 from netkf.linalg.portable import cholesky
 from netkf.plants.diffusion import NO_TIMES
-from netkf.plants.laws import grid_time
-from netkf.plants.paths import BLOCK, Block, course_shape
+from netkf.plants.laws import course_width, grid_time
+from netkf.plants.paths import BLOCK, Block
 from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
@@ -26,18 +26,27 @@ from netkf.scenario.scenario import Scenario
 
 MOST_BLOCKS = 16  # of steps that are drawn at once
 MOST_NORMALS = 1 << 20  # of all sensors
+COURSES = 16
+"""Pieces of a run whose courses are kept at a time: nodes are at much the same time, and all of
+them would not fit the processor's cache.
+"""
 
 
 def blocks_to_the_end(scenario: Scenario) -> int:
     """Number of blocks of steps that reach the horizon."""
+    return -(-steps_to_the_end(scenario) // BLOCK)
+
+
+def steps_to_the_end(scenario: Scenario) -> int:
+    """Number of steps that reach the horizon."""
     period = scenario.truth.sensing_period
     assert period is not None
     # A first guess from below, which the loop completes.
-    blocks = max(1, int(scenario.horizon / (period * BLOCK)))
+    steps = max(1, int(scenario.horizon / period) - 1)
     # The test is the grid time itself, as the engine compares it.
-    while grid_time(period, blocks * BLOCK) < scenario.horizon:
-        blocks += 1
-    return blocks
+    while grid_time(period, steps) < scenario.horizon:
+        steps += 1
+    return steps
 
 
 def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
@@ -97,7 +106,7 @@ class Paths:
     def block(self, block: Block, together: int = 1) -> PathBlock:
         """The same for the event loop, which simulates so many runs ``together``."""
         ends, laws = block.ends, self._paths.laws
-        pieces, n = len(block.start), laws.n
+        n = laws.n
         # A Struct takes C-contiguous arrays only.
         parts = (block.x_start, block.x_end, block.moments, block.cubic)
         x_start, x_stop, moments, cubic = (np.ascontiguousarray(part) for part in parts)
@@ -112,9 +121,9 @@ class Paths:
             step=block.step,
             last=ends[block.step],
             grid=ends[ends < self._horizon] if self._senses else np.empty(0),
-            to_end=laws.to_end,
-            course=aligned((together, pieces, *course_shape(laws.to_end, n))),
-            known=np.zeros((together, pieces), dtype=np.uint8),
+            table=laws.course_table,
+            course=aligned((together, COURSES, len(laws.course_table), course_width(n))),
+            known=np.full((together, COURSES), -1, dtype=np.int64),
         )
 
 
@@ -131,9 +140,9 @@ def no_path(n: int) -> PathBlock:
         last=np.array([math.inf]),
         grid=np.empty(0),
         **rows,
-        to_end=np.zeros((1, 1)),
-        course=np.zeros((1, 1, *course_shape(np.zeros((1, 1)), n))),
-        known=np.zeros((1, 1), dtype=np.uint8),
+        table=np.zeros((1, 1, 1)),
+        course=np.zeros((1, 1, 1, 1)),
+        known=np.zeros((1, 1), dtype=np.int64),
     )
 
 
@@ -155,6 +164,7 @@ def _sensors(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int,
     hosts = [0 if pooled else index[node] for node in scenario.increment_sensors]
     shared = {
         "rows": rows,
+        "kind": np.array([place.entry for _, place in placed], dtype=np.int64),
         "H": H,
         "root": root,
         "host": np.array(hosts, dtype=np.int64),
@@ -174,11 +184,13 @@ class Noise:
         self._period = float(scenario.truth.sensing_period or 1.0) if keys else 1.0
         runs, ziggurat = len(streams.per_replica), normal_ziggurat()
         count, most = shared["H"].shape[:2]
+        even = bool((shared["rows"] == most).all())
         self.sensing = Sensing(
             **shared,
-            noise=np.zeros((runs, count, steps, 2, most)),
-            rest=np.zeros((runs, count, 2, most)),
-            step=np.full((runs, count), -1, dtype=np.int64),
+            # Rows that a sensor does not have stay 0.
+            noise=(np.empty if even else np.zeros)((runs, count, steps, 2, most)),
+            rest=with_spare((runs * count, 2, most)),
+            step=np.full(runs * count, -1, dtype=np.int64),
             cuts=cuts.states,
             **ziggurat._asdict(),
         )

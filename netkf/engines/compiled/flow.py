@@ -274,7 +274,8 @@ class Workspace:
 
 def ticks_of(window: Window) -> Ticks:
     """The ticks of a window."""
-    return Ticks(**window._asdict(), heard=np.zeros(len(window.t), dtype=np.int64))
+    heard = np.zeros(len(window.t), dtype=np.int64) if window.heard is None else window.heard
+    return Ticks(**window._replace(heard=heard)._asdict())
 
 
 def empty_shown(shape: tuple[int, int, int, int], terms: int = 0) -> Shown:

@@ -6,9 +6,10 @@ from netkf.algorithms.flow import stretch_end
 from netkf.algorithms.kernels.root_flow import gain_root, information_rate, move_root
 from netkf.algorithms.models import usable
 from netkf.engines.base import LONGER, SHORTEST_SHARE
-from netkf.engines.compiled.state import Sensing, Simulation
+from netkf.engines.compiled.state import PathBlock, Sensing, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
 from netkf.linalg.small import copy_matrix
 from netkf.plants.paths import fill_course, fill_seen
 from netkf.plants.sensors import divide, fill_reading
@@ -17,71 +18,83 @@ from netkf.rng.numbers import NormalZiggurat, next_normal
 
 @kernel
 def read_increments(
-    state: Simulation, run: int, h: int, step: int, u: float, length: float, out: FloatArray
+    state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Moments (2 p,) of the readings of node ``h``, where x has the moments
-    ``scratch.state_moments``, over the first share ``u`` of the ``length`` seconds left of a step
-    (-1: all of it).
+    """Moments (2 p,) of the readings of node ``h`` over [now, end], where x has the moments
+    ``scratch.state_moments``, in the step of a ``piece``.
     """
     sensing, early = state.sensing, state.scratch.early
     x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0
+    step, last = state.path.step[piece], state.path.last[piece]
     for s in range(state.nodes[h].sensor, state.nodes[h].sensors):
-        # The first reading of a step takes over the noise of that step.
-        if sensing.step[run, s] != step:
-            sensing.step[run, s] = step
-            copy_matrix(sensing.rest[run, s], sensing.noise[run, s, step])
-        noise = sensing.rest[run, s]
+        noise = sensing.rest[begin_step(sensing, run, s, step)]
         # A part of the step: divide its noise exactly, and keep the rest for the next call.
-        if u >= 0.0:
+        if end < last:
             draw_cut(sensing, run, s, state.scratch.cut)
-            divide(early, noise, state.scratch.cut, u, length)
+            left = last - now
+            divide(ONE, early, noise, state.scratch.cut, (end - now) / left, left)
             noise = early
-        fill_reading(state.size, out, row, sensing.rows[s], x, H, noise, root, s)
+        fill_reading(ONE, state.size, out, row, sensing.rows[s], x, H, noise, root, s)
         row += sensing.rows[s]
+
+
+@kernel(inlined=True)
+def begin_step(sensing: Sensing, run: int, s: int, step: int) -> int:
+    """Return the place of what is left of the noise of sensor ``s`` in a step."""
+    # Streams are numbered run by run, sensor by sensor.
+    k = run * len(sensing.rows) + s
+    # The first reading of a step takes over the noise of that step.
+    if sensing.step[k] != step:
+        sensing.step[k] = step
+        copy_matrix(sensing.rest[k], sensing.noise[run, s, step])
+    return k
 
 
 @kernel
 def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
     """The next standard normals (2, p) that cut a step of sensor ``s``."""
     ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
-    # Streams are numbered run by run, sensor by sensor.
     stream = run * len(sensing.rows) + s
     for half in range(2):
         for i in range(sensing.rows[s]):
             normals[half, i] = next_normal(sensing.cuts, stream, ziggurat)
 
 
+@kernel(inlined=True)
+def know_course(state: Simulation, run: int, piece: int) -> int:
+    """Make the course of x in a piece known; returns its place among those of the run."""
+    path, k = state.path, run - state.first_run
+    place = int(piece % path.known.shape[1])
+    # The same for all nodes that read a part of the piece.
+    if path.known[k, place] != piece:
+        path.known[k, place] = piece
+        length, values = path.stop[piece] - path.start[piece], state.scratch.values
+        x_start, cubic, course = path.x_start[run], path.cubic[run], path.course[k, place]
+        fill_course(course, path.table, length, x_start, cubic, piece, values)
+    return place
+
+
 @kernel
 def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
     """Write the moments of x over [now, end], inside one piece, into ``scratch.state_moments``."""
-    path, scratch, k = state.path, state.scratch, run - state.first_run
+    path, scratch = state.path, state.scratch
     start, stop = path.start[piece], path.stop[piece]
     # A whole piece has its moments already, drawn from their exact law.
     if now == start and end == stop:
         copy_matrix(scratch.state_moments, path.moments[run, piece])
         return
-    # The same for all nodes that read a part of the piece.
-    if path.known[k, piece] == 0:
-        path.known[k, piece] = 1
-        fill_course(
-            state.size,
-            path.course[k, piece],
-            path.to_end,
-            stop - start,
-            path.x_start[run],
-            path.cubic[run],
-            piece,
-            scratch.values,
-        )
-    fill_seen(
-        state.size,
-        scratch.state_moments,
-        path.course[k, piece],
-        now - start,
-        end - now,
-        stop - start,
-        scratch.values,
-    )
+    course = path.course[run - state.first_run, know_course(state, run, piece)]
+    seen, values = scratch.state_moments, scratch.values
+    fill_seen(state.size, seen, course, now - start, end - now, stop - start, values)
+
+
+@kernel(inlined=True)
+def piece_of(path: PathBlock, piece: int, end: float) -> int:
+    """Return the piece that ``end`` lies in, which is not after ``piece``."""
+    # Back from the present piece: a node may be behind it.
+    while piece > 0 and path.stop[piece - 1] >= end:
+        piece -= 1
+    return piece
 
 
 @kernel
@@ -89,10 +102,8 @@ def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float
     """Write the moments of x over [now, end], inside one step that samples of other nodes may cut,
     into ``scratch.state_moments``; ``end`` is not after ``piece``.
     """
-    path, k = state.path, piece
-    # Back to the piece that ``end`` lies in: the node may be behind the present piece.
-    while k > 0 and path.stop[k - 1] >= end:
-        k -= 1
+    path = state.path
+    k = piece_of(path, piece, end)
     if now >= path.start[k]:
         fill_moments_of_piece(state, run, k, now, end)
         return
@@ -123,25 +134,17 @@ def fill_readings(
     """Write the moments of the readings of node ``h`` over [now, end] into ``out`` (2 p,); ``end``
     is not after ``piece``, and in its step.
     """
-    path = state.path
-    last = path.last[piece]
     fill_moments(state, run, piece, now, end)
-    # Share of what is left of the step; -1 takes all of it.
-    share = (end - now) / (last - now) if end < last else -1.0
-    read_increments(state, run, h, path.step[piece], share, last - now, out)
+    read_increments(state, run, h, piece, now, end, out)
 
 
-@kernel
-def next_stretch(
-    state: Simulation, m: int, k: int, now: float, time: float, least: float
-) -> tuple[float, float]:
-    """Return until when the readings of a node at place ``k`` may be used at once, ``time`` at
+@kernel(inlined=True)
+def next_stretch(rate: float, now: float, time: float, least: float) -> tuple[float, float]:
+    """Return until when readings may be used at once at a ``rate`` of information, ``time`` at
     most, and the shortest stretch that may follow (``least`` is what this returned for the stretch
     before, or 0).
     """
-    end = time
-    # How much of the gap may be used at once depends on the rate of information, trace(P G).
-    stretch = usable(information_rate(state.size, state.table, m, state.root, k))
+    end, stretch = time, usable(rate)
     if stretch < time - now:
         # A lower bound that is set once per gap, else an exploding P asks for ever shorter
         # stretches.
@@ -174,8 +177,10 @@ def predict_with_increments(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
 ) -> None:
     """``use_stretch`` up to ``time``, which is not after ``piece``, in as many as it takes."""
-    least = 0.0
+    seen, least = state.table.seen[state.nodes[h].model], 0.0
     while now < time:
-        end, least = next_stretch(state, state.nodes[h].model, k, now, time, least)
+        # How much of the gap may be used at once depends on the rate of information, trace(P G).
+        rate = information_rate(ONE, state.size, seen, state.root[k])
+        end, least = next_stretch(rate, now, time, least)
         use_stretch(state, run, h, k, piece, now, end)
         now = end

@@ -40,7 +40,7 @@ class Drawing(NamedTuple):
     the streams of ``ticks`` (E, 4) and of what decides about messages, ``luck`` (S, 4), of which
     each run has ``streams`` (S = 0: nothing is drawn). Of one run: entity e sends on the ways
     ``hearing`` from ``first[e]`` up to ``first[e + 1]``, way w has the stream ``source[w]`` and the
-    ``chance[w]`` to arrive.
+    ``chance[w]`` to arrive. ``bits``: what is drawn of a tick is only which messages arrive.
     """
 
     coming: FloatArray
@@ -52,10 +52,13 @@ class Drawing(NamedTuple):
     hearing: np.ndarray
     source: np.ndarray
     chance: FloatArray
+    bits: bool
 
 
 class Found(NamedTuple):
-    """Ticks as they are found: ``t, entity`` (K,), and where in ``delay`` their outcomes begin."""
+    """Ticks as they are found: ``t, entity`` (K,), and where in ``delay`` their outcomes begin, or
+    a bit for each of them.
+    """
 
     t: FloatArray
     entity: np.ndarray
@@ -85,8 +88,8 @@ def draw_ticks(
             # they are for this tick.
             if used[0] == len(found.t) or used[1] + first[e + 1] - first[e] > len(found.delay):
                 return False
-            found.t[used[0]], found.entity[used[0]], found.at[used[0]] = coming[k], e, used[1]
-            luck, drawn = 0.0, -1
+            found.t[used[0]], found.entity[used[0]] = coming[k], e
+            at, luck, drawn = 0 if drawing.bits else used[1], 0.0, -1
             # One uniform number for each source of outcomes: directions that share a source follow
             # one another.
             for m in range(first[e], first[e + 1]):
@@ -95,8 +98,13 @@ def draw_ticks(
                     drawn = drawing.source[w]
                     # The number is below 1, so that a link with probability 1 never loses.
                     luck = next_unit(drawing.luck, run * drawing.streams + drawn)
-                found.delay[used[1]] = delay if luck < drawing.chance[w] else LOST
-                used[1] += 1
+                arrives = luck < drawing.chance[w]
+                if drawing.bits:
+                    at |= np.int64(arrives) << (m - first[e])
+                else:
+                    found.delay[used[1]] = delay if arrives else LOST
+                    used[1] += 1
+            found.at[used[0]] = at
             used[0] += 1
             # The next tick is drawn now: it may lie in the next window.
             gap: float = next_exponential(drawing.ticks, k, exponential)
@@ -141,7 +149,7 @@ def put_in_time_order(
 class AllTicks(NamedTuple):
     """The ticks of R runs one after the other, those of run r from ``first[r]`` up to ``first[r +
     1]``, as in a Window; ``at`` counts from the first outcome of the run, which is ``delay`` at
-    ``first_delay[r]``.
+    ``first_delay[r]``; with ``bits`` it says which messages arrive.
     """
 
     t: FloatArray
@@ -150,6 +158,7 @@ class AllTicks(NamedTuple):
     delay: FloatArray
     first: np.ndarray
     first_delay: np.ndarray
+    bits: bool = False
 
 
 @kernel
@@ -206,7 +215,11 @@ class PoissonSchedules:
     """The ticks of some runs of such a scenario, a window at a time."""
 
     def __init__(
-        self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders | None = None
+        self,
+        scenario: Scenario,
+        streams: Streams | ReplicaStreams,
+        senders: Senders | None = None,
+        bits: bool = False,
     ) -> None:
         runs = len(streams.per_replica)
         senders = senders_of(scenario) if senders is None else senders
@@ -226,6 +239,7 @@ class PoissonSchedules:
             hearing=senders.hearing,
             source=senders.source,
             chance=chances,
+            bits=bits,
         )
         # The first tick of each entity, unit exponentials over its rate.
         self._drawing.coming[:] /= self._drawing.rate
@@ -271,12 +285,13 @@ class PoissonSchedules:
                 state[:] = before
 
     def _space(self, ticks: int) -> Found:
-        return _room(ticks, int(self._sends * ticks) + self._most)
+        sends = 0.0 if self._drawing.bits else self._sends
+        return _room(ticks, int(sends * ticks) + self._most)
 
     def _space_for_all(self, ticks: int) -> AllTicks:
         t, entity, at, delay = self._space(ticks)
         first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
-        return AllTicks(t, entity, at, delay, first, first_delay)
+        return AllTicks(t, entity, at, delay, first, first_delay, self._drawing.bits)
 
     def _window(self, run: int, begin: float, end: float) -> Window:
         last, used = min(end, self._horizon), np.zeros(2, dtype=np.int64)
@@ -312,10 +327,12 @@ def _room(ticks: int, sends: int) -> Found:
     return Found(np.empty(ticks), entity, at, np.empty(sends))
 
 
-def all_ticks(scenario: Scenario, streams: ReplicaStreams) -> AllTicks:
-    """All ticks of several runs."""
+def all_ticks(scenario: Scenario, streams: ReplicaStreams, bits: bool = False) -> AllTicks:
+    """All ticks of several runs; where clocks are Poisson and no message takes time, with ``bits``
+    for outcomes if they are wanted.
+    """
     if is_poisson(scenario):
-        return PoissonSchedules(scenario, streams).whole()
+        return PoissonSchedules(scenario, streams, bits=bits).whole()
     # Any other clock or channel: windows made in Python, joined run after run.
     windows = whole_schedules(scenario, streams)
     first, first_delay = (

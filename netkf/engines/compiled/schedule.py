@@ -41,7 +41,8 @@ LOST = -1.0
 class Window(NamedTuple):
     """Ticks before ``end`` in the order of (time, entity): ``t`` (K,), ``entity`` (K,) places among
     the senders' entities; the outcomes of what tick k sends are ``delay`` from ``at[k]`` on, in the
-    order of its directed links: seconds, or LOST.
+    order of its directed links: seconds, or LOST. Where no message takes time it may say instead
+    which ones are ``heard`` (K,), a bit for each.
     """
 
     end: float
@@ -49,6 +50,7 @@ class Window(NamedTuple):
     entity: np.ndarray
     at: np.ndarray
     delay: FloatArray
+    heard: np.ndarray | None = None
 
 
 class Ticks(NamedTuple):

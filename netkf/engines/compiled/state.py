@@ -22,7 +22,7 @@ from netkf.algorithms.models import FlowModel, first_root
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.structs import Size, Struct
-from netkf.plants.paths import course_shape
+from netkf.plants.laws import course_width
 from netkf.scenario.scenario import Scenario
 
 
@@ -89,13 +89,14 @@ class Scratch(Struct):
 
 class Sensing(Struct):
     """S increment sensors of R runs: rows p (S,), H (S, p, n), root of R (S, p, p); noise of the
-    steps (R, S, steps, 2, p), the ``rest`` of that of the present step (R, S, 2, p) and which step
-    that is (R, S); the streams ``cuts`` (R S, 4) of normals for parts of a step, with numpy's table
-    for these (height, width, inside). ``host`` and ``node`` (K,) say who wakes at a grid point, in
-    their order.
+    steps (R, S, steps, 2, p), the ``rest`` of that of the present step (R S, 2, p) and which step
+    that is (R S,); the streams ``cuts`` (R S, 4) of normals for parts of a step, with numpy's table
+    for these (height, width, inside). Sensors of one ``kind`` (S,) have the same H and R. ``host``
+    and ``node`` (K,) say who wakes at a grid point, in their order.
     """
 
     rows: IntArray
+    kind: IntArray
     H: FloatArray
     root: FloatArray
     noise: FloatArray
@@ -133,9 +134,10 @@ class PathBlock(Struct):
 
     K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both
     (R, K, n), moments (R, K, 2, n), cubic (R, K, 4, n), whose step (K,) it is and where that ends
-    (K,); ``grid`` holds the times at which sensors wake; ``to_end`` is that of the plant's laws.
-    The ``course`` (G, K, D, W) of x in the pieces that are ``known`` (G, K), of the G runs that
-    are simulated together. Where nothing senses increments there is one piece without an end.
+    (K,); ``grid`` holds the times at which sensors wake; ``table`` is the
+    course_table of the plant's laws. The ``course`` (G, C, D, W) of x in some pieces: those that
+    are ``known`` (G, C), each at the remainder of its number, of the G runs that are simulated
+    together. Where nothing senses increments there is one piece without an end.
     """
 
     end: float
@@ -148,7 +150,7 @@ class PathBlock(Struct):
     step: IntArray
     last: FloatArray
     grid: FloatArray
-    to_end: FloatArray
+    table: FloatArray
     course: FloatArray
     known: np.ndarray
 
@@ -348,8 +350,8 @@ def scratch_arrays(
         cut=np.zeros((2, most // 2)),
         state_moments=np.zeros((2, n)),
         total=np.zeros((2, n)),
-        # fill_seen() needs two rows of a course.
-        values=np.zeros(max(width, 2 * course_shape(np.zeros(0), n)[1])),
+        # fill_course() needs four rows of a course, and fill_seen() two.
+        values=np.zeros(max(width, 4 * course_width(n))),
         y=np.zeros(q),
         H=np.zeros((q, n)),
         root_R=np.zeros((q, q)),

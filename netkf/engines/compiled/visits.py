@@ -17,10 +17,12 @@ import numpy as np
 
 from netkf.algorithms.kernels.root_flow import (
     cell_of,
+    information_rate,
     is_quick,
     move_mean,
     move_root,
     place_of_flow,
+    root_size,
     shrink_root,
     take_root,
     transform,
@@ -29,7 +31,15 @@ from netkf.algorithms.kernels.root_flow import (
 )
 from netkf.algorithms.kernels.root_update import absorb_columns
 from netkf.engines.compiled.event_loop import show_all
-from netkf.engines.compiled.increments import fill_readings, next_stretch, use_stretch
+from netkf.engines.compiled.increments import next_stretch, use_stretch
+from netkf.engines.compiled.lane_readings import (
+    LaneReadings,
+    begin_reading,
+    empty_readings,
+    end_readings,
+    know_model,
+    read_alone,
+)
 from netkf.engines.compiled.lane_series import (
     LaneSeries,
     blind_series,
@@ -81,12 +91,11 @@ class Visits(Struct):
     ``stretches`` (F,), a ring of ``begun`` up to ``added``. ``shares`` (W, 4) of directed links:
     own weight and that of the message, and their roots.
 
-    Predictions that wait for company, of nodes without sensors and with them: ``waiting`` (2,) of
-    them, ``lanes`` (2, L), their ``places`` (2, L), what their series give, ``blind_rows`` and
-    ``sensing_rows`` (L, W), and the ``moments`` (q, L) of their readings. The same by entry, of
-    all lanes: ``columns`` (W, L), ``values`` (E, L) and ``gains`` (3 n q, L), states ``x`` and
-    ``other_x`` (n, L), ``S`` and ``other_S`` (n, n, L); V, T (n, n, L) and ``moved`` (n, L) are
-    scratch.
+    Predictions side by side, of nodes without sensors, of which some are ``waiting`` for company,
+    and with them: ``lanes`` (2, L), their ``places`` (2, L), what their series give, ``blind_rows``
+    and ``sensing_rows`` (L, W), and ``readings``. The same by entry, of all lanes: ``columns``
+    (W, L), ``values`` (E, L) and ``gains`` (3 n q, L), states ``x`` and ``other_x`` (n, L), ``S``
+    and ``other_S`` (n, n, L); V, T (n, n, L) and ``moved`` (n, L) are scratch.
     """
 
     records: np.ndarray
@@ -95,14 +104,13 @@ class Visits(Struct):
     pairs: IntArray
     stretches: np.ndarray
     shares: FloatArray
-    waiting: IntArray
     lanes: np.ndarray
     places: IntArray
     blind: LaneSeries
     sensing: LaneSeries
     blind_rows: FloatArray
     sensing_rows: FloatArray
-    moments: FloatArray
+    readings: LaneReadings
     columns: FloatArray
     values: FloatArray
     gains: FloatArray
@@ -113,6 +121,7 @@ class Visits(Struct):
     V: FloatArray
     T: FloatArray
     moved: FloatArray
+    waiting: int
     count: int
     top: int
     begun: int
@@ -128,7 +137,6 @@ def empty_visits(filters: Filters, weights: FloatArray, places: int, period: flo
     blind, sensing = blind_series(filters), sensing_series(filters, period)
     q = most_moments(filters)
     shapes = {
-        "moments": (q, LANES),
         "gains": (3 * n * q, LANES),
         **dict.fromkeys(("x", "other_x", "moved"), (n, LANES)),
         **dict.fromkeys(("S", "other_S", "V", "T"), (n, n, LANES)),
@@ -144,13 +152,14 @@ def empty_visits(filters: Filters, weights: FloatArray, places: int, period: flo
         first=np.full(most + 2, -1, dtype=np.int64),
         pairs=np.zeros(most, dtype=np.int64),
         shares=np.stack([own, weights, np.sqrt(own), np.sqrt(weights)], axis=1),
-        waiting=np.zeros(2, dtype=np.int64),
+        readings=empty_readings(filters),
         lanes=np.zeros((2, LANES), dtype=LANE),
         places=np.zeros((2, LANES), dtype=np.int64),
         blind=blind,
         sensing=sensing,
         **{name: with_spare(shape) for name, shape in shapes.items()},
         stretches=np.zeros(places, dtype=STRETCH),
+        waiting=0,
         count=0,
         top=0,
         begun=0,
@@ -245,14 +254,20 @@ def join(state: Simulation, visits: Visits, v: int, place: int) -> None:
     if not now < visit.time:
         return
     state.now[place] = visit.time
-    node, gap = state.nodes[node_at(state, visit.run, place)], visit.time - now
+    node = state.nodes[node_at(state, visit.run, place)]
     if node.sensors > node.sensor:
         add_stretch(visits, place, v, now, 0.0)
         return
+    # Nothing is observed, so that P may be as wide as it is.
     m = node.model
-    if not is_quick(state.size, state.table, m, state.root, place, gap):
+    if not is_quick(state.table, m, visit.time - now, 0.0):
+        gap = visit.time - now
         move_root(state.table, m, state.root, state.xhat, place, gap, state.flow_scratch)
-    elif wait(visits, BLIND, v, place, m, now, visit.time) == LANES:
+        return
+    q = visits.waiting
+    visits.waiting = q + 1
+    use_lane(visits, BLIND, q, place, v, m, now, visit.time)
+    if q + 1 == LANES:
         predict_blind(state, visits)
 
 
@@ -277,54 +292,80 @@ def use_stretches(state: Simulation, visits: Visits) -> None:
     while visits.begun < visits.added:
         # What follows a stretch is added while it is used.
         count = min(LANES, visits.added - visits.begun)
-        for _ in range(count):
-            begin_stretch(state, visits)
-        predict_sensing(state, visits)
+        for q in range(count):
+            stretch = visits.stretches[(visits.begun + q) % len(visits.stretches)]
+            visits.places[SENSING, q] = stretch.place
+        take_states(state, visits.places[SENSING], count, visits.x, visits.S)
+        fill_rates(state, visits, count)
+        for q in range(count):
+            begin_stretch(state, visits, q)
+        predict_sensing(state, visits, count)
 
 
 @kernel
-def begin_stretch(state: Simulation, visits: Visits) -> None:
-    """Take the next stretch: give it a lane, or use it at once where it is to be used alone."""
-    stretch = visits.stretches[visits.begun % len(visits.stretches)]
+def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
+    """Write trace(P G) and trace(P) of the nodes in lanes, of which so many are used."""
+    size, readings = state.size, visits.readings
+    for q in range(count):
+        stretch = visits.stretches[(visits.begun + q) % len(visits.stretches)]
+        visit = visits.records[stretch.visit]
+        h = node_at(state, visit.run, stretch.place)
+        know_model(readings, q, state.nodes[h].model, state.table.seen)
+    store(MANY, readings.rate, 0, information_rate(MANY, size, readings.seen, visits.S))
+    store(MANY, readings.trace, 0, root_size(MANY, size, visits.S))
+
+
+@kernel
+def begin_stretch(state: Simulation, visits: Visits, q: int) -> None:
+    """Take the next stretch, whose node is in lane q: let it use the lane, or use it at once where
+    it is to be used alone.
+    """
+    stretch, readings = visits.stretches[visits.begun % len(visits.stretches)], visits.readings
     place, now, v = stretch.place, stretch.now, stretch.visit
     visits.begun += 1
     visit = visits.records[v]
     h = node_at(state, visit.run, place)
     m, time = state.nodes[h].model, visit.time
-    end, least = next_stretch(state, m, place, now, time, stretch.least)
-    if is_quick(state.size, state.table, m, state.root, place, end - now):
-        wait(visits, SENSING, v, place, m, now, end)
+    end, least = next_stretch(readings.rate[0, q], now, time, stretch.least)
+    if is_quick(state.table, m, end - now, readings.trace[0, q]):
+        use_lane(visits, SENSING, q, place, v, m, now, end)
     else:
+        visits.places[SENSING, q] = NOBODY
         use_stretch(state, visit.run, h, place, visit.piece, now, end)
     if end < time:
         add_stretch(visits, place, v, end, least)
 
 
-@kernel
-def wait(visits: Visits, kind: int, v: int, place: int, m: int, now: float, end: float) -> int:
-    """Give a node at a place, with model ``m``, a lane among those of its kind, for its prediction
-    from ``now`` to ``end``; returns how many wait.
+@kernel(inlined=True)
+def use_lane(
+    visits: Visits, kind: int, q: int, place: int, v: int, m: int, now: float, end: float
+) -> None:
+    """Give a node at a place, with model ``m``, lane q among those of its kind, for its prediction
+    from ``now`` to ``end``.
     """
-    q = visits.waiting[kind]
     lane = visits.lanes[kind, q]
     lane.visit, lane.model, lane.now, lane.end = v, m, now, end
     visits.places[kind, q] = place
-    visits.waiting[kind] = q + 1
-    return int(q + 1)
 
 
 @kernel
-def read_in_lane(state: Simulation, visits: Visits, q: int) -> None:
-    """Write the moments of the readings of the node in a lane."""
-    lane, readings = visits.lanes[SENSING, q], state.scratch.moments
-    visit, count = visits.records[lane.visit], state.gains.moments[lane.model]
-    h = node_at(state, visit.run, visits.places[SENSING, q])
-    fill_readings(state, visit.run, h, visit.piece, lane.now, lane.end, readings[:count])
-    half, rows = len(visits.moments) // 2, count // 2
-    for i in range(half):
-        # Nodes with fewer rows read zeros, with gains of 0.
-        visits.moments[i, q] = readings[i] if i < rows else 0.0
-        visits.moments[half + i, q] = readings[rows + i] if i < rows else 0.0
+def read_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
+    """Write the moments of the readings of the nodes in lanes."""
+    places, readings = visits.places[SENSING], visits.readings
+    for q in range(LANES):
+        readings.stream[q] = NOBODY
+    for q in range(count):
+        if places[q] == NOBODY:
+            continue
+        lane = visits.lanes[SENSING, q]
+        visit = visits.records[lane.visit]
+        h = node_at(state, visit.run, places[q])
+        if readings.alone:
+            read_alone(state, readings, visit.run, h, visit.piece, lane.now, lane.end, q)
+        else:
+            begin_reading(state, readings, visit.run, h, visit.piece, lane.now, lane.end, q)
+    if not readings.alone:
+        end_readings(state, readings)
 
 
 @kernel
@@ -354,10 +395,10 @@ def put_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray
 @kernel
 def predict_blind(state: Simulation, visits: Visits) -> None:
     """Predict the nodes without sensors that wait."""
-    n, count, places = len(state.size), visits.waiting[BLIND], visits.places[BLIND]
+    n, count, places = len(state.size), visits.waiting, visits.places[BLIND]
     if count == 0:
         return
-    visits.waiting[BLIND] = 0
+    visits.waiting = 0
     # What lanes do alone goes from lane to lane in short loops: a processor overlaps their turns.
     for q in range(count):
         fill_lane(state, visits, BLIND, q, visits.blind, visits.blind_rows)
@@ -369,23 +410,20 @@ def predict_blind(state: Simulation, visits: Visits) -> None:
 
 
 @kernel
-def predict_sensing(state: Simulation, visits: Visits) -> None:
-    """Predict the nodes with sensors that wait, and use their readings."""
-    count, places = visits.waiting[SENSING], visits.places[SENSING]
-    if count == 0:
-        return
-    visits.waiting[SENSING] = 0
+def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
+    """Predict the nodes with sensors in lanes, whose states are there, and use their readings."""
+    places = visits.places[SENSING]
     for q in range(count):
-        fill_lane(state, visits, SENSING, q, visits.sensing, visits.sensing_rows)
-    for q in range(count):
-        read_in_lane(state, visits, q)
-    take_states(state, places, count, visits.x, visits.S)
+        if places[q] != NOBODY:
+            fill_lane(state, visits, SENSING, q, visits.sensing, visits.sensing_rows)
+    read_in_lanes(state, visits, count)
     turn_rows(visits.sensing_rows, visits.columns)
     width = width_of(len(state.size), True)
     spread_columns(visits.columns, visits.sensing.place, 0, width, visits.values)
     spread_columns(visits.columns, visits.sensing.place, width, len(visits.gains), visits.gains)
     predict_lanes(state, visits, True)
-    use_moments(MANY, state.size, visits.S, visits.x, visits.gains, visits.moments)
+    moments = visits.readings.moments
+    use_moments(MANY, state.size, visits.S, visits.x, visits.gains, moments)
     put_states(state, places, visits.x, visits.S)
 
 

@@ -1,0 +1,210 @@
+"""Readings of nodes side by side, one in each lane.
+
+The formulas are those of ``increments``, of as many nodes at a time as there are lanes. What a lane
+does alone is to find its piece of the path, add up its series and draw its normals.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.engines.compiled.increments import (
+    begin_step,
+    draw_cut,
+    fill_moments,
+    fill_readings,
+    know_course,
+    piece_of,
+)
+from netkf.engines.compiled.state import Filters, Sensing, Simulation
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, MANY, gather, load, scatter, turn, with_spare
+from netkf.linalg.structs import Struct
+from netkf.plants.laws import course_width
+from netkf.plants.paths import fill_integrals, fill_moments_between
+from netkf.plants.sensors import divide, fill_reading
+
+
+class LaneReadings(Struct):
+    """Readings of L nodes, one in each lane.
+
+    The ``moments`` (q, L) of the readings. Where some node has several sensors lanes read
+    ``alone``.
+
+    What is known of the nodes: the ``model`` (L,) and its ``seen`` (q, n, L), see FlowTable, the
+    ``kind`` (L,) of sensor with H (1, p, n, L) and ``root`` of R (1, p, p, L). Of the roots in
+    lanes: ``rate``, trace(P G), and ``trace`` of P (1, L).
+
+    Of a reading: at which share of a piece it begins, ``first``, and its own ``share``; how long it
+    is, ``gap``, and how long what is ``left`` of the step, seconds (1, L); both integrals by lane,
+    ``rows`` (L, 2 W), and all lanes together, ``integrals`` (2 W, L); the moments ``x`` (2, n, L)
+    of x. Noise: the place ``stream`` (L,) of what is left of the step, ``rest``, ``early`` and
+    ``normals`` (2, p, L).
+    """
+
+    moments: FloatArray
+    model: IntArray
+    seen: FloatArray
+    kind: IntArray
+    H: FloatArray
+    root: FloatArray
+    rate: FloatArray
+    trace: FloatArray
+    gap: FloatArray
+    left: FloatArray
+    first: FloatArray
+    share: FloatArray
+    rows: FloatArray
+    integrals: FloatArray
+    x: FloatArray
+    stream: IntArray
+    rest: FloatArray
+    early: FloatArray
+    normals: FloatArray
+    alone: int
+
+
+def empty_readings(filters: Filters) -> LaneReadings:
+    """No readings."""
+    n, q = filters.xhat.shape[1], int(filters.gains.moments.max())
+    p, width = q // 2, 2 * course_width(n)
+    names = ("rate", "trace", "gap", "left", "first", "share")
+    shapes = {
+        "moments": (q, LANES),
+        "seen": (*filters.table.seen.shape[1:], LANES),
+        "H": (1, p, n, LANES),
+        "root": (1, p, p, LANES),
+        **dict.fromkeys(names, (1, LANES)),
+        "rows": (LANES, width),
+        "integrals": (width, LANES),
+        "x": (2, n, LANES),
+        **dict.fromkeys(("rest", "early", "normals"), (2, p, LANES)),
+    }
+    several = (filters.nodes["sensors"] - filters.nodes["sensor"]).max() > 1
+    unknown: dict[str, Any] = {
+        name: np.full(LANES, -1, dtype=np.int64) for name in ("model", "kind", "stream")
+    }
+    return LaneReadings(
+        **{name: with_spare(shape) for name, shape in shapes.items()},
+        **unknown,
+        alone=int(several),
+    )
+
+
+@kernel
+def know_model(readings: LaneReadings, q: int, m: int, seen: FloatArray) -> None:
+    """Write what the model of the node in lane q sees, unless it is there."""
+    if readings.model[q] == m:
+        return
+    readings.model[q] = m
+    for r in range(seen.shape[1]):
+        for i in range(seen.shape[2]):
+            readings.seen[r, i, q] = seen[m, r, i]
+
+
+@kernel
+def know_sensor(readings: LaneReadings, q: int, sensing: Sensing, s: int) -> None:
+    """Write H and the root of R of the sensor of the node in lane q, unless they are there."""
+    if readings.kind[q] == sensing.kind[s]:
+        return
+    readings.kind[q] = sensing.kind[s]
+    for i in range(sensing.H.shape[1]):
+        for j in range(sensing.H.shape[2]):
+            readings.H[0, i, j, q] = sensing.H[s, i, j]
+        for j in range(sensing.root.shape[2]):
+            readings.root[0, i, j, q] = sensing.root[s, i, j]
+        # Rows that a sensor does not have draw nothing.
+        readings.normals[0, i, q] = readings.normals[1, i, q] = 0.0
+
+
+@kernel
+def read_alone(
+    state: Simulation,
+    readings: LaneReadings,
+    run: int,
+    h: int,
+    piece: int,
+    now: float,
+    end: float,
+    q: int,
+) -> None:
+    """Write the moments of the readings of node ``h`` over [now, end] into lane q."""
+    count = state.gains.moments[state.nodes[h].model]
+    found, moments = state.scratch.moments[:count], readings.moments
+    fill_readings(state, run, h, piece, now, end, found)
+    half, rows = len(moments) // 2, count // 2
+    for i in range(half):
+        # Nodes with fewer rows read zeros, with gains of 0.
+        moments[i, q] = found[i] if i < rows else 0.0
+        moments[half + i, q] = found[rows + i] if i < rows else 0.0
+
+
+@kernel
+def begin_reading(
+    state: Simulation,
+    readings: LaneReadings,
+    run: int,
+    h: int,
+    piece: int,
+    now: float,
+    end: float,
+    q: int,
+) -> None:
+    """Let lane q read for node ``h``, which has one sensor, over [now, end]: see
+    ``fill_readings``.
+    """
+    path, sensing, s = state.path, state.sensing, state.nodes[h].sensor
+    know_sensor(readings, q, sensing, s)
+    readings.stream[q] = begin_step(sensing, run, s, path.step[piece])
+    last, normals = path.last[piece], state.scratch.cut
+    readings.gap[0, q], readings.left[0, q] = end - now, last - now
+    # The whole rest needs none: what a lane has is multiplied by 0.
+    if end < last:
+        draw_cut(sensing, run, s, normals)
+        for i in range(sensing.rows[s]):
+            readings.normals[0, i, q], readings.normals[1, i, q] = normals[0, i], normals[1, i]
+    k = piece_of(path, piece, end)
+    start, stop = path.start[k], path.stop[k]
+    if now < start or (now == start and end == stop):
+        fill_moments(state, run, piece, now, end)
+        give_moments(readings, q, state.scratch.state_moments)
+        return
+    first, share = (now - start) / (stop - start), (end - now) / (stop - start)
+    readings.first[0, q], readings.share[0, q] = first, share
+    course = path.course[run - state.first_run, know_course(state, run, k)]
+    fill_integrals(readings.rows[q], course, first, first + share)
+
+
+@kernel
+def give_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
+    """Let lane q have these moments (2, n) of x, of a whole piece or parts of several: its
+    integrals are those of a piece in which x has them.
+    """
+    rows, n = readings.rows, moments.shape[1]
+    half = rows.shape[1] // 2
+    readings.first[0, q], readings.share[0, q] = 0.0, 1.0
+    for i in range(n):
+        rows[q, i] = rows[q, n + i] = 0.0
+        rows[q, half + i] = moments[0, i]
+        rows[q, half + n + i] = 0.5 * (moments[0, i] + moments[1, i])
+
+
+@kernel
+def end_readings(state: Simulation, readings: LaneReadings) -> None:
+    """Write the moments of what all lanes read."""
+    r, size, p = readings, state.size, readings.rest.shape[1]
+    for j in range(0, r.rows.shape[1], LANES):
+        turn(MANY, r.rows, j, r.integrals)
+    first, share = load(MANY, r.first, 0), load(MANY, r.share, 0)
+    fill_moments_between(MANY, size, r.x, r.integrals, r.rows.shape[1] // 2, first, share)
+    rest, streams = state.sensing.rest, r.stream
+    for j in range(0, 2 * p, LANES):
+        gather(MANY, rest, streams, j, r.rest)
+    left = load(MANY, r.left, 0)
+    divide(MANY, r.early, r.rest, r.normals, load(MANY, r.gap, 0) / left, left)
+    for j in range(0, 2 * p, LANES):
+        scatter(MANY, r.rest, j, rest, streams, 2 * p - j)
+    fill_reading(MANY, size, r.moments, 0, p, r.x, r.H, r.early, r.root, 0)

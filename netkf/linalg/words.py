@@ -1,0 +1,10 @@
+"""Words of 64 bits, which kernels multiply as a processor does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def high_word(a: Any, b: Any) -> Any:  # noqa: ARG001
+    """Return, in kernels, the upper 64 bits of a product. Python raises TypeError."""
+    raise TypeError("high_word is for kernels")
