@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, ONE, Lanes, load, spread, store
-from netkf.linalg.portable import apply, product
+from netkf.linalg.portable import apply
 from netkf.linalg.structs import Size
 from netkf.plants.laws import GridLaws, grid_time
 from netkf.plants.transitions import Transitions
@@ -184,38 +184,142 @@ class DiffusionPaths:
         """Draw the paths at ``times`` given the pieces in ``rows``, all of one length and cut at
         the same place, and divide each with the rows after it up to its ``stops``.
         """
-        n, laws = self.laws.n, self.laws
+        laws = self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
         left = float(times[0] - pieces.start[rows[0]])
-        # Law of (state, moments) at the cut given (end, moments) of the piece, all without the
-        # response to its start.
-        gain, spread = laws.conditional_law(length, left)
-        x, end = pieces.x_start[:, rows], pieces.x_end[:, rows]
-        known = np.concatenate([end[:, :, None], pieces.moments[:, rows]], axis=2)
-        residual = (known - _moved(laws.responses(length), x)).reshape(*x.shape[:2], 3 * n)
-        noise = (product(residual, gain.T) + product(normals, spread.T)).reshape(known.shape)
-        # Add the response to the start again.
-        values = _moved(laws.responses(left), x) + noise
-        middle, first = values[:, :, 0], values[:, :, 1:]
-        share = left / length
-        # Moments of the rest: the whole's P_1 is (share - 1) + share P_1 on the left part and
-        # share + (1 - share) P_1 on the right one.
-        plain = known[:, :, 1] - first[:, :, 0]
-        tilted = known[:, :, 2] - (share - 1.0) * first[:, :, 0] - share * first[:, :, 1]
-        second = np.stack([plain, (tilted - share * plain) / (1.0 - share)], axis=2)
-        later = np.concatenate([end[:, :, None], second], axis=2)
-        # The rest starts from the state at the cut: what noise adds there is what the response to
-        # that state leaves.
-        later -= _moved(laws.responses(length - left), middle)
-        cubics = _cubics(left, noise[:, :, 0], noise[:, :, 1:])
-        rest = _cubics(length - left, later[:, :, 0], later[:, :, 1:])
-        # The row itself becomes the part before the cut, and all rows after it the rest.
-        pieces.end[rows], pieces.x_end[:, rows] = times, middle
-        pieces.moments[:, rows], pieces.cubic[:, rows] = first, cubics
-        for k, (row, stop) in enumerate(zip(rows.tolist(), stops.tolist(), strict=True)):
-            after = slice(row + 1, stop)
-            pieces.start[after], pieces.x_start[:, after] = times[k], middle[:, k, None]
-            pieces.moments[:, after], pieces.cubic[:, after] = second[:, k, None], rest[:, k, None]
+        split_pieces(
+            rows,
+            stops,
+            normals,
+            *laws.conditional_law(length, left),
+            np.stack([laws.responses(gap) for gap in (length, left, length - left)]),
+            np.array([length, left]),
+            np.empty((4, 3 * laws.n)),
+            (pieces.x_start, pieces.x_end, pieces.moments, pieces.cubic),
+        )
+        pieces.end[rows] = times
+        for row, stop, time in zip(rows.tolist(), stops.tolist(), times.tolist(), strict=True):
+            pieces.start[row + 1 : stop] = time
+
+
+@kernel
+def split_pieces(
+    rows: IntArray,
+    stops: IntArray,
+    normals: FloatArray,
+    gain: FloatArray,
+    spread: FloatArray,
+    responses: FloatArray,
+    lengths: FloatArray,
+    work: FloatArray,
+    pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Cut the pieces in ``rows`` (K,) of B paths, all of one length and at the same place, from
+    standard normals (B, K, 3 n): a row becomes the part before the cut, and those after it up to
+    its ``stops`` (K,) the rest. ``pieces`` are states at their starts and ends, moments and cubics
+    as in ``fill_steps``. ``gain`` and ``spread`` (3 n, 3 n) are GridLaws.conditional_law,
+    ``responses`` (3, 3, n, n) those over the whole, the part before and the rest, ``lengths`` (2,)
+    the seconds of the first two; ``work`` (4, 3 n) is scratch.
+    """
+    x_start, x_end, moments, _ = pieces
+    n, length, left = x_start.shape[2], lengths[0], lengths[1]
+    known, free, noise, values = work[0], work[1], work[2], work[3]
+    share = left / length
+    for run in range(len(normals)):
+        for k in range(len(rows)):
+            row = rows[k]
+            for i in range(n):
+                known[i] = x_end[run, row, i]
+                known[n + i], known[2 * n + i] = moments[run, row, 0, i], moments[run, row, 1, i]
+            # Law of (state, moments) at the cut given (end, moments) of the piece, all without the
+            # response to its start.
+            add_response(free, known, -1.0, responses, 0, x_start, run, row)
+            for e in range(3 * n):
+                mean = deviation = 0.0
+                for c in range(3 * n):
+                    mean += free[c] * gain[e, c]
+                    deviation += normals[run, k, c] * spread[e, c]
+                noise[e] = mean + deviation
+            # Add the response to the start again.
+            add_response(values, noise, 1.0, responses, 1, x_start, run, row)
+            set_part(pieces, run, row, left, values, noise)
+            # Moments of the rest: the whole's P_1 is (share - 1) + share P_1 on the left part and
+            # share + (1 - share) P_1 on the right one.
+            for i in range(n):
+                x_end[run, row, i] = values[i]
+                first, slope = values[n + i], values[2 * n + i]
+                plain = known[n + i] - first
+                tilted = known[2 * n + i] - (share - 1.0) * first - share * slope
+                known[n + i], known[2 * n + i] = plain, (tilted - share * plain) / (1.0 - share)
+            # The rest starts from the state at the cut: what noise adds there is what the response
+            # to that state leaves.
+            add_response(free, known, -1.0, responses, 2, x_end, run, row)
+            for after in range(row + 1, stops[k]):
+                for i in range(n):
+                    x_start[run, after, i] = values[i]
+                set_part(pieces, run, after, length - left, known, free)
+
+
+@kernel
+def add_response(
+    out: FloatArray,
+    given: FloatArray,
+    sign: float,
+    responses: FloatArray,
+    which: int,
+    x: FloatArray,
+    run: int,
+    row: int,
+) -> None:
+    """Write what is ``given`` (3 n,) and, with a ``sign``, what the state x[run, row] adds to state
+    and moments.
+    """
+    n = x.shape[2]
+    for m in range(3):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += x[run, row, j] * responses[which, m, i, j]
+            out[m * n + i] = given[m * n + i] + sign * total
+
+
+@kernel
+def set_part(
+    pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    run: int,
+    row: int,
+    length: float,
+    values: FloatArray,
+    noise: FloatArray,
+) -> None:
+    """Write the moments in ``values`` (3 n,) and the cubic of what ``noise`` (3 n,) adds to the end
+    and to the moments of a piece of ``length`` seconds.
+    """
+    _, _, moments, cubic = pieces
+    n = moments.shape[3]
+    for i in range(n):
+        moments[run, row, 0, i], moments[run, row, 1, i] = values[n + i], values[2 * n + i]
+        fill_cubic(cubic, run, row, i, length, noise[i], noise[n + i], noise[2 * n + i])
+
+
+@kernel(inlined=True)
+def fill_cubic(
+    cubic: FloatArray,
+    run: int,
+    row: int,
+    i: int,
+    length: float,
+    end: float,
+    plain: float,
+    tilted: float,
+) -> None:
+    """Write the Legendre coefficients of the cubic on [0, 1] that starts at 0, ends at ``end`` and
+    has these moments over ``length`` seconds: P_0 and P_1 follow from the moments, P_2 and P_3 from
+    the ends.
+    """
+    mean, slope = plain / length, 3.0 * tilted / length
+    cubic[run, row, 0, i], cubic[run, row, 1, i] = mean, slope
+    cubic[run, row, 2, i], cubic[run, row, 3, i] = 0.5 * end - mean, 0.5 * end - slope
 
 
 @kernel
@@ -246,14 +350,11 @@ def fill_steps(
                 for j in range(i + 1):
                     noise[i] += factor[i, j] * normals[run, k, j]
             for i in range(n):
-                # The cubic starts at 0, ends at ``end`` and has the two moments: P_0 and P_1 follow
-                # from the moments, P_2 and P_3 from the ends.
-                end, mean, slope = noise[i], noise[n + i] / period, 3.0 * noise[2 * n + i] / period
-                cubic[run, k, 0, i], cubic[run, k, 1, i] = mean, slope
-                cubic[run, k, 2, i], cubic[run, k, 3, i] = 0.5 * end - mean, 0.5 * end - slope
+                end, plain, tilted = noise[i], noise[n + i], noise[2 * n + i]
+                fill_cubic(cubic, run, k, i, period, end, plain, tilted)
                 x_start[run, k, i] = x[run, i]
                 x_end[run, k, i] = end
-                moments[run, k, 0, i], moments[run, k, 1, i] = noise[n + i], noise[2 * n + i]
+                moments[run, k, 0, i], moments[run, k, 1, i] = plain, tilted
                 # Response to the start of the step, exact for all three.
                 for j in range(n):
                     x_end[run, k, i] += response[0, i, j] * x[run, j]
@@ -380,21 +481,6 @@ class DiffusionPath:
             return x + self._moved_origin(time - float(self.frame_times[self._frame - 1]))
 
     state = absolute
-
-
-def _moved(responses: FloatArray, x: FloatArray) -> FloatArray:
-    """(B, K, m, n) of responses (m, n, n) to states (B, K, n)."""
-    return np.swapaxes(product(x[:, None], np.swapaxes(responses, 1, 2)), 1, 2)
-
-
-def _cubics(length: float, end: FloatArray, moments: FloatArray) -> FloatArray:
-    """(B, K, 4, n) Legendre coefficients of the cubics on [0, 1] that start at 0, end at ``end``
-    (B, K, n) and have these moments (B, K, 2, n).
-    """
-    # Legendre coefficients of P_0 and P_1 are the moments times 2 j + 1 over the length; those of
-    # P_2 and P_3 make the cubic 0 at the start and ``end`` at the end.
-    mean, slope = moments[:, :, 0] / length, 3.0 * moments[:, :, 1] / length
-    return np.stack([mean, slope, 0.5 * end - mean, 0.5 * end - slope], axis=2)
 
 
 def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
