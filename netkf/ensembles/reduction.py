@@ -28,11 +28,12 @@ from netkf.linalg.lanes import (
     store,
     turn,
 )
+from netkf.linalg.structs import Struct
 from netkf.trace.batch import RunBatch
 from netkf.trace.nees import errors, fill_nees
 from netkf.trace.run import BLUR, ROUNDING
 
-TOGETHER = 256
+TOGETHER = 512
 """Numbers of a run that are looked at together: some lines of the cache."""
 
 
@@ -51,7 +52,7 @@ class Reduced(NamedTuple):
     rounding_from: FloatArray
 
 
-class Batch(NamedTuple):
+class Batch(Struct):
     """The arrays of a RunBatch, with the samples of each run that are ``kept`` (R,), and NEES
     ``given`` (R, T, F) of the runs that are ``known`` (R,). Averages begin with sample ``start``.
     Once more with a row a run: ``x_rows`` (R, T n), ``P_rows`` and ``error_rows``.
@@ -63,7 +64,7 @@ class Batch(NamedTuple):
     error: FloatArray
     lengths: np.ndarray
     diverged: np.ndarray
-    exact: bool
+    exact: int
     kept: np.ndarray
     known: np.ndarray
     given: FloatArray
@@ -73,7 +74,7 @@ class Batch(NamedTuple):
     error_rows: FloatArray
 
 
-class Sums(NamedTuple):
+class Sums(Struct):
     """What is found: ``size`` (K, T) of K pieces, their ``mean`` and ``M2`` (K, T, F (2 u + 1)), of
     the runs ``averages`` and ``rounding_from`` as in Reduced, and whether all their P are
     ``regular`` (R,).
@@ -87,7 +88,7 @@ class Sums(NamedTuple):
     regular: np.ndarray
 
 
-class Room(NamedTuple):
+class Room(Struct):
     """Scratch for S times and C = F (2 u + 1) columns of L runs, with some memory behind.
 
     ``lines`` (L, S F n n) as they are in a batch; in lanes ``error`` (S F n, L), ``P``
@@ -171,27 +172,45 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     bounds = np.array([0, *(piece.stop for piece in pieces)])
     columns, most = filters * (n * (n + 1) + 1), int(np.diff(bounds).max())
     sums = Sums(
-        np.empty((len(pieces), count)), np.empty((len(pieces), count, columns)),
-        np.empty((len(pieces), count, columns)),
-        np.zeros((runs, filters, 3)), np.full(runs, np.inf), np.ones(runs, dtype=np.bool_),
-    )  # fmt: skip
+        size=np.empty((len(pieces), count)),
+        mean=np.empty((len(pieces), count, columns)),
+        M2=np.empty((len(pieces), count, columns)),
+        averages=np.zeros((runs, filters, 3)),
+        rounding_from=np.full(runs, np.inf),
+        regular=np.ones(runs, dtype=np.bool_),
+    )
+    given = _given(batch)
     room = reduction_room(filters, n, most)
-    # Arrays of one kind from all engines, for which the kernel is compiled once.
-    times, x = np.array(batch.times), np.ascontiguousarray(batch.x)
-    given = Batch(
-        times, x, batch.P, batch.error, batch.lengths, batch.diverged,
-        batch.exact_errors, batch.lengths - batch.diverged, np.zeros(runs, dtype=np.bool_),
-        np.empty((0, 0, 0)), int(np.searchsorted(times, 0.0, side="right")),
-        *(values.reshape(runs, -1) for values in (x, batch.P, batch.error)),
-    )  # fmt: skip
     reduce_runs(MANY, given, bounds, sums, room)
     if not sums.regular.all():
         # Some P is exactly singular: those that are singular up to rounding are left out as well.
-        given = given._replace(known=~sums.regular, given=_nees_of_irregular(given, sums.regular))
+        given.given, given.known = _nees_of_irregular(given, sums.regular), ~sums.regular
         sums.averages[:], sums.rounding_from[:] = 0.0, np.inf
         reduce_runs(MANY, given, bounds, sums, room)
-    samples = [Moments(*found) for found in zip(*sums[:3], strict=True)]
+    samples = [Moments(*found) for found in zip(sums.size, sums.mean, sums.M2, strict=True)]
     return Reduced(samples, sums.averages, sums.rounding_from)
+
+
+def _given(batch: RunBatch) -> Batch:
+    """The arrays of a batch."""
+    runs = len(batch)
+    x, P, error = (np.ascontiguousarray(part) for part in (batch.x, batch.P, batch.error))
+    return Batch(
+        times=np.ascontiguousarray(batch.times, dtype=np.float64),
+        x=x,
+        P=P,
+        error=error,
+        lengths=batch.lengths,
+        diverged=batch.diverged,
+        exact=int(batch.exact_errors),
+        kept=batch.lengths - batch.diverged,
+        known=np.zeros(runs, dtype=np.bool_),
+        given=np.empty((0, 0, 0)),
+        start=int(np.searchsorted(batch.times, 0.0, side="right")),
+        x_rows=x.reshape(runs, -1),
+        P_rows=P.reshape(runs, -1),
+        error_rows=error.reshape(runs, -1),
+    )
 
 
 def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
@@ -223,11 +242,11 @@ def reduce_runs(lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, room: Ro
             # Those at the end that have no neighbour join from right to left.
             while depth > 1:
                 depth = join_nodes(room, depth, count)
+            mean, M2, mean_of, M2_of = room.mean, room.M2, sums.mean, sums.M2
             for s in range(count):
                 sums.size[k, t + s] = room.node_size[0, s]
-                for c in range(sums.mean.shape[2]):
-                    sums.mean[k, t + s, c] = room.mean[0, s, c]
-                    sums.M2[k, t + s, c] = room.M2[0, s, c]
+                for c in range(mean.shape[2]):
+                    mean_of[k, t + s, c], M2_of[k, t + s, c] = mean[0, s, c], M2[0, s, c]
     for r in range(len(b.kept)):
         divide_averages(b, sums, r)
 
@@ -258,7 +277,7 @@ def add_node(lanes: Lanes, room: Room, active: int, count: int, node: int, whole
 @kernel
 def merge_whole(lanes: Lanes, room: Room, count: int, node: int) -> None:
     """``merge_row`` of L rows where all sizes are equal, L columns at a time."""
-    rows, work = room.rows, room.work
+    rows, work, mean_of, M2_of = room.rows, room.work, room.mean, room.M2
     for s in range(count):
         room.node_size[node, s] = 1.0 * len(lanes)
     for c in range(0, count * rows.shape[2], len(lanes)):
@@ -274,8 +293,8 @@ def merge_whole(lanes: Lanes, room: Room, count: int, node: int) -> None:
                     M2 = load(lanes, work, a, 0, c) + (load(lanes, work, a + stride, 0, c) + M2)
                 store(lanes, work, a, 0, c, M2)
             stride *= 2
-        store(lanes, room.mean, node, 0, c, load(lanes, rows, 0, 0, c))
-        store(lanes, room.M2, node, 0, c, load(lanes, work, 0, 0, c))
+        store(lanes, mean_of, node, 0, c, load(lanes, rows, 0, 0, c))
+        store(lanes, M2_of, node, 0, c, load(lanes, work, 0, 0, c))
 
 
 @kernel
@@ -315,16 +334,16 @@ def reduce_group(
     on, and add them to the averages; return True if no run lacks one of them.
     """
     filters, n = b.error.shape[2:]
-    each, whole = filters * n, True
+    each, whole, kept, totals, averages = filters * n, True, b.kept, room.totals, sums.averages
     take_lines(lanes, b.error_rows, first, active, t * each, count * each, room.lines, room.error)
     take_lines(lanes, b.P_rows, first, active, t * each * n, count * each * n, room.lines, room.P)
     if not b.exact:
         take_lines(lanes, b.x_rows, first, active, t * n, count * n, room.lines, room.x)
     for q in range(active):
-        whole = whole and t + count <= b.kept[first + q]
+        whole = whole and t + count <= kept[first + q]
         for f in range(filters):
             for a in range(3):
-                room.totals[f, a, q] = sums.averages[first + q, f, a]
+                totals[f, a, q] = averages[first + q, f, a]
     for s in range(count):
         find_blur(lanes, b, sums, room, first, active, t + s, s)
         choose_counted(b, sums, room, first, active, t + s)
@@ -335,7 +354,7 @@ def reduce_group(
     for q in range(active):
         for f in range(filters):
             for a in range(3):
-                sums.averages[first + q, f, a] = room.totals[f, a, q]
+                averages[first + q, f, a] = totals[f, a, q]
     if not whole or active < len(lanes):
         mark_missing(b, room, first, active, t, count)
     return whole
@@ -367,20 +386,22 @@ def reduce_sample(
     """Fill the columns of sample ``t``, the ``s``-th of a group, of filter ``f``, and add it to the
     averages.
     """
-    n, filters = len(room.z), len(room.totals)
+    # Taken from the struct once, and not in each step of the loops.
+    errors_of, P, columns, factor, z = room.error, room.P, room.columns, room.factor, room.z
+    n, filters = len(z), len(room.totals)
     half, place, place_P = n * (n + 1) // 2, (s * filters + f) * n, (s * filters + f) * n * n
     column = (s * filters + f) * (2 * half + 1)
     last, square, trace = column + 2 * half, spread(lanes, 0.0), spread(lanes, 0.0)
     for i in range(n):
-        e = load(lanes, room.error, place + i)
-        store(lanes, room.z, i, e)
+        e = load(lanes, errors_of, place + i)
+        store(lanes, z, i, e)
         square += e * e
-        trace += load(lanes, room.P, place_P + i * n + i)
+        trace += load(lanes, P, place_P + i * n + i)
         for j in range(i, n):
-            entry = load(lanes, room.P, place_P + i * n + j)
-            store(lanes, room.factor, j, i, entry)
-            store(lanes, room.columns, column, entry)
-            store(lanes, room.columns, half + column, e * load(lanes, room.error, place + j))
+            entry = load(lanes, P, place_P + i * n + j)
+            store(lanes, factor, j, i, entry)
+            store(lanes, columns, column, entry)
+            store(lanes, columns, half + column, e * load(lanes, errors_of, place + j))
             column += 1
     if any_lane(nees_of_lanes(lanes, room)):
         # Singular or broken: alone, with a choice of pivots.
@@ -388,7 +409,7 @@ def reduce_sample(
             if room.broken[q] > 0.0 and t < b.kept[first + q]:
                 nees_alone(b, sums, room, first + q, t, f, q)
     nees = load(lanes, room.nees, 0)
-    store(lanes, room.columns, last, nees)
+    store(lanes, columns, last, nees)
     clear, traced = load(lanes, room.clear, 0) > 0.0, load(lanes, room.traced, 0) > 0.0
     add_total(lanes, room.totals, f, 0, select(clear, square, 0.0))
     add_total(lanes, room.totals, f, 1, select(traced, trace, 0.0))
@@ -415,14 +436,16 @@ def choose_counted(b: Batch, sums: Sums, room: Room, first: int, active: int, t:
     """Note in which runs sample ``t`` counts in the averages, by the rule of
     ``runs.summary.averaged_samples``: in those of errors (``clear``), in that of P (``traced``).
     """
+    kept, diverged, times, start = b.kept, b.diverged, b.times, b.start
+    blurred_from, clears, traces = sums.rounding_from, room.clear, room.traced
     for q in range(active):
-        r, from_here = first + q, sums.rounding_from[first + q]
-        begin = b.start if b.start < b.kept[r] else 0  # no sample after time 0: all there are
-        there = begin <= t < b.kept[r]
-        clear = there and b.times[t] < from_here
+        r, from_here = first + q, blurred_from[first + q]
+        begin = start if start < kept[r] else 0  # no sample after time 0: all there are
+        there = begin <= t < kept[r]
+        clear = there and times[t] < from_here
         # Covariances have all their digits, but those of a run that diverges outgrow all bounds.
-        traced = clear or (there and not (b.diverged[r] and b.times[begin] < from_here))
-        room.clear[q], room.traced[q] = 1.0 if clear else 0.0, 1.0 if traced else 0.0
+        traced = clear or (there and not (diverged[r] and times[begin] < from_here))
+        clears[q], traces[q] = 1.0 if clear else 0.0, 1.0 if traced else 0.0
 
 
 @kernel
@@ -446,18 +469,19 @@ def nees_of_lanes(lanes: Lanes, room: Room) -> Any:
     of the latter.
     """
     # P = L D L', and e' P^-1 e = z' D^-1 z with L z = e; P becomes L, and the error z.
-    n, total, broken = len(room.z), spread(lanes, 0.0), spread(lanes, 0.0)
+    rest, error = room.factor, room.z
+    n, total, broken = len(error), spread(lanes, 0.0), spread(lanes, 0.0)
     for k in range(n):
-        pivot, z = load(lanes, room.factor, k, k), load(lanes, room.z, k)
+        pivot, z = load(lanes, rest, k, k), load(lanes, error, k)
         broken += select(pivot > 0.0, 0.0, 1.0)
         inverse = 1.0 / pivot
         total += z * z * inverse
         for i in range(k + 1, n):
-            factor = load(lanes, room.factor, i, k) * inverse
+            factor = load(lanes, rest, i, k) * inverse
             for j in range(k + 1, i + 1):
-                entry = load(lanes, room.factor, i, j) - factor * load(lanes, room.factor, j, k)
-                store(lanes, room.factor, i, j, entry)
-            store(lanes, room.z, i, load(lanes, room.z, i) - factor * z)
+                entry = load(lanes, rest, i, j) - factor * load(lanes, rest, j, k)
+                store(lanes, rest, i, j, entry)
+            store(lanes, error, i, load(lanes, error, i) - factor * z)
     store(lanes, room.nees, 0, total)
     store(lanes, room.broken, 0, broken)
     return broken > 0.0
@@ -471,13 +495,14 @@ def find_blur(
     # Squares tell without a root where it is surely not. A nan is no number here: what is blurred
     # is not decided by it either.
     filters, n = b.error.shape[2:]
+    errors_of, P = room.error, room.P
     largest, least = spread(lanes, 0.0), spread(lanes, np.inf)
     for f in range(s * filters, (s + 1) * filters):
         for i in range(n):
-            variance = load(lanes, room.P, f * n * n + i * n + i)
+            variance = load(lanes, P, f * n * n + i * n + i)
             least = select(variance < least, variance, least)
             if b.exact:
-                size = magnitude(load(lanes, room.error, f * n + i))
+                size = magnitude(load(lanes, errors_of, f * n + i))
                 largest = select(size > largest, size, largest)
     for place in range(0 if b.exact else s * n, 0 if b.exact else (s + 1) * n):
         size = magnitude(load(lanes, room.x, place))

@@ -122,9 +122,9 @@ def test_samples_show_the_covariance_and_frames_move_estimates(seed, n, framed):
     absolute = 100.0 + random.standard_normal((1, 1, n, LANES))
     samples = slots.SlotSamples(
         np.empty((runs, 1, n)),
-        np.empty((runs, 1, 2, n)),
-        np.empty((runs, 1, 2, n, n)),
-        np.empty((runs, 1, 2, n)),
+        np.empty((runs, 1, 2 * n)),
+        np.empty((runs, 1, 2 * n * n)),
+        np.empty((runs, 1, 2 * n)),
         np.zeros((1, 2, LANES), int),
         np.zeros((1, 2, 2, LANES)),
         absolute,
@@ -135,18 +135,19 @@ def test_samples_show_the_covariance_and_frames_move_estimates(seed, n, framed):
     flags, up = np.array([True]), np.zeros((1, 1, 1, 0, LANES), dtype=np.uint8)
     plan, room = slots.SlotPlan(0, flags, flags, np.array([0]), up), slots.slot_room(2, n)
     slots.show(nodes, plan, samples, room, 0, 0)
-    before = nodes.xhat.copy()
+    xhat, error = (v.reshape(runs, 2, n) for v in (samples.xhat, samples.error))
+    P, before = samples.P.reshape(runs, 2, n, n), nodes.xhat.copy()
     slots.rebase(nodes, readings, room, 0, 0)
     for q in range(runs):
         for h in range(2):
             cov = estimates(nodes, h, q)[1]
-            np.testing.assert_allclose(samples.P[q, 0, h], cov, rtol=1e-10, atol=1e-12)
+            np.testing.assert_allclose(P[q, h], cov, rtol=1e-10, atol=1e-12)
             local = readings.local[0, 0, :, q]
             mine = before[0, h, :, q] + framed * (absolute[0, 0, :, q] - local)
-            np.testing.assert_allclose(samples.xhat[q, 0, h], mine, rtol=1e-13)
-            np.testing.assert_array_equal(samples.error[q, 0, h], local - before[0, h, :, q])
+            np.testing.assert_allclose(xhat[q, h], mine, rtol=1e-13)
+            np.testing.assert_array_equal(error[q, h], local - before[0, h, :, q])
         np.testing.assert_array_equal(samples.x[q, 0], absolute[0, 0, :, q])
-        shown = samples.xhat[q].sum() + sum(np.tril(P).sum() for P in samples.P[q, 0])
+        shown = xhat[q].sum() + sum(np.tril(cov).sum() for cov in P[q])
         np.testing.assert_allclose(samples.total[0, q], shown, rtol=1e-10)
     moved = before - readings.local[0, 0]
     np.testing.assert_array_equal(nodes.xhat, moved)

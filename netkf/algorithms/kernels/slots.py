@@ -89,9 +89,10 @@ class SlotLinks(NamedTuple):
 
 
 class SlotSamples(NamedTuple):
-    """States x (R, T, n), xhat (R, T, H, n) and P (R, T, H, n, n) in the coordinates of the plant,
-    and errors (R, T, H, n); the slot in which each filter stopped learning for good, ``stopped``
-    (B, H, L), and what it holds of K conserved sums at the last sample, ``conserved`` (B, H, K, L).
+    """States x (R, T, n), xhat (R, T, H n) and P (R, T, H n n) in the coordinates of the plant, and
+    errors (R, T, H n), all filters side by side; the slot in which each filter stopped learning for
+    good, ``stopped`` (B, H, L), and what it holds of K conserved sums at the last sample,
+    ``conserved`` (B, H, K, L).
 
     Of the slots, the states ``absolute`` and ``local`` (B, S, n, L), the latter in the coordinates
     of the estimates, which are the plant's unless they are ``framed``. ``total`` (B, L): the sum of
@@ -189,17 +190,17 @@ def show(
         room.places[q] = first + q if shown else -1
         for i in range(n if shown else 0):
             samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
-    hand_out(room, room.shown_xhat, samples.xhat[:, k], len(nodes.rows) * n)
-    hand_out(room, room.shown_error, samples.error[:, k], len(nodes.rows) * n)
-    hand_out(room, room.shown_P, samples.P[:, k], len(nodes.rows) * n * n)
+    hand_out(lanes, room.shown_xhat, samples.xhat[:, k], room.places)
+    hand_out(lanes, room.shown_error, samples.error[:, k], room.places)
+    hand_out(lanes, room.shown_P, samples.P[:, k], room.places)
 
 
-@kernel(inlined=True)
-def hand_out(room: SlotRoom, lines: FloatArray, samples: FloatArray, count: int) -> None:
-    """Write ``count`` lines (>= count, L) of a block into the ``samples`` (R, ...) of its runs."""
-    for c in range(0, count, len(room.lanes)):
-        most = min(count - c, len(room.lanes))
-        scatter(room.lanes, lines, c, samples, room.places, most)
+@kernel
+def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, places: np.ndarray) -> None:
+    """Write the first C ``lines`` (>= C, L) of a block into the ``samples`` (R, C) of its runs."""
+    count = samples.shape[1]
+    for c in range(0, count, len(lanes)):
+        scatter(lanes, lines, c, samples, places, min(count - c, len(lanes)))
 
 
 @kernel
@@ -250,8 +251,7 @@ def use_reading(
             store(lanes, row, j, select(arrived, total, 0.0))
             weight = load(lanes, readings.H, c, t, sender, k, j)
             innovation -= weight * load(lanes, nodes.xhat, b, h, j)
-        # ``size`` is the standard deviation of the innovation, so the gain is gains / size.
-        step = innovation / rotate_lanes(lanes, nodes.root, b, h, row, gains)
+        step = innovation * rotate_lanes(lanes, nodes.root, b, h, row, gains)
         for i in range(n):
             x = load(lanes, nodes.xhat, b, h, i)
             store(lanes, nodes.xhat, b, h, i, x + load(lanes, gains, i) * step)
@@ -262,7 +262,7 @@ def rotate_lanes(
     lanes: Lanes, root: FloatArray, b: int, h: int, row: FloatArray, gains: FloatArray
 ) -> Any:
     """Use the scalar observation with ``h S = row`` (n, L) and unit noise; the gain is ``gains``
-    (n, L) over the value that is returned, the standard deviation of the innovation.
+    (n, L) times the value that is returned, 1 over the standard deviation of the innovation.
 
     These are the rotations of ``root_update.rotate_out``; an entry of 0 turns nothing.
     """
@@ -270,7 +270,7 @@ def rotate_lanes(
     for i in range(n):
         store(lanes, gains, i, 0.0)
     # [1, h S; 0, S] times rotations that empty h S from its end, so that S stays triangular.
-    pivot = square = spread(lanes, 1.0)
+    pivot = square = over_pivot = spread(lanes, 1.0)
     for j in range(n - 1, -1, -1):
         entry = load(lanes, row, j)
         square += entry * entry
@@ -279,13 +279,13 @@ def rotate_lanes(
         # Exactly 1 for an entry of 0, so that not even rounding touches the root.
         idle = entry == 0.0
         c, s = select(idle, 1.0, pivot * inverse), entry * inverse
-        pivot = select(idle, pivot, whole)
+        pivot, over_pivot = select(idle, pivot, whole), select(idle, over_pivot, inverse)
         # Rotate column j of [h S; S] into the column of the gain.
         for i in range(j, n):
             old, gain = load(lanes, root, b, h, i, j), load(lanes, gains, i)
             store(lanes, root, b, h, i, j, c * old - s * gain)
             store(lanes, gains, i, s * old + c * gain)
-    return pivot
+    return over_pivot
 
 
 @kernel
@@ -359,10 +359,12 @@ def reflect_row(
     # pivot and its length with one sign: nothing cancels.
     sign = with_sign(spread(lanes, 1.0), pivot)
     head = pivot + sign * length
-    # TINY keeps a row of zeros from dividing by zero: its reflection then only flips a column.
-    scale = 1.0 / (length * (length + magnitude(pivot)) + TINY)
     # Columns are flipped so that the diagonal stays nonnegative.
     store(lanes, root, b, h, i, i, length)
+    if i == n - 1:
+        return
+    # TINY keeps a row of zeros from dividing by zero: its reflection then only flips a column.
+    scale = 1.0 / (length * (length + magnitude(pivot)) + TINY)
     for r in range(i + 1, n):
         first = load(lanes, moved, r, i)
         total = head * first

@@ -121,10 +121,12 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
         shuffle(m.states, r, m.order, count)
         for k in range(count):
             i, j = ends[m.order[k], 0], ends[m.order[k], 1]
-            if m.busy[i] == 0 and m.busy[j] == 0:
-                m.busy[i] = m.busy[j] = 1
-                active[found] = m.order[k]
-                found += 1
+            # Without a branch, which nobody could predict.
+            free = (m.busy[i] | m.busy[j]) ^ 1
+            place = min(found, len(active) - 1)
+            active[place] += free * (m.order[k] - active[place])
+            m.busy[i], m.busy[j] = m.busy[i] | free, m.busy[j] | free
+            found += free
         return found
     # Independent: each link wakes with the probability, and busy counts its ends.
     for k in range(count):

@@ -51,26 +51,26 @@ from netkf.trace.schema import EVENT, KINDS
 NEVER = np.iinfo(np.int64).max
 
 
-class SlotBlock(NamedTuple):
-    """Results of S slots of R runs: the slots that are ``sampled`` (T,), and what the filters had
-    then.
-    """
-
-    sampled: np.ndarray
-    samples: SlotSamples
-    times: SlotTimes
-    drawn: Drawn
-
-
 class Shown(NamedTuple):
-    """Samples of R runs as ``SlotSamples`` has them: x (R, T, n), xhat (R, T, H, n), P
-    (R, T, H, n, n), errors (R, T, H, n).
+    """Samples of R runs in the coordinates of the plant: x (R, T, n), xhat (R, T, H, n), P
+    (R, T, H, n, n), and errors (R, T, H, n).
     """
 
     x: FloatArray
     xhat: FloatArray
     P: FloatArray
     error: FloatArray
+
+
+class SlotBlock(NamedTuple):
+    """Results of S slots of R runs: the slots that are ``sampled`` (T,), and what was ``shown``
+    there.
+    """
+
+    sampled: np.ndarray
+    shown: Shown
+    times: SlotTimes
+    drawn: Drawn
 
 
 class SlotRuns:
@@ -205,14 +205,16 @@ class SlotRuns:
         readings = self._readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
         shown = self.shown if self.shown is not None else self._space(len(sampled))
+        x, xhat, P, error = (part.reshape(*part.shape[:2], -1) for part in shown)
         samples = SlotSamples(
-            *shown, self._stopped, self._conserved, absolute, local, setup.frame > 0, self._total
-        )
+            x, xhat, P, error, self._stopped, self._conserved, absolute, local, setup.frame > 0,
+            self._total,
+        )  # fmt: skip
         plan = SlotPlan(self._slot, times.sensed, times.exchanged, times.sample, drawn.up)
         kernel = type(setup.algorithm).slot_kernel
         kernel(self._nodes, readings, plan, setup.links, samples, self._room, *self._extra)
         self._slot += count
-        return SlotBlock(sampled, samples, times, drawn)
+        return SlotBlock(sampled, shown, times, drawn)
 
     def _space(self, count: int) -> Shown:
         """Space for so many samples."""
@@ -402,19 +404,14 @@ def _record_block(
     if len(block.sampled):
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
-    samples = block.samples
-    fine = recorded(
-        scenario,
-        recorder,
-        progress,
-        block.times.start[block.sampled],
-        samples.x[0],
-        samples.xhat[0],
-        samples.P[0],
-        samples.error[0],
+    x, xhat, P, error = (part[0] for part in block.shown)
+    times = block.times.start[block.sampled]
+
+    def pass_rows_on(k: int) -> None:
         # The rows up to the first broken sample, if there is one.
-        lambda k: recorder.extend(rows[: before[k]]),
-    )
+        recorder.extend(rows[: before[k]])
+
+    fine = recorded(scenario, recorder, progress, times, x, xhat, P, error, pass_rows_on)
     if fine:
         recorder.extend(rows)
     return fine
