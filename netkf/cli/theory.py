@@ -12,10 +12,11 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    scenario = load_scenario(options)
+    # Afterwards: a scenario that is refused needs no theory, whose imports take half a second.
     from netkf.runs.failures import explain_failures
     from netkf.runs.promises import compute_promises, promises_text
 
-    scenario = load_scenario(options)
     with explain_failures(scenario):
         found = compute_promises(scenario)
     print_notes(scenario.notes)
