@@ -34,6 +34,8 @@ FIGURES: Mapping[str, Callable[[Subject], Picture]] = {
 }
 """The figures of runs and ensembles; a sweep has ``stability`` only."""
 
+ACRONYMS = ("nees", "nis")
+
 
 def plot(result: Any, figure: str = "error") -> Picture:
     """Return a figure of a run, an ensemble or a sweep that was read from its directory, as a
@@ -74,7 +76,7 @@ class FigureSet:
                 return message_figure(*self._explain(name, str(reason)))
 
     def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
-        claim = f"No {name} to show"
+        claim = f"No {name.upper() if name in ACRONYMS else name} to show"
         if self._subject is None:
             return claim, reason, [f"{self._sweep.scenario.name}, a sweep."]
         return self._subject.claim(claim), reason, self._subject.caption()

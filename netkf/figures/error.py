@@ -141,7 +141,8 @@ def quantiles_figure(subject: Subject) -> Picture:
     axes.plot(times, median, color=INK, lw=1.6, label="median node")
     worst = np.nanmax(values, axis=1)
     axes.plot(times, worst, color=SENSING, ls="--", lw=1.1, label="worst node")
-    claim = _mark_worst(axes, subject, times, values)
+    name = "error" if subject.shows_errors else "root of trace P"
+    claim = _mark_worst(axes, subject, times, values, name)
     set_scale(axes, values)
     axes.margins(y=0.15)
     axes.set(xlabel=SECONDS, ylabel=f"{label}, units of the state")
@@ -152,7 +153,9 @@ def quantiles_figure(subject: Subject) -> Picture:
     return figure
 
 
-def _mark_worst(axes: Any, subject: Subject, times: FloatArray, values: FloatArray) -> str:
+def _mark_worst(
+    axes: Any, subject: Subject, times: FloatArray, values: FloatArray, name: str
+) -> str:
     """Mark the worst instants, each of another node, and return a sentence on the first."""
     used = np.flatnonzero(np.isin(times, subject.times[subject.used]))
     used = used if len(used) else np.arange(len(times))
@@ -175,7 +178,7 @@ def _mark_worst(axes: Any, subject: Subject, times: FloatArray, values: FloatArr
             label=f"worst of node {subject.nodes[k]}: {value:.3g} at {t:g} s",
         )
         of_node = f"of node {subject.nodes[k]} at {t:g} s"
-        words = words or f"The largest error after the start is {value:.3g}, {of_node}"
+        words = words or f"The largest {name} after the start is {value:.3g}, {of_node}"
     typical = float(np.nanmedian(values[used]))
     return f"{words}, {value_ratio(values[used], typical)}" if words else "No error is finite"
 

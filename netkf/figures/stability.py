@@ -190,6 +190,10 @@ def _short(value: Any) -> str:
     return text if len(text) <= 24 else text[:21] + "..."
 
 
+SAME = 1e-6
+"""Relative range of traces of P below which they are one value."""
+
+
 def law_figure(subject: Subject) -> Picture:
     """Draw the share of samples whose trace of P exceeds a value, and the invariant law where the
     readings of one sensor arrive independently (R).
@@ -226,6 +230,8 @@ def law_figure(subject: Subject) -> Picture:
     shown = values[np.isfinite(values) & (values > 0.0)]
     if shown.size and shown.max() > SPREAD * shown.min():
         axes.set_xscale("log")
+    elif shown.size and shown.max() - shown.min() < SAME * shown.max():  # rounding alone
+        axes.set_xlim(0.9 * shown.min(), 1.1 * shown.max())
     axes.set_yscale("log")
     axes.set(xlabel="trace of P, squared units of the state", ylabel="share of samples above")
     draw_legend(axes)

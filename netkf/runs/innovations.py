@@ -49,12 +49,12 @@ def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
     makes other events, as another version may.
     """
     scenario: Scenario = run.scenario
-    if len(run.log) > most:
-        raise NetkfError(f"a run of more than {most:,} events is not replayed")
     if not isinstance(scenario.filter.algorithm, Filter):
         raise NetkfError("filters of the former contracts keep their readings to themselves")
     if not scenario.slotted and not scenario.sampled_sensors:
         raise NetkfError("sensors give increments and no samples")
+    if len(run.log) > most:
+        raise NetkfError(f"a run of more than {most:,} events is not replayed")
     noted: list[tuple[Reading, FloatArray, FloatArray | None]] = []
     filtering = dataclasses.replace(
         scenario.filter, algorithm=_noting(scenario.filter.algorithm, noted)

@@ -74,27 +74,27 @@ class StoredRun(Run):
 
     @cached_property
     def states(self) -> pd.DataFrame:
-        """The table of state samples as it was written."""
+        """Return the table of state samples as it was written."""
         return self.stored
 
     @cached_property
     def sq_error(self) -> FloatArray:
-        """The squared errors (T, N) as they were written, nan without known truth."""
+        """Return the squared errors (T, N) as they were written, nan without known truth."""
         return self._column("sq_error")
 
     @cached_property
     def nees(self) -> FloatArray:
-        """The NEES (T, N) as it was written, nan where it is unknown."""
+        """Return the NEES (T, N) as it was written, nan where it is unknown."""
         return self._column("nees")
 
     @cached_property
     def promised(self) -> PromisedTraces:
-        """What theory promises at the sample times: bound, limit, centralised filter."""
+        """Return what theory promises at the sample times: bound, limit, centralised filter."""
         return promise_traces(self.scenario, self.times)
 
     @property
     def bound(self) -> FloatArray | None:
-        """Traces (T, N) of the bound H(12) at the sample times, None if it does not apply."""
+        """Return traces (T, N) of the bound H(12) at the samples, None if it does not apply."""
         return self.promised.bound
 
     def _column(self, name: str) -> FloatArray:

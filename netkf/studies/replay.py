@@ -58,12 +58,12 @@ class DeliveringLoss(Loss):
 
     @property
     def deterministic(self) -> bool:
-        """That of the given losses, so that the same numbers are drawn."""
+        """Return that of the given losses, so that the same numbers are drawn."""
         return self.given.deterministic
 
     @property
     def stateful(self) -> bool:
-        """That of the given losses, so that the same numbers are drawn."""
+        """Return that of the given losses, so that the same numbers are drawn."""
         return self.given.stateful
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
@@ -85,7 +85,7 @@ class DeliveringLoss(Loss):
 
     @property
     def independent(self) -> bool:
-        """False: this is one outcome, not a law."""
+        """Return False: this is one outcome, not a law."""
         return False
 
     def check(self, topology: Topology) -> None:
@@ -106,17 +106,17 @@ class HurryingDelay(Delay):
 
     @property
     def fixed(self) -> float | None:
-        """That of the given delays."""
+        """Return that of the given delays."""
         return self.given.fixed
 
     @property
     def longest(self) -> float:
-        """That of the given delays."""
+        """Return that of the given delays."""
         return self.given.longest
 
     @property
     def is_random(self) -> bool:
-        """That of the given delays, so that the same numbers are drawn."""
+        """Return that of the given delays, so that the same numbers are drawn."""
         return self.given.is_random
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
