@@ -11,6 +11,7 @@ import numpy as np
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing, find_unknown
 from netkf.checks.exact import (
+    MIN_REPLAYED,
     check_bias,
     check_error_covariance,
     check_expected_nees,
@@ -33,6 +34,8 @@ from netkf.theory import error_covariance, information_level, tracking_level
 from netkf.theory.diffusion.information import MAX_REGRESSORS, few_regressors
 from netkf.trace.run import Run
 
+ALONE = MIN_REPLAYED
+"""Runs that are repeated without cooperation: the comparison is of exact mean squares."""
 PASTS = 400
 """Pasts of the regressors from which the level of D (19) is computed."""
 DRAWS = 20
@@ -72,8 +75,7 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
     """Compare exact mean squares at the end, with and without neighbours, on the same truth."""
-    most = most_replayed(samples.scenario)
-    Sigma, Sigma_alone = samples.runs.Sigma[:most, -1], samples.runs.alone[:most]
+    Sigma, Sigma_alone = samples.runs.Sigma[:ALONE, -1], samples.runs.alone[:ALONE]
     together = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
     alone = np.trace(Sigma_alone, axis1=-2, axis2=-1).mean(axis=0)
     margin = 1.0 - float(together.max() / alone.max())
@@ -187,7 +189,7 @@ class DiffusionChecks(PaperChecks):
         """Return the summary of a run whose samples are at ``check_times``."""
         sampled = sampled_indices(scenario)
         alone = np.full(run.P[0, sampled].shape, np.nan)
-        if run.replica < most_replayed(scenario) and few_errors(scenario).holds:
+        if run.replica < ALONE and few_errors(scenario).holds:
             silent = _without_cooperation(scenario)
             last = error_covariance(silent, simulate(silent, run.seed, run.replica))[-1]
             alone = last[sampled]

@@ -21,7 +21,12 @@ from netkf.checks.laws import (
     find_largest,
     pool,
 )
-from netkf.checks.points import sampled_indices
+from netkf.checks.points import (
+    checked_samples,
+    errors_at_once,
+    sample_times,
+    sampled_indices,
+)
 from netkf.checks.rounding import EPS, OPERATIONS, compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples
 from netkf.checks.statistics import (
@@ -42,9 +47,11 @@ from netkf.trace.run import BLUR, Run, blurred
 
 MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 250_000
 """Replicas whose exact covariances are computed, fewer (but at least 20) where their errors are
-integrated in many short steps; the others show their errors only. A step takes a fraction of a
+integrated in many short steps; the others show their errors only. A step takes a tenth of a
 millisecond.
 """
+ENOUGH_ERRORS = 24_000
+"""Errors with which a covariance that is wrong by 5 % is found; more are not replayed."""
 MAX_ERRORS = 64
 """Errors of all nodes together for which the exact covariance (64, 64) is cheap."""
 LEAST_VARIANCE_INTEGRATED, LEAST_VARIANCE = 0.02, 1e-8
@@ -60,43 +67,52 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     """Return the summary of a run at the sampled nodes, with exact covariances if the errors of all
     nodes are few enough.
     """
-    sampled = sampled_indices(scenario)
+    at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     _, nees = errors(run.error, run.P)
     e = np.where(blurred(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
-    P, e, nees = run.P[:, sampled], e[:, sampled], nees[:, sampled]
+    P, e, nees = run.P[at][:, sampled], e[at][:, sampled], nees[at][:, sampled]
     if run.replica < most_replayed(scenario) and few_errors(scenario).holds:
         try:
             law = error_law(with_promised_filter(scenario), run)
         except TheoryError:  # an assumption says so, and rows that need them are not promised
-            return _unreplayed(P, e, nees)
+            return _unreplayed(P, e, nees, len(run.times) * errors_at_once(scenario))
         return _replayed_summary(scenario, run, law, e, nees)
-    return _unreplayed(P, e, nees)
+    return _unreplayed(P, e, nees, len(run.times) * errors_at_once(scenario))
 
 
-@lru_cache(maxsize=8)
 def most_replayed(scenario: Scenario) -> int:
     """Return the number of replicas whose exact covariances are computed."""
+    per_run = len(sample_times(scenario)) * errors_at_once(scenario)
     affordable = MAX_REPLAYED_STEPS // max(integration_steps(scenario), 1)
-    return min(MAX_REPLAYED, max(MIN_REPLAYED, affordable))
+    wanted = min(MAX_REPLAYED, math.ceil(ENOUGH_ERRORS / per_run), affordable)
+    return max(MIN_REPLAYED, wanted)
 
 
-def _unreplayed(P: FloatArray, e: FloatArray, nees: FloatArray) -> ReplicaSummary:
-    """Return a summary without exact covariances."""
+def _unreplayed(P: FloatArray, e: FloatArray, nees: FloatArray, size: int) -> ReplicaSummary:
+    """Return a summary without exact covariances; ``size`` is the number of all errors."""
     times, n = len(P), P.shape[-1]
-    unknown = np.full(P.shape, np.nan)
-    pair = np.full(2, np.nan)
-    bias = np.full((n, n + 1), np.nan)
-    mean = np.full(e.shape, np.nan)
-    return ReplicaSummary(P, e, nees, unknown, mean, unknown, np.tile(pair, (times, 1)), pair, bias)
+    unknown, pair = np.full(P.shape, np.nan), np.full(2, np.nan)
+    return ReplicaSummary(
+        P,
+        e,
+        nees,
+        replayed=unknown,
+        mean=np.full(e.shape, np.nan),
+        Sigma=unknown,
+        whole=np.tile(pair, (times, 1)),
+        joint=pair,
+        quadratic=np.full(1 + size, np.nan),
+        bias=np.full((n, n + 1), np.nan),
+    )
 
 
 def _replayed_summary(
     scenario: Scenario, run: Run, law: ErrorLaw, e: FloatArray, nees: FloatArray
 ) -> ReplicaSummary:
     """Return the summary of a run with the exact law of its errors."""
-    sampled, nodes, times = sampled_indices(scenario), len(scenario.nodes), len(run.times)
-    hosts, n = law.P.shape[1], scenario.plant.n
+    at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
+    nodes, times, hosts, n = len(scenario.nodes), len(run.times), law.P.shape[1], scenario.plant.n
     size = hosts * n
     # Blocks on the diagonal: the covariance at each time.
     stacked = np.einsum("kakb->kab", law.covariance.reshape(times, size, times, size))
@@ -105,15 +121,19 @@ def _replayed_summary(
     centred = run.error[:, :hosts] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
     least = _least_variance(scenario)
-    whole = whiten_errors(centred, stacked, least, floor)
+    whole = whiten_errors(centred[at], stacked[at], least, floor[at])
     joint, bias = _pool_times(centred, law.covariance, least, float(floor.max()))
+    quadratic = _pool_nees(centred, run.P[:, :hosts], law)
     if hosts < nodes:  # all share one pooled filter
         mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
-    lost = blurred(run, Sigma)[:, sampled]
+    lost = blurred(run, Sigma)[at][:, sampled]
+    if lost.any():
+        quadratic = np.full_like(quadratic, np.nan)
     e = np.where(lost[..., None], np.nan, e)
     nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
-    replayed, mean, Sigma = (part[:, sampled] for part in (replayed, mean, Sigma))
-    return ReplicaSummary(run.P[:, sampled], e, nees, replayed, mean, Sigma, whole, joint, bias)
+    replayed, mean, Sigma = (part[at][:, sampled] for part in (replayed, mean, Sigma))
+    P = run.P[at][:, sampled]
+    return ReplicaSummary(P, e, nees, replayed, mean, Sigma, whole, joint, quadratic, bias)
 
 
 def _pool_times(
@@ -137,6 +157,24 @@ def _pool_times(
     design = white.reshape(len(white), -1, n).sum(axis=1)
     bias = np.concatenate([design.T @ design, (design.T @ z)[:, None]], axis=1)
     return np.array([z @ z, used.sum()]), bias
+
+
+def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
+    """Return the sum of ``e' P^-1 e`` over all times and hosts, and its weights given the events,
+    (1 + K M n,); all nan if some P has no inverse.
+
+    ``e`` is (K, M, n) less its mean, ``P`` (K, M, n, n) that of the run; the weights are those for
+    the P that the events should give.
+    """
+    if _nearly_singular(P).any() or _nearly_singular(law.P).any():
+        return np.full(1 + e.size, np.nan)
+    n = e.shape[-1]
+    total = np.einsum("kia,kia->", e, np.linalg.solve(P, e[..., None])[..., 0])
+    # e' D e with D = L L' has the weights of the eigenvalues of L' C L.
+    L = np.linalg.inv(np.linalg.cholesky(law.P)).reshape(-1, n, n)
+    blocks = law.covariance.reshape(len(L), n, len(L), n)
+    moved = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(e.size, e.size)
+    return np.append(total, np.maximum(np.linalg.eigvalsh(moved), 0.0))
 
 
 def _nearly_singular(P: FloatArray) -> np.ndarray:
@@ -344,12 +382,20 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
         f"mean NEES {nees[:, known].mean():.4g}, exact errors say "
         f"{mean[known].mean() / len(P):.4g}, n is {n}; largest relative difference"
     )
-    each, squares = weights[:, known].sum(axis=2), (weights[:, known] ** 2).sum(axis=2)
-    together = pooled_nees(nees[:, known], each, squares, 0.5 * level)
+    together = _expected_together(runs.quadratic[:most], 0.5 * level)
     finding = pool(
         find_largest(found, NEES_TOLERANCE, message), together, EVERYTHING, NEES_TOLERANCE
     )
     return finding._replace(message=finding.message + samples.blurred_note, most_runs=most)
+
+
+def _expected_together(quadratic: FloatArray, level: float) -> Interval:
+    """Return an interval for the relative difference of the NEES of all times, nodes and runs from
+    what is expected of it, from stacked sums with their weights (R, 1 + S).
+    """
+    known = quadratic[np.isfinite(quadratic).all(axis=1)]
+    ratio = quadratic_interval(float(known[:, 0].sum()), known[:, 1:].ravel(), level)
+    return deviation_interval(1.0, ratio) if len(known) else ratio
 
 
 def check_nees(samples: RunSamples, level: float) -> Finding:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.checks.evidence import Assumption
-from netkf.linalg.arrays import IntArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
 
 HORIZON_SHARES = (0.125, 0.25, 0.5, 1.0)
+POOLED_ERRORS, MOST_POOLED = 192, 24
+"""Errors of all nodes at all times of a run that are whitened together, and times of a run at which
+they are looked at: many times of one run say as much about a covariance as many runs.
+"""
 MAX_NODES = 60
 """Nodes of a network of which all samples are kept."""
 MIN_SAMPLED, MAX_SAMPLED = 20, 50
@@ -37,6 +41,35 @@ def check_times(scenario: Scenario) -> list[float]:
     if scenario.slotted:
         return [round(scenario.slot_plant.period * slot, 12) for slot in check_slots(scenario)]
     return [scenario.horizon * share for share in HORIZON_SHARES]
+
+
+def errors_at_once(scenario: Scenario) -> int:
+    """Return the number of errors of all filters together at one time."""
+    filters = 1 if scenario.filter.algorithm.pooled else len(scenario.nodes)
+    return filters * scenario.plant.n
+
+
+def sample_times(scenario: Scenario) -> list[float]:
+    """Return the times at which runs are sampled: those of :func:`check_times`, and others spread
+    evenly over the horizon at which only all errors together are looked at.
+    """
+    checked = check_times(scenario)
+    count = min(MOST_POOLED, POOLED_ERRORS // errors_at_once(scenario))
+    even = np.linspace(0.0, checked[-1], max(count, 0) + 1)[1:].tolist()
+    if scenario.slotted:
+        period = scenario.slot_plant.period
+        even = [round(period * max(1, round(time / period)), 12) for time in even]
+    # Further times replace none of those that rows are about.
+    others = sorted(set(even) - set(checked))
+    spare = min(max(count - len(checked), 0), len(others))
+    chosen = np.linspace(0, len(others) - 1, spare).round().astype(int).tolist()
+    return sorted({*checked, *(others[k] for k in chosen)})
+
+
+def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
+    """Return the indices of :func:`check_times` among the ``times`` of a run."""
+    wanted = np.array(check_times(scenario))
+    return np.asarray(np.argmin(np.abs(times[None] - wanted[:, None]), axis=1), dtype=np.int64)
 
 
 def sampled_indices(scenario: Scenario) -> IntArray:

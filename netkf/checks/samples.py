@@ -29,7 +29,9 @@ class ReplicaSummary:
     mean, Sigma : (K, N, n), (K, N, n, n) mean and covariance of the errors given the events
     whole      : (K, 2) squared errors of all nodes together, whitened by their covariance given the
                  events, and their degrees of freedom
-    joint      : (2,) the same of all times together
+    joint      : (2,) the same of all times together, also those between the K ones
+    quadratic  : (1 + S,) the NEES of all of them together, and its S weights: given the events it
+                 is a sum of squares of standard normal numbers with these weights
     bias       : (n, n + 1) information on a constant bias of all errors, and that information times
                  its estimate
 
@@ -45,6 +47,7 @@ class ReplicaSummary:
     Sigma: FloatArray
     whole: FloatArray
     joint: FloatArray
+    quadratic: FloatArray
     bias: FloatArray
 
 
