@@ -14,6 +14,7 @@ import scipy.special
 
 from netkf.algorithms.registry import LINK_WEIGHTS, base_filter, built_in_class, own_attributes
 from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
+from netkf.checks.parts.moments import whitening_matrix
 from netkf.checks.laws import (
     EVERYTHING,
     NEES_TOLERANCE,
@@ -22,6 +23,7 @@ from netkf.checks.laws import (
     pool,
 )
 from netkf.checks.points import (
+    check_slots,
     checked_samples,
     errors_at_once,
     sample_times,
@@ -46,18 +48,18 @@ from netkf.trace.nees import errors
 from netkf.trace.run import BLUR, Run, blurred
 
 MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 250_000
-"""Replicas whose exact covariances are computed, fewer (but at least 20) where their errors are
-integrated in many short steps; the others show their errors only. A step takes a tenth of a
-millisecond.
+"""Replicas whose exact covariances are computed, fewer (but at least 20) where there are many slots
+or errors are integrated in many short steps; the others show their errors only. A step takes a
+tenth of a millisecond.
 """
-ENOUGH_ERRORS = 24_000
-"""Errors with which a covariance that is wrong by 5 % is found; more are not replayed."""
+ENOUGH_ERRORS, ENOUGH_RUNS = 24_000, 400
+"""Errors with which a covariance that is wrong by 5 % is found; more are not replayed. In slots,
+where limits are promised to each node, rows about one node at one time need so many runs.
+"""
 MAX_ERRORS = 64
 """Errors of all nodes together for which the exact covariance (64, 64) is cheap."""
-LEAST_VARIANCE_INTEGRATED, LEAST_VARIANCE = 0.02, 1e-8
-"""Relative variances below which a direction is left out. Readings that are integrated over steps
-may be off by 1e-3 of the largest variance; in slots nothing is.
-"""
+LEAST_VARIANCE = 1e-8
+"""Relative variance below which a direction is left out: rounding decides about its errors."""
 BOUND_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
 SINGULAR = 1e-12
 """Relative size of an eigenvalue below which a covariance has no inverse to judge by."""
@@ -84,9 +86,12 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
 def most_replayed(scenario: Scenario) -> int:
     """Return the number of replicas whose exact covariances are computed."""
     per_run = len(sample_times(scenario)) * errors_at_once(scenario)
-    affordable = MAX_REPLAYED_STEPS // max(integration_steps(scenario), 1)
-    wanted = min(MAX_REPLAYED, math.ceil(ENOUGH_ERRORS / per_run), affordable)
-    return max(MIN_REPLAYED, wanted)
+    steps, least = integration_steps(scenario), 0
+    if scenario.slotted:
+        steps, least = check_slots(scenario)[-1], ENOUGH_RUNS
+    affordable = MAX_REPLAYED_STEPS // max(steps, 1)
+    enough = max(math.ceil(ENOUGH_ERRORS / per_run), least)
+    return max(MIN_REPLAYED, min(MAX_REPLAYED, enough, affordable))
 
 
 def _unreplayed(P: FloatArray, e: FloatArray, nees: FloatArray, size: int) -> ReplicaSummary:
@@ -120,9 +125,8 @@ def _replayed_summary(
     Sigma, replayed = diagonal_blocks(stacked, hosts), law.P
     centred = run.error[:, :hosts] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
-    least = _least_variance(scenario)
-    whole = whiten_errors(centred[at], stacked[at], least, floor[at])
-    joint, bias = _pool_times(centred, law.covariance, least, float(floor.max()))
+    whole = whiten_errors(centred[at], stacked[at], LEAST_VARIANCE, floor[at])
+    joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
     quadratic = _pool_nees(centred, run.P[:, :hosts], law)
     if hosts < nodes:  # all share one pooled filter
         mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
@@ -137,7 +141,7 @@ def _replayed_summary(
 
 
 def _pool_times(
-    e: FloatArray, covariance: FloatArray, least: float, floor: float
+    e: FloatArray, covariance: FloatArray, floor: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the squared errors of all times together with their degrees of freedom (2,), and what
     they say about a bias that all of them have, (n, n + 1).
@@ -150,7 +154,7 @@ def _pool_times(
     scale = np.repeat(np.sqrt(np.diagonal(covariance).reshape(-1, size).max(axis=1)), size)
     scale = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    used = (values > least * values[-1]) & (values > floor / scale.min() ** 2)
+    used = (values > LEAST_VARIANCE * values[-1]) & (values > floor / scale.min() ** 2)
     white = (vectors / np.sqrt(np.where(used, values, np.inf))).T / scale
     z = white @ e.reshape(-1)
     # A constant bias b adds white X b, with X the identities of all estimates below each other.
@@ -191,11 +195,6 @@ def _variance_floor(scenario: Scenario) -> float:
     information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
     left = 1.0 / information if information > 0.0 else 0.0
     return (OPERATIONS * EPS) ** 2 * (left + float(np.trace(scenario.plant.start_cov)))
-
-
-def _least_variance(scenario: Scenario) -> float:
-    """Return the relative variance below which a direction is left out."""
-    return LEAST_VARIANCE if scenario.slotted else LEAST_VARIANCE_INTEGRATED
 
 
 def few_errors(scenario: Scenario) -> Assumption:
@@ -292,7 +291,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     alone = whiten_errors(
         e.reshape(-1, 1, n),
         Sigma.reshape(-1, n, n),
-        _least_variance(scenario),
+        LEAST_VARIANCE,
         _variance_floor(scenario),
     ).reshape(len(e), -1, 2)
     both = np.concatenate([alone, whole], axis=1)
@@ -319,11 +318,11 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     """Test that errors less their exact mean have no bias that is the same at all nodes and times,
     by generalised least squares.
 
-    The distance is that of the bias from 0 in standard deviations of an error that is typical, the
-    inverse of the information that one run has on it.
+    The distance is that of the bias from 0 in standard deviations of an error: those of the mean
+    covariance of all nodes and times.
     """
     most = most_replayed(samples.scenario)
-    bias = samples.runs.bias[:most]
+    bias, Sigma = samples.runs.bias[:most], samples.runs.Sigma[:most]
     bias = bias[np.isfinite(bias).all(axis=(1, 2))]
     n = bias.shape[1]
     if not len(bias) or not np.abs(bias).any():
@@ -331,22 +330,30 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     information, vector = bias[:, :, :n].sum(axis=0), bias[:, :, n].sum(axis=0)
     values, vectors = np.linalg.eigh(information)
     seen = values > 1e-10 * values[-1]
+    # z is standard normal without a bias, and the bias is spread z.
     z = (vectors.T @ vector)[seen] / np.sqrt(values[seen])
-    # z is standard normal without a bias; its length is at most that of the noise and the bias.
-    length, freedom = float(np.linalg.norm(z)), int(seen.sum())
-    reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(freedom / 2.0, level)))
-    per_run = 1.0 / math.sqrt(len(bias))
-    apart = Interval(
-        length * per_run,
-        max(0.0, length - reach) * per_run,
-        (length + reach) * per_run,
-        (reach + float(scipy.special.ndtri(POWER))) * per_run,
-        length * per_run,
-        0.0,
-    )
-    message = "bias that all errors share, in standard deviations of what one run tells of it,"
+    covariances = Sigma.reshape(-1, n, n)
+    typical = covariances[np.isfinite(covariances).all(axis=(1, 2))].mean(axis=0)
+    spread = whitening_matrix(typical) @ (vectors[:, seen] / np.sqrt(values[seen]))
+    apart = _length_interval(spread, z, level)
+    message = "bias that all errors share, in standard deviations of an error,"
     found = find_largest([(apart, "all nodes and times")], BIAS_TOLERANCE, message)
     return found._replace(most_runs=most)
+
+
+def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interval:
+    """Return an interval for the length of ``spread`` (d, k) times the mean of Gaussian numbers z
+    (k,) with variance 1, which is above 0 if and only if the mean is not 0 at this level.
+    """
+    reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(len(z) / 2.0, level)))
+    sizes = np.linalg.svd(spread, compute_uv=False)
+    least = float(sizes[-1]) if len(sizes) == len(z) else 0.0
+    value, wide = float(np.linalg.norm(spread @ z)), reach * float(sizes[0])
+    # The mean is within ``reach`` of z.
+    excess = float(np.linalg.norm(z)) - reach
+    low = max(value - wide, excess * max(least, 1e-9 * float(sizes[0])), 0.0)
+    find = wide + float(scipy.special.ndtri(POWER)) * float(sizes[0])
+    return Interval(value, low if excess > 0.0 else 0.0, value + wide, find, value, 0.0)
 
 
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:

@@ -25,12 +25,13 @@ def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
     phases = (scenario.hosted.schedule or ()).count("exchange")
     steps = np.array([scenario.hosted.exchange_steps(phase) for phase in range(phases)])
     step = np.round(since * steps[rows["phase"]] / length).astype(int)
-    up: ArrivalsByStep = {}
-    columns = (slot, rows["phase"], step, rows["node"], rows["peer"])
-    for t, phase, k, node, peer in zip(*(c.tolist() for c in columns), strict=True):
-        matrix = up.setdefault((t, phase, k), np.zeros((size, size)))
-        matrix[index[node], index[peer]] = 1.0
-    return up
+    if not len(rows):
+        return {}
+    keys, which = np.unique(np.stack([slot, rows["phase"], step]), axis=1, return_inverse=True)
+    place = np.vectorize(index.__getitem__, otypes=[int])
+    up = np.zeros((keys.shape[1], size, size))
+    up[which.reshape(-1), place(rows["node"]), place(rows["peer"])] = 1.0
+    return {(t, phase, k): up[n] for n, (t, phase, k) in enumerate(keys.T.tolist())}
 
 
 def require_traced_exchanges(scenario: Scenario, run: Run) -> None:
