@@ -14,7 +14,6 @@ import scipy.special
 
 from netkf.algorithms.registry import LINK_WEIGHTS, base_filter, built_in_class, own_attributes
 from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
-from netkf.checks.parts.moments import whitening_matrix
 from netkf.checks.laws import (
     EVERYTHING,
     NEES_TOLERANCE,
@@ -22,6 +21,7 @@ from netkf.checks.laws import (
     find_largest,
     pool,
 )
+from netkf.checks.parts.moments import whitening_matrix
 from netkf.checks.points import (
     check_slots,
     checked_samples,

@@ -94,7 +94,7 @@ def test_predictions_are_those_of_van_loan(gap):
 
 
 def test_settled_forms_stay_valid_while_inputs_are_reduced():
-    # Random walks x and y, driven by common noise and noises of their own: C(s, t) = C(s, s), s < t.
+    # Random walks x and y with some common noise: C(s, t) = C(s, s) for s < t.
     n, stack, random = 2, GaussianStack(2), np.random.default_rng(3)
     stack.put("x", np.zeros((n, 0)))
     stack.put("y", np.zeros((n, 0)))
