@@ -1,0 +1,109 @@
+"""What rows would have found at the default number of runs, and what it takes to know."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
+from netkf.checks.exact import _compare_pooled, check_expected_nees, most_replayed
+from netkf.checks.points import check_times, errors_at_once, sample_times
+from netkf.checks.samples import stack_summaries
+from netkf.scenario.reading import load
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+NAMES = ("poisson_ring", "gossip_ring", "push_sum_planar", "diffusion_regression", "threshold")
+RUNS, FEW = 500, 25
+FOUND = {
+    # Part of the name of a row, and the error that it has to find at 500 runs.
+    "noises of the sensors have their covariance": 0.05,
+    "the plant's noise has its covariance": 0.05,
+    "messages are lost as often": 0.02,
+    "readings have no bias": 0.1,
+    "the plant follows its equation without a bias": 0.1,
+    "noises of the sensors are white": 0.2,
+    "the plant's noise is white": 0.2,
+    "clocks tick at the rates": 0.04,
+}
+
+
+def load_shipped(name):
+    return load(SCENARIOS / f"{name}.toml")
+
+
+@pytest.fixture(scope="module")
+def ring():
+    """Return a scenario and the results of some of its runs."""
+    scenario = with_check_times(load_shipped("poisson_ring"))
+    return scenario, [run_replica(scenario, 5, k) for k in range(FEW)]
+
+
+def test_rows_would_have_found_small_errors_at_the_default(ring):
+    # What a row would find depends on how much it saw, and not on what: each run counts 20 times.
+    scenario, results = ring
+    rows = judge_replicas(scenario, [results[k % FEW] for k in range(RUNS)], 5, 0.99).rows
+    for name, size in FOUND.items():
+        (row,) = [row for row in rows if name in row.promise]
+        assert 0.0 < row.detectable <= size, name
+
+
+def test_errors_have_the_freedom_to_find_five_per_cent(ring):
+    scenario, results = ring
+    joint = np.array([one.summary.joint for one in results])
+    # The part of the level that the row has for all errors together, among ten rows.
+    found = _compare_pooled(np.tile(joint, (20, 1))[: most_replayed(scenario)], 0.01 / 40.0)
+    assert 0.0 < found.detectable <= 0.052
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_runs_are_sampled_where_rows_look_and_often_enough(name):
+    scenario = load_shipped(name)
+    times = sample_times(scenario)
+    assert set(check_times(scenario)) <= set(times)
+    assert len(times) <= max(24, len(check_times(scenario)))
+    assert all(0.0 < time <= scenario.horizon for time in times)
+    # A variance is known to 5 % with probability 0.9 from so many numbers, or from 500 runs.
+    errors = len(times) * errors_at_once(scenario)
+    assert most_replayed(scenario) >= min(RUNS, 23_000 / errors)
+
+
+@pytest.fixture(scope="module")
+def samples(ring):
+    scenario, results = ring
+    checks = find_checks(scenario)
+    return checks.collect(scenario, stack_summaries([one.summary for one in results]), 5)
+
+
+def test_the_expected_nees_of_all_errors_is_exact(samples):
+    # Given the events the sum is a quadratic form with these weights: compare its moments.
+    quadratic = samples.runs.quadratic
+    weights = quadratic[:, 1:]
+    z = (quadratic[:, 0] - weights.sum(axis=1)) / np.sqrt(2.0 * (weights**2).sum(axis=1))
+    assert abs(z.mean()) < 4.0 / math.sqrt(FEW)
+    assert 0.3 < z.std() < 2.0
+    # The weights of one time alone are those of P^-1 Sigma there.
+    shares = np.linalg.inv(samples.runs.replayed) @ samples.runs.Sigma
+    at_checked = np.trace(shares, axis1=-2, axis2=-1).sum(axis=(1, 2))
+    share = len(check_times(samples.scenario)) / len(sample_times(samples.scenario))
+    assert weights.shape[1] == len(sample_times(samples.scenario)) * errors_at_once(
+        samples.scenario
+    )
+    assert np.allclose(at_checked / weights.sum(axis=1), share, rtol=0.2)
+
+
+@pytest.mark.parametrize(("factor", "broken"), [(1.0, False), (1.6, True), (0.6, True)])
+def test_covariances_that_are_too_large_or_too_small_change_the_nees(ring, factor, broken):
+    scenario, results = ring
+    changed = []
+    for one in results:
+        summary = one.summary
+        # P by the engine is off by a factor: so is the NEES, and not what is expected of it.
+        quadratic = np.append(summary.quadratic[0] / factor, summary.quadratic[1:])
+        found = dataclasses.replace(summary, quadratic=quadratic, nees=summary.nees / factor)
+        changed.append(one._replace(summary=found))
+    summaries = stack_summaries([one.summary for one in changed])
+    samples = find_checks(scenario).collect(scenario, summaries, 5)
+    finding = check_expected_nees(samples, 0.01)
+    assert (finding.margin[2] < 0.0) == broken
