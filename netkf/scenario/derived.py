@@ -170,8 +170,12 @@ class DerivedScenario(ScenarioModel):
         be. Raises TheoryError where H differs from slot to slot.
         """
         placed = (self.placed if self.slotted else self.increment_sensors).get(node, ())
-        if any(self.sensors[place.entry].varying for place in placed):
-            raise TheoryError(f"node {node} has a sensor whose H is random, or not linear")
+        for sensor in (self.sensors[place.entry] for place in placed):
+            if sensor.varying:
+                what = (
+                    "a regressor sensor, whose H is random" if sensor.linear else "no linear sensor"
+                )
+                raise TheoryError(f"node {node} has {what}")
         return self._stacked(placed, believed)
 
     def _stacked(

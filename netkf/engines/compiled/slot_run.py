@@ -205,7 +205,10 @@ class SlotRuns:
         readings = self._readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
         shown = self.shown if self.shown is not None else self._space(len(sampled))
-        x, xhat, P, error = (part.reshape(*part.shape[:2], -1) for part in shown)
+        # Blocks without a sample have empty arrays, of which reshape cannot tell the last length.
+        x, xhat, P, error = (
+            part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in shown
+        )
         samples = SlotSamples(
             x, xhat, P, error, self._stopped, self._conserved, absolute, local, setup.frame > 0,
             self._total,
