@@ -197,7 +197,7 @@ def announce(function: Callable[..., Any]) -> None:
     _said.add(function)
     folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
     if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
-        words = "netkf: compiling, once after an installation (5 to 10 s) ..."
+        words = "netkf: compiling, once after an installation (5 to 15 s) ..."
         print(words, file=sys.stderr, flush=True)
 
 
