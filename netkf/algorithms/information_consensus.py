@@ -231,7 +231,7 @@ class InformationConsensus(Filter):
         return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))
 
     def update(self, state: ConsensusState, reading: Any) -> ConsensusState:
-        """In slots begin the pairs; under clocks the Kalman update."""
+        """Return the state with its first pairs, under clocks after the Kalman update."""
         if not isinstance(state.model, SlotModel):
             updated: ConsensusState = super().update(state, reading)
             return updated

@@ -76,7 +76,7 @@ class OneBit(Filter):
         return state._replace(reading=reading if len(reading.y) else None)
 
     def emit(self, state: OneBitState, exchange: Exchange) -> tuple[OneBitState, Bits | None]:
-        """In the node's turn use its reading as bits, and send them."""
+        """Send the reading as bits in the node's turn, and use them."""
         if state.reading is None or exchange.slot % state.nodes != state.turn:
             return state, None
         y, H = whitened(*state.reading[:3])

@@ -46,7 +46,7 @@ class StoredEnsemble(Ensemble):
 
     @cached_property
     def promised(self) -> PromisedTraces:
-        """What theory promises at the sample times: bound, limit, centralised filter."""
+        """Return what theory promises at the sample times: bound, limit, centralised filter."""
         assert self.scenario is not None
         return promise_traces(self.scenario, self.times)
 

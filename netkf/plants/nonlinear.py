@@ -11,12 +11,11 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.clock import Clock, all_ticks
+from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     choice,
@@ -31,7 +30,7 @@ from netkf.core.fields import (
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import SlotReadings
 from netkf.plants.sampling import Samples, sampling
-from netkf.plants.sensors import Sensor
+from netkf.plants.sensors import Sensor, sampling_ticks
 
 GRAPH = "graph"
 
@@ -105,8 +104,7 @@ class NonlinearSensor(Sensor):
     ) -> FloatArray:
         """(K,) from the streams "sampling" and "sampling phase"."""
         assert self.sampling is not None
-        entity, phase = (node, ordinal), partial(generator, "sampling phase")
-        return all_ticks(self.sampling, entity, phase, generator("sampling"), horizon, "sampling")
+        return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float

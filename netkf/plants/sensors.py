@@ -88,6 +88,19 @@ class Sensor(Component):
         raise NotImplementedError
 
 
+def sampling_ticks(
+    clock: Clock,
+    entity: tuple[int, int],
+    generator: Callable[[str], np.random.Generator],
+    horizon: float,
+) -> FloatArray:
+    """Return the times (K,) at which a sensor (node, number on it) samples, from the streams
+    "sampling" and "sampling phase".
+    """
+    phase = partial(generator, "sampling phase")
+    return all_ticks(clock, entity, phase, generator("sampling"), horizon, "sampling")
+
+
 @dataclass(frozen=True, eq=False)
 class LinearSensor(Sensor):
     """In continuous time ``dy = H x dt + dv``, cov(dv) = R dt, H (3), or with a clock as
@@ -110,8 +123,7 @@ class LinearSensor(Sensor):
         """(K,) from the streams "sampling" and "sampling phase"."""
         # Only sensors with a clock are asked.
         assert self.sampling is not None
-        entity, phase = (node, ordinal), partial(generator, "sampling phase")
-        return all_ticks(self.sampling, entity, phase, generator("sampling"), horizon, "sampling")
+        return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float

@@ -137,41 +137,15 @@ def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait
 
     Raises TheoryError where losses or delays have no law that can be used here.
     """
-    topology, channel = scenario.topology, scenario.network.channel
-    loss, delay = channel.loss, channel.delay.fixed
-    if is_recorded(channel):
-        raise TheoryError("losses or delays are recorded: their law is not known")
-    if delay is None:
-        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
-    bursts = isinstance(loss, GilbertElliott)
-    if not (bursts or loss.independent):
-        raise TheoryError("losses depend on earlier ones in a way that is not known here")
-    links = list(weights)
+    _require_law(scenario)
+    loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
+    links, index = list(weights), scenario.topology.index
     at = {link: k for k, link in enumerate(_sources(scenario, links))}
     source = np.array([at[_source(scenario, link)] for link in links], dtype=np.int64)
-    chained = bursts and not loss.independent
-    if chained and len(at) > MAX_CHAINS:
-        raise TheoryError(
-            f"bursts on {len(at)} links have 2^{len(at)} joint states; exact mean squares are "
-            f"computed for at most {MAX_CHAINS} links with bursts"
-        )
-    tables = [scenario.table_probability(link) for link in links]
-    good, bad = (
-        np.array(
-            [
-                loss.delivery_probability(link, 0, state, table)
-                for link, table in zip(links, tables, strict=True)
-            ]
-        )
-        for state in (False, True)
-    )
-    modes = np.arange(1 << len(at) if chained else 1)
-    delivery = np.where(modes[:, None] >> source & 1, bad, good) if chained else good[None]
-    if bursts and not chained:
-        delivery = np.array([[loss.mean_delivery(link, 1.0) for link in links]])
-    if delay > wait:
+    chained = isinstance(loss, GilbertElliott) and not loss.independent
+    delivery = _deliveries(scenario, links, source, len(at))
+    if delay is not None and delay > wait:
         delivery = np.zeros_like(delivery)
-    index = topology.index
     return Ways(
         np.array([index[i] for i, _ in links], dtype=np.int64),
         np.array([index[j] for _, j in links], dtype=np.int64),
@@ -180,6 +154,42 @@ def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait
         delivery,
         loss.transitions if isinstance(loss, GilbertElliott) and chained else None,
     )
+
+
+def _require_law(scenario: Scenario) -> None:
+    """Raise TheoryError where losses or delays have no law that can be used here."""
+    channel = scenario.network.channel
+    if is_recorded(channel):
+        raise TheoryError("losses or delays are recorded: their law is not known")
+    if channel.delay.fixed is None:
+        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
+    if not (isinstance(channel.loss, GilbertElliott) or channel.loss.independent):
+        raise TheoryError("losses depend on earlier ones in a way that is not known here")
+
+
+def _deliveries(
+    scenario: Scenario, links: list[tuple[int, int]], source: IntArray, chains: int
+) -> FloatArray:
+    """Return the probabilities (S, K) that a message arrives on each of ``links``, by mode; bit c
+    of a mode says if chain c of ``chains`` is bad. Raises TheoryError for too many chains.
+    """
+    loss = scenario.network.channel.loss
+    if isinstance(loss, GilbertElliott) and loss.independent:
+        return np.array([[loss.mean_delivery(link, 1.0) for link in links]])
+
+    def probabilities(bad: bool) -> FloatArray:
+        tables = ((link, scenario.table_probability(link)) for link in links)
+        return np.array([loss.delivery_probability(link, 0, bad, table) for link, table in tables])
+
+    if not isinstance(loss, GilbertElliott):
+        return probabilities(False)[None]
+    if chains > MAX_CHAINS:
+        raise TheoryError(
+            f"bursts on {chains} links have 2^{chains} joint states; exact mean squares are "
+            f"computed for at most {MAX_CHAINS} links with bursts"
+        )
+    modes = np.arange(1 << chains)
+    return np.where(modes[:, None] >> source & 1, probabilities(True), probabilities(False))
 
 
 def _source(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
