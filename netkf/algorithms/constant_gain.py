@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo
-from netkf.algorithms.kernels.neighbours import combine_convex_roots
+from netkf.algorithms.kernels.neighbours import combine_convex_roots, copy_pairs
 from netkf.algorithms.kernels.root_update import combine_roots, lower_root
 from netkf.algorithms.kernels.slots import (
     SlotLinks,
@@ -104,17 +104,6 @@ def constant_gain_slots(
                     combine_convex_roots(nodes, plan, links, room, b, s, h)
             show(nodes, plan, samples, room, b, s)
             rebase(nodes, readings, room, b, s)
-
-
-@kernel
-def copy_pairs(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
-    """Copy what all filters of a block send."""
-    for h in range(len(nodes.rows)):
-        for i in range(nodes.xhat.shape[2]):
-            store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
-            for j in range(i + 1):
-                entry = load(room.lanes, nodes.root, b, h, i, j)
-                store(room.lanes, room.root, h, i, j, entry)
 
 
 @kernel

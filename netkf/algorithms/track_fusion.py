@@ -17,6 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading, State
+from netkf.algorithms.kernels.neighbours import copy_pairs
 from netkf.algorithms.kernels.pair_fusion import fuse_pair, fused_pair
 from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.slots import (
@@ -37,7 +38,6 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, field
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import load, store
 
 TRACE, DETERMINANT = "trace", "determinant"
 NEGLIGIBLE = 1e-12
@@ -76,22 +76,12 @@ def fusion_slots(
                 read_all(nodes, readings, room, b, s)
             if plan.exchanged[s]:
                 # What was sent: all estimates from before the exchange.
-                for h in range(len(nodes.rows)):
-                    copy_estimate(nodes, room, b, h)
+                copy_pairs(nodes, room, b)
                 for h in range(len(nodes.rows)):
                     for q in range(len(room.lanes)):
                         fuse_heard(nodes, plan, links, room, arrays, (b, s, h, q))
             show(nodes, plan, samples, room, b, s)
             rebase(nodes, readings, room, b, s)
-
-
-@kernel(inlined=True)
-def copy_estimate(nodes: SlotNodes, room: SlotRoom, b: int, h: int) -> None:
-    """Copy the estimate of filter h of a block, with its root, to the room of what is sent."""
-    for i in range(nodes.xhat.shape[2]):
-        store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
-        for j in range(i + 1):
-            store(room.lanes, room.root, h, i, j, load(room.lanes, nodes.root, b, h, i, j))
 
 
 @kernel

@@ -124,6 +124,17 @@ def fuse_readings(
 
 
 @kernel
+def copy_pairs(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
+    """Copy the pairs (xhat, root) of all filters of a block, which they send, to ``room``."""
+    for h in range(len(nodes.rows)):
+        for i in range(nodes.xhat.shape[2]):
+            store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
+            for j in range(i + 1):
+                entry = load(room.lanes, nodes.root, b, h, i, j)
+                store(room.lanes, room.root, h, i, j, entry)
+
+
+@kernel
 def combine_convex_roots(
     nodes: SlotNodes,
     plan: SlotPlan,

@@ -137,7 +137,7 @@ class ClockJumps:
 
     @cached_property
     def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """For each tick pairs of its ways, and the rates (S, P) at which both messages arrive."""
+        """Return for each tick pairs of its ways, and the rates (S, P) at which both arrive."""
         assert self.ways is not None
         found = []
         for rate, among in self.ticks:
