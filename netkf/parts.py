@@ -8,6 +8,7 @@ scenario file can name (``kinds()`` lists them); the contracts that users' own c
 from __future__ import annotations
 
 from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.belief_propagation import BeliefPropagation
 from netkf.algorithms.constant_gain import ConstantGain
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
@@ -119,6 +120,7 @@ __all__ = [
     "BarShalomCampo",
     "BearingSensor",
     "Belief",
+    "BeliefPropagation",
     "Bernoulli",
     "Broadcast",
     "Central",

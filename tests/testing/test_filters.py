@@ -36,6 +36,10 @@ SOUND = {
     "bar-shalom-campo": [parts.BarShalomCampo()],
     "event-triggered-ci": [parts.EventTriggeredCi()],
     "stochastic-trigger": [parts.StochasticTrigger()],
+    "belief-propagation": [
+        parts.BeliefPropagation(steps=2),
+        parts.BeliefPropagation(memory="all"),
+    ],
     "kcf": [parts.Kcf(epsilon=0.2)],
     "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [

@@ -1,0 +1,170 @@
+"""Exact errors of belief propagation along the messages of a run, in information form.
+
+Readings ``y = H x + v`` that were put together say ``u = U x + s``, with the sums U and s of
+``H' R^-1 H`` and ``H' R^-1 v``. A node with the prior error e_0 that knows them has the error
+``e = (I - P U) e_0 - P s``, ``P = (P_0^-1 + U)^-1``, whatever was counted twice in U and s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+import scipy.linalg
+
+from netkf.algorithms.belief_propagation import ALL, BeliefPropagation
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.theory.numerics.prediction import triangular_root
+from netkf.trace.run import Run
+
+
+class BeliefRule(ErrorRule):
+    """Evidence of nodes and of what each was told, and the beliefs that follow from it.
+
+    In the stack of errors each piece of evidence is a vector s, whose matrix is U.
+    """
+
+    takes_messages = False
+
+    def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
+        super().__init__(scenario, errors)
+        algorithm = scenario.filter.algorithm
+        assert isinstance(algorithm, BeliefPropagation)
+        self._keeps = not scenario.slotted or algorithm.memory == ALL
+        if self._keeps and errors.follows:
+            raise TheoryError("the filters' plant is not the true one: messages follow the state")
+        self._steps = algorithm.steps
+        self._arrivals = arrivals_by_step(scenario, run) if scenario.slotted else {}
+        self._told: dict[int, dict[int, float]] = {host: {} for host in range(errors.hosts)}
+        self._evidence: set[Hashable] = set()
+        for host in range(errors.hosts):
+            errors.copy(host, _prior(host), host)
+
+    def _put(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
+        """Set a piece of evidence."""
+        self._evidence.add(name)
+        self.errors.stack.put(name, s)
+        self.errors.stack.matrices[self.errors.stack.place(name)] = U
+
+    def _drop(self, names: Sequence[Hashable]) -> None:
+        self._evidence.difference_update(names)
+        self.errors.stack.drop(names)
+
+    def _sum(self, names: Sequence[Hashable]) -> tuple[FloatArray, FloatArray]:
+        """Return U (n, n) and the form of s (n, inputs) of several pieces of evidence together."""
+        stack, n = self.errors.stack, self.errors.n
+        known = [name for name in names if name in self._evidence]
+        U = sum((stack.matrices[stack.place(name)] for name in known), np.zeros((n, n)))
+        return U, sum((stack.form(name) for name in known), np.zeros((n, stack.used)))
+
+    def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
+        """Let all evidence speak about the present state."""
+        if gap > 0.0:
+            self._move(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
+
+    def _move(self, back: FloatArray) -> None:
+        stack = self.errors.stack
+        for name in self._evidence:
+            U = stack.matrices[stack.place(name)]
+            self._put(name, back.T @ U @ back, back.T @ stack.form(name))
+
+    def _begin_slot(self) -> None:
+        """Move the evidence that is kept, or begin with what nodes believe as their priors."""
+        if self._keeps:
+            self._move(np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64))
+            return
+        self._drop(list(self._evidence))
+        for host, told in self._told.items():
+            told.clear()
+            self.errors.copy(host, _prior(host), host)
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Add the readings to the nodes' own evidence."""
+        if self.scenario.slotted:
+            self._begin_slot()
+        columns = self.errors.reading_noises(observations)
+        for host, one in observations.items():
+            weighted = np.linalg.solve(one.R, one.H).T
+            U, s = self._sum([_own(host)])
+            s[:, columns[host]] += weighted @ one.root
+            self._put(_own(host), U + weighted @ one.H, s)
+        for host in observations:
+            self._believe(host)
+
+    def _believe(self, host: int) -> None:
+        """Set the error and the root of P of a node."""
+        errors, eye = self.errors, np.eye(self.errors.n)
+        U, s = self._sum([_own(host), *((host, j) for j in self._told[host])])
+        S = errors.roots[_prior(host)]
+        spread = np.linalg.cholesky(eye + S.T @ U @ S)
+        root = scipy.linalg.solve_triangular(spread, S.T, lower=True).T
+        P = root @ root.T
+        errors.stack.put(host, (eye - P @ U) @ errors.stack.form(_prior(host)) - P @ s)
+        errors.roots[host] = triangular_root(root)
+
+    def _said(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
+        """Return what a node says to another: all but what that one told."""
+        others = [(sender, j) for j in self._told[sender] if j != receiver]
+        return self._sum([_own(sender), *others])
+
+    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
+        """Pass the messages of all steps of a slot that arrived."""
+        hosts = self.errors.hosts
+        nothing = np.zeros((hosts, hosts))
+        for step in range(self._steps):
+            up = self._arrivals.get((slot, phase, step), nothing)
+            pairs = [(i, j) for i, j in np.argwhere(up).tolist()]
+            said = {(i, j): self._said(j, i) for i, j in pairs}
+            for (i, j), (U, s) in said.items():
+                self._put((i, j), U, s)
+                self._told[i][j] = slot
+        for host in range(hosts):
+            self._believe(host)
+
+    def send(self, messages: Sequence[SentMessage]) -> None:
+        """Keep the evidence of each message that takes time."""
+        for message in messages:
+            if message.late:
+                self._put(message, *self._said(message.sender, message.receiver))
+
+    def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
+        """Replace what the senders told before, unless it was sent later."""
+        late = [message for message in messages if message.late]
+        # All at once: a message says what its sender knew before this instant's messages.
+        said = {
+            message: self._sum([message])
+            if message.late
+            else self._said(message.sender, message.receiver)
+            for message in messages
+        }
+        for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
+            told = self._told[message.receiver]
+            if told.get(message.sender, -np.inf) <= message.time:
+                told[message.sender] = message.time
+                self._put((message.receiver, message.sender), *said[message])
+        self._drop(late)
+        for host in {message.receiver for message in messages}:
+            self._believe(host)
+
+
+def _prior(host: int) -> Hashable:
+    return ("prior", host)
+
+
+def _own(host: int) -> Hashable:
+    return ("own", host)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    if scenario.slotted:
+        require_traced_exchanges(scenario, run)
+    return BeliefRule(scenario, errors, run)

@@ -1,0 +1,234 @@
+"""Belief propagation: its textbook, exactness on trees in any order, and loops."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import netkf
+from netkf import theory
+from netkf.rng.streams import Streams
+from netkf.theory.common.errors import error_law
+from netkf.theory.common.replay import delivered_messages
+from tests.algorithms.test_literature import (
+    CENTRAL,
+    LOSSY,
+    assert_same,
+    clocked,
+    heard_by_slot,
+    scenario_of,
+    states,
+    textbook,
+)
+from tests.theory.test_replay import close, engine_covariance
+
+BELIEF = {"kind": "belief-propagation"}
+BROADCAST = {"kind": "broadcast"}
+TREE = {"kind": "edges", "edges": [[0, 1], [1, 2], [1, 3], [3, 4]]}
+ON_TREE = {"graph": TREE, "activation": BROADCAST}
+LOST_ON_TREE = {**ON_TREE, "channel": LOSSY}
+RING = {"graph": {"kind": "cycle", "nodes": 5}, "activation": BROADCAST}
+STILL = {"kind": "linear", "F": [[1.0, 0.2], [0.0, 0.9]], "Q": [[0.0, 0.0], [0.0, 0.0]]}
+STILL |= {"cov": [[2.0, 0.5], [0.5, 1.0]], "period": 1.0}
+EXACT = "P is the covariance of the error, given the events"
+
+
+def expected_states(scenario, run, steps, keeps):
+    """Sums of information by the plain formula ``m_ij = own_i + sum of m_li, l != j``."""
+    heard, F = heard_by_slot(scenario, run, steps), scenario.plant.F
+    N, n = len(scenario.nodes), len(F)
+    nothing = np.zeros((n, n)), np.zeros(n)
+    own, told, prior = [nothing] * N, [{} for _ in range(N)], None
+
+    def add(pairs):
+        return tuple(sum(part) for part in zip(nothing, *pairs, strict=True))
+
+    def earlier(pair):
+        V = np.linalg.inv(F)
+        return V.T @ pair[0] @ V, V.T @ pair[1]
+
+    def step(slot, x, P, readings):
+        nonlocal own, told, prior
+        if keeps:
+            start = (np.zeros(n), scenario.plant.cov) if prior is None else prior
+            prior = F @ start[0], F @ start[1] @ F.T
+            own = [earlier(pair) for pair in own]
+            told = [{j: earlier(pair) for j, pair in one.items()} for one in told]
+            x, P = [prior[0]] * N, [prior[1]] * N
+        else:
+            own, told = [nothing] * N, [{} for _ in range(N)]
+        for i, (y, H, R) in readings.items():
+            own[i] = add([own[i], (H.T @ np.linalg.inv(R) @ H, H.T @ np.linalg.inv(R) @ y)])
+        for up in heard.get(slot, np.zeros((steps, N, N))):
+            before = [dict(one) for one in told]
+            for i, j in np.argwhere(up).tolist():
+                others = [pair for k, pair in before[j].items() if k != i]
+                told[i][j] = add([own[j], *others])
+        found = []
+        for i in range(N):
+            U, u = add([own[i], *told[i].values()])
+            C = np.linalg.inv(np.linalg.inv(P[i]) + U)
+            found.append((x[i] + C @ (u - U @ x[i]), C))
+        return [one for one, _ in found], [C for _, C in found]
+
+    states = list(textbook(scenario, run, step))
+    return np.stack([x for x, _ in states]), np.stack([P for _, P in states])
+
+
+@pytest.mark.parametrize("memory", ["slot", "all"])
+@pytest.mark.parametrize("graph", [TREE, RING["graph"]], ids=["tree", "ring"])
+def test_the_textbook(graph, memory, tmp_path):
+    network = {**LOST_ON_TREE, "graph": graph}
+    for steps in (1, 3):
+        algorithm = {**BELIEF, "steps": steps, "memory": memory}
+        more = {"plant": STILL} if memory == "all" else {}
+        scenario = scenario_of(algorithm, tmp_path, 1, network=network, **more)
+        run = netkf.simulate(scenario)
+        xhat, P = expected_states(scenario, run, steps, memory == "all")
+        np.testing.assert_allclose(run.P, P, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(run.xhat, xhat, rtol=1e-10, atol=1e-10)
+
+
+def test_as_many_steps_as_the_tree_is_wide_are_the_central_filter(tmp_path):
+    assert_same({**BELIEF, "steps": 3}, CENTRAL, tmp_path, network=ON_TREE)
+    # A link more, and readings arrive on two ways.
+    edges = {"graph": {**TREE, "edges": [*TREE["edges"], [0, 2]]}, "activation": BROADCAST}
+    (_, P), (_, central) = (
+        states(f, tmp_path, network=edges) for f in ({**BELIEF, "steps": 3}, CENTRAL)
+    )
+    size, right = (np.trace(C[1:, :4], axis1=-2, axis2=-1) for C in (P, central))
+    assert (size < right - 1e-3).all()
+
+
+@pytest.mark.parametrize("memory", ["slot", "all"])
+@pytest.mark.parametrize("graph", [TREE, RING["graph"]], ids=["tree", "ring"])
+def test_theory_follows_it_and_on_trees_p_is_the_covariance(graph, memory, tmp_path):
+    more = {
+        "horizon": 4.0,
+        "probe": [0.0, 1.0, 2.0, 3.0],
+        "network": {**LOST_ON_TREE, "graph": graph},
+    }
+    if memory == "all":
+        more["plant"] = STILL
+    scenario = scenario_of({**BELIEF, "steps": 3, "memory": memory}, tmp_path, 2, **more)
+    run = netkf.simulate(scenario)
+    exact, _ = engine_covariance(scenario)
+    Sigma = theory.error_covariance(scenario, run)
+    close(Sigma, exact, 1e-9)
+    close(error_law(scenario, run).P, run.P, 1e-9)
+    gap = np.linalg.eigvalsh(run.P - Sigma)
+    if graph is TREE:
+        assert np.abs(gap).max() < 1e-10
+    else:
+        assert gap.min() < -0.01
+        assert any("P is too small" in note for note in scenario.notes)
+
+
+def test_on_a_ring_means_become_exact_and_variances_too_small(tmp_path):
+    """Weiss and Freeman: readings of one slot, carried around the ring for many steps."""
+    plant = {**STILL, "F": [[1.0, 0.0], [0.0, 1.0]], "cov": [[1e6, 0.0], [0.0, 1e6]]}
+    sensors = [
+        {"nodes": [0, 1, 2, 3, 4], "H": [[1.0, 0.3], [0.2, 1.0]], "R": [[0.5, 0.1], [0.1, 0.3]]}
+    ]
+    more = {"plant": plant, "sensors": sensors, "network": RING, "horizon": 2.0, "probe": [1.0]}
+    xhat, P = states({**BELIEF, "steps": 400}, tmp_path, **more)
+    central, C = states(CENTRAL, tmp_path, **more)
+    np.testing.assert_allclose(xhat, central, rtol=3e-3, atol=3e-3)
+    assert np.trace(P[0, 0]) < 0.02 * np.trace(C[0, 0])
+
+
+# Under clocks.
+
+DRIFTING = {"kind": "diffusion", "A": [[-0.1, 0.8], [-0.8, 0.05]], "B": [[0.0], [0.0]]}
+DRIFTING |= {"cov": [[2.0, 0.3], [0.3, 1.0]]}
+
+
+def drifting(folder, graph, at, seed=0):
+    """Poisson samples and clocks, random delays that let messages overtake each other."""
+    sampling = {"kind": "poisson", "rate": 2.0}
+    channel = {"delay": {"kind": "exponential", "mean": 0.4}, **LOSSY}
+    network = {"graph": graph, "activation": {"kind": "poisson", "rate": 3.0, "at": at}}
+    more = {"plant": DRIFTING, "network": {**network, "channel": channel}, "probe": 0.5}
+    return clocked(BELIEF, folder, {}, sampling, seed=seed, **more)
+
+
+def batch(scenario, run):
+    """The posterior of each node at the end from the set of readings that have reached it."""
+    streams, A = Streams(run.seed, run.replica), scenario.truth.A
+    rows = []
+    for node, places in scenario.placed.items():
+        for place in places:
+            sensor = scenario.sensors[place.entry]
+            times = scenario.sample_times(streams)[node, place.ordinal]
+            rows += [(float(t), node, sensor.H, sensor.R) for t in times]
+    known = {node: {j: set() for j in scenario.nodes} for node in scenario.nodes}
+    sent_at = {node: {} for node in scenario.nodes}
+    messages = delivered_messages(scenario, run)
+    events = [(m.time, 0, k, m) for k, m in enumerate(messages)]
+    events += [(m.arrives, 1, k, m) for k, m in enumerate(messages)]
+    content = {}
+    for time, kind, k, m in sorted(events, key=lambda e: e[:3]):
+        if kind == 0:
+            own = {r for r, row in enumerate(rows) if row[1] == m.sender and row[0] <= time}
+            others = [s for j, s in known[m.sender].items() if j != m.receiver]
+            content[k] = own.union(*others)
+        elif sent_at[m.receiver].get(m.sender, -1.0) <= m.time:
+            sent_at[m.receiver][m.sender] = m.time
+            known[m.receiver][m.sender] = content[k]
+    T, found = run.times[-1], []
+    for node in scenario.nodes:
+        own = {r for r, row in enumerate(rows) if row[1] == node and row[0] <= T}
+        U = np.linalg.inv(scenario.plant.cov)
+        for r in own.union(*known[node].values()):
+            t, _, H, R = rows[r]
+            G = H @ scipy.linalg.expm(A * t)
+            U = U + G.T @ np.linalg.inv(R) @ G
+        F = scipy.linalg.expm(A * T)
+        found.append(F @ np.linalg.inv(U) @ F.T)
+    return np.stack(found)
+
+
+@pytest.mark.parametrize("at", ["links", "nodes"])
+def test_exact_on_trees_in_any_order(at, tmp_path):
+    graph = {"kind": "edges", "edges": [[0, 1], [1, 2], [1, 3]]}
+    scenario = drifting(tmp_path, graph, at)
+    run = netkf.simulate(scenario)
+    assert run.count("lost") > 5
+    np.testing.assert_allclose(run.P[-1], batch(scenario, run), rtol=1e-9, atol=1e-12)
+    Sigma = theory.error_covariance(scenario, run)
+    close(Sigma, run.P, 1e-9)
+    close(error_law(scenario, run).P, run.P, 1e-9)
+    if at == "links":
+        return
+    table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+    assert table.loc[EXACT, "verdict"] == "holds"
+    assert set(table["verdict"]) <= {"holds", "undecided"}
+
+
+def test_too_sure_on_a_ring_under_clocks(tmp_path):
+    scenario = drifting(tmp_path, {"kind": "cycle", "nodes": 4}, "directions")
+    run = netkf.simulate(scenario)
+    Sigma = theory.error_covariance(scenario, run)
+    ratio = np.trace(Sigma[-1], axis1=-2, axis2=-1) / np.trace(run.P[-1], axis1=-2, axis2=-1)
+    assert ratio.min() > 1.5
+    table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+    assert table.loc[EXACT, "verdict"] == "not promised"
+    assert "broken" not in set(table["verdict"])
+
+
+def test_unstable_plants_keep_their_digits(tmp_path):
+    plant = {**STILL, "F": [[1.3, 0.2], [0.0, 1.2]]}
+    settings = {"plant": plant, "network": LOST_ON_TREE, "horizon": 151.0, "probe": [150.0]}
+    scenario = scenario_of({**BELIEF, "memory": "all"}, tmp_path, **settings)
+    run = netkf.simulate(scenario)
+    assert np.abs(run.x).max() > 1e12
+    nees = np.einsum("tia,tiab,tib->ti", run.error, np.linalg.inv(run.P), run.error)
+    assert nees.max() < 25.0
+
+
+def test_what_would_not_be_exact_is_refused(tmp_path):
+    words = "plant.Q: must be zero where belief propagation keeps messages"
+    with pytest.raises(netkf.ScenarioError, match=words):
+        scenario_of({**BELIEF, "memory": "all"}, tmp_path)
+    singular = {**STILL, "F": [[1.0, 0.0], [0.0, 0.0]]}
+    with pytest.raises(netkf.ScenarioError, match="which inverts covariances"):
+        scenario_of({**BELIEF, "memory": "all"}, tmp_path, plant=singular)
