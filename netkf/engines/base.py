@@ -76,14 +76,18 @@ class Engine(ABC):
         """The number of runs, a power of two, that are best handed out together at least."""
         return 1
 
-    def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
+    def run_many(
+        self, scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
+    ) -> Iterator[RunBatch]:
         """Yield the runs of consecutive ``replicas`` in order, as many at a time as suits the
-        engine; each run is to the last bit what ``run`` gives for its replica.
+        engine; each run is to the last bit what ``run`` gives for its replica. With
+        ``fingerprint``, the first batch has that of the events of its first run.
         """
         # Engines that have no batches run replicas one by one; only counts and samples are kept.
         for replica in replicas:
             sink = batch_sink(scenario, range(replica, replica + 1))
-            recorder = Recorder([sink], counts_only=True)
+            recorded = fingerprint and replica == replicas.start
+            recorder = Recorder([sink], counts_only=not recorded)
             # Streams depend on the seed and the replica alone: any division into calls gives the
             # same runs.
             status = self.run(scenario, Streams(seed, replica), recorder, silent)

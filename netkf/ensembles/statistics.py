@@ -84,15 +84,15 @@ def block_statistics(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int = 0
 ) -> RunStatistics:
     """Simulate a block of replicas and merge their statistics; the first ``traces`` replicas of the
-    ensemble keep everything too. Only their events and those of replica 0 have a fingerprint.
+    ensemble keep everything too. The fingerprint is that of replica 0.
     """
     tree, done = MergeTree(merge), 0
-    for batch, fingerprint, kept in _batches(scenario, seed, replicas, engine, traces):
+    for batch, kept in _batches(scenario, seed, replicas, engine, traces):
         pieces = list(aligned_pieces(done, done + len(batch)))
         values = run_values(batch, scenario, done)
         for number, (level, k) in enumerate(pieces):
             piece = merge_runs(values, number)
-            tree.add(k, piece._replace(fingerprint=fingerprint, traces=kept), level)
+            tree.add(k, piece._replace(fingerprint=batch.fingerprint, traces=kept), level)
         done += len(batch)
     whole: RunStatistics = tree.result()
     return whole
@@ -100,37 +100,29 @@ def block_statistics(
 
 def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
-) -> Iterator[tuple[RunBatch, str, tuple[Trace, ...]]]:
-    """Batches with the fingerprint and the traces of those that are a single recorded run."""
-    if traces == 0 and replicas.start == 0 and 1 < engine.together(scenario) <= len(replicas):
-        # Runs are side by side: one more costs nothing, and the batch is a whole node of the tree.
-        recorder = Recorder([])
-        engine.run(scenario, Streams(seed, 0), recorder, silent)
-        for batch in engine.run_many(scenario, seed, replicas):
-            yield batch, recorder.fingerprint, ()
-        return
-    recorded = min(max(traces, 1), replicas.stop)  # replica 0 always has a fingerprint
-    for replica in range(replicas.start, recorded):
-        yield _recorded_run(scenario, seed, replica, engine, replica < traces)
-    rest = range(max(replicas.start, recorded), replicas.stop)
+) -> Iterator[tuple[RunBatch, tuple[Trace, ...]]]:
+    """Batches, and the traces of those that are a single traced run; the batch of replica 0 has a
+    fingerprint.
+    """
+    for replica in range(replicas.start, min(traces, replicas.stop)):
+        yield _traced_run(scenario, seed, replica, engine)
+    rest = range(max(replicas.start, traces), replicas.stop)
     if rest:
-        for batch in engine.run_many(scenario, seed, rest):
-            yield batch, "", ()
+        for batch in engine.run_many(scenario, seed, rest, fingerprint=rest.start == 0):
+            yield batch, ()
 
 
-def _recorded_run(
-    scenario: Scenario, seed: int, replica: int, engine: Engine, traced: bool
-) -> tuple[RunBatch, str, tuple[Trace, ...]]:
-    """Simulate one replica with its fingerprint and, if it is ``traced``, its trace."""
+def _traced_run(
+    scenario: Scenario, seed: int, replica: int, engine: Engine
+) -> tuple[RunBatch, tuple[Trace, ...]]:
+    """Simulate one replica and keep its trace."""
     sink, memory = batch_sink(scenario, range(replica, replica + 1)), MemorySink()
-    recorder = Recorder([sink, memory] if traced else [sink])
+    recorder = Recorder([sink, memory])
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)
     sink.finish(recorder, status)
-    if not traced:
-        return sink.batch(), recorder.fingerprint, ()
     run = collect(scenario, memory, recorder, seed, replica, engine.name, status)
     trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
-    return sink.batch(), run.fingerprint, (trace,)
+    return sink.batch(), (trace,)
 
 
 class RunValues(NamedTuple):

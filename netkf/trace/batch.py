@@ -28,7 +28,8 @@ class RunBatch:
 
     ``counts`` (R, len(KINDS)) are events by kind and ``status`` (R,) holds complete or diverged.
     ``sums`` gives for each conserved sum its values (R, 2) at the start and at the last sample.
-    With ``exact_errors``, errors keep their digits however large the state is.
+    With ``exact_errors``, errors keep their digits however large the state is. ``fingerprint`` is
+    that of the events of the first run, empty if they were only counted.
 
     ``error`` is what the engine computes in the coordinates of its estimates; ``x - xhat`` of
     large states has fewer digits.
@@ -45,6 +46,7 @@ class RunBatch:
     status: np.ndarray
     sums: Mapping[str, FloatArray] = field(default_factory=dict)
     exact_errors: bool = False
+    fingerprint: str = ""
 
     def __len__(self) -> int:
         """Number of runs."""
@@ -79,6 +81,7 @@ class BatchSink(Sink):
         self._counts = np.zeros((len(replicas), len(KINDS)), dtype=np.int64)
         self._status: list[str] = []
         self._sums: list[dict[str, tuple[float, float]]] = []
+        self._fingerprint = ""
 
     def events(self, rows: np.ndarray) -> None:
         """Counted by the recorder."""
@@ -98,6 +101,8 @@ class BatchSink(Sink):
 
     def finish(self, recorder: Recorder, status: str) -> None:
         """End the present run; what follows belongs to the next replica."""
+        if not self._status:
+            self._fingerprint = recorder.fingerprint
         self._counts[len(self._status)] = recorder.counts
         self._status.append(status)
         self._sums.append(recorder.sums)
@@ -116,4 +121,5 @@ class BatchSink(Sink):
             status=np.array(self._status),
             sums={name: np.array([sums[name] for sums in self._sums]) for name in self._sums[0]},
             exact_errors=self.exact_errors,
+            fingerprint=self._fingerprint,
         )

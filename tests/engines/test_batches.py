@@ -33,10 +33,15 @@ CASES = {
 }
 
 
-def assert_alone(scenario, engine, seed, replicas):
+def assert_alone(scenario, engine, seed, replicas, fingerprint=False):
     """The batches of ``run_many`` hold the runs of ``run``, to the last bit."""
     done = []
-    for batch in engine.run_many(scenario, seed, replicas):
+    for batch in engine.run_many(scenario, seed, replicas, fingerprint):
+        if not fingerprint or done:
+            assert batch.fingerprint == ""
+        else:
+            first = netkf.simulate(scenario, seed, replicas[0], SimpyEngine())
+            assert batch.fingerprint == first.fingerprint
         done += batch.replicas
         for r, replica in enumerate(batch.replicas):
             run = netkf.simulate(scenario, seed, replica, engine)
@@ -72,16 +77,32 @@ def test_a_batch_of_one_where_memory_is_short(ring, monkeypatch):
 def test_compiled_batches_hold_the_runs_of_the_scenarios(name):
     scenario = netkf.load(FILES[name])
     horizon = min(scenario.horizon, SHORT.get(name, scenario.horizon))
-    assert_alone(scenario.replace({"horizon": horizon}), CompiledEngine(), 7, range(1, 4))
+    case = scenario.replace({"horizon": horizon})
+    # In slots the events of a run of a batch are recorded, else those of a run alone.
+    assert_alone(case, CompiledEngine(), 7, range(1, 4), fingerprint=scenario.slotted)
 
 
 @pytest.mark.parametrize("changes", [{}, {"filter": {"kind": "central"}}])
 def test_simpy_batches_hold_its_runs(ring, changes):
     case = ring.replace({"horizon": 3.0, **changes})
-    assert_alone(case, SimpyEngine(), 3, range(2, 5))
+    assert_alone(case, SimpyEngine(), 3, range(2, 5), fingerprint=True)
 
 
 def test_batches_hold_runs_that_diverge(build):
     grown = build(horizon=600.0, probe=10.0, plant=UNSTABLE, filter={"kind": "local"})
-    assert_alone(grown, CompiledEngine(), 0, range(3))
+    assert_alone(grown, CompiledEngine(), 0, range(3), fingerprint=True)
     assert_alone(grown.replace({"horizon": 450.0}), SimpyEngine(), 0, range(2))
+
+
+def test_batches_in_slots_hold_runs_that_diverge(build):
+    plant = {"kind": "linear", "F": [[2.0]], "Q": [[1.0]], "cov": [[1.0]], "period": 1.0}
+    grown = build(
+        horizon=1100.0,
+        probe=100.0,
+        plant=plant,
+        network={"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}},
+        filter={"kind": "local"},
+    )
+    (batch,) = CompiledEngine().run_many(grown, 0, range(3))
+    assert batch.diverged.all()
+    assert_alone(grown, CompiledEngine(), 0, range(3), fingerprint=True)

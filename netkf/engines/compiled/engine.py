@@ -95,15 +95,20 @@ class CompiledEngine(Engine):
             return 1
         return slot_setup(scenario).quick_runs()
 
-    def run_many(self, scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
+    def run_many(
+        self, scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
+    ) -> Iterator[RunBatch]:
         """Yield the runs of consecutive replicas in order."""
+        alone = partial(super().run_many, scenario, seed)
         if not scenario.slotted:
-            yield from flow_batches(scenario, seed, replicas)
+            # Batches make no rows of events.
+            first = replicas[: int(fingerprint)]
+            yield from alone(first, fingerprint)
+            yield from flow_batches(scenario, seed, replicas[len(first) :])
         # Messages made in Python come one run at a time.
         elif not slot_setup(scenario).is_drawn:
-            yield from super().run_many(scenario, seed, replicas)
+            yield from alone(replicas, fingerprint)
         else:
             # A run that diverges has to be repeated alone: batches carry it to the end.
-            alone = partial(super().run_many, scenario, seed)
-            for batch in slot_batches(scenario, seed, replicas):
+            for batch in slot_batches(scenario, seed, replicas, fingerprint):
                 yield with_ends(batch, alone)

@@ -341,11 +341,21 @@ def note(
 
 @kernel
 def make_rows(
-    stages: Stages, times: SlotTimes, c: Channels, h: Hearing, d: Drawn, pairwise: bool, rows: Rows
+    stages: Stages,
+    times: SlotTimes,
+    c: Channels,
+    h: Hearing,
+    d: Drawn,
+    pairwise: bool,
+    first: int,
+    stop: int,
+    rows: Rows,
 ) -> int:
-    """Write the events of a run that is alone, in their order; return how many there are."""
+    """Write the events of the first run in the slots from place ``first`` up to ``stop`` in their
+    order; return how many there are.
+    """
     at = 0
-    for s in range(len(times.start)):
+    for s in range(first, stop):
         # Filters that predict are sampled before anything happens in the slot.
         if times.predicts:
             mark_sample(times, s, rows, at)

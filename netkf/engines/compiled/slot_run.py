@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,7 +46,7 @@ from netkf.rng.numbers import normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
-from netkf.trace.recorder import Recorder
+from netkf.trace.recorder import LONG, Recorder
 from netkf.trace.schema import EVENT, KINDS
 
 NEVER = np.iinfo(np.int64).max
@@ -188,13 +189,15 @@ class SlotRuns:
         """Return True if all slots are done."""
         return self._slot >= self.setup.slots
 
-    def following(self, rows: int) -> SlotBlock:
-        """Carry the filters through the next slots, of about so many ``rows`` of events at most."""
+    def following(self, rows: int, timed: bool = True) -> SlotBlock:
+        """Carry the filters through the next slots, of about so many ``rows`` of events at most (0:
+        any number); events need slots that are ``timed``.
+        """
         setup, drawn = self.setup, None
         if self._events is None:
             # The kernels draw the messages of many slots and runs at once.
             count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
-            times = self._times(count, rows > 0)
+            times = self._times(count, timed)
             drawn = self._draw_messages(times)
         else:
             # Python makes the messages: as many slots as gave about so many rows.
@@ -333,19 +336,32 @@ class SlotRuns:
         """The EVENT rows of a block of one run and how many of them come before each sample."""
         if self._events is not None:
             return self._events.rows(self._stopped[0, :, 0])
+        at_sample = np.zeros(len(block.sampled), dtype=np.int64)
+        return self._rows(block, 0, len(block.times.start), at_sample), at_sample
+
+    def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
+        """Yield the EVENT rows of the first run of a batch, of some slots at a time."""
+        size = max(1, LONG // max(1, self.setup.rows_of(1)))
+        # Samples of a batch are counted from the first of the run.
+        at_sample = np.zeros(len(self.setup.samples), dtype=np.int64)
+        count = len(block.times.start)
+        for first in range(0, count, size):
+            yield self._rows(block, first, min(first + size, count), at_sample)
+
+    def _rows(self, block: SlotBlock, first: int, stop: int, at_sample: np.ndarray) -> np.ndarray:
+        """EVENT rows of the first run in the slots ``first`` to ``stop`` of a block; ``at_sample``
+        (T,) gets how many of them come before each sample there.
+        """
         setup = self.setup
         # Space for the largest number of rows.
-        size = setup.rows_of(len(block.times.start))
-        table = np.empty(size, dtype=EVENT)
+        table = np.empty(setup.rows_of(stop - first), dtype=EVENT)
         # Kernels write the columns where the records have them.
         places: Any = [table[name] for name in ROW_COLUMNS]
-        at_sample = np.zeros(len(block.sampled), dtype=np.int64)
-        rows = Rows._make([*places, at_sample])
         count = make_rows(
             setup.stages, block.times, self._channels, self._hearing(), block.drawn,
-            setup.algorithm.pairwise, rows,
+            setup.algorithm.pairwise, first, stop, Rows._make([*places, at_sample]),
         )  # fmt: skip
-        return table[:count], at_sample
+        return table[:count]
 
     def count_events(self, block: SlotBlock) -> None:
         """Add the events of a block to ``counts``."""
@@ -424,25 +440,36 @@ MOST_ROWS = 1 << 15
 """Rows of events that are made at once."""
 
 
-def slot_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
-    """Yield the runs of consecutive replicas in order."""
+def slot_batches(
+    scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
+) -> Iterator[RunBatch]:
+    """Yield the runs of consecutive replicas in order, the first with its ``fingerprint``."""
     setup = slot_setup(scenario)
     # As many runs side by side as fit the memory.
     size = setup.batch_runs()
     for first in range(replicas.start, replicas.stop, size):
         count = min(size, replicas.stop - first)
-        yield slot_batch(scenario, seed, range(first, first + count))
+        recorded = fingerprint and first == replicas.start
+        yield slot_batch(scenario, seed, range(first, first + count), recorded)
 
 
-def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
+def slot_batch(
+    scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
+) -> RunBatch:
     """Simulate consecutive replicas side by side; a run that diverges goes on to the end with what
     it has (``with_ends`` mends that).
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), whole=True)
     assert runs.shown is not None
+    # Without sinks: the rows of one run only pass by, for their fingerprint.
+    recorder = Recorder([], counts_only=not fingerprint)
     while not runs.over:
         with np.errstate(over="ignore", invalid="ignore"):
-            runs.count_events(runs.following(0))
+            block = runs.following(0, timed=fingerprint)
+        runs.count_events(block)
+        for rows in runs.first_events(block) if fingerprint else ():
+            recorder.extend(rows)
+    recorder.flush()
     x, xhat, P, error = runs.shown
     return RunBatch(
         replicas=replicas,
@@ -456,14 +483,20 @@ def slot_batch(scenario: Scenario, seed: int, replicas: range) -> RunBatch:
         status=np.where(runs.broken, DIVERGED, COMPLETE),
         sums=runs.conserved(),
         exact_errors=scenario.exact_errors,
+        fingerprint=recorder.fingerprint,
     )
 
 
-def with_ends(batch: RunBatch, alone: Callable[[range], Iterator[RunBatch]]) -> RunBatch:
-    """The batch with every run that diverges as it is ``alone``, where it ends."""
+def with_ends(batch: RunBatch, alone: Callable[[range, bool], Iterator[RunBatch]]) -> RunBatch:
+    """The batch with every run that diverges as it is ``alone``, where it ends; it gets the
+    replicas and whether their fingerprint is wanted.
+    """
     # A run that diverges goes on in a batch; its true end is that of the run alone.
     for r in np.flatnonzero(batch.diverged).tolist():
-        (one,) = alone(batch.replicas[r : r + 1])
+        fingerprint = r == 0 and bool(batch.fingerprint)
+        (one,) = alone(batch.replicas[r : r + 1], fingerprint)
+        if fingerprint:
+            batch = replace(batch, fingerprint=one.fingerprint)
         for name in ("x", "xhat", "P", "error", "lengths", "counts", "status"):
             getattr(batch, name)[r] = getattr(one, name)[0]
         for name, values in batch.sums.items():
