@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
-from netkf.theory.push_sum import averaging, mean_square
-from netkf.theory.push_sum import covariance as push_sum_covariance
+from netkf.theory.numerics import positive_maps
+from netkf.theory.push_sum import averaging
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import RHO_T1, T1, of_case, planar, scenario
 
@@ -173,13 +173,11 @@ def test_the_methods_for_large_networks_agree_with_dense_ones(settings, monkeypa
     radius, P = theory.push_sum_radius(made), theory.push_sum_error_covariance(made)
     monkeypatch.setattr(averaging, "MAX_KRONECKER", 1)
     assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
-    monkeypatch.setattr(mean_square, "MAX_DENSE_FALLBACK", 1)
-    monkeypatch.setattr(push_sum_covariance, "MAX_DENSE_FALLBACK", 1)
+    monkeypatch.setattr(positive_maps, "MAX_DENSE_FALLBACK", 1)
     assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7, atol=1e-12)
     monkeypatch.undo()
-    monkeypatch.setattr(mean_square, "MAX_DENSE", 40)
-    monkeypatch.setattr(push_sum_covariance, "MAX_DENSE", 40)
+    monkeypatch.setattr(positive_maps, "MAX_DENSE", 10**6)
     assert theory.push_sum_radius(made) == pytest.approx(radius, rel=1e-11)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7, atol=1e-12)
 
@@ -297,7 +295,7 @@ def test_close_to_the_threshold_the_errors_are_still_exact(monkeypatch):
     radius = theory.push_sum_radius(made)
     assert 0.9999 < radius < 1.0
     P = theory.push_sum_error_covariance(made)
-    monkeypatch.setattr(push_sum_covariance, "MAX_DENSE", 40)
+    monkeypatch.setattr(positive_maps, "MAX_DENSE", 10**6)
     np.testing.assert_allclose(theory.push_sum_error_covariance(made), P, rtol=1e-7)
 
 

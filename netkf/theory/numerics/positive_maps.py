@@ -1,80 +1,182 @@
 """Linear maps on symmetric matrices that keep them positive semidefinite: radius and fixed point.
 
 A map T takes and gives a stack (S, M, M) of symmetric matrices, such as second moments in each of S
-modes. Its spectral radius is an eigenvalue with a semidefinite stack (Krein and Rutman), and below
-1 if and only if ``X = T(X) + Q`` has a semidefinite solution for a positive definite Q.
+modes. Its spectral radius is an eigenvalue with a semidefinite stack X (Krein and Rutman), the
+rightmost one, which Arnoldi's method computes and a positive definite X proves (Collatz and
+Wielandt). If X is singular and proves nothing, small systems are solved by dense eigenvalues. The
+radius is below 1 if and only if ``X = T(X) + Q`` has a semidefinite solution for a positive
+definite Q.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 
 PositiveMap = Callable[[FloatArray], FloatArray]
+Shape = tuple[int, ...]
 
-MAX_DENSE = 40
-"""Numbers in a stack up to which T is a dense matrix."""
+MAX_DENSE, MAX_DENSE_FALLBACK = 55, 820
+"""Numbers in the triangles of a stack up to which T is a dense matrix: always, or if an iteration
+fails."""
+PROOF_TOLERANCE = 1e-6  # relative, between the radius and the bound that X proves
 KRYLOV_VECTORS, RESTARTS = 24, 200
-RESIDUAL, MAX_ROUNDS = 1e-11, 20
+RESIDUAL, MAX_ROUNDS = 1e-10, 20
 
 
-def spectral_radius(T: PositiveMap, shape: tuple[int, ...]) -> float:
+def spectral_radius(T: PositiveMap, shape: Shape) -> float:
     """Return the spectral radius of a positive map on stacks of a ``shape`` (S, M, M).
 
-    Raises TheoryError if the iteration does not converge.
+    Raises TheoryError if it is neither proved nor found by two different searches.
     """
-    start = np.broadcast_to(np.eye(shape[-1]), shape).ravel()
-    if len(start) <= MAX_DENSE:
-        columns = [_apply(T, shape)(unit) for unit in np.eye(len(start))]
-        return float(np.abs(np.linalg.eigvals(np.stack(columns, axis=1))).max())
-    try:
-        values = scipy.sparse.linalg.eigs(
-            _operator(_apply(T, shape), len(start)),
-            k=1,
-            which="LR",  # an eigenvalue, so that none has a larger real part
-            v0=start,
-            ncv=KRYLOV_VECTORS,
-            maxiter=RESTARTS,
-            tol=1e-10,
-            return_eigenvectors=False,
-        )
-    except scipy.sparse.linalg.ArpackError as error:
-        raise TheoryError(f"the mean-square radius was not found: {error}") from None
-    return float(values[0].real)
+    if _numbers(shape) > MAX_DENSE:
+        value, X = _extreme(T, np.broadcast_to(np.eye(shape[-1]), shape), "LR")
+        if _least_factor(T, X) <= value * (1.0 + PROOF_TOLERANCE):
+            return value
+        if _numbers(shape) > MAX_DENSE_FALLBACK:
+            return _confirmed(T, X, value)
+    return float(np.abs(np.linalg.eigvals(_dense(T, shape))).max())
 
 
 def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
     """Return the solution (S, M, M) of ``X = T(X) + Q`` by GMRES with refinement, for a positive
     map of spectral ``radius`` below 1.
 
-    Its residual is below RESIDUAL times 1 - radius, relative to the largest entry of X. Raises
-    TheoryError if that is not reached.
+    Its residual is below RESIDUAL times 1 - radius, relative to the standard deviations of row and
+    column. Raises TheoryError if that is not reached.
     """
-    apply, X = _apply(T, Q.shape), np.array(Q)
-    operator = _operator(lambda x: x - apply(x), Q.size)
+    # The error of the solution is up to 1 / (1 - radius) times the residual.
+    tolerance = RESIDUAL * max(1.0 - radius, 1e-3)
+    few, X = _numbers(Q.shape) <= MAX_DENSE, np.array(Q)
     for _ in range(MAX_ROUNDS):
         rest = Q + T(X) - X
-        # The error of the solution is up to 1 / (1 - radius) times the residual.
-        if np.abs(rest).max() <= RESIDUAL * max(1.0 - radius, 1e-3) * np.abs(X).max():
+        if _is_small(rest, X, tolerance):
             return symmetric(X)
-        step, _ = scipy.sparse.linalg.gmres(
-            operator, rest.ravel(), rtol=1e-8, atol=0.0, restart=KRYLOV_VECTORS, maxiter=20
-        )
-        X = X + symmetric(np.asarray(step).reshape(Q.shape))
+        X = X + (_eliminated(T, rest) if few else _by_gmres(T, rest))
+    if not few and _numbers(Q.shape) <= MAX_DENSE_FALLBACK:
+        return _eliminated(T, Q)
     raise TheoryError(f"the mean squares were solved to {np.abs(rest).max():.1e} only")
 
 
-def _apply(T: PositiveMap, shape: tuple[int, ...]) -> Callable[[FloatArray], FloatArray]:
-    """Return T on vectors; what is not symmetric in a vector does not count."""
-    return lambda x: np.asarray(T(symmetric(np.reshape(x, shape))).ravel())
+def _numbers(shape: Shape) -> int:
+    """Return how many numbers the upper triangles of a stack have."""
+    return shape[0] * shape[-1] * (shape[-1] + 1) // 2
 
 
-def _operator(
-    apply: Callable[[FloatArray], FloatArray], size: int
-) -> scipy.sparse.linalg.LinearOperator:
-    return scipy.sparse.linalg.LinearOperator((size, size), matvec=apply, dtype=np.float64)
+def _confirmed(T: PositiveMap, X: FloatArray, value: float) -> float:
+    """Return the radius ``value`` if a different search, for the largest modulus from another
+    start, agrees; raises TheoryError if not.
+    """
+    start = X + np.diag(np.linspace(0.5, 1.5, X.shape[-1])) * np.trace(X.sum(axis=0))
+    again, _ = _extreme(T, start, "LM")
+    if not abs(again - value) <= 1e-8 * value:
+        raise TheoryError(f"the radius is not certain: searches found {value:.8g} and {again:.8g}")
+    return value
+
+
+def _extreme(
+    T: PositiveMap, start: FloatArray, which: Literal["LR", "LM"]
+) -> tuple[float, FloatArray]:
+    """Return the modulus of an extreme eigenvalue of T and its X (S, M, M), of positive trace.
+
+    The search begins at ``start``: a positive definite one has a component along X.
+    """
+    shape = start.shape
+    try:
+        values, vectors = scipy.sparse.linalg.eigs(
+            _operator(T, shape),
+            k=1,
+            which=which,
+            v0=start.ravel(),
+            ncv=KRYLOV_VECTORS,
+            tol=1e-12,
+            maxiter=RESTARTS,
+        )
+    except scipy.sparse.linalg.ArpackError as error:
+        if _numbers(shape) <= MAX_DENSE_FALLBACK:
+            return 0.0, np.zeros(shape)  # proves nothing
+        raise TheoryError(f"the mean-square radius was not found: {error}") from None
+    X = symmetric(vectors[:, 0].real.reshape(shape))
+    return float(abs(values[0])), X * np.sign(np.trace(X.sum(axis=0)))
+
+
+def _least_factor(T: PositiveMap, X: FloatArray) -> float:
+    """Return the least c with T(X) <= c X, which bounds the radius; inf if X is not definite."""
+    try:
+        roots = np.linalg.cholesky(X)
+    except np.linalg.LinAlgError:
+        return np.inf
+    return max(_largest_ratio(moved, L) for moved, L in zip(T(X), roots, strict=True))
+
+
+def _largest_ratio(moved: FloatArray, L: FloatArray) -> float:
+    """Return the largest eigenvalue of ``L^-1 moved L^-T``, for lower triangular L (M, M)."""
+    half = scipy.linalg.solve_triangular(L, moved, lower=True)
+    scaled = scipy.linalg.solve_triangular(L, half.T, lower=True)
+    return float(np.linalg.eigvalsh(symmetric(scaled))[-1])
+
+
+def _is_small(rest: FloatArray, X: FloatArray, tolerance: float) -> bool:
+    """Return True if a residual is below ``tolerance`` for every entry of X."""
+    variances = np.abs(np.diagonal(X, axis1=1, axis2=2)).sum(axis=0)
+    deviations = np.sqrt(variances)
+    # Small variances must be accurate too, beside large ones of other states.
+    allowed = np.outer(deviations, deviations) + 1e-6 * variances.max(initial=0.0)
+    return bool((np.abs(rest) <= tolerance * allowed).all())
+
+
+def _triangles(shape: Shape) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the indices of the upper triangles of a stack: of matrices, rows and columns."""
+    rows, columns = np.triu_indices(shape[-1])
+    which = np.repeat(np.arange(shape[0]), len(rows))
+    return which, np.tile(rows, shape[0]), np.tile(columns, shape[0])
+
+
+def _dense(T: PositiveMap, shape: Shape) -> FloatArray:
+    """Return T as a matrix on upper triangles."""
+    at, columns = _triangles(shape), []
+    for s, i, j in zip(*at, strict=True):
+        unit = np.zeros(shape)
+        unit[s, i, j] = unit[s, j, i] = 1.0
+        columns.append(T(unit)[at])
+    return np.stack(columns, axis=1)
+
+
+def _eliminated(T: PositiveMap, right: FloatArray) -> FloatArray:
+    """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination."""
+    s, i, j = at = _triangles(right.shape)
+    X = np.zeros_like(right)
+    X[s, i, j] = X[s, j, i] = np.linalg.solve(
+        np.eye(len(s)) - _dense(T, right.shape), symmetric(right)[at]
+    )
+    return X
+
+
+def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
+    """Return an approximate solution (S, M, M) of ``X - T(X) = right``."""
+    x, _ = scipy.sparse.linalg.gmres(
+        _operator(lambda X: X - T(X), right.shape),
+        right.ravel(),
+        rtol=1e-8,
+        atol=0.0,
+        restart=KRYLOV_VECTORS,
+        maxiter=20,
+    )
+    return symmetric(np.asarray(x).reshape(right.shape))
+
+
+def _operator(apply: PositiveMap, shape: Shape) -> scipy.sparse.linalg.LinearOperator:
+    """Return a map on vectors; what is not symmetric in a vector does not count."""
+    size = int(np.prod(shape))
+    return scipy.sparse.linalg.LinearOperator(
+        (size, size),
+        matvec=lambda x: np.asarray(apply(symmetric(np.reshape(x, shape))).ravel()),
+        dtype=np.float64,
+    )

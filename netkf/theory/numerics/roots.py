@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import copy_matrix, solve_inplace
@@ -22,30 +23,11 @@ def triangularise(parts: FloatArray, n: int, columns: int) -> None:
     """Write lower triangular S (n, n) with ``S S' = parts parts'`` over the first n columns of
     ``parts`` (n, at least n), of which ``columns`` count; the others become rubbish.
     """
-    # Householder reflections of columns, from the right: they leave parts parts' as it is.
-    for i in range(min(n, columns)):
-        square = 0.0
-        for c in range(i, columns):
-            square += parts[i, c] * parts[i, c]
-        size = math.sqrt(square)
-        if size == 0.0:
-            continue
-        # The sign for which the difference loses no digits.
-        diagonal = -size if parts[i, i] > 0.0 else size
-        head = parts[i, i] - diagonal
-        for r in range(i + 1, n):
-            dot = head * parts[r, i]
-            for c in range(i + 1, columns):
-                dot += parts[r, c] * parts[i, c]
-            dot /= size * abs(head)
-            parts[r, i] -= dot * head
-            for c in range(i + 1, columns):
-                parts[r, c] -= dot * parts[i, c]
-        parts[i, i] = diagonal
-        for c in range(i + 1, columns):
-            parts[i, c] = 0.0
-    for i in range(columns, n):
-        for c in range(columns, n):
+    # Reflections from the right leave parts parts' as it is.
+    for i in range(n):
+        reflect(parts, i, n, columns)
+        # What is right of the diagonal, and what does not count.
+        for c in range(min(i + 1, columns), max(n, columns)):
             parts[i, c] = 0.0
 
 
