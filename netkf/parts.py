@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.belief_propagation import BeliefPropagation
+from netkf.algorithms.consensus_innovations import ConsensusInnovations
 from netkf.algorithms.constant_gain import ConstantGain
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
 from netkf.algorithms.diffusion import DiffusionFilter
@@ -21,6 +22,7 @@ from netkf.algorithms.filter import (
     Increments,
     Message,
     Model,
+    NetworkInfo,
     NodeInfo,
     Reading,
     State,
@@ -127,6 +129,7 @@ __all__ = [
     "Channel",
     "Clock",
     "Complete",
+    "ConsensusInnovations",
     "ConstantDelay",
     "ConstantGain",
     "CovarianceIntersection",
@@ -167,6 +170,7 @@ __all__ = [
     "Message",
     "Model",
     "Network",
+    "NetworkInfo",
     "NoDelay",
     "NoLoss",
     "NodeInfo",

@@ -54,6 +54,17 @@ class Model(Protocol):
         """Return the seconds of increments that may be used at once from this root on."""
 
 
+class NetworkInfo(NamedTuple):
+    """The whole network of N nodes, for filters whose gains are computed before a run.
+
+    information (N, n, n): H' R^-1 H of each node's sensors, as the filters believe it; heard: the
+    places, from 0 in the order of ids, of the nodes that each can hear.
+    """
+
+    information: FloatArray
+    heard: tuple[tuple[int, ...], ...]
+
+
 class NodeInfo(NamedTuple):
     """Facts that a node may know about itself and the network at time 0.
 
@@ -61,7 +72,7 @@ class NodeInfo(NamedTuple):
     it; nodes: how many there are in all; own_weight: what is left to it when the messages of all
     neighbours arrive; information (n, n): the sum of H' R^-1 H over all sensors, as the filters
     believe it; max_delay: the longest time a message may take, seconds (inf where unbounded);
-    place: its place in the order of ids, from 0.
+    place: its place in the order of ids, from 0; network: of all nodes, if it ``needs_network``.
     """
 
     node: int
@@ -72,6 +83,7 @@ class NodeInfo(NamedTuple):
     information: FloatArray
     max_delay: float = 0.0
     place: int = 0
+    network: NetworkInfo | None = None
 
 
 class Exchange(NamedTuple):
@@ -183,6 +195,7 @@ class Filter(Component):
               class only; None: it runs in the SimPy engine
     newest_only    of several messages of one sender at one instant the newest counts
     fixed_sensors  it adds up information, so the H of a sensor must not vary
+    needs_network  ``NodeInfo.network`` is told to its nodes
     randomised     in slots ``emit`` is given a number ``Exchange.uniform``, from the stream
                    "trigger" of the node, which nothing else draws from
     paper        the paper whose theory and checks speak about it: rooms of that name
@@ -206,6 +219,7 @@ class Filter(Component):
     newest_only: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = False
     randomised: ClassVar[bool] = False
+    needs_network: ClassVar[bool] = False
     paper: ClassVar[str] = ""
     combination: ClassVar[str] = ""
     P_by_design: ClassVar[tuple[str, str]] = ("", "")

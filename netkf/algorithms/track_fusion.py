@@ -34,6 +34,7 @@ from netkf.algorithms.kernels.slots import (
 )
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.starts import require_common_start
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, field
 from netkf.linalg.arrays import FloatArray, square_root
@@ -243,15 +244,8 @@ class BarShalomCampo(Filter):
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where tracks do not begin alike or H varies."""
-        starts = [scenario.start(node) for node in scenario.nodes]
-        mean, cov = starts[0]
-        if not all(np.array_equal(m, mean) and np.array_equal(C, cov) for m, C in starts):
-            raise ScenarioError(
-                "filter.mean",
-                "must be that of all nodes, and cov too: cross-covariances begin there",
-                "several",
-                "give one mean and cov, or use optimised-covariance-intersection",
-            )
+        why = "where cross-covariances begin"
+        require_common_start(scenario, why, "optimised-covariance-intersection")
         for k, sensor in enumerate(scenario.sensors):
             if sensor.varying:
                 raise ScenarioError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.filter import NodeInfo, commutes
+from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval_for
 from netkf.algorithms.models import FlowModel, SlotModel
 from netkf.core.errors import TheoryError
@@ -64,18 +65,39 @@ class DerivedScenario(ScenarioModel):
     def node_infos(self) -> tuple[NodeInfo, ...]:
         """The facts that each node may use about itself and the network, in order of ``nodes``."""
         information = np.zeros((self.plant.n, self.plant.n))
-        for node in self.nodes:
-            H, R = self._stacked(self.placed.get(node, ()), believed=True)
-            information = information + symmetric(H.T @ np.linalg.solve(R, H))
+        for one in self._informations:
+            information = information + one
         degrees, own, size = self.topology.degrees, self.own_weights, len(self.nodes)
         receivers = dict.fromkeys(self.nodes, 0)
         for sender, _ in self.topology.directions:
             receivers[sender] += 1
         delay = 0.0 if self.slotted else self.network.channel.delay.longest
+        network = self._network_info
         return tuple(
-            NodeInfo(node, degrees[node], receivers[node], size, own[node], information, delay, k)
+            NodeInfo(
+                node, degrees[node], receivers[node], size, own[node], information, delay, k,
+                network,
+            )
             for k, node in enumerate(self.nodes)
-        )
+        )  # fmt: skip
+
+    @property
+    def _informations(self) -> Iterator[FloatArray]:
+        """``H' R^-1 H`` (n, n) of the sensors of each node, as the filters believe it."""
+        for node in self.nodes:
+            H, R = self._stacked(self.placed.get(node, ()), believed=True)
+            yield symmetric(H.T @ np.linalg.solve(R, H))
+
+    @property
+    def _network_info(self) -> NetworkInfo | None:
+        """The whole network, for filters that ask for it."""
+        if not self.hosted.needs_network:
+            return None
+        heard: dict[int, list[int]] = {node: [] for node in self.nodes}
+        for sender, receiver in self.topology.directions:
+            heard[receiver].append(self.topology.index[sender])
+        places = tuple(tuple(sorted(heard[node])) for node in self.nodes)
+        return NetworkInfo(np.stack(list(self._informations)), places)
 
     @property
     def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Exchange, Message, NodeInfo, Reading
+from netkf.algorithms.filter import Exchange, Message, NetworkInfo, NodeInfo, Reading
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.testing.estimates import check_estimate, check_state_pickles
@@ -49,8 +49,7 @@ class Trial(ABC):
         """The present shift of the truth (n,)."""
         self.nodes, self.weights = _network(self.part)
         models = [self.model(sees=node != 1) for node in self.nodes]
-        information = np.sum([model.information for model in models], axis=0)
-        self.states = [self._start(node, models[node], information) for node in self.nodes]
+        self.states = [self._start(node, models) for node in self.nodes]
         self.models = models
         check_state_pickles(watched, self.states[0])
 
@@ -62,11 +61,16 @@ class Trial(ABC):
     def run(self) -> None:
         """Let everything happen that may happen."""
 
-    def _start(self, node: int, model: Any, information: FloatArray) -> Any:
+    def _start(self, node: int, models: Sequence[Any]) -> Any:
         others = len(self.nodes) - 1
         own = max(0.0, 1.0 - float(self.weights[:, node].sum()))
-        info = NodeInfo(node, others, others, others + 1, own, information, MAX_DELAY)
-        state = self.watched.call("init", model, self.system.mean, self.system.cov, info)
+        parts = np.stack([model.information for model in models])
+        heard = tuple(tuple(j for j in self.nodes if j != i) for i in self.nodes)
+        info = NodeInfo(
+            node, others, others, others + 1, own, parts.sum(axis=0), MAX_DELAY, node,
+            NetworkInfo(parts, heard),
+        )  # fmt: skip
+        state = self.watched.call("init", models[node], self.system.mean, self.system.cov, info)
         self.show(node, state, "init")
         return state
 

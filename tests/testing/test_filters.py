@@ -40,6 +40,7 @@ SOUND = {
         parts.BeliefPropagation(steps=2),
         parts.BeliefPropagation(memory="all"),
     ],
+    "consensus-innovations": [parts.ConsensusInnovations()],
     "kcf": [parts.Kcf(epsilon=0.2)],
     "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [

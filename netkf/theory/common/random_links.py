@@ -156,6 +156,20 @@ def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait
     )
 
 
+def messages_are_sure(scenario: Scenario) -> bool:
+    """Return True if every message of a scenario in slots arrives in its exchange."""
+    channel = scenario.network.channel
+    delay = channel.delay.fixed
+    return (
+        delay is not None
+        and delay <= scenario.phase_length
+        and all(
+            channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
+            for link in scenario.topology.directions
+        )
+    )
+
+
 def _require_law(scenario: Scenario) -> None:
     """Raise TheoryError where losses or delays have no law that can be used here."""
     channel = scenario.network.channel

@@ -15,7 +15,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.jumps import SlotJumps
-from netkf.theory.common.random_links import ways_of
+from netkf.theory.common.random_links import messages_are_sure, ways_of
 from netkf.theory.intermittent.riccati import steady_covariance
 
 
@@ -56,13 +56,7 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
 
 def _require_sure_links(scenario: Scenario) -> None:
     """Raise TheoryError unless every message arrives in its slot."""
-    channel = scenario.network.channel
-    delay = channel.delay.fixed
-    sure = delay is not None and delay <= scenario.phase_length
-    for link in scenario.topology.directions:
-        table = scenario.table_probability(link)
-        sure = sure and channel.loss.mean_delivery(link, table) == 1.0
-    if not sure:
+    if not messages_are_sure(scenario):
         raise TheoryError(
             "gains follow the readings that arrive; exact steady mean squares of kcf are known "
             "with share_readings = false, or where nothing is lost"

@@ -1,0 +1,324 @@
+"""Consensus plus innovations with optimal gains: Das and Moura, "Consensus+Innovations distributed
+Kalman filter with optimized gains", IEEE Trans. Signal Processing 65, 2017.
+
+With ``G = sum_i H_i' R_i^-1 H_i`` of all sensors each node estimates the state x and the
+pseudo-state y = G x, of which its pseudo-observation ``H_i' R_i^-1 z_i`` shows a part:
+
+    yhat+ = yhat + sum_l B_il (yhat_l - yhat) + M_i (H_i' R_i^-1 z_i - H_i' R_i^-1 H_i G^+ yhat)
+    xhat+ = xhat + K_i (yhat+ - G xhat)
+
+then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G^+ G) xhat+)``. The
+gains are those of the Gauss-Markov theorem: B and M minimise the mean square error of yhat+, and K
+that of xhat+. They follow from the joint covariance of the errors of all nodes, in which nothing
+depends on data, and which is computed as if no message were lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.root_update import lower_root
+from netkf.algorithms.registry import built_in
+from netkf.algorithms.starts import require_common_start
+from netkf.linalg.arrays import FloatArray, square_root
+
+NEGLIGIBLE = 1e-6
+"""Deviation of a difference, relative to those of its terms, that counts as rounding."""
+SETTLED = 1e-14
+"""Relative change of covariances in a slot from which on gains are taken to be constant."""
+
+
+class Design(NamedTuple):
+    """All that gains depend on, as keys: numbers of states and nodes; F, Q (n, n), the covariance
+    of x(0) and ``information`` (N, n, n) as bytes; the places of the nodes that each one hears.
+    """
+
+    n: int
+    nodes: int
+    F: bytes
+    Q: bytes
+    cov: bytes
+    information: bytes
+    heard: tuple[tuple[int, ...], ...]
+
+
+class NodeGains(NamedTuple):
+    """The gains of one node in one slot.
+
+    B : (d, n, n) for the d nodes that it hears, in the order of their places
+    M, K : (n, n) of the pseudo-observation, and of the pseudo-state
+    predicted, root : (n, n) roots of the covariance of x - xhat before and after
+    """
+
+    B: FloatArray
+    M: FloatArray
+    K: FloatArray
+    predicted: FloatArray
+    root: FloatArray
+
+
+class PseudoStates(NamedTuple):
+    """The matrices (n, n) by which pseudo-states belong to states: G, its pseudo-inverse, and
+    ``A = G F G^+`` and ``rest = G F (I - G^+ G)`` of their prediction.
+    """
+
+    G: FloatArray
+    inverse: FloatArray
+    A: FloatArray
+    rest: FloatArray
+
+
+def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
+    """Return the matrices of pseudo-states, ``information`` (n, n) being that of all sensors."""
+    inverse = np.asarray(np.linalg.pinv(information, hermitian=True))
+    seen = inverse @ information
+    return PseudoStates(
+        information, inverse, information @ F @ inverse, information @ F @ (np.eye(len(F)) - seen)
+    )
+
+
+class GainSequence:
+    """The gains of all nodes from slot 1 on, computed when they are asked for.
+
+    Errors are rows of factors of independent inputs, those of ``x - xhat_i`` of all nodes and then
+    those of ``y - yhat_i``: differences of nearly equal estimates keep their digits.
+    """
+
+    def __init__(self, design: Design) -> None:
+        n, N = design.n, design.nodes
+        self._heard, self._n = design.heard, n
+        F, Q, cov = (np.frombuffer(one).reshape(n, n) for one in (design.F, design.Q, design.cov))
+        self._information = np.frombuffer(design.information).reshape(N, n, n)
+        self._pseudo = p = pseudo_states(F, self._information.sum(axis=0))
+        self._noises = [square_root(one) for one in self._information]
+        # All estimates start at one mean, and the plant's noise is one.
+        alike = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(p.G, (N, 1))])
+        self._driven, self._errors = alike @ square_root(Q), alike @ square_root(cov)
+        one = np.block([[F, np.zeros((n, n))], [p.rest, p.A]])
+        blocks = np.einsum("aibj,kl->akiblj", one.reshape(2, n, 2, n), np.eye(N))
+        self._step = blocks.reshape(2 * N * n, 2 * N * n)
+        self._found: list[tuple[NodeGains, ...]] = []
+        self._settled = False
+
+    def at(self, slot: int) -> tuple[NodeGains, ...]:
+        """Return the gains of all nodes in a slot, counted from 1."""
+        while len(self._found) < slot and not self._settled:
+            self._found.append(self._advance())
+            self._settled = len(self._found) > 1 and self._is_settled(*self._found[-2:])
+        return self._found[min(slot, len(self._found)) - 1]
+
+    @staticmethod
+    def _is_settled(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
+        """Return True if no covariance has changed by more than rounding."""
+        roots = (np.stack([one.root for one in gains]) for gains in (before, now))
+        old, new = (S @ np.swapaxes(S, 1, 2) for S in roots)
+        return bool(np.abs(new - old).max() <= SETTLED * np.abs(new).max())
+
+    def _advance(self) -> tuple[NodeGains, ...]:
+        """Carry the errors through a slot, and return its gains."""
+        nodes = range(len(self._heard))
+        self._errors = np.hstack([self._step @ self._errors, self._driven])
+        predicted = [self._root(i) for i in nodes]
+        gains = self._correct_pseudo_states()
+        K = [self._correct_state(i) for i in nodes]
+        # Only products of rows count: as many inputs as rows are enough.
+        self._errors = np.asarray(np.linalg.qr(self._errors.T, mode="r")).T
+        return tuple(
+            NodeGains(B, M, K[i], predicted[i], self._root(i)) for i, (B, M) in enumerate(gains)
+        )
+
+    def _x(self, i: int) -> FloatArray:
+        """Return the error (n, inputs) of a node's xhat, which may be written to."""
+        return self._errors[i * self._n : (i + 1) * self._n]
+
+    def _y(self, i: int) -> FloatArray:
+        """Return the error (n, inputs) of a node's yhat."""
+        return self._x(len(self._heard) + i)
+
+    def _root(self, i: int) -> FloatArray:
+        return lower_root(np.ascontiguousarray(self._x(i)))
+
+    def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Correct all yhat at once; return B (d, n, n) and M (n, n) of each node."""
+        n, N, width = self._n, len(self._heard), self._errors.shape[1]
+        self._errors = np.hstack([self._errors, np.zeros((len(self._errors), N * n))])
+        gains, corrected = [], []
+        for i, heard in enumerate(self._heard):
+            e, seen = self._y(i), self._information[i] @ self._pseudo.inverse
+            innovation = seen @ e
+            # The noise of the pseudo-observation has the covariance H' R^-1 H.
+            innovation[:, width + i * n : width + (i + 1) * n] = self._noises[i]
+            theta = np.concatenate([*(e - self._y(j) for j in heard), innovation])
+            sizes = [variances(e) + variances(self._y(j)) for j in heard]
+            sizes.append(np.square(seen) @ variances(e) + np.diag(self._information[i]))
+            gain = optimal_gain(e, theta, np.concatenate(sizes))
+            corrected.append(e - gain @ theta)
+            split = np.stack(np.split(gain, len(heard) + 1, axis=1))
+            gains.append((split[:-1], split[-1]))
+        self._errors[N * n :] = np.concatenate(corrected)
+        return gains
+
+    def _correct_state(self, i: int) -> FloatArray:
+        """Correct xhat_i by ``yhat_i - G xhat_i``, which is ``G e - e_y``; return K (n, n)."""
+        G, e, e_y = self._pseudo.G, self._x(i), self._y(i)
+        theta = G @ e - e_y
+        K = optimal_gain(e, theta, np.square(G) @ variances(e) + variances(e_y))
+        e -= K @ theta
+        return K
+
+
+def variances(errors: FloatArray) -> FloatArray:
+    """Return the variances (k,) of errors (k, inputs)."""
+    return np.asarray(np.square(errors).sum(axis=1))
+
+
+def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatArray:
+    """Return ``E[e theta'] E[theta theta']^+`` (n, k) of errors e (n, inputs) and what corrects
+    them, theta (k, inputs), differences of ``terms`` (k,) so large in variance.
+    """
+    # What is left of a difference of equal estimates is rounding, and counts as 0.
+    scale = np.divide(1.0, np.sqrt(terms), out=np.zeros_like(terms), where=terms > 0.0)
+    U, S, V = np.linalg.svd(scale[:, None] * theta, full_matrices=False)
+    used = S > NEGLIGIBLE
+    return np.asarray((e @ V[used].T / S[used]) @ (U[:, used].T * scale))
+
+
+@lru_cache(maxsize=8)
+def gain_sequence(design: Design) -> GainSequence:
+    """Return the gains of a network, which all of its nodes and runs share."""
+    return GainSequence(design)
+
+
+class PseudoState(NamedTuple):
+    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance and the model; the estimate of the
+    pseudo-state, ``yhat`` (n,), and the matrices of ``pseudo``-states; the pseudo-observation (n,)
+    of this ``slot``; the ``design``, and the node's ``place`` in it.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    model: Any
+    yhat: FloatArray
+    pseudo: PseudoStates
+    observed: FloatArray | None
+    slot: int
+    design: Design
+    place: int
+
+    @property
+    def P(self) -> FloatArray:
+        """``root root'`` (n, n)."""
+        return self.root @ self.root.T
+
+    @property
+    def gains(self) -> NodeGains:
+        """The node's gains of this slot."""
+        return gain_sequence(self.design).at(self.slot)[self.place]
+
+
+class PseudoEstimate(NamedTuple):
+    """A payload: the sender's ``yhat`` (n,), its ``place``, and G (n, n), which all nodes know."""
+
+    yhat: FloatArray
+    place: int
+    G: FloatArray
+
+
+@built_in("consensus-innovations")
+@dataclass(frozen=True, eq=False)
+class ConsensusInnovations(Filter):
+    """Estimates of the pseudo-state move towards those of the neighbours and the node's own
+    observation, and estimates of the state towards them, with gains that are optimal for the whole
+    network; all nodes know its sensors and links.
+
+    P is the covariance of the error if no message is lost. A term whose message is lost is left
+    out, and P is then too small.
+    """
+
+    paper: ClassVar[str] = "consensus_innovations"
+    combination: ClassVar[str] = "pseudo-states"
+    clocks: ClassVar[tuple[str, ...]] = ()
+    first_slot: ClassVar[int] = 1
+    one_way: ClassVar[bool] = True
+    fixed_sensors: ClassVar[bool] = True
+    needs_network: ClassVar[bool] = True
+
+    def check_scenario(self, scenario: Any) -> None:
+        """Raise ScenarioError where estimates do not begin alike."""
+        require_common_start(scenario, "from which gains are computed", "hcmci")
+
+    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+        """A message is an estimate of the pseudo-state."""
+        return n
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PseudoState:
+        """Return the first state of a node, which knows the whole network."""
+        network = node.network
+        assert network is not None
+        F, Q, start, information = (
+            np.asarray(part, dtype=np.float64).tobytes()
+            for part in (model.F, model.Q, cov, network.information)
+        )
+        size = len(mean), len(network.information)
+        design = Design(*size, F, Q, start, information, network.heard)
+        pseudo = pseudo_states(model.F, network.information.sum(axis=0))
+        root = lower_root(square_root(cov))
+        return PseudoState(mean, root, model, pseudo.G @ mean, pseudo, None, 0, design, node.place)
+
+    def predict(self, state: PseudoState, gap: float) -> PseudoState:
+        """Predict both estimates."""
+        pseudo, slot = state.pseudo, state.slot
+        xhat, yhat = state.xhat, state.yhat
+        for _ in range(round(gap / state.model.period)):
+            yhat = pseudo.A @ yhat + pseudo.rest @ xhat
+            xhat, slot = state.model.F @ xhat, slot + 1
+        state = state._replace(xhat=xhat, yhat=yhat, slot=slot, observed=None)
+        return state._replace(root=state.gains.predicted)
+
+    def update(self, state: PseudoState, reading: Reading) -> PseudoState:
+        """Keep the pseudo-observation for the exchange of the slot."""
+        if not len(reading.y):
+            return state
+        return state._replace(observed=reading.H.T @ np.linalg.solve(reading.R, reading.y))
+
+    def emit(self, state: PseudoState, exchange: Exchange) -> tuple[PseudoState, PseudoEstimate]:
+        """Send the prediction of the pseudo-state."""
+        return state, PseudoEstimate(state.yhat, state.place, state.pseudo.G)
+
+    def absorb(
+        self, state: PseudoState, messages: Sequence[Message], exchange: Exchange
+    ) -> PseudoState:
+        """Correct the pseudo-state by what was heard and observed, and the state by that."""
+        gains, pseudo, place = state.gains, state.pseudo, state.place
+        order = state.design.heard[place]
+        yhat = state.yhat.copy()
+        for message in messages:
+            B = gains.B[order.index(message.payload.place)]
+            yhat += B @ (message.payload.yhat - state.yhat)
+        if state.observed is not None:
+            n = len(yhat)
+            own = np.frombuffer(state.design.information).reshape(-1, n, n)[place]
+            yhat += gains.M @ (state.observed - own @ pseudo.inverse @ state.yhat)
+        xhat = state.xhat + gains.K @ (yhat - pseudo.G @ state.xhat)
+        return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
+
+    def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
+        """Affine: gains multiply differences."""
+        observed = state.observed
+        if observed is not None:
+            n = len(offset)
+            own = np.frombuffer(state.design.information).reshape(-1, n, n)[state.place]
+            observed = observed + own @ offset
+        return state._replace(
+            xhat=state.xhat + offset, yhat=state.yhat + state.pseudo.G @ offset, observed=observed
+        )
+
+    def shift_payload(self, payload: PseudoEstimate, offset: FloatArray) -> PseudoEstimate:
+        """Move the pseudo-state."""
+        return payload._replace(yhat=payload.yhat + payload.G @ offset)

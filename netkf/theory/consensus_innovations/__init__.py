@@ -1,0 +1,1 @@
+"""Theory of consensus plus innovations: exact errors and assumptions."""

@@ -1,0 +1,22 @@
+"""Assumptions under which P of consensus plus innovations is the covariance of the error."""
+
+from __future__ import annotations
+
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import AssumptionRow, true_model_row
+from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.random_links import messages_are_sure
+
+SOURCE = "Das and Moura 2017"
+SURE = "no message is lost"
+
+
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows about the model, the messages and the first covariances."""
+    sure = messages_are_sure(scenario)
+    words = "every message arrives in its slot" if sure else "gains are those without losses"
+    return [
+        true_model_row(scenario, SOURCE, "same F, Q and R"),
+        (SURE, SOURCE, sure, words),
+        *start_rows(scenario, SOURCE),
+    ]

@@ -1,0 +1,85 @@
+"""Exact errors of consensus plus innovations along the messages of a run.
+
+Beside the errors e of states each node has the difference ``u = G xhat - yhat`` of its estimates of
+the pseudo-state, which no noise of the plant enters: it is predicted by ``G F G^+``. The error of
+yhat is ``u + G e``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import numpy as np
+
+from netkf.algorithms.consensus_innovations import ConsensusInnovations, gain_sequence
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.trace.run import Run
+
+
+class PseudoStateRule(ErrorRule):
+    """Corrections by the gains of a network without losses; what is lost is left out."""
+
+    def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        super().__init__(scenario, errors)
+        algorithm = scenario.filter.algorithm
+        assert isinstance(algorithm, ConsensusInnovations)
+        self._seen: HostObservations = {}
+        state = algorithm.init(
+            scenario.slot_models[0], *scenario.start(scenario.nodes[0]), scenario.node_infos[0]
+        )
+        self._design, self._pseudo = state.design, state.pseudo
+        self._slot = 0
+        for host in range(errors.hosts):
+            errors.stack.put(_difference(host), np.zeros((errors.n, 0)))
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Predict the differences, and keep the readings of the slot."""
+        self._seen, self._slot, stack = observations, self._slot + 1, self.errors.stack
+        for host in range(self.errors.hosts):
+            stack.put(_difference(host), self._pseudo.A @ stack.form(_difference(host)))
+        gains = gain_sequence(self._design).at(self._slot)
+        for host, one in enumerate(gains):
+            self.errors.roots[host] = one.predicted
+
+    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
+        """Correct all estimates by what was heard and read."""
+        errors, G, hosts = self.errors, self._pseudo.G, range(self.errors.hosts)
+        columns = errors.reading_noises(self._seen)
+        states = [errors.stack.form(host) for host in hosts]
+        before = [errors.stack.form(_difference(i)) + G @ states[i] for i in hosts]
+        after = [form.copy() for form in before]
+        gains = gain_sequence(self._design).at(self._slot)
+        for message in messages:
+            i, j = message.receiver, message.sender
+            B = gains[i].B[self._design.heard[i].index(j)]
+            after[i] += B @ (before[j] - before[i])
+        for i, one in self._seen.items():
+            weighted = np.linalg.solve(one.R, one.H).T
+            seen = weighted @ one.H
+            after[i] -= gains[i].M @ seen @ self._pseudo.inverse @ before[i]
+            after[i][:, columns[i]] -= gains[i].M @ weighted @ one.root
+        for i in hosts:
+            e = states[i] - gains[i].K @ (G @ states[i] - after[i])
+            self._set(i, e, after[i] - G @ e)
+            errors.roots[i] = gains[i].root
+
+    def _set(self, host: int, e: FloatArray, u: FloatArray) -> None:
+        self.errors.stack.put(host, e)
+        self.errors.stack.put(_difference(host), u)
+
+
+def _difference(host: int) -> Hashable:
+    return ("difference", host)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run."""
+    require_traced_exchanges(scenario, run)
+    return PseudoStateRule(scenario, errors)

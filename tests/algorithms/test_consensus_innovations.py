@@ -1,0 +1,202 @@
+"""Consensus plus innovations: its textbook, optimal gains, P without losses, and refusals."""
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf import theory
+from netkf.theory.common.errors import error_law
+from tests.algorithms.test_literature import (
+    CENTRAL,
+    GRAPH,
+    heard_by_slot,
+    scenario_of,
+    states,
+    textbook,
+)
+from tests.theory.test_replay import close, engine_covariance
+
+FILTER = {"kind": "consensus-innovations"}
+SURE = {"graph": GRAPH, "activation": {"kind": "broadcast"}}
+EXACT = "P is the covariance of the error, given the events"
+
+
+def gauss_markov(e, theta, sizes):
+    """``E[e t'] E[t t']^+``; what is small beside the terms that it is a difference of is 0."""
+    size = np.where(sizes > 0.0, np.sqrt(sizes), 1.0)
+    U, S, _ = np.linalg.svd(theta / size[:, None], full_matrices=False)
+    used = S > 1e-6
+    part = U[:, used] / size[:, None]
+    return e @ theta.T @ part / S[used] ** 2 @ part.T
+
+
+def variances(*forms):
+    return sum(np.sum(form**2, axis=1) for form in forms)
+
+
+def gains_by_slot(scenario, slots):
+    """B, M, K and P of every node in each slot, from the joint covariance of all errors, each of
+    which is a dictionary of factors of x, y and noises in the columns of one large matrix.
+    """
+    F, Q = scenario.plant.F, scenario.plant.Q
+    N, n, eye = len(scenario.nodes), len(F), np.eye(len(F))
+    info = [H.T @ np.linalg.inv(R) @ H for H, R in map(scenario.observation, scenario.nodes)]
+    G = sum(info)
+    V = np.linalg.pinv(G)
+    neighbours = [
+        sorted({a if b == i else b for a, b in scenario.topology.links if i in (a, b)})
+        for i in scenario.nodes
+    ]
+    L = np.linalg.cholesky(scenario.plant.cov)
+    # Rows of factors of independent unit noises: e_x and e_y of each node.
+    ex, ey = [L.copy() for _ in range(N)], [G @ L for _ in range(N)]
+    rootQ, found = np.linalg.cholesky(Q), []
+    for _ in range(slots):
+        zero = np.zeros((n, n))
+        ex = [np.hstack([F @ e, rootQ]) for e in ex]
+        ey = [
+            np.hstack([G @ F @ V @ f + G @ F @ (eye - V @ G) @ e[:, :-n], G @ rootQ])
+            for e, f in zip(ex_before(ex, F), ey, strict=True)
+        ]
+        width = ex[0].shape[1]
+        ex = [np.hstack([e, *[zero] * N]) for e in ex]
+        ey = [np.hstack([f, *[zero] * N]) for f in ey]
+        noise = []
+        for i in range(N):
+            values, vectors = np.linalg.eigh(info[i])
+            root = vectors * np.sqrt(np.maximum(values, 0.0))
+            s = np.zeros((n, width + N * n))
+            s[:, width + i * n : width + (i + 1) * n] = root
+            noise.append(s)
+        gains, new = [], []
+        for i in range(N):
+            theta = [ey[i] - ey[j] for j in neighbours[i]] + [info[i] @ V @ ey[i] + noise[i]]
+            theta = np.vstack(theta)
+            sizes = [variances(ey[i], ey[j]) for j in neighbours[i]]
+            squares = (info[i] @ V) ** 2 @ variances(ey[i])
+            W = gauss_markov(ey[i], theta, np.concatenate([*sizes, squares + np.diag(info[i])]))
+            new.append(ey[i] - W @ theta)
+            gains.append(W)
+        ey = new
+        K, fresh = [], []
+        for e, f in zip(ex, ey, strict=True):
+            d = G @ e - f
+            K.append(gauss_markov(e, d, G**2 @ variances(e) + variances(f)))
+            fresh.append(e - K[-1] @ d)
+        ex = fresh
+        found.append((gains, K, [e @ e.T for e in ex]))
+        # As many columns as rows: only products of rows count.
+        triangle = np.linalg.qr(np.vstack(ex + ey).T, mode="r").T
+        parts = np.split(triangle, 2 * N)
+        ex, ey = parts[:N], parts[N:]
+    return G, V, info, neighbours, found
+
+
+def ex_before(ex, F):
+    """Undo the prediction of factors, so that pseudo-states are predicted from the same errors."""
+    V = np.linalg.inv(F)
+    return [np.hstack([V @ e[:, : -len(F)], e[:, -len(F) :]]) for e in ex]
+
+
+def expected_states(scenario, run):
+    G, V, info, neighbours, gains = gains_by_slot(scenario, len(run.times) - 1)
+    heard = heard_by_slot(scenario, run, 1)
+    F, n, N = scenario.plant.F, len(G), len(info)
+    yhat, last = [np.zeros(n)] * N, [np.zeros(n)] * N
+
+    def step(slot, x, P, readings):
+        nonlocal yhat, last
+        W, K, C = gains[slot - 1]
+        yhat = [
+            G @ F @ V @ f + G @ F @ (np.eye(n) - V @ G) @ e for e, f in zip(last, yhat, strict=True)
+        ]
+        up = heard.get(slot, np.zeros((1, N, N)))[0]
+        new = []
+        for i in range(N):
+            theta = [up[i, j] * (yhat[j] - yhat[i]) for j in neighbours[i]]
+            z = np.zeros(n)
+            if i in readings:
+                y, H, R = readings[i]
+                z = H.T @ np.linalg.inv(R) @ y - info[i] @ V @ yhat[i]
+            new.append(yhat[i] + W[i] @ np.concatenate([*theta, z]))
+        yhat = new
+        last = [one + K[i] @ (yhat[i] - G @ one) for i, one in enumerate(x)]
+        return last, C
+
+    found = list(textbook(scenario, run, step))
+    return np.stack([x for x, _ in found]), np.stack([P for _, P in found])
+
+
+@pytest.mark.parametrize("lossy", [False, True])
+def test_the_textbook(lossy, tmp_path):
+    # With four states optimal gains of nearly equal estimates have fewer digits than P has.
+    for n in (1, 2, 4):
+        more = {} if lossy else {"network": SURE}
+        scenario = scenario_of(FILTER, tmp_path, 1, n, **more)
+        run = netkf.simulate(scenario)
+        xhat, P = expected_states(scenario, run)
+        np.testing.assert_allclose(run.P, P, rtol=1e-10, atol=1e-10)
+        digits = 1e-10 if n < 4 else 1e-8
+        np.testing.assert_allclose(run.xhat, xhat, rtol=digits, atol=digits)
+
+
+@pytest.mark.parametrize("lossy", [False, True])
+def test_theory_follows_it_and_p_is_the_covariance_without_losses(lossy, tmp_path):
+    more = {"horizon": 4.0, "probe": [0.0, 1.0, 2.0, 3.0]} | ({} if lossy else {"network": SURE})
+    scenario = scenario_of(FILTER, tmp_path, 2, 3, **more)
+    run = netkf.simulate(scenario)
+    exact, _ = engine_covariance(scenario)
+    Sigma = theory.error_covariance(scenario, run)
+    close(Sigma, exact, 1e-9)
+    close(error_law(scenario, run).P, run.P, 1e-9)
+    gap = np.abs(np.linalg.eigvalsh(run.P - Sigma)).max()
+    assert gap > 1e-3 if lossy else gap < 1e-10
+
+
+def test_a_pseudo_state_that_hides_a_direction(tmp_path):
+    """Sensors of one coordinate of two that the plant couples: G has no inverse."""
+    plant = {"kind": "linear", "F": [[1.0, 0.5], [0.0, 0.9]], "Q": [[0.1, 0.0], [0.0, 0.2]]}
+    plant |= {"cov": [[1.0, 0.0], [0.0, 2.0]], "period": 1.0}
+    sensors = [{"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[0.3]]}]
+    more = {"plant": plant, "sensors": sensors, "network": SURE}
+    scenario = scenario_of(FILTER, tmp_path, **more)
+    run = netkf.simulate(scenario)
+    xhat, P = expected_states(scenario, run)
+    np.testing.assert_allclose(run.P, P, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
+    close(theory.error_covariance(scenario, run), run.P, 1e-9)
+
+
+def test_better_than_gains_that_are_not_optimal_and_no_better_than_central(tmp_path):
+    more = {"network": SURE, "horizon": 41.0, "probe": [40.0]}
+    traces = []
+    for algorithm in (CENTRAL, FILTER, {"kind": "local"}):
+        scenario = scenario_of(algorithm, tmp_path, 1, **more)
+        Sigma = theory.error_covariance(scenario, netkf.simulate(scenario))
+        traces.append(np.trace(Sigma[0], axis1=-2, axis2=-1))
+    central, ours, local = traces
+    assert (central <= ours + 1e-12).all()
+    assert (ours < local).all()
+
+
+def test_checks_promise_p_without_losses(tmp_path):
+    for more, verdict in (({"network": SURE}, "holds"), ({}, "not promised")):
+        scenario = scenario_of(FILTER, tmp_path, 1, horizon=9.0, **more)
+        table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+        assert table.loc[EXACT, "verdict"] == verdict
+        assert "broken" not in set(table["verdict"])
+
+
+def test_estimates_that_start_apart_are_refused(tmp_path):
+    mean = [[float(k), 0.0] for k in range(5)]
+    with pytest.raises(netkf.ScenarioError, match="must be that of all nodes"):
+        scenario_of({**FILTER, "mean": mean}, tmp_path)
+
+
+def test_gains_settle_and_stay(tmp_path):
+    """Long runs do not compute gains for ever, and P is the fixed point of the recursion."""
+    scenario = scenario_of(FILTER, tmp_path, 1, network=SURE, horizon=401.0, probe=[300.0, 400.0])
+    run = netkf.simulate(scenario)
+    np.testing.assert_array_equal(run.P[0], run.P[1])
+    _, P = states(FILTER, tmp_path, seed=1, network=SURE, horizon=402.0, probe=[100.0])
+    np.testing.assert_allclose(P[0], run.P[1], rtol=1e-8)
