@@ -34,6 +34,28 @@ def test_closed_streams_stop_nothing(line, status):
     assert (done.returncode, done.stderr) == (status, "")
 
 
+LONG = """
+import argparse, sys
+from netkf.cli import main
+def run(options):
+    print("x" * 1_000_000)
+    print("more", flush=True)
+    return 1
+class Parser:
+    def parse_args(self, arguments):
+        return argparse.Namespace(run=run)
+main.make_parser = Parser
+main.main()
+"""
+
+
+def test_an_answer_of_no_stays_one_where_nobody_reads_it():
+    line = '"$0" -c "$1" | head -c 0; exit ${PIPESTATUS[0]}'
+    words = ["bash", "-c", line, sys.executable, LONG]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 def test_a_run_without_streams_is_complete(tmp_path):
     """The first files that are opened would get the numbers of the closed streams."""
     out = tmp_path / "out"

@@ -35,12 +35,13 @@ from netkf.runs.files import (
     write_atomically,
     write_scenario,
     write_text,
+    writing,
 )
 from netkf.runs.provenance import machine, versions
 from netkf.scenario.scenario import Scenario
 
-RESULTS, VERDICT = "results.npz", "verdict.json"
-FILES = (RESULTS, "verdict.csv", "verdict.txt", "verdict.png")
+RESULTS, VERDICT, PICTURE = "results.npz", "verdict.json", "verdict.png"
+FILES = (RESULTS, "verdict.csv", "verdict.txt", PICTURE)
 """Files that a check writes before the verdict itself."""
 
 
@@ -61,6 +62,9 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     with write_atomically(directory / "verdict.csv") as part:
         verdict.table.to_csv(part, index=False)
     write_text(directory / "verdict.txt", text + "\n")
+    # A picture of fewer runs is none of this verdict.
+    with writing(directory / PICTURE):
+        (directory / PICTURE).unlink(missing_ok=True)
     document = verdict_json(verdict)
     document |= {
         "digest": scenario_digest(scenario),

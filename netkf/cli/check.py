@@ -7,8 +7,9 @@ import contextlib
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from netkf.cli import pictures
 from netkf.cli.options import (
     FAILED,
     Command,
@@ -21,7 +22,6 @@ from netkf.cli.options import (
     print_json,
     print_notes,
 )
-from netkf.cli.pictures import VERDICT, load_drawing, print_missing
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 
@@ -89,14 +89,16 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
         )
     text = verdict_text(verdict, scenario.claim, _replay_command(options))
     print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
-    if options.out is not None:
-        _save(scenario, verdict, text, options)
-    if options.json:
-        print_json(verdict_json(verdict))
-    else:
-        print(text)
+    try:
         if options.out is not None:
-            print(f"written to {options.out}")
+            _save(scenario, verdict, text, options)
+    finally:  # a verdict whose files cannot be written is an answer too
+        if options.json:
+            print_json(verdict_json(verdict))
+        else:
+            print(text)
+    if options.out is not None and not options.json:
+        print(f"written to {options.out}")
     return 0 if verdict else FAILED
 
 
@@ -130,17 +132,13 @@ def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
 
 
 def _save(scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace) -> None:
-    """Write the files of a verdict, and its picture if matplotlib is there."""
+    """Write the files of a verdict, and its picture if that is possible."""
     from netkf.checks.storage import save_verdict
 
     save_verdict(options.out, scenario, verdict, text)
-    if options.no_plot:
-        return
-    draw: Any = load_drawing(VERDICT)
-    if draw is None:
-        print_missing()
-    else:
-        draw(options.out / "verdict.png", verdict, scenario.claim)
+    if not options.no_plot:
+        path = options.out / "verdict.png"
+        pictures.draw_picture(pictures.VERDICT, path, verdict, scenario.claim)
 
 
 def _replay_command(options: argparse.Namespace) -> str:

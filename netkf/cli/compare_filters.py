@@ -47,6 +47,13 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from netkf.runs.directory_lock import only_writer
+
+    with only_writer(options.out, empty=True):
+        return _compare(options)
+
+
+def _compare(options: argparse.Namespace) -> int:
     from netkf.scenario.values import typed_values
     from netkf.studies.compare_filters import compare_filters, write_comparison
     from netkf.studies.tables import filters_text
@@ -64,18 +71,19 @@ def _run(options: argparse.Namespace) -> int:
             scheduler=options.scheduler,
             progress=line.counter("filters"),
         )
-    written = None
-    if options.out is not None:
-        written = write_comparison(scenario, comparison, options.out)
-        if not options.no_plot:
-            pictures.draw_picture(pictures.FILTERS, scenario, written)
-    if options.json:
-        print_json(comparison.document())
-        return 0
-    print_title(scenario)
-    print(f"\n{filters_text(comparison)}")
-    if written is not None:
-        print(f"written to {written.directory}")
+    try:
+        if options.out is not None:
+            written = write_comparison(scenario, comparison, options.out)
+            if not options.no_plot:
+                pictures.draw_picture(pictures.FILTERS, scenario, written)
+    finally:  # a comparison whose files cannot be written is an answer too
+        if options.json:
+            print_json(comparison.document())
+        else:
+            print_title(scenario)
+            print(f"\n{filters_text(comparison)}")
+    if options.out is not None and not options.json:
+        print(f"written to {options.out}")
     return 0
 
 

@@ -81,8 +81,6 @@ def _attempt(arguments: Sequence[str], interruption: Interruption) -> _Ending:
         sys.stdout.flush()
     except OutputError as error:
         discard_output()
-        if isinstance(error.__cause__, BrokenPipeError):
-            return _Ending(0)
         return _Ending(BAD_USAGE, f"cannot write: {_reason(error.__cause__)}")
     except Exception as error:
         line = _explain(error)

@@ -1,20 +1,21 @@
-"""Pictures of finished runs; without matplotlib a run is complete but has none."""
+"""Pictures of finished runs, which are complete without one: it never decides the exit status."""
 
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from netkf.scenario.scenario import Scenario
+from netkf.cli.options import print_notes
+from netkf.core.errors import WriteError
 
 RUN = "netkf.figures.pictures", "run_picture"
 ENSEMBLE = "netkf.figures.pictures", "ensemble_picture"
 SWEEP = "netkf.studies.picture", "sweep_picture"
 FILTERS = "netkf.studies.filter_picture", "filter_picture"
 VERDICT = "netkf.checks.picture", "verdict_picture"
+UNSHOWN = {SWEEP: "it shows one or two keys", VERDICT: "no row has an interval"}
+"""Why a drawing function has returned False."""
 
 
 def load_drawing(function: tuple[str, str]) -> Callable[..., Any] | None:
@@ -27,15 +28,16 @@ def load_drawing(function: tuple[str, str]) -> Callable[..., Any] | None:
     return draw
 
 
-def draw_picture(function: tuple[str, str], scenario: Scenario, completed: Any) -> None:
-    """Draw the picture of a completed run or ensemble, or print why there is none."""
+def draw_picture(function: tuple[str, str], *results: Any) -> None:
+    """Draw a picture of ``results``, or print a note that says why there is none."""
     draw = load_drawing(function)
     if draw is None:
-        print_missing()
+        print_notes(["no picture: matplotlib is missing (pip install matplotlib)"])
         return
-    draw(scenario, completed)
-
-
-def print_missing() -> None:
-    """Print that matplotlib is missing and how to install it."""
-    print("no picture: matplotlib is missing (pip install matplotlib)", file=sys.stderr)
+    try:
+        shown = draw(*results)
+    except WriteError as error:
+        print_notes([f"no picture: {error}"])
+    else:
+        if shown is False:
+            print_notes([f"no picture: {UNSHOWN[function]}"])

@@ -161,7 +161,8 @@ class SafeStream:
 
     write  : a text with its control characters escaped, as far as the stream can encode it
     direct : a text as it is
-    A ``lossy`` stream drops what cannot be written; else OutputError is raised.
+    A ``lossy`` stream drops what cannot be written; else OutputError is raised, but where nobody
+    reads any more: that stops no command.
     """
 
     def __init__(self, stream: TextIO, lossy: bool) -> None:
@@ -193,6 +194,9 @@ class SafeStream:
     def _failures(self) -> Iterator[None]:
         try:
             yield
+        except BrokenPipeError:
+            if not self._lossy:
+                discard_output(self._stream)
         except (OSError, ValueError) as error:  # ValueError: the stream is closed
             if not self._lossy:
                 raise OutputError(getattr(error, "errno", None), str(error)) from error
@@ -211,10 +215,10 @@ def safe_streams() -> Iterator[None]:
         sys.stdout, sys.stderr = before
 
 
-def discard_output() -> None:
+def discard_output(stream: Any = None) -> None:
     """Send the rest of standard output to the null device; it would fail again at the end."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
 
 
 def run_as_process(command: Callable[[Interruption], int]) -> NoReturn:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,6 +51,7 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.studies.sweep import sweep_to_directory
 
     grid, scenario = parse_grid(options.vary), load_scenario(options)
+    draw = partial(pictures.draw_picture, pictures.SWEEP, scenario.name)
     with only_writer(options.out), ProgressLine() as line:
         completed = sweep_to_directory(
             scenario,
@@ -62,7 +62,7 @@ def _run(options: argparse.Namespace) -> int:
             options.workers,
             options.scheduler,
             progress=line.counter("points"),
-            finish=None if options.no_plot else partial(_draw, scenario),
+            finish=None if options.no_plot else draw,
         )
     if options.json:
         rows = completed.table.to_dict("records")
@@ -82,15 +82,6 @@ def _print_sweep(scenario: Scenario, completed: CompletedSweep, runs: int) -> No
     line += f" in {completed.seconds:.2f} s, all with the same random draws"
     print(line + ("; +- one standard error" if runs > 1 else ""))
     print(f"written to {completed.directory}")
-
-
-def _draw(scenario: Scenario, completed: CompletedSweep) -> None:
-    draw = pictures.load_drawing(pictures.SWEEP)
-    if draw is None:
-        pictures.print_missing()
-    elif not draw(scenario.name, completed):
-        reason = "it shows one or two keys"
-        print(f"no picture: {reason}", file=sys.stderr)
 
 
 COMMAND = Command(

@@ -57,11 +57,18 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from netkf.studies.why import why
+    from netkf.runs.directory_lock import only_writer
 
     if (options.node is None) != (options.at is None):
         remedy = "give both, or neither for the worst sample"
         raise ScenarioError("why", "takes --node and --at together", None, remedy)
+    with only_writer(options.out, empty=True):
+        return _explain(options)
+
+
+def _explain(options: argparse.Namespace) -> int:
+    from netkf.studies.why import why
+
     node, at = options.node, options.at
     if node is None:
         node, at = _worst_sample(options)
@@ -75,12 +82,14 @@ def _run(options: argparse.Namespace) -> int:
         replays=options.replays,
         trust=options.trust,
     )
-    if options.out is not None:
-        _keep(found, options.out)
-    if options.json:
-        print_json(found.to_dict())
-    else:
-        print(found)
+    try:
+        if options.out is not None:
+            _keep(found, options.out)
+    finally:  # an answer that cannot be kept is one too
+        if options.json:
+            print_json(found.to_dict())
+        else:
+            print(found)
     return 0
 
 
@@ -108,13 +117,12 @@ def _worst_sample(options: argparse.Namespace) -> tuple[int, float]:
 
 
 def _keep(found: Why, directory: Path) -> None:
-    """Write why.txt, why.json and why.csv into a new directory."""
-    from netkf.runs.files import new_directory, write_atomically, write_json, write_text
+    """Write why.txt, why.json and why.csv."""
+    from netkf.runs.files import write_atomically, write_json, write_text
 
-    folder = new_directory(directory, "why")
-    write_text(folder / "why.txt", f"{found}\n")
-    write_json(folder / "why.json", found.to_dict())
-    with write_atomically(folder / "why.csv") as part:
+    write_text(directory / "why.txt", f"{found}\n")
+    write_json(directory / "why.json", found.to_dict())
+    with write_atomically(directory / "why.csv") as part:
         found.table.to_csv(part, index=False)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +18,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.documents import COUNT, NUMBER, DamagedError, check_files
 from netkf.runs.files import scenario_digest
 from netkf.runs.parquet_files import column_names, read_numbers
-from netkf.runs.stored import SUMMARY, StoredRun, read_form, read_run
-from netkf.runs.summary import PromisedTraces, promise_traces
+from netkf.runs.stored import SUMMARY, StoredRun, WithPromises, read_form, read_run
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import ensemble_columns
 
@@ -32,7 +30,7 @@ FORM["messages"] = {f"{name}?": NUMBER for name in MESSAGES}
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class StoredEnsemble(Ensemble):
+class StoredEnsemble(WithPromises, Ensemble):
     """An ensemble that is read back from ``directory``, with its ``manifest`` and ``summary``.
 
     ``status`` is complete, diverged, interrupted or failed; of one that did not finish it has the
@@ -43,17 +41,6 @@ class StoredEnsemble(Ensemble):
     manifest: dict[str, Any]
     summary: dict[str, Any]
     status: str
-
-    @cached_property
-    def promised(self) -> PromisedTraces:
-        """Return what theory promises at the sample times: bound, limit, centralised filter."""
-        assert self.scenario is not None
-        return promise_traces(self.scenario, self.times)
-
-    @property
-    def bound(self) -> FloatArray | None:
-        """Traces (T, N) of the bound H(12) at the sample times, None if it does not apply."""
-        return self.promised.bound
 
     def replica(self, number: int = 0) -> StoredRun:
         """Return one run of the ensemble; raises ScenarioError if its trace was not kept."""

@@ -19,6 +19,9 @@ from typing import Any, TypeVar, cast, overload
 from netkf.linalg.linking import linked_once
 from netkf.linalg.shortcuts import kernel_compiler, without_collection
 
+ROOT = Path(__file__).parents[1]
+"""The folder of netkf."""
+
 ROOMS = (
     "linalg",
     "rng",
@@ -201,19 +204,23 @@ def announce(function: Callable[..., Any]) -> None:
         print(words, file=sys.stderr, flush=True)
 
 
+def source_digest(*rooms: str) -> str:
+    """Return 16 hexadecimal digits of the digest of netkf's modules, or of those of ``rooms``."""
+    digest = hashlib.sha256()
+    files = [file for room in rooms or ("",) for file in (ROOT / room).rglob("*.py")]
+    for file in sorted(files):
+        digest.update(f"{file.relative_to(ROOT).as_posix()}\0".encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
 @cache
 def _folder(chosen: str) -> Path:
     """Return the folder of compiled code: one for each state of the sources."""
-    root = Path(__file__).parents[1]
-    sources = hashlib.sha256()
-    # A kernel may hold constants and kernels of any of these folders, so each of their files
-    # counts.
-    files = [file for room in ROOMS for file in (root / room).rglob("*.py")]
-    for file in sorted(files):
-        # A change of any byte makes a new folder: compiled code is never out of date.
-        sources.update(file.read_bytes())
-    name = f"netkf-{sources.hexdigest()[:16]}"
-    kept = _kept_in(chosen, root)
+    # A kernel may hold constants and kernels of any of these rooms, and a change of any byte makes
+    # a new folder: compiled code is never out of date.
+    name = f"netkf-{source_digest(*ROOMS)}"
+    kept = _kept_in(chosen, ROOT)
     if not (kept / name).exists():
         _make_room(kept)
     return kept / name

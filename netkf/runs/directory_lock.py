@@ -11,16 +11,16 @@ from hashlib import sha256
 from pathlib import Path
 
 from netkf.core.errors import ScenarioError
-from netkf.runs.files import make_directory
+from netkf.runs.files import make_directory, new_directory
 
 
 @contextlib.contextmanager
-def only_writer(directory: Path | None) -> Iterator[None]:
+def only_writer(directory: Path | None, empty: bool = False) -> Iterator[None]:
     """Make a directory and lock it for the body; the operating system unlocks it if this process
     dies. It is removed again if it was made here and is empty at the end. Nothing for None.
 
-    Raises ScenarioError if another command has locked it, or if it cannot be made. A note says so
-    where a file system has no locks.
+    Raises ScenarioError if another command has locked it, if it cannot be made, or if it has to be
+    ``empty`` and is not. A note says so where a file system has no locks.
     """
     if directory is None:
         yield
@@ -30,6 +30,8 @@ def only_writer(directory: Path | None) -> Iterator[None]:
     make_directory(directory)
     try:
         with _locked(directory):
+            if empty:
+                new_directory(directory, "")
             yield
     finally:
         if made:

@@ -9,12 +9,12 @@ import os
 import platform
 from functools import cache
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from netkf.core.version import __version__
+from netkf.linalg.compiling import source_digest
 
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "simpy", "networkx")
 """Arithmetic and random draws (numpy, scipy), compiled code (numba, llvmlite), order of events
@@ -34,7 +34,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def _versions() -> dict[str, str]:
-    found = {"netkf": __version__, "source": _source(), "python": platform.python_version()}
+    found = {"netkf": __version__, "source": source_digest(), "python": platform.python_version()}
     for package in PACKAGES:
         try:
             found[package] = metadata.version(package)
@@ -44,15 +44,6 @@ def _versions() -> dict[str, str]:
     if "name" in blas:
         found["blas"] = f"{blas['name']} {blas.get('version', '')}".strip()
     return found
-
-
-def _source() -> str:
-    """Return 16 hexadecimal digits of the digest of netkf's modules."""
-    folder, digest = Path(__file__).parents[1], hashlib.sha256()
-    for file in sorted(folder.rglob("*.py")):
-        digest.update(f"{file.relative_to(folder).as_posix()}\0".encode())
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()[:16]
 
 
 @cache

@@ -58,8 +58,25 @@ MANIFEST: dict[str, Any] = {
 TABLES = ("states.parquet", "events.parquet")
 
 
+class WithPromises:
+    """What theory promises about results that are read back: they know their scenario and times."""
+
+    scenario: Any
+    times: FloatArray
+
+    @cached_property
+    def promised(self) -> PromisedTraces:
+        """Return what theory promises at the sample times: bound, limit, centralised filter."""
+        return promise_traces(self.scenario, self.times)
+
+    @property
+    def bound(self) -> FloatArray | None:
+        """Return traces (T, N) of the bound H(12) at the samples, None if it does not apply."""
+        return self.promised.bound
+
+
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class StoredRun(Run):
+class StoredRun(WithPromises, Run):
     """A run that is read back from ``directory``, with its ``manifest`` and ``summary``.
 
     ``error`` is the difference of the stored x and xhat, so that it has lost digits where both are
@@ -86,16 +103,6 @@ class StoredRun(Run):
     def nees(self) -> FloatArray:
         """Return the NEES (T, N) as it was written, nan where it is unknown."""
         return self._column("nees")
-
-    @cached_property
-    def promised(self) -> PromisedTraces:
-        """Return what theory promises at the sample times: bound, limit, centralised filter."""
-        return promise_traces(self.scenario, self.times)
-
-    @property
-    def bound(self) -> FloatArray | None:
-        """Return traces (T, N) of the bound H(12) at the samples, None if it does not apply."""
-        return self.promised.bound
 
     def _column(self, name: str) -> FloatArray:
         shape = len(self.times), len(self.nodes)

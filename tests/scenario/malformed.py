@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tests.conftest import SCENARIOS, scenario_files
+from tests.stress.endings import complaints
 
 LONG = 50_000
 SECONDS = 120
 MEMORY = 3 << 30
-STATUSES = (0, 1, 2, 130)
 KINDS = (
     *("diffusion", "linear", "recorded", "unknown", "regressor", "cycle", "path", "complete"),
     *("star", "grid", "regular", "erdos-renyi", "geometric", "edges", "csv", "poisson", "renewal"),
@@ -428,15 +428,11 @@ def _child(arguments: list[str], folder: Path) -> None:
 
 def complaint(ended: Ended, folder: Path) -> str | None:
     """Return what is wrong with how a case ended, None if nothing."""
-    refused = ended.status == 2
-    if ended.status not in STATUSES:
-        return f"status {ended.status}"
-    if "Traceback" in ended.err:
-        return "traceback"
+    wrong, refused = complaints(ended.status, ended.err, ended.out), ended.status == 2
+    if wrong:
+        return "; ".join(wrong)
     if refused and (ended.err.count("\n") != 1 or ended.out):
         return "not one line"
-    if any(not c.isprintable() and c not in "\n\t" for c in ended.err + ended.out):
-        return "control characters"
     if (folder / "ran").exists():
         return "a stranger's module was executed"
     if refused and ended.seconds > 3.0:

@@ -37,6 +37,7 @@ from netkf.ensembles import checkpoints
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.studies.opening import open as open_result
+from tests.stress.endings import complaints, contents
 
 RING = str(Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml")
 SHORT = ["--set", "horizon=1.0", "--no-plot"]
@@ -268,32 +269,15 @@ def open_directory(command: list[str]) -> int:
             found.replica(0)
         print(printable(repr(found)))
     except ScenarioError as error:
-        print(error, file=sys.stderr)
+        print(f"netkf: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
 def look(status: Any, out: str, err: str, seconds: float) -> list[str]:
     """Return what is wrong with how a command ended."""
-    wrong = []
-    if status not in (0, 1, 2):
-        wrong.append(f"status {status}")
-    lines = [line for line in err.splitlines() if not line.startswith("note: ")]
-    if (status == 2 and len(lines) != 1) or (status in (0, 1) and lines):
-        wrong.append(f"printed {err[-400:]!r}")
-    if "Traceback" in err:
-        wrong.append("traceback")
-    if not (out + err).replace("\n", "").isprintable():
-        wrong.append("control characters")
-    if max(map(len, err.splitlines()), default=0) > 3000:
-        wrong.append("a line of more than 3000 characters")
-    if seconds > LIMIT:
-        wrong.append(f"took {seconds:.1f} s")
-    return wrong
+    slow = [f"took {seconds:.1f} s"] if seconds > LIMIT else []
+    return complaints(status, err, out, allowed=(0, 1, 2)) + slow
 
 
 def main() -> int:

@@ -24,10 +24,11 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.stress.endings import COMPILING, complaints, contents, error_lines, unfinished
+
 ROOT = Path(__file__).parents[2]
 RING = str(ROOT / "scenarios" / "poisson_ring.toml")
 LIMIT = 10.0
-COMPILING = "netkf: compiling, once"
 EARLIEST = 0.3
 """Seconds after which Python itself has started."""
 SHORT = ["--set", "horizon=2.0"]
@@ -85,11 +86,6 @@ def leave_alone(name: str, folder: Path) -> Reference:
     return Reference(time.monotonic() - began, process.returncode, error_lines(printed), kept)
 
 
-def error_lines(printed: str) -> list[str]:
-    """Return the lines that are no notes."""
-    return [line for line in printed.splitlines() if not line.startswith(("note: ", COMPILING))]
-
-
 def begin(command: list[str], out: Path | None) -> subprocess.Popen[str]:
     """Start a command in a session of its own."""
     where = ["--out", str(out), "--no-plot"] if out is not None else []
@@ -131,15 +127,6 @@ def workers_of(process: subprocess.Popen[str]) -> list[int]:
     return found
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of all files of a directory."""
-    return {
-        str(file.relative_to(folder)): file.read_bytes()
-        for file in folder.rglob("*")
-        if file.is_file()
-    }
-
-
 def strike(process: subprocess.Popen[str], draw: random.Random) -> str:
     """Send a signal, or kill a worker; return what was done."""
     workers = workers_of(process)
@@ -174,8 +161,8 @@ def trial(name: str, alone: Reference, draw: random.Random) -> list[str]:
             return [f"{done} after {after:.2f} s: did not end"]
         seconds = time.monotonic() - began
         wrong = look(process, printed, seconds, killed, alone)
-        if not takes_out(name) and (parts := [str(file) for file in ONE.rglob("*.part")]):
-            wrong.append(f"left {parts}")
+        if not takes_out(name):
+            wrong += unfinished(ONE)
         if alone.kept is not None and out is not None:
             wrong += resume(name, out, alone.kept)
     print(f"  {name}: {done} after {after:.2f} s: status {process.returncode}, {seconds:.2f} s")
@@ -186,11 +173,11 @@ def look(
     process: subprocess.Popen[str], printed: str, seconds: float, killed: bool, alone: Reference
 ) -> list[str]:
     """Return what was wrong with how a command ended."""
-    wrong, lines = [], error_lines(printed)
+    wrong = complaints(process.returncode, printed)
     if process.returncode == 130 and not killed:
-        if len(lines) != 1 or not lines[0].startswith("netkf: interrupted"):
+        if "netkf: interrupted" not in printed:
             wrong.append(f"printed {printed!r}")
-    elif (process.returncode, lines) != (alone.status, alone.lines):
+    elif (process.returncode, error_lines(printed)) != (alone.status, alone.lines):
         wrong.append(f"status {process.returncode}, printed {printed!r}")
     if seconds > LIMIT and not killed:
         wrong.append(f"took {seconds:.1f} s")
@@ -205,8 +192,7 @@ def look(
 
 def resume(name: str, out: Path, kept: Path) -> list[str]:
     """Finish a run; return how its files differ from those of a run that was left alone."""
-    parts = [str(file) for file in out.rglob("*.part")]
-    return ([f"left {parts}"] if parts else []) + finish(COMMANDS[name], out, kept)
+    return unfinished(out) + finish(COMMANDS[name], out, kept)
 
 
 def finish(command: list[str], out: Path, kept: Path) -> list[str]:

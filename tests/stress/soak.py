@@ -23,6 +23,7 @@ import time
 from pathlib import Path
 
 from tests.scenario import malformed
+from tests.stress.endings import complaints, unfinished
 
 GROWTH = 64 << 20
 """Bytes by which the memory may grow after the first third."""
@@ -103,13 +104,9 @@ def step(draw: random.Random, folder: Path) -> tuple[int, list[str], str | None]
     if draw.random() < READING:
         (folder / "out").mkdir()
         words = draw_reading(draw)
-    status, _, err = malformed.attempt(words)
-    wrong = "traceback" if "Traceback" in err else None
-    if status not in (0, 1, 2) or (status == 2 and err.count("netkf: ") != 1):
-        wrong = f"status {status}: {err[-300:]!r}"
-    if any(path.suffix == ".part" for path in folder.rglob("*")):
-        wrong = "left .part files"
-    return status, words, wrong
+    status, out, err = malformed.attempt(words)
+    wrong = complaints(status, err, out, allowed=(0, 1, 2)) + unfinished(folder)
+    return status, words, "; ".join(wrong) or None
 
 
 def main() -> int:

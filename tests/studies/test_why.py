@@ -359,6 +359,17 @@ def test_the_answer_is_said_in_sentences_a_table_and_json(runs):
     assert "node 1 at 7 s" in repr(found)
 
 
+@pytest.mark.parametrize("name", ["hybrid", "swaps", "gossip", "late"])
+def test_before_the_first_event_a_node_knows_what_it_began_with(name, runs):
+    scenario, run = runs[name]
+    for at in (1e-13, min(run.log["t"][0], 0.4) / 2.0):
+        found = why(run, 1, at, replays=1)
+        # dP = (1 - 0.6 P) dt from P = 1 on; a slot is asked about at its start.
+        expected = 1.0 if scenario.slotted else (1.0 - 0.4 * math.exp(-0.6 * at)) / 0.6
+        assert found.trace == pytest.approx(expected, rel=1e-9)
+        assert all(math.isnan(source.heard) for source in found.sources)
+
+
 def test_what_cannot_be_answered_is_refused_in_one_line(runs):
     _, run = runs["gossip"]
     with pytest.raises(ScenarioError, match="node: must be a node of the scenario; got 9"):
