@@ -36,7 +36,7 @@ from netkf.checks.looks import (
     next_runs,
 )
 from netkf.checks.paper import PaperChecks
-from netkf.checks.parts.rows import part_promises
+from netkf.checks.parts.rows import gaussian_noises, part_promises
 from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
 from netkf.checks.points import check_slots, sample_times
 from netkf.checks.rounding import EPS, OPERATIONS
@@ -221,17 +221,19 @@ def judge_replicas(
         return finish(tuple(judge([NONE_DIVERGED], found, [], len(found), 1.0)))
     stacked = stack_summaries([one.summary for one in found if one.summary is not None])
     promised = with_promised_filter(scenario)
+    parts = stack_parts(scenario, seed, [one.parts for one in found if one.parts is not None])
     rows = judge(
         checks.promises(scenario),
         checks.collect(scenario, stacked, seed),
         [
             *(Assumption(*row) for row in assumptions(promised).itertuples(index=False)),
             *checks.assumptions(scenario),
+            gaussian_noises(parts),
         ],
         len(found),
         0.5 * (1.0 - confidence),
     )
-    rows += _judge_parts(scenario, found, seed, 0.5 * (1.0 - confidence))
+    rows += judge(part_promises(parts), parts, [], len(found), 0.5 * (1.0 - confidence))
     return finish((*_judge_base(scenario, found), *rows))
 
 
@@ -249,14 +251,6 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
         why = f"it differs by design: {listed} is its own; {row.evidence}"
         return [dataclasses.replace(row, verdict=NOT_PROMISED, assumptions=why)]
     return [dataclasses.replace(row, evidence=f"{row.evidence}; its own: {listed}")]
-
-
-def _judge_parts(
-    scenario: Scenario, results: list[ReplicaResult], seed: int, level: float
-) -> list[Evidence]:
-    """Return the rows about the parts of the scenario."""
-    samples = stack_parts(scenario, seed, [one.parts for one in results if one.parts is not None])
-    return judge(part_promises(samples), samples, [], len(results), level)
 
 
 def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:

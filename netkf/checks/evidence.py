@@ -13,6 +13,8 @@ HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not pr
 VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
 MAX_RUNS = 1e9
 """Number of runs beyond which ``Evidence.needed`` gives none."""
+GAUSSIAN = "noises are Gaussian"
+"""Name of the assumption of tests that take squared errors for chi-square variables."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,16 @@ class Promise:
     exact: bool = False
 
 
+GAUSSIAN_TESTS: set[Callable[[Any, float], Finding]] = set()
+"""Tests that assume GAUSSIAN."""
+
+
+def gaussian_test(test: Callable[[Any, float], Finding]) -> Callable[[Any, float], Finding]:
+    """Mark a test that assumes GAUSSIAN."""
+    GAUSSIAN_TESTS.add(test)
+    return test
+
+
 class Assumption(NamedTuple):
     """A row of the table of assumptions; ``holds`` is None if it is not known."""
 
@@ -137,7 +149,8 @@ def _test(promise: Promise, samples: Any, level: float) -> Finding:
 
 
 def _is_needed(promise: Promise, row: Assumption) -> bool:
-    return any(need in f"{row.assumption} [{row.source}]" for need in promise.needs)
+    needs = (*promise.needs, GAUSSIAN) if promise.test in GAUSSIAN_TESTS else promise.needs
+    return any(need in f"{row.assumption} [{row.source}]" for need in needs)
 
 
 def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:

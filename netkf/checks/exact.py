@@ -13,7 +13,13 @@ import numpy as np
 import scipy.special
 
 from netkf.algorithms.registry import LINK_WEIGHTS, base_filter, built_in_class, own_attributes
-from netkf.checks.evidence import Assumption, Finding, find_nothing, find_unknown
+from netkf.checks.evidence import (
+    Assumption,
+    Finding,
+    find_nothing,
+    find_unknown,
+    gaussian_test,
+)
 from netkf.checks.laws import (
     EVERYTHING,
     NEES_TOLERANCE,
@@ -277,6 +283,7 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
 
 
+@gaussian_test
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     """Test that errors whitened by their exact covariance are chi-square at every node and time,
     and for all nodes together.
@@ -356,6 +363,7 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
     return Interval(value, low if excess > 0.0 else 0.0, value + wide, find, value, 0.0)
 
 
+@gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     """Compare the mean NEES with its expected value given the events of each run.
 
@@ -405,6 +413,7 @@ def _expected_together(quadratic: FloatArray, level: float) -> Interval:
     return deviation_interval(1.0, ratio) if len(known) else ratio
 
 
+@gaussian_test
 def check_nees(samples: RunSamples, level: float) -> Finding:
     """Test NEES / n for mean 1: given the exchanges, errors are Gaussian with covariance P."""
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)

@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing, find_unknown
+from netkf.checks.evidence import (
+    Assumption,
+    Finding,
+    Promise,
+    find_nothing,
+    find_unknown,
+    gaussian_test,
+)
 from netkf.checks.exact import (
     LEAST_VARIANCE,
     check_bias,
@@ -172,6 +179,7 @@ def _gaussian_radius(level: float, n: int) -> float:
     return float(np.sqrt(2.0 * scipy.special.gammainccinv(n / 2.0, level)))
 
 
+@gaussian_test
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     """Compare mean squares of the errors at the end, in units of the exact steady ones, with 1, and
     with what the steps give for the links of these runs.

@@ -9,6 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
+from netkf.checks.parts.sources import stated_part
+from netkf.checks.parts.ticks import (
+    Ticks,
+    distance_from_lattice,
+    gap_law,
+    ticks_on_lattice,
+)
 from netkf.core.clock import ClockPosition, Entity
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
@@ -40,8 +47,9 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
     at one of N links by sqrt(N) times as much (6 links: 7.5 %); where ``mean_rate`` is nan, a rate
     of one link that differs from the others by as much. Where the clock says that it is
     ``memoryless``: gaps at a distance of 0.013 from the exponential law, and a correlation of 0.03
-    of neighbouring gaps or of equal gaps of two links. A sound class fails once in a million
-    checks.
+    of neighbouring gaps or of equal gaps of two links. A class that derives from Renewal or
+    Periodic, and states no rate of its own, is held to their law as much. A sound class fails once
+    in a million checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
@@ -214,13 +222,36 @@ def _rates(watched: Watched, entities: tuple[Entity, ...], seed: int) -> None:
             chains += [_chain(part, entity, seed, r, k) for r in range(runs)]
     if min(map(len, chains)) < LENGTH:
         return  # it stops by chance: there is no long run
-    gaps = np.diff(np.array(chains), prepend=0.0).reshape(len(entities), runs, LENGTH)
+    times = np.array(chains)
+    gaps = np.diff(times, prepend=0.0).reshape(len(entities), runs, LENGTH)
     _check_drawn(watched, entities, gaps)
     _check_rates(watched, entities, gaps, stated)
     if part.memoryless:
         found = gaps[:, :, 1:].mean(axis=(1, 2))
         known = np.where(np.isnan(stated), found, 1.0 / stated)
         _exponential(watched, entities, gaps / known[:, None, None])
+    else:
+        _check_stated_law(watched, gaps, times)
+
+
+def _check_stated_law(watched: Watched, gaps: FloatArray, times: FloatArray) -> None:
+    """Check gaps (E, runs, length), or the ``times`` (E runs, length) of ticks on a lattice,
+    against the built-in clock from which a class derives without a mean rate of its own.
+    """
+    stated, where = stated_part(watched.part, "activation"), f"{watched.name}.ticks"
+    known = f"{type(stated).__name__}, from which it derives"
+    remedy = "define mean_rate and memoryless too if it differs by design"
+    if ticks_on_lattice(stated):
+        number = np.tile(np.arange(times.shape[1]), len(times))
+        ticks = Ticks(times.ravel(), number, np.full(number.shape, times.shape[1]), number == 0)
+        off = distance_from_lattice(stated, ticks)
+        words = f"{off:.3g} s beside one of them"
+        demand(
+            off <= 1e-9 * times.max(), where, f"must tick at the times of {known}", words, remedy
+        )
+    uniform = gap_law(stated, gaps.reshape(-1)).reshape(gaps.shape)
+    if np.isfinite(uniform).all():
+        _check_uniform(uniform, where, f"gaps must have the law of {known}", remedy)
 
 
 def _chain(part: Any, entity: Entity, seed: int, run: int, k: int) -> FloatArray:
@@ -279,20 +310,7 @@ def _exponential(watched: Watched, entities: tuple[Entity, ...], gaps: FloatArra
     """
     where, rule = f"{watched.name}.memoryless", "must be False where ticks are no Poisson process"
     remedy = "return False: theory relies on it"
-    values = np.sort(gaps.reshape(-1))
-    steps = np.arange(values.size + 1) / values.size
-    law = -np.expm1(-values)
-    apart = float(max((steps[1:] - law).max(), (law - steps[:-1]).max()))
-    # P(sqrt(N) D > x) <= 2 exp(-2 x^2), Massart 1990.
-    limit = math.sqrt(0.5 * math.log(2.0 * FAMILIES / LEVEL) / values.size)
-    words = f"gaps at a distance of {apart:.3g} from the exponential law"
-    demand(apart <= limit, where, rule, words, remedy)
-    # Uniform for exponential gaps, so that long gaps do not hide the others.
-    unit = math.sqrt(12.0) * (-np.expm1(-gaps) - 0.5)
-    pairs = (unit[:, :, 1:] * unit[:, :, :-1]).reshape(-1, 1)
-    if (found := largest_deviation(pairs)) is not None:
-        words = f"neighbouring gaps with a correlation of {found.mean:.3g} +- {found.error:.2g}"
-        demand(False, where, rule, words, remedy)
+    unit = _check_uniform(-np.expm1(-gaps), where, rule, remedy)
     for a, one in enumerate(entities):
         for b, other in enumerate(entities[:a]):
             found = largest_deviation((unit[a] * unit[b]).reshape(-1, 1))
@@ -300,3 +318,23 @@ def _exponential(watched: Watched, entities: tuple[Entity, ...], gaps: FloatArra
                 words = f"a correlation of {found.mean:.3g} of {list(other)} and {list(one)}"
                 rule = "ticks of links with streams of their own must be independent"
                 demand(False, f"{watched.name}.ticks", rule, words, "use the generator given")
+
+
+def _check_uniform(uniform: FloatArray, where: str, rule: str, remedy: str) -> FloatArray:
+    """Check that gaps, as numbers (E, runs, length) in [0, 1], are uniform and neighbouring ones
+    uncorrelated; return them with mean 0 and variance 1.
+    """
+    values = np.sort(uniform.reshape(-1))
+    steps = np.arange(values.size + 1) / values.size
+    apart = float(max((steps[1:] - values).max(), (values - steps[:-1]).max()))
+    # P(sqrt(N) D > x) <= 2 exp(-2 x^2), Massart 1990.
+    limit = math.sqrt(0.5 * math.log(2.0 * FAMILIES / LEVEL) / values.size)
+    words = f"gaps at a distance of {apart:.3g} from the law"
+    demand(apart <= limit, where, rule, words, remedy)
+    # Of uniform numbers, so that long gaps do not hide the others.
+    unit = np.asarray(math.sqrt(12.0) * (uniform - 0.5))
+    pairs = (unit[:, :, 1:] * unit[:, :, :-1]).reshape(-1, 1)
+    if (found := largest_deviation(pairs)) is not None:
+        words = f"neighbouring gaps with a correlation of {found.mean:.3g} +- {found.error:.2g}"
+        demand(False, where, rule, words, remedy)
+    return unit

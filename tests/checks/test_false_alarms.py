@@ -14,7 +14,7 @@ from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
 from netkf.checks.rounding import compare_identities
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError, TheoryError
-from netkf.parts import Filter, Hybrid, number, setting
+from netkf.parts import Bernoulli, ExponentialDelay, Filter, Hybrid, Poisson, number, setting
 from netkf.scenario.reading import from_table
 from netkf.theory.common.stacked_errors import integration_steps
 from netkf.theory.intermittent.scalar_law import scalar_law
@@ -289,3 +289,67 @@ def test_runs_without_an_exact_covariance_are_judged_too(tmp_path, monkeypatch):
         assert all(math.isfinite(row.margin) for row in covariances)
     precise = scenario_of(RING, tmp_path, sensors=[{**RING["sensors"][0], "R": [[1e-7]]}])
     assert integration_steps(precise) > 20 * integration_steps(scenario) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Downhill(Bernoulli):
+    """Loses more upwards, and says so."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return self.mean_delivery(link, table_probability)
+
+    def mean_delivery(self, link, table_probability):
+        return self.delivery if link[0] < link[1] else 0.8 * self.delivery
+
+
+@dataclass(frozen=True, eq=False)
+class TimedOut(ExponentialDelay):
+    """Gives a message up that would take too long."""
+
+    @property
+    def longest(self):
+        return 2.0 * self.mean
+
+    def message_delay(self, link, message, drawn):
+        return drawn if drawn <= self.longest else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Hurried(Poisson):
+    """Ticks at twice the rate, and says so."""
+
+    def mean_rate(self, entity):
+        return 2.0 * super().mean_rate(entity)
+
+
+OWN = "tests.testing.sound_parts"
+LAPLACE, UNIFORM = f"{OWN}:LaplaceSensor", f"{OWN}:UniformNoise"
+    f"tests.testing.sound_parts:{name}" for name in ("LaplaceSensor", "UniformNoise")
+)
+OWN_PARTS = {
+    # By design: what a class states is what it is held to.
+    "Laplace noise": (GOSSIP, {"sensors": [{**GOSSIP["sensors"][0], "kind": LAPLACE}]}),
+    "uniform noise": (SCALAR, {"plant": {**SCALAR["plant"], "kind": UNIFORM, "F": [[0.95]]}}),
+    "own matching": (GOSSIP, {"network.activation": {
+        "kind": "tests.testing.sound_parts:FirstLinkMore", "protocol": "one-edge"}}),
+    "own loss": (GOSSIP, {"network.channel.loss": {"kind": f"{__name__}:Downhill", "delivery": 0.9},
+                          "network.channel.symmetric": False}),
+    "own delay": (RING, {"network.channel.delay": {"kind": f"{__name__}:TimedOut", "mean": 0.1}}),
+    "own clock": (RING, {"network.activation": {"kind": f"{__name__}:Hurried", "rate": 1.5}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OWN_PARTS)
+def test_parts_are_held_to_what_they_state(name, tmp_path):
+    table, changes = OWN_PARTS[name]
+    scenario = scenario_of(table, tmp_path, **changes)
+    for seed in range(2):
+        assert not broken_rows(scenario, runs=30, seed=seed)
+
+
+def test_squares_of_other_noises_are_not_taken_for_chi_square(tmp_path):
+    table, changes = OWN_PARTS["Laplace noise"]
+    rows = check(scenario_of(table, tmp_path, **changes), runs=60, workers=1).rows
+    reasons = [row.assumptions for row in rows if "noises are Gaussian" in row.assumptions]
+    assert reasons
+    assert all("the noise of the sensors is not" in reason for reason in reasons)

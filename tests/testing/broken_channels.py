@@ -6,8 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netkf.network.channels import Bernoulli, Delay, GilbertElliott, Loss
-from netkf.network.clocks import LinkClock, Poisson
+from netkf.network.channels import (
+    Bernoulli,
+    ConstantDelay,
+    Delay,
+    ExponentialDelay,
+    GilbertElliott,
+    Loss,
+)
+from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
 
 CHANNELS, CLOCKS = {}, {}
 
@@ -314,3 +321,47 @@ class Even(Poisson):
 
     def ticks(self, link, origin, index, now, random, count):
         return np.add.accumulate([now, *(random.standard_gamma(1.1, count) / 2.2)])[1:]
+
+
+@says(CHANNELS, "Slower.message_delay: delays must have the law of ExponentialDelay", mean=0.3)
+class Slower(ExponentialDelay):
+    def draw(self, random):
+        return 1.1 * super().draw(random)
+
+
+@says(CHANNELS, "Instant.message_delay: delays must have the law of ConstantDelay", seconds=0.3)
+class Instant(ConstantDelay):
+    def message_delay(self, link, message, drawn):
+        return 0.0
+
+
+@says(
+    CHANNELS,
+    "Scattered.next_state: losses must follow each other as in GilbertElliott",
+    mean_loss=0.3,
+    mean_burst=4.0,
+)
+class Scattered(GilbertElliott):
+    """Loses as many messages, one by one."""
+
+    def next_state(self, bad, random):
+        return super().next_state(None, random)
+
+
+@says(
+    CLOCKS,
+    "OtherShape.ticks: gaps must have the law of Renewal",
+    distribution="gamma",
+    shape=3.0,
+    rate=2.0,
+)
+class OtherShape(Renewal):
+    def ticks(self, entity, origin, index, now, random, count):
+        gaps = random.standard_gamma(2.0, count) / 4.0
+        return np.add.accumulate([now, *gaps])[1:]
+
+
+@says(CLOCKS, "OffBeat.ticks: must tick at the times of Periodic", period=0.5)
+class OffBeat(Periodic):
+    def ticks(self, entity, origin, index, now, random, count):
+        return 0.01 + super().ticks(entity, origin, index, now, random, count)

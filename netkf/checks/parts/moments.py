@@ -19,21 +19,28 @@ from netkf.checks.statistics import (
     Interval,
     detectable_shift,
     deviation_interval,
+    probability_interval,
     scale_interval,
 )
 from netkf.linalg.arrays import FloatArray
 
 VARIANCE_TOLERANCE, MEAN_TOLERANCE, CORRELATION_TOLERANCE = 0.1, 0.1, 0.2
 """Tolerated relative error of a variance, mean in standard deviations, and correlation."""
+CELLS, SHARE_TOLERANCE = 16, 0.02
+"""Cells of equal probability into which numbers of a known law are sorted, and the tolerated error
+of the share of one.
+"""
 LEAST = 1e-10
 """Share of the largest variance below which a direction has no noise."""
-MIN_COUNT = 20
+MIN_COUNT, MIN_COUNT_OF_ANY_LAW = 20, 200
+"""Numbers from which means and variances are judged; of the latter if the law is not known."""
 
 
 class NoiseMoments(NamedTuple):
     """Sums over whitened noises z of d entries, some of which may be missing: how often two entries
     were there ``together`` (d, d), sums of z (d,), of z z' (d, d), and of z z' with the z
-    before it (d, d), of which there are ``pairs`` (d, d).
+    before it (d, d), of which there are ``pairs`` (d, d); how many of each lie in the ``cells``
+    (CELLS, d), which standard normal numbers fill evenly; and sums of z^4, ``fourth`` (d,).
     """
 
     together: FloatArray
@@ -41,15 +48,31 @@ class NoiseMoments(NamedTuple):
     second: FloatArray
     lagged: FloatArray
     pairs: FloatArray
+    cells: FloatArray
+    fourth: FloatArray
 
 
 def moments(z: FloatArray) -> NoiseMoments:
     """Return the sums over a series z (S, d), in which missing entries are nan."""
-    there = np.isfinite(z).astype(float)
-    z = np.where(there > 0.0, z, 0.0)
+    known = np.isfinite(z)
+    there = known.astype(float)
+    z = np.where(known, z, 0.0)
     return NoiseMoments(
-        there.T @ there, z.sum(axis=0), z.T @ z, z[1:].T @ z[:-1], there[1:].T @ there[:-1]
+        there.T @ there,
+        z.sum(axis=0),
+        z.T @ z,
+        z[1:].T @ z[:-1],
+        there[1:].T @ there[:-1],
+        count_cells(scipy.special.ndtr(z), known),
+        (z**4).sum(axis=0),
     )
+
+
+def count_cells(u: FloatArray, known: np.ndarray) -> FloatArray:
+    """Return how many of the ``known`` numbers u (S, d) in [0, 1] lie in each cell, (CELLS, d)."""
+    place = np.minimum((CELLS * u).astype(np.int64), CELLS - 1) * u.shape[1] + np.arange(u.shape[1])
+    counts = np.bincount(place[known], minlength=CELLS * u.shape[1])
+    return counts.reshape(CELLS, u.shape[1]).astype(float)
 
 
 def total(many: NoiseMoments) -> NoiseMoments:
@@ -64,17 +87,30 @@ def whitening_matrix(covariance: FloatArray) -> FloatArray:
     return np.asarray((vectors[:, used] / np.sqrt(values[used])).T)
 
 
-def compare_variances(found: NoiseMoments, labels: list[str], level: float, what: str) -> Finding:
-    """Test that all entries together, and each of them, have the variance 1."""
+def compare_variances(
+    found: NoiseMoments, labels: list[str], level: float, what: str, gaussian: bool = True
+) -> Finding:
+    """Test that all entries together, and each of them, have the variance 1; numbers that need not
+    be Gaussian are judged by their own fourth moment.
+    """
     counts, squares = np.diagonal(found.together), np.diagonal(found.second)
-    if counts.max() < MIN_COUNT:
+    if counts.max() < (MIN_COUNT if gaussian else MIN_COUNT_OF_ANY_LAW):
         return nothing_to_see(VARIANCE_TOLERANCE)
-    whole = scale_interval(float(squares.sum()), float(counts.sum()), level / 2.0)
-    intervals = [(deviation_interval(1.0, whole), f"all {what} together")]
+
+    def interval(square: float, fourth: float, count: float, part: float) -> Interval:
+        # The freedom of a chi-square variable whose variance is that of the sum of squares.
+        excess = 0.0 if gaussian else count * fourth / square**2 - 3.0
+        freedom = 2.0 * count / max(2.0 + excess, 2.0)
+        scale = scale_interval(freedom * square / count, freedom, part)
+        return deviation_interval(1.0, scale)
+
+    sums = float(squares.sum()), float(found.fourth.sum()), float(counts.sum())
+    intervals = [(interval(*sums, level / 2.0), f"all {what} together")]
     share = level / (2.0 * len(squares))
-    for value, count, label in zip(squares.tolist(), counts.tolist(), labels, strict=True):
-        if count >= MIN_COUNT:
-            intervals.append((deviation_interval(1.0, scale_interval(value, count, share)), label))
+    for k, label in enumerate(labels):
+        if counts[k] >= MIN_COUNT:
+            one = float(squares[k]), float(found.fourth[k]), float(counts[k])
+            intervals.append((interval(*one, share), label))
     message = f"variances over the stated ones, {counts.sum():,.0f} values,"
     return with_best(intervals, VARIANCE_TOLERANCE, message)
 
@@ -108,6 +144,35 @@ def compare_correlations(found: NoiseMoments, labels: list[str], level: float) -
             (deviation_interval(0.0, correlation_interval(value, count, share)), label)
         )
     return find_largest(intervals, CORRELATION_TOLERANCE, "largest correlation")
+
+
+def compare_cells(cells: FloatArray, labels: list[str], level: float, what: str) -> Finding:
+    """Test that numbers counted in ``cells`` (CELLS, d) fill all cells evenly, those of all columns
+    together and each column.
+    """
+    counts = cells.sum(axis=0)
+    if counts.sum() < 10 * CELLS:
+        return nothing_to_see(SHARE_TOLERANCE)
+    intervals = [
+        (_cell_interval(count, counts.sum(), level / (2.0 * CELLS)), f"all, {_cell_label(k)}")
+        for k, count in enumerate(cells.sum(axis=1).tolist())
+    ]
+    share = level / (2.0 * CELLS * len(labels))
+    for column, label in enumerate(labels if len(labels) > 1 else ()):
+        if counts[column] >= 10 * CELLS:
+            for k, count in enumerate(cells[:, column].tolist()):
+                apart = _cell_interval(count, counts[column], share)
+                intervals.append((apart, f"{label}, {_cell_label(k)}"))
+    message = f"{counts.sum():,.0f} {what}, largest difference of a share from 1/{CELLS}"
+    return with_best(intervals, SHARE_TOLERANCE, message, CELLS)
+
+
+def _cell_interval(count: float, total: float, level: float) -> Interval:
+    return deviation_interval(1.0 / CELLS, probability_interval(int(count), int(total), level))
+
+
+def _cell_label(k: int) -> str:
+    return f"rank {k / CELLS:.2f} to {(k + 1) / CELLS:.2f}"
 
 
 def correlation_interval(value: float, count: float, level: float) -> Interval:
@@ -145,18 +210,20 @@ def _correlations(found: NoiseMoments, products: FloatArray, counts: FloatArray)
         return np.asarray(np.nan_to_num(products / counts / np.outer(size, size)))
 
 
-def with_best(intervals: list[tuple[Interval, str]], tolerance: float, message: str) -> Finding:
-    """Return the finding of one interval over everything, the first, and of its parts.
+def with_best(
+    intervals: list[tuple[Interval, str]], tolerance: float, message: str, whole: int = 1
+) -> Finding:
+    """Return the finding of intervals over everything, the ``whole`` first ones, and of its parts.
 
     A part that is off is the finding; else what is known of everything, which is more precise.
     """
     off = [item for item in intervals if item[0].low > 0.0]
     if off:
         return find_largest(intervals, tolerance, message)
-    finding = find_largest(intervals[:1], tolerance, message)
-    if len(intervals) == 1:
+    finding = find_largest(intervals[:whole], tolerance, message)
+    if len(intervals) == whole:
         return finding
-    worst, label = max(intervals[1:], key=lambda item: item[0].value)
+    worst, label = max(intervals[whole:], key=lambda item: item[0].value)
     text = f"{finding.message}; furthest off {label}: {worst.value:.3g}"
     if math.isfinite(worst.detectable):
         text += f", {worst.detectable:.2g} would have been seen"

@@ -7,14 +7,15 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import scipy.special
 
 from netkf.checks.evidence import Finding, Promise
 from netkf.checks.laws import find_largest
-from netkf.checks.parts.events import CELLS, clock_entities, reversed_directions
+from netkf.checks.parts.clock_rows import clock_promises, largest_correlation
+from netkf.checks.parts.delays import delay_promises
+from netkf.checks.parts.events import reversed_directions
 from netkf.checks.parts.moments import (
     CORRELATION_TOLERANCE,
-    correlation_interval,
+    MIN_COUNT,
     nothing_to_see,
     with_best,
 )
@@ -22,7 +23,6 @@ from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.sources import stated_part
 from netkf.checks.statistics import (
     Interval,
-    detectable_shift,
     deviation_interval,
     probability_interval,
     scale_interval,
@@ -30,115 +30,15 @@ from netkf.checks.statistics import (
 )
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
+from netkf.network.channels import GilbertElliott, delay_depends_on_message
+from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching
 from netkf.network.recorded import RecordedLoss
 from netkf.scenario.scenario import Scenario
 
-RATE_TOLERANCE, PROBABILITY_TOLERANCE, DISPERSION_TOLERANCE = 0.05, 0.05, 0.25
-FIRST_TICK = 1.0
-"""Ticks by which a clock that is not memoryless may be off its rate in a run: it has begun."""
-
-
-def _stated_clock(scenario: Scenario) -> Any:
-    return stated_part(scenario.network.activation, "activation")
-
-
-@lru_cache(maxsize=8)
-def clock_rates(scenario: Scenario) -> FloatArray:
-    """Return the stated rates (E,) of all clocks in ticks per second; nan if unknown."""
-    stated = _stated_clock(scenario)
-    return np.array([stated.mean_rate(entity) for entity in clock_entities(scenario)])
-
-
-def _clock_labels(scenario: Scenario) -> list[str]:
-    return [f"clock {'-'.join(map(str, entity))}" for entity in clock_entities(scenario)]
-
-
-def _rates(samples: PartSamples, level: float) -> Finding:
-    """Compare the ticks of all runs with the rates, all clocks together and one by one."""
-    scenario, counts = samples.scenario, samples.ticks.ticks.sum(axis=1)
-    expected = clock_rates(scenario) * scenario.horizon
-    poisson, found = bool(_stated_clock(scenario).memoryless), counts.sum(axis=0).astype(float)
-    intervals = []
-    share = level / (2.0 * len(expected))
-    jobs = [(counts.sum(axis=1), float(expected.sum()), level / 2.0, "all clocks together")]
-    jobs += [
-        (counts[:, k], float(expected[k]), share, label)
-        for k, label in enumerate(_clock_labels(scenario))
-    ]
-    for values, mean, part, label in jobs:
-        clocks = len(expected) if part > share or len(expected) == 1 else 1
-        slack = 0.0 if poisson else FIRST_TICK * clocks / mean
-        intervals.append((_count_interval(values, mean, part, poisson, slack), label))
-    message = f"{found.sum():,.0f} ticks, relative difference from the rates,"
-    return with_best(intervals, RATE_TOLERANCE, message)
-
-
-def _count_interval(
-    values: np.ndarray, mean: float, level: float, poisson: bool, slack: float
-) -> Interval:
-    """Return an interval for how far counts (R,) are from ``mean`` in a run, relative to it.
-
-    ``slack`` is a difference that says nothing. Sums of Poisson counts are Poisson, with exact
-    limits; other clocks are judged by the spread of their counts.
-    """
-    total, runs = float(values.sum()), len(values)
-    if poisson:
-        low = float(scipy.special.gammaincinv(total, level / 2.0)) if total else 0.0
-        high = float(scipy.special.gammaincinv(total + 1.0, 1.0 - level / 2.0))
-        spread = math.sqrt(runs * mean)
-    else:
-        spread = math.sqrt(max(float(values.var(ddof=1)), 0.25) * runs)
-        _, low, high = student_interval(total, spread, runs, level)[:3]
-    whole = runs * mean
-    ratio = Interval(
-        total / whole, low / whole, high / whole, detectable_shift(spread, level) / whole
-    )
-    apart = deviation_interval(1.0, ratio)
-    value, low, high = (max(0.0, end - slack) for end in apart[:3])
-    return apart._replace(value=value, low=low, high=high, detectable=apart.detectable + slack)
-
-
-def _gaps(samples: PartSamples, level: float) -> Finding:
-    """Compare the gaps of Poisson clocks with the exponential law, cell by cell, and with the gap
-    before.
-    """
-    cells, products = samples.ticks.cells.sum(axis=0), samples.ticks.products.sum(axis=0)
-    total = int(cells.sum())
-    if total < 10 * CELLS:
-        return nothing_to_see(PROBABILITY_TOLERANCE)
-    share, intervals = level / (CELLS + 1.0), []
-    for k, count in enumerate(cells.tolist()):
-        found = probability_interval(count, total, share)
-        label = f"gaps of rank {k / CELLS:.2f} to {(k + 1) / CELLS:.2f}"
-        intervals.append((deviation_interval(1.0 / CELLS, found), label))
-    related = correlation_interval(float(products[0] / products[1]), float(products[2]), share)
-    intervals.append((deviation_interval(0.0, related), "neighbouring gaps, their correlation"))
-    message = f"{total:,} gaps, largest difference of a share"
-    return find_largest(intervals, PROBABILITY_TOLERANCE, message)
-
-
-def _clocks_apart(samples: PartSamples, level: float) -> Finding:
-    """Compare the spread of all ticks of a run with that of independent Poisson clocks."""
-    scenario, ticks = samples.scenario, samples.ticks.ticks
-    counts = ticks.reshape(-1, ticks.shape[2])
-    mean = float((clock_rates(scenario) * scenario.horizon).sum()) / ticks.shape[1]
-    values = counts.sum(axis=1) - mean
-    # A squared Poisson count has a little more spread than a squared normal one.
-    freedom = len(values) / (1.0 + 0.5 / mean)
-    ratio = scale_interval(freedom * float((values**2).mean()) / mean, freedom, level / 2.0)
-    apart = deviation_interval(1.0, ratio)
-    intervals = [(apart, "variance of all ticks at once over that of independent clocks")]
-    pairs = _largest_correlation(counts - counts.mean(axis=0), level / 2.0)
-    if pairs is not None:
-        value, clocks = pairs
-        labels = _clock_labels(scenario)
-        intervals.append((value, f"correlation of {labels[clocks[0]]} and {labels[clocks[1]]}"))
-    return find_largest(intervals, DISPERSION_TOLERANCE, "largest difference")
-
-
-MAX_CLOCKS = 60
-"""Clocks of which all pairs are compared."""
+PROBABILITY_TOLERANCE = 0.05
+MIN_RUNS = 10
+"""Runs from whose spread an interval is computed."""
 
 
 def _stated_loss(scenario: Scenario) -> Any:
@@ -164,8 +64,14 @@ def _losses(samples: PartSamples, level: float) -> Finding:
     q = loss_probabilities(scenario)
     sent, lost = fates.sent.sum(axis=1), fates.lost.sum(axis=1)
     used = np.flatnonzero(sent.sum(axis=0) > 0)
-    intervals = [(_loss_interval(scenario, sent, lost, q, used, level / 2.0), "all directions")]
-    share = level / (2.0 * max(len(used), 1))
+    intervals = [(_loss_interval(scenario, sent, lost, q, used, level / 3.0), "all directions")]
+    windows = np.flatnonzero(fates.sent.sum(axis=(0, 2)) > 0)
+    for w in windows.tolist() if fates.sent.shape[1] > 1 else ():
+        part = fates.sent[:, w], fates.lost[:, w]
+        found = _loss_interval(scenario, *part, q, used, level / (3.0 * len(windows)))
+        label = f"all directions in part {w + 1} of {fates.sent.shape[1]} of the run"
+        intervals.append((found, label))
+    share = level / (3.0 * max(len(used), 1))
     for k in used.tolist():
         one = np.array([k])
         found = _loss_interval(scenario, sent, lost, q, one, share)
@@ -229,6 +135,44 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
     return find_largest(intervals, CORRELATION_TOLERANCE, "largest difference")
 
 
+def _bursts(samples: PartSamples, level: float) -> Finding:
+    """Compare how often a message is lost after another loss with the chain that is stated."""
+    scenario, fates = samples.scenario, samples.fates
+    loss, q = _stated_loss(scenario), loss_probabilities(scenario)
+    runs, followed = len(fates.sent), fates.followed.sum(axis=1)
+    total = float(followed.sum())
+    if total < MIN_COUNT or runs < MIN_RUNS:
+        return nothing_to_see(PROBABILITY_TOLERANCE)
+    again = loss_twice(loss) / float(q.mean())
+    excess = fates.repeated.sum(axis=1) - again * followed
+    # At least the spread of independent pairs: a few rare ones may show none.
+    least = max(total * again * (1.0 - again), 1.0)
+    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, least)) / total
+    seen = again + float(excess.sum()) / total
+    apart = deviation_interval(again, student_interval(seen, spread, runs, level))
+    message = f"{total:,.0f} losses, after which the next message is lost with a probability off"
+    return find_largest([(apart, "all directions")], PROBABILITY_TOLERANCE, message)
+
+
+def loss_twice(chain: GilbertElliott) -> float:
+    """Return the probability that two messages in a row are lost, by the chain of the losses."""
+    to_bad, to_good = chain.transitions
+    start = np.array([to_good, to_bad]) / (to_bad + to_good)
+    step = np.array([[1.0 - to_bad, to_bad], [to_good, 1.0 - to_good]])
+    kept = [chain.delivery_probability((0, 1), 0, bad, 1.0) for bad in (False, True)]
+    lost = 1.0 - np.array(kept)
+    return float((start * lost) @ step @ lost)
+
+
+def _one_step_a_message(scenario: Scenario) -> bool:
+    """Return True if the chain of a direction makes one step for each of its messages."""
+    clock, channel = scenario.network.activation, scenario.network.channel
+    if isinstance(clock, Matching):
+        return True
+    at_once = isinstance(clock, LinkClock) and clock.at == "links"
+    return at_once or (isinstance(clock, LinkClock) and not channel.symmetric)
+
+
 def _neighbours_variance(p: Any) -> Any:
     """Return the variance for each pair of the number of pairs of neighbours in a long row of
     independent events of probability p that both happened; neighbouring pairs share an event.
@@ -253,7 +197,7 @@ def _correlation_of_runs(
     correlated, covariances with its neighbours included: few rare events spread less by chance.
     """
     weight = float((count * scale).sum())
-    if not weight > 0.0 or len(excess) < 10:
+    if not weight > 0.0 or len(excess) < MIN_RUNS:
         return None
     values = excess.sum(axis=1)
     runs, least = len(values), float((count * variance).sum())
@@ -276,7 +220,7 @@ def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str
         -1, fates.sent.shape[2]
     )
     excess = excess[:, columns]
-    found = _largest_correlation(excess, level / 2.0)
+    found = largest_correlation(excess, level / 2.0)
     if found is None:
         return []
     interval, (a, b) = found
@@ -303,28 +247,6 @@ def _mean_correlation(ratio: Interval, links: int) -> Interval:
     return Interval(value, low - 0.02 * scale, high + 0.02 * scale, ratio.detectable * scale)
 
 
-def _largest_correlation(
-    values: FloatArray, level: float
-) -> tuple[Interval, tuple[int, int]] | None:
-    """Return an interval for the largest correlation of two columns of values (K, L) of mean 0, by
-    the spread of their products over the K independent rows.
-    """
-    some = values[:, :MAX_CLOCKS]
-    kept = np.flatnonzero(some.var(axis=0) > 0.0)
-    runs = len(some)
-    if len(kept) < 2 or runs < 100:
-        return None
-    z = some[:, kept] / some[:, kept].std(axis=0)
-    related = z.T @ z / runs
-    upper = np.triu_indices(len(kept), 1)
-    worst = int(np.argmax(np.abs(related[upper])))
-    a, b = int(upper[0][worst]), int(upper[1][worst])
-    products = z[:, a] * z[:, b]
-    spread = max(float(products.std(ddof=1)), 1.0) / math.sqrt(runs)
-    found = student_interval(float(related[upper][worst]), spread, runs, level / len(upper[0]))
-    return deviation_interval(0.0, found), (int(kept[a]), int(kept[b]))
-
-
 @lru_cache(maxsize=8)
 def pair_probabilities(scenario: Scenario) -> FloatArray | None:
     """Return the stated probability (L,) of each link in a matching; None if it is not known."""
@@ -347,7 +269,12 @@ def _matchings(samples: PartSamples, level: float) -> Finding:
     p = pair_probabilities(scenario)
     assert p is not None
     slots, runs = float(pairs.slots[0]), len(pairs.paired)
-    share, intervals = level / (2.0 * len(p)), []
+    share = level / (3.0 * len(p))
+    # A few rare pairs may show no spread: there is at least that of one pair in all runs.
+    number = pairs.paired.sum(axis=1) / slots
+    spread = max(float(number.std(ddof=1)) / math.sqrt(runs), 1.0 / (runs * slots))
+    together = student_interval(float(number.mean()), spread, runs, level / 3.0)
+    intervals = [(deviation_interval(float(p.sum()), together), "pairs in a slot, of all links")]
     for k, link in enumerate(scenario.topology.links):
         label = f"link {link[0]}-{link[1]}"
         found = probability_interval(int(pairs.paired[:, k].sum()), int(runs * slots), share)
@@ -367,14 +294,9 @@ def _matchings(samples: PartSamples, level: float) -> Finding:
         if related is not None:
             intervals.append((related, f"{label} and the slot before, their correlation"))
     message = f"{runs * slots:,.0f} slots, largest difference of a share"
-    return find_largest(intervals, PROBABILITY_TOLERANCE, message)
+    return with_best(intervals, PROBABILITY_TOLERANCE, message)
 
 
-CLOCK_RATES = Promise("clocks tick at the rates of the scenario", "the scenario", (), _rates)
-CLOCK_GAPS = Promise(
-    "gaps between ticks are exponential, and independent of those before", "the scenario", (), _gaps
-)
-CLOCKS_APART = Promise("clocks tick independently of each other", "the scenario", (), _clocks_apart)
 LOSSES = Promise(
     "messages are lost as often as the scenario says, in each direction",
     "the scenario",
@@ -384,6 +306,7 @@ LOSSES = Promise(
 LOSSES_APART = Promise(
     "messages are lost independently of each other", "the scenario", (), _losses_apart
 )
+BURSTS = Promise("losses follow each other as the scenario says", "the scenario", (), _bursts)
 MATCHINGS = Promise(
     "links are paired as often as the protocol says, whatever happened before",
     "the scenario",
@@ -394,19 +317,21 @@ MATCHINGS = Promise(
 
 def network_promises(samples: PartSamples) -> list[Promise]:
     """Return the promises about the network that have a stated law and were seen in the runs."""
-    found: list[Promise] = []
+    found = clock_promises(samples)
     scenario = samples.scenario
-    if samples.ticks is not None and np.isfinite(clock_rates(scenario)).all():
-        found.append(CLOCK_RATES)
-        if _stated_clock(scenario).memoryless:
-            found += [CLOCK_GAPS, CLOCKS_APART]
     drawn = samples.pairs is not None and scenario.hosted.talks
     if drawn and pair_probabilities(scenario) is not None:
         found.append(MATCHINGS)
-    if samples.fates is not None and not isinstance(_stated_loss(scenario), RecordedLoss):
+    # A delay of its own for each message may be the end of a message.
+    certain = not delay_depends_on_message(scenario.network.channel.delay)
+    recorded = isinstance(_stated_loss(scenario), RecordedLoss)
+    sent = samples.fates is not None and samples.fates.sent.any()
+    if sent and certain and not recorded:
         q = loss_probabilities(scenario)
         if np.isfinite(q).all():
             found.append(LOSSES)
             if _stated_loss(scenario).independent and ((q > 0.0) & (q < 1.0)).any():
                 found.append(LOSSES_APART)
-    return found
+            if isinstance(_stated_loss(scenario), GilbertElliott) and _one_step_a_message(scenario):
+                found.append(BURSTS)
+    return found + delay_promises(samples)

@@ -6,9 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from netkf.checks.evidence import Finding, Promise
+from netkf.checks.evidence import GAUSSIAN, Assumption, Finding, Promise
 from netkf.checks.parts.moments import (
     NoiseMoments,
+    compare_cells,
     compare_correlations,
     compare_means,
     compare_variances,
@@ -18,10 +19,14 @@ from netkf.checks.parts.moments import (
 from netkf.checks.parts.network_rows import network_promises
 from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts
 from netkf.checks.parts.samples import PartSamples
+from netkf.checks.parts.sources import is_own_class
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
 STARTS = 10_000
 """States x(0) that are drawn: each run has only one."""
+LAW_LEVEL = 0.05
+"""Level at which a noise of a user's class is found not to be Gaussian."""
 
 
 def _labels(what: str, count: int) -> list[str]:
@@ -36,12 +41,19 @@ def _starts(scenario: Scenario, seed: int) -> NoiseMoments:
 def _start_variance(samples: PartSamples, level: float) -> Finding:
     found = _starts(samples.scenario, samples.seed)
     labels = _labels("direction", len(found.first))
-    return compare_variances(found, labels, level, "directions of x(0)")
+    gaussian = not is_own_class(samples.scenario.plant, "plant")
+    return compare_variances(found, labels, level, "directions of x(0)", gaussian)
 
 
 def _start_mean(samples: PartSamples, level: float) -> Finding:
     found = _starts(samples.scenario, samples.seed)
     return compare_means(found, _labels("direction", len(found.first)), level)
+
+
+def _start_law(samples: PartSamples, level: float) -> Finding:
+    found = _starts(samples.scenario, samples.seed)
+    labels = _labels("direction", len(found.first))
+    return compare_cells(found.cells, labels, level, "directions of x(0)")
 
 
 def _steps(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
@@ -51,7 +63,8 @@ def _steps(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
 
 def _step_variance(samples: PartSamples, level: float) -> Finding:
     found, labels = _steps(samples)
-    return compare_variances(found, labels, level, "directions of the noise")
+    gaussian = not is_own_class(samples.scenario.plant, "plant")
+    return compare_variances(found, labels, level, "directions of the noise", gaussian)
 
 
 def _step_mean(samples: PartSamples, level: float) -> Finding:
@@ -62,9 +75,15 @@ def _step_correlation(samples: PartSamples, level: float) -> Finding:
     return compare_correlations(*_steps(samples), level)
 
 
+def _step_law(samples: PartSamples, level: float) -> Finding:
+    found, labels = _steps(samples)
+    return compare_cells(found.cells, labels, level, "directions of the noise")
+
+
 def _reading_variance(samples: PartSamples, level: float) -> Finding:
     labels = reading_labels(samples.scenario)
-    return compare_variances(total(samples.readings), labels, level, "readings")
+    gaussian = not _own_sensors(samples.scenario)
+    return compare_variances(total(samples.readings), labels, level, "readings", gaussian)
 
 
 def _reading_mean(samples: PartSamples, level: float) -> Finding:
@@ -75,15 +94,50 @@ def _reading_correlation(samples: PartSamples, level: float) -> Finding:
     return compare_correlations(total(samples.readings), reading_labels(samples.scenario), level)
 
 
+def _reading_law(samples: PartSamples, level: float) -> Finding:
+    cells = total(samples.readings).cells
+    return compare_cells(cells, reading_labels(samples.scenario), level, "readings")
+
+
+def _own_sensors(scenario: Scenario) -> bool:
+    return any(is_own_class(sensor, "sensor") for sensor in scenario.sensors)
+
+
+def gaussian_noises(samples: PartSamples) -> Assumption:
+    """Return the assumption that all noises are Gaussian, which rows about squared errors need.
+
+    What is stated of a noise is its covariance, so that a class of a user may have another law.
+    """
+    scenario, found = samples.scenario, []
+    if is_own_class(scenario.plant, "plant"):
+        if samples.steps is not None:
+            found.append((total(samples.steps).cells, "the noise of the plant"))
+        if scenario.plant.is_random and np.any(scenario.plant.start_cov):
+            found.append((_starts(scenario, samples.seed).cells, "the law of x(0)"))
+    if _own_sensors(scenario) and samples.readings is not None:
+        found.append((total(samples.readings).cells, "the noise of the sensors"))
+    off = [what for cells, what in found if not _fills_evenly(cells)]
+    evidence = f"{' and '.join(off)} is not" if off else "none is found that is not"
+    return Assumption(GAUSSIAN, "the scenario", not off, evidence)
+
+
+def _fills_evenly(cells: FloatArray) -> bool:
+    """Return False if numbers counted in ``cells`` (CELLS, d) are not Gaussian at LAW_LEVEL."""
+    finding = compare_cells(cells, [""] * cells.shape[1], LAW_LEVEL, "")
+    return not finding.margin[2] < 0.0
+
+
 START_ROWS = (
     Promise("the state starts with its covariance", "the scenario", (), _start_variance),
     Promise("the state starts with its mean", "the scenario", (), _start_mean),
 )
+START_LAW = Promise("the state starts with a Gaussian law", "the scenario", (), _start_law)
 PLANT_ROWS = (
     Promise("the plant's noise has its covariance", "the scenario", (), _step_variance),
     Promise("the plant follows its equation without a bias", "the scenario", (), _step_mean),
     Promise("the plant's noise is white", "the scenario", (), _step_correlation),
 )
+STEP_LAW = Promise("the plant's noise is Gaussian", "the scenario", (), _step_law)
 SENSOR_ROWS = (
     Promise("noises of the sensors have their covariance", "the scenario", (), _reading_variance),
     Promise("readings have no bias", "the scenario", (), _reading_mean),
@@ -96,14 +150,18 @@ SENSOR_ROWS = (
 )
 
 
+READING_LAW = Promise("noises of the sensors are Gaussian", "the scenario", (), _reading_law)
+
+
 def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
     """Return the promises about the parts that these samples can be held to."""
     scenario = samples.scenario
     found: list[Promise] = []
+    own_plant = is_own_class(scenario.plant, "plant")
     if scenario.plant.is_random and np.any(scenario.plant.start_cov):
-        found += START_ROWS
+        found += START_ROWS if own_plant else (*START_ROWS, START_LAW)
     if samples.steps is not None and path_law(scenario) is not None:
-        found += PLANT_ROWS
+        found += PLANT_ROWS if own_plant else (*PLANT_ROWS, STEP_LAW)
     if samples.readings is not None:
-        found += SENSOR_ROWS
+        found += SENSOR_ROWS if _own_sensors(scenario) else (*SENSOR_ROWS, READING_LAW)
     return (*found, *network_promises(samples))

@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.checks.parts.delays import DelayCounts, count_delays
 from netkf.checks.parts.events import (
     FateCounts,
     PairCounts,
-    TickCounts,
     count_fates,
     count_pairs,
-    count_ticks,
 )
 from netkf.checks.parts.moments import NoiseMoments
 from netkf.checks.parts.noises import plant_moments, reading_moments
+from netkf.checks.parts.ticks import TickCounts, count_samples, count_ticks
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -31,6 +31,8 @@ class PartSummary(NamedTuple):
     pairs: PairCounts | None
     steps: NoiseMoments | None
     readings: NoiseMoments | None
+    delays: DelayCounts | None
+    sampling: TickCounts | None
 
 
 PART_TYPES: dict[str, type[Any]] = {
@@ -39,6 +41,8 @@ PART_TYPES: dict[str, type[Any]] = {
     "pairs": PairCounts,
     "steps": NoiseMoments,
     "readings": NoiseMoments,
+    "delays": DelayCounts,
+    "sampling": TickCounts,
 }
 """The classes of the fields of :class:`PartSummary`."""
 
@@ -52,6 +56,8 @@ def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
         count_pairs(scenario, run),
         plant_moments(scenario, streams),
         reading_moments(scenario, streams),
+        count_delays(scenario, run),
+        count_samples(scenario, streams),
     )
 
 
@@ -68,6 +74,8 @@ class PartSamples:
     pairs: Any
     steps: Any
     readings: Any
+    delays: Any
+    sampling: Any
 
 
 def stack_parts(scenario: Scenario, seed: int, summaries: Sequence[PartSummary]) -> PartSamples:

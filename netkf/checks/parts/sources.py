@@ -1,7 +1,8 @@
 """The built-in part that a part of a scenario says that it is.
 
 A user's class is held to the built-in class that it derives from, with the same fields; a class
-that derives from a contract alone is held to what it states about itself.
+that derives from a contract alone, or that defines a statement of its base anew, is held to what it
+states about itself.
 """
 
 from __future__ import annotations
@@ -11,11 +12,30 @@ from typing import Any
 from netkf.core.fields import as_class
 from netkf.scenario.registry import KINDS
 
+CLOCK_STATEMENTS = ("mean_rate", "memoryless")
+STATEMENTS = {
+    "activation": CLOCK_STATEMENTS,
+    "sampling": CLOCK_STATEMENTS,
+    "loss": ("mean_delivery", "independent"),
+    "delay": ("fixed", "longest"),
+    "slot activation": ("mean",),
+}
+"""By which methods and properties a part states its law."""
+
+
+def is_own_class(part: Any, family: str) -> bool:
+    """Return True if the class of a part is not built in."""
+    return type(part) not in set(KINDS[family].values())
+
 
 def stated_part(part: Any, family: str) -> Any:
-    """Return the part that states the law: the part itself if its class is built in or derives from
-    a contract alone, else one of the built-in class that it derives from, with the same fields.
+    """Return the part that states the law: the part itself if its class is built in, derives from
+    a contract alone or has a statement of its own, else one of the built-in class that it derives
+    from, with the same fields.
     """
-    known = set(KINDS[family].values())
-    base = next((cls for cls in type(part).__mro__ if cls in known), type(part))
-    return part if base is type(part) else as_class(part, base)
+    known, order = set(KINDS[family].values()), type(part).__mro__
+    place = next((k for k, cls in enumerate(order) if cls in known), 0)
+    own = {name for cls in order[:place] for name in vars(cls)}
+    if place == 0 or own.intersection(STATEMENTS.get(family, ())):
+        return part
+    return as_class(part, order[place])

@@ -10,19 +10,35 @@ import scipy.stats
 
 import netkf
 from netkf.checks.evidence import BROKEN, HOLDS, judge
-from netkf.checks.parts.events import CELLS, _sort_gaps
+from netkf.checks.parts.delays import delay_law
 from netkf.checks.parts.moments import (
+    CELLS,
+    compare_cells,
     compare_correlations,
     compare_means,
     compare_variances,
     moments,
     whitening_matrix,
 )
-from netkf.checks.parts.network_rows import _correlation_of_runs, _neighbours_variance
+from netkf.checks.parts.network_rows import (
+    _correlation_of_runs,
+    _neighbours_variance,
+    loss_twice,
+)
 from netkf.checks.parts.noises import start_states
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
+from netkf.checks.parts.ticks import ClockGroup, _count
 from netkf.checks.statistics import probability_interval, scale_interval
+from netkf.parts import (
+    ConstantDelay,
+    ExponentialDelay,
+    GilbertElliott,
+    LognormalDelay,
+    Poisson,
+    Renewal,
+    UniformDelay,
+)
 from netkf.scenario.reading import from_table as scenario_from
 
 PLANT = {
@@ -91,6 +107,17 @@ READINGS_SENT = {
     },
     "filter": {"kind": "intermittent"},
 }
+
+
+def with_network(table, **changes):
+    return {**table, "network": {**table["network"], **changes}}
+
+
+GAMMAS = with_network(TICKS, activation=GAMMA)
+PERIODIC = with_network(TICKS, activation={"kind": "periodic", "period": 0.4})
+IN_BURSTS = with_network(TICKS, channel={"loss": BURSTS})
+LATE = with_network(TICKS, channel={"delay": {"kind": "exponential", "mean": 0.2}})
+DELAYED = with_network(TICKS, channel={"delay": {"kind": "constant", "seconds": 0.2}})
 HEALTHY = {
     "slots": (SLOTS, {}),
     "one direction of some links": (READINGS_SENT, {}),
@@ -100,6 +127,17 @@ HEALTHY = {
     "one fate": (TICKS, {"network.channel.symmetric": True}),
     "gamma": (TICKS, {"network.activation": GAMMA}),
     "nodes": (TICKS, {"network.activation": {"kind": "poisson", "rate": 2.0, "at": "nodes"}}),
+    "late": (TICKS, {"network.channel": {"delay": {"kind": "exponential", "mean": 0.7}}}),
+    "delayed": (TICKS, {"network.channel": {"delay": {"kind": "constant", "seconds": 0.3}}}),
+    "delayed slots": (
+        SLOTS,
+        {"network.channel": {"delay": {"kind": "uniform", "low": 0.1, "high": 0.6}}},
+    ),
+    "periodic": (TICKS, {"network.activation": {"kind": "periodic", "period": 0.3, "jitter": 0.1}}),
+    "random phases": (
+        TICKS,
+        {"network.activation": {"kind": "periodic", "period": 0.3, "phase": "random"}},
+    ),
 }
 
 
@@ -149,6 +187,17 @@ WRONG = {
     "OneWay": (TICKS, "network.channel.loss", "messages are lost as often as"),
     "Sticky": (TICKS, "network.channel.loss", "messages are lost independently"),
     "Preferring": (SLOTS, "network.activation", "links are paired as often"),
+    "Lazier": (SLOTS, "network.activation", "links are paired as often"),
+    "Rarely": (TICKS, "sensors[0]", "sensors sample at the rates"),
+    "Regular": (TICKS, "sensors[0]", "gaps between samples are exponential"),
+    "LateFirst": (TICKS, "network.activation", "clocks tick at the rates"),
+    "OtherShape": (GAMMAS, "network.activation", "ticks follow the law of their clocks"),
+    "OffBeat": (PERIODIC, "network.activation", "clocks tick at the times"),
+    "LongerBursts": (IN_BURSTS, "network.channel.loss", "losses follow each other"),
+    "FirstLost": (TICKS, "network.channel.loss", "messages are lost as often as"),
+    "Slow": (LATE, "network.channel.delay", "delays of messages have the law"),
+    "OneSlow": (LATE, "network.channel.delay", "delays of messages have the law"),
+    "Sooner": (DELAYED, "network.channel.delay", "messages take the time"),
 }
 
 
@@ -165,23 +214,72 @@ def with_class(table, key, name):
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_parts_are_found(name):
     table, key, promise = WRONG[name]
-    rows = verdicts(with_class(table, key, name), 100)
+    rows = verdicts(with_class(table, key, name), 100 if key == "plant" else 60)
     assert any(one.startswith(promise) for one in broken(rows))
 
 
-def test_uniform_gaps_are_uniform_however_short_the_run():
-    # Given the number of ticks, gaps of a Poisson clock as numbers in [0, 1) are uniform exactly.
-    random, counts = np.random.default_rng(3), np.zeros(CELLS)
-    products = np.zeros(3)
+GAPS = {
+    # Clocks, with gaps drawn by scipy's law and not by ours.
+    "poisson": (Poisson(rate=1.3), scipy.stats.expon(scale=1.0 / 1.3)),
+    "gamma": (
+        Renewal(distribution="gamma", shape=2.5, mean=0.4),
+        scipy.stats.gamma(2.5, scale=0.16),
+    ),
+    "weibull": (
+        Renewal(distribution="weibull", shape=0.7, scale=0.5),
+        scipy.stats.weibull_min(0.7, scale=0.5),
+    ),
+    "uniform": (
+        Renewal(distribution="uniform", low=0.2, high=0.9),
+        scipy.stats.uniform(0.2, 0.7),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GAPS)
+def test_gaps_are_uniform_numbers_however_short_the_run(name):
+    (clock, law), random = GAPS[name], np.random.default_rng(3)
+    counts, products, horizon = np.zeros(CELLS), np.zeros(3), 2.0
+    group = ClockGroup(((0, 1),), (clock,), ("",))
     for _ in range(4000):
-        ticks = np.cumsum(random.standard_exponential(30) / 1.3)
-        ticks = ticks[ticks < 3.0]
-        cells, more = _sort_gaps(ticks, np.zeros(len(ticks), int), np.array([len(ticks)]), 3.0)
-        counts += cells
-        products += more
+        ticks = np.cumsum(law.rvs(60, random_state=random))
+        ticks = ticks[ticks < horizon]
+        found = _count(group, ticks, np.zeros(len(ticks), int), horizon)
+        counts += found.cells[:, 0]
+        products += found.products
+    assert counts.sum() > 5000
     assert scipy.stats.chisquare(counts).pvalue > 1e-3
     assert abs(products[0]) < 4.0 * math.sqrt(products[2])
-    assert abs(products[1] / products[2] - 1.0) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("delay", "law"),
+    [
+        (ExponentialDelay(mean=0.3), scipy.stats.expon(scale=0.3)),
+        (UniformDelay(low=0.1, high=0.4), scipy.stats.uniform(0.1, 0.3)),
+        (LognormalDelay(mean=0.3, sigma=0.5), scipy.stats.lognorm(0.5, scale=0.3 * np.exp(-0.125))),
+        (ConstantDelay(seconds=0.3), None),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_laws_of_delays_are_those_of_scipy(delay, law):
+    seconds = np.linspace(0.0, 1.0, 11)
+    found = delay_law(delay, seconds)
+    if law is None:
+        assert found is None
+    else:
+        assert found == pytest.approx(law.cdf(seconds), abs=1e-12)
+
+
+@pytest.mark.parametrize(("to_bad", "to_good", "good"), [(0.1, 0.3, 1.0), (0.4, 0.2, 0.8)])
+def test_losses_in_a_row_are_those_of_a_simulated_chain(to_bad, to_good, good):
+    chain = GilbertElliott(to_bad=to_bad, to_good=to_good, deliver_good=good, deliver_bad=0.1)
+    random, bad = np.random.default_rng(2), np.zeros(200_000, dtype=bool)
+    bad[0] = random.random() < to_bad / (to_bad + to_good)
+    for k, u in enumerate(random.random(len(bad) - 1).tolist()):
+        bad[k + 1] = u >= to_good if bad[k] else u < to_bad
+    lost = random.random(len(bad)) >= np.where(bad, 0.1, good)
+    assert loss_twice(chain) == pytest.approx((lost[1:] & lost[:-1]).mean(), abs=0.01)
 
 
 def test_whitening_gives_the_identity_and_drops_certain_directions():
@@ -196,6 +294,7 @@ TESTS = {
     "variances": lambda found, level: compare_variances(found, LABELS, level, "values"),
     "means": lambda found, level: compare_means(found, LABELS, level),
     "correlations": lambda found, level: compare_correlations(found, LABELS, level),
+    "cells": lambda found, level: compare_cells(found.cells, LABELS, level, "values"),
 }
 
 
@@ -209,7 +308,7 @@ def test_moments_keep_their_level(name):
     assert low <= level
 
 
-@pytest.mark.parametrize("name", TESTS)
+@pytest.mark.parametrize("name", ["variances", "means", "correlations"])
 def test_moments_find_what_they_say(name):
     # An error of the size that a row calls detectable is found with probability 0.9.
     random, count, level = np.random.default_rng(8), 2000, 0.01

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netkf.network.channels import Bernoulli
-from netkf.network.clocks import Poisson
+from netkf.network.channels import Bernoulli, ConstantDelay, ExponentialDelay, GilbertElliott
+from netkf.network.clocks import Periodic, Poisson, Renewal
 from netkf.network.matchings import Matching
 from netkf.plants.linear import LinearPlant, SlotReadings
 from netkf.plants.sensors import LinearSensor
@@ -124,3 +124,98 @@ class Preferring(Matching):
         return (
             [topology.links[1]] if pairs == [topology.links[0]] and random.random() < 0.4 else pairs
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Lazier(Matching):
+    """Drops one pair of twenty."""
+
+    def draw(self, topology, random):
+        pairs = super().draw(topology, random)
+        return pairs if random.random() > 0.05 else []
+
+
+@dataclass(frozen=True, eq=False)
+class Rarely(LinearSensor):
+    """Leaves out every tenth sample."""
+
+    def sample_times(self, node, ordinal, generator, horizon):
+        times = super().sample_times(node, ordinal, generator, horizon)
+        return np.delete(times, np.arange(9, len(times), 10))
+
+
+@dataclass(frozen=True, eq=False)
+class Regular(LinearSensor):
+    """Samples at the rate of its Poisson clock, at equal distances."""
+
+    def sample_times(self, node, ordinal, generator, horizon):
+        gap = 1.0 / self.sampling.mean_rate((node, ordinal))
+        return np.arange(generator("sampling").random() * gap + 1e-9, horizon, gap)
+
+
+@dataclass(frozen=True, eq=False)
+class LateFirst(Poisson):
+    """Every clock begins a quarter of a second late."""
+
+    def ticks(self, entity, origin, index, now, random, count):
+        late = 0.25 if index == 0 else 0.0
+        return late + super().ticks(entity, origin, index, now, random, count)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherShape(Renewal):
+    """Has the rate, and gaps that vary more."""
+
+    def ticks(self, entity, origin, index, now, random, count):
+        gaps = random.standard_gamma(2.0, count) / 2.0 / self.mean_rate(entity)
+        return np.add.accumulate(np.concatenate([[now], gaps]))[1:]
+
+
+@dataclass(frozen=True, eq=False)
+class OffBeat(Periodic):
+    """Ticks a hundredth of a second late."""
+
+    def ticks(self, entity, origin, index, now, random, count):
+        return 0.01 + super().ticks(entity, origin, index, now, random, count)
+
+
+@dataclass(frozen=True, eq=False)
+class LongerBursts(GilbertElliott):
+    """Loses as many messages, in bursts twice as long."""
+
+    @property
+    def transitions(self):
+        to_bad, to_good = super().transitions
+        return 0.5 * to_bad, 0.5 * to_good
+
+
+@dataclass(frozen=True, eq=False)
+class FirstLost(Bernoulli):
+    """Loses the first two messages of every direction."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return self.delivery if message > 1 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Slow(ExponentialDelay):
+    """Takes a tenth longer."""
+
+    def draw(self, random):
+        return 1.1 * super().draw(random)
+
+
+@dataclass(frozen=True, eq=False)
+class OneSlow(ExponentialDelay):
+    """Takes longer on one link."""
+
+    def message_delay(self, link, message, drawn):
+        return drawn * (1.5 if link == (0, 1) else 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Sooner(ConstantDelay):
+    """Takes a little less time than it says."""
+
+    def message_delay(self, link, message, drawn):
+        return 0.99 * drawn

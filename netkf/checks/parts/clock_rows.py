@@ -1,0 +1,316 @@
+"""Promises about the clocks of the network and of sensors, from the counts of many runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.special
+
+from netkf.checks.evidence import Finding, Promise, find_identity
+from netkf.checks.laws import find_largest
+from netkf.checks.parts.moments import (
+    CELLS,
+    compare_cells,
+    correlation_interval,
+    with_best,
+)
+from netkf.checks.parts.samples import PartSamples
+from netkf.checks.parts.ticks import (
+    ClockGroup,
+    draw_samples,
+    draw_ticks,
+    network_clocks,
+    sampling_clocks,
+    ticks_on_lattice,
+)
+from netkf.checks.statistics import (
+    POWER,
+    Interval,
+    detectable_shift,
+    deviation_interval,
+    scale_interval,
+    student_interval,
+)
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+
+RATE_TOLERANCE, DISPERSION_TOLERANCE = 0.05, 0.25
+FIRST_TICK = 1.0
+"""Ticks by which a clock that is not memoryless may be off its rate in a run: it has begun."""
+WANTED_RATE = 0.02
+"""Error of the rate of one clock that should be found."""
+ENOUGH_TICKS, MAX_DRAWN, MAX_DRAWN_TICKS, DRAWN_PER_RUN = 80_000, 20_000, 3e6, 4
+"""Ticks of one clock in which that error shows; the most times that a clock is drawn for a replica
+beyond those of the runs, in all and for each run, and the most ticks of all of them.
+"""
+MAX_CLOCKS = 60
+"""Clocks of which all pairs are compared."""
+LATTICE_TOLERANCE = 1e-9
+"""Seconds, for each second of the run, by which rounding may move a tick."""
+
+
+class Clocks(NamedTuple):
+    """Clocks of one kind, the counts of their ticks in all runs, and how more are drawn."""
+
+    scenario: Scenario
+    seed: int
+    group: ClockGroup
+    counts: Any
+    draw: Callable[[Scenario, int, int], np.ndarray]
+
+    @property
+    def rates(self) -> FloatArray:
+        """The stated rates (E,) of all clocks in ticks per second; nan if unknown."""
+        pairs = zip(self.group.stated, self.group.entities, strict=True)
+        return np.array([stated.mean_rate(entity) for stated, entity in pairs])
+
+    @property
+    def poisson(self) -> bool:
+        """True if all clocks are Poisson processes."""
+        return all(stated.memoryless for stated in self.group.stated)
+
+
+def _network(samples: PartSamples) -> Clocks:
+    scenario = samples.scenario
+    return Clocks(scenario, samples.seed, network_clocks(scenario), samples.ticks, draw_ticks)
+
+
+def _sampling(samples: PartSamples) -> Clocks:
+    scenario = samples.scenario
+    group = sampling_clocks(scenario)
+    return Clocks(scenario, samples.seed, group, samples.sampling, draw_samples)
+
+
+Group = Callable[[PartSamples], Clocks]
+
+
+@lru_cache(maxsize=4)
+def _drawn_counts(
+    draw: Callable[[Scenario, int, int], np.ndarray],
+    scenario: Scenario,
+    seed: int,
+    first: int,
+    count: int,
+) -> np.ndarray:
+    """Return the ticks (count, E) of all clocks in the replicas from ``first`` on."""
+    return np.array([draw(scenario, seed, first + k) for k in range(count)])
+
+
+def _counts_of_each(clocks: Clocks) -> np.ndarray:
+    """Return the ticks (R', E) of each clock in the runs, and in as many further replicas, of which
+    only the clocks are drawn, as it takes to find that one rate is off by WANTED_RATE.
+    """
+    counts = clocks.counts.ticks.sum(axis=1)
+    runs, rates = len(counts), clocks.rates * clocks.scenario.horizon
+    wanted = min(
+        math.ceil(ENOUGH_TICKS / rates.min()) - runs,
+        DRAWN_PER_RUN * runs,
+        int(MAX_DRAWN / len(rates)),
+        int(MAX_DRAWN_TICKS / rates.sum()),
+    )
+    if wanted <= 0:
+        return np.asarray(counts)
+    more = _drawn_counts(clocks.draw, clocks.scenario, clocks.seed, runs, wanted)
+    return np.concatenate([counts, more])
+
+
+def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
+    """Compare the ticks of all runs with the rates: all clocks together, also in parts of the run,
+    and one by one.
+    """
+    clocks = group(samples)
+    windows, each = clocks.counts.ticks, _counts_of_each(clocks)
+    expected, poisson = clocks.rates * clocks.scenario.horizon, clocks.poisson
+    total = windows.sum(axis=(1, 2))
+    together = FIRST_TICK * len(expected)
+    intervals = [
+        (
+            _count_interval(total, float(expected.sum()), level / 3.0, poisson, together),
+            "all clocks together",
+        )
+    ]
+    if poisson:
+        intervals += _rates_by_window(windows, float(expected.sum()), level / 3.0)
+    share = level / (3.0 * len(expected))
+    singles = [
+        _count_interval(each[:, k], float(expected[k]), share, poisson, FIRST_TICK)
+        for k in range(len(expected))
+    ]
+    intervals += zip(singles, clocks.group.labels, strict=True)
+    message = f"{total.sum():,.0f} ticks, relative difference from the rates,"
+    finding = with_best(intervals, RATE_TOLERANCE, message)
+    note = _limit_of_one_clock(clocks, each, singles, level)
+    return finding._replace(message=finding.message + note)
+
+
+def _rates_by_window(windows: np.ndarray, mean: float, level: float) -> list[tuple[Interval, str]]:
+    """Return how far the ticks (R, W, E) of all clocks are from the rates in each window."""
+    parts = windows.sum(axis=2)
+    count = parts.shape[1]
+    return [
+        (
+            _count_interval(parts[:, k], mean / count, level / count, True, 0.0),
+            f"all clocks in part {k + 1} of {count} of the run",
+        )
+        for k in range(count if count > 1 else 0)
+    ]
+
+
+def _limit_of_one_clock(
+    clocks: Clocks, each: np.ndarray, singles: list[Interval], level: float
+) -> str:
+    """Return what no test could find at one clock, where that is more than WANTED_RATE.
+
+    The estimate of a rate from N ticks of a Poisson process has at least the relative standard
+    deviation 1 / sqrt(N), by the bound of Cramer and Rao.
+    """
+    worst = max(range(len(singles)), key=lambda k: singles[k].detectable)
+    if singles[worst].detectable <= WANTED_RATE or not clocks.poisson:
+        return ""
+    ticks = float(clocks.rates[worst]) * clocks.scenario.horizon * len(each)
+    quantiles = scipy.special.ndtri(1.0 - level) + scipy.special.ndtri(POWER)
+    least = float(quantiles) / math.sqrt(ticks)
+    return (
+        f"; of one clock, no test at this level finds less than {least:.2g} in {ticks:,.0f} ticks"
+    )
+
+
+def _count_interval(
+    values: np.ndarray, mean: float, level: float, poisson: bool, first_ticks: float
+) -> Interval:
+    """Return an interval for how far counts (R,) are from ``mean`` in a run, relative to it.
+
+    Sums of Poisson counts are Poisson, with exact limits; other clocks are judged by the spread of
+    their counts, and a difference of ``first_ticks`` says nothing.
+    """
+    total, runs = float(values.sum()), len(values)
+    slack = 0.0 if poisson else first_ticks / mean
+    if poisson:
+        low = float(scipy.special.gammaincinv(total, level / 2.0)) if total else 0.0
+        high = float(scipy.special.gammaincinv(total + 1.0, 1.0 - level / 2.0))
+        spread = math.sqrt(runs * mean)
+    else:
+        spread = math.sqrt(max(float(values.var(ddof=1)), 0.25) * runs)
+        _, low, high = student_interval(total, spread, runs, level)[:3]
+    whole = runs * mean
+    ratio = Interval(
+        total / whole, low / whole, high / whole, detectable_shift(spread, level) / whole
+    )
+    apart = deviation_interval(1.0, ratio)
+    value, low, high = (max(0.0, end - slack) for end in apart[:3])
+    return apart._replace(value=value, low=low, high=high, detectable=apart.detectable + slack)
+
+
+def _gaps(group: Group, samples: PartSamples, level: float) -> Finding:
+    """Compare gaps with the law of their clock, cell by cell, and with the gap before."""
+    counts = group(samples).counts
+    found = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
+    products = counts.products.sum(axis=0)
+    if products[2] < 10 * CELLS:
+        return found
+    related = correlation_interval(float(products[0] / products[1]), products[2], level / 2.0)
+    apart = deviation_interval(0.0, related)
+    if apart.low > 0.0 and not found.margin[2] < 0.0:
+        label = "neighbouring gaps"
+        return find_largest([(apart, label)], found.tolerance, "largest correlation")
+    text = f"; correlation of neighbouring gaps {related.value:.2g}"
+    return found._replace(message=f"{found.message}{text}, {apart.detectable:.2g} would be seen")
+
+
+def _lattice(group: Group, samples: PartSamples, level: float) -> Finding:
+    """Compare ticks of clocks without randomness with where they should be."""
+    counts, horizon = group(samples).counts, samples.scenario.horizon
+    off, ticks = float(counts.off.max()), counts.ticks.sum()
+    message = f"{ticks:,.0f} ticks, in seconds, of the run's length"
+    return find_identity(off / horizon, LATTICE_TOLERANCE, message)
+
+
+def _clocks_apart(group: Group, samples: PartSamples, level: float) -> Finding:
+    """Compare the spread of all ticks of a run with that of independent Poisson clocks."""
+    clocks = group(samples)
+    ticks = clocks.counts.ticks
+    counts = ticks.reshape(-1, ticks.shape[2])
+    mean = float((clocks.rates * samples.scenario.horizon).sum()) / ticks.shape[1]
+    values = counts.sum(axis=1) - mean
+    # A squared Poisson count has a little more spread than a squared normal one.
+    freedom = len(values) / (1.0 + 0.5 / mean)
+    ratio = scale_interval(freedom * float((values**2).mean()) / mean, freedom, level / 2.0)
+    apart = deviation_interval(1.0, ratio)
+    intervals = [(apart, "variance of all ticks at once over that of independent clocks")]
+    pairs = largest_correlation(counts - counts.mean(axis=0), level / 2.0)
+    if pairs is not None:
+        value, (a, b) = pairs
+        labels = clocks.group.labels
+        intervals.append((value, f"correlation of {labels[a]} and {labels[b]}"))
+    return find_largest(intervals, DISPERSION_TOLERANCE, "largest difference")
+
+
+def largest_correlation(
+    values: FloatArray, level: float
+) -> tuple[Interval, tuple[int, int]] | None:
+    """Return an interval for the largest correlation of two columns of values (K, L) of mean 0, by
+    the spread of their products over the K independent rows.
+    """
+    some = values[:, :MAX_CLOCKS]
+    kept = np.flatnonzero(some.var(axis=0) > 0.0)
+    runs = len(some)
+    if len(kept) < 2 or runs < 100:
+        return None
+    z = some[:, kept] / some[:, kept].std(axis=0)
+    related = z.T @ z / runs
+    upper = np.triu_indices(len(kept), 1)
+    worst = int(np.argmax(np.abs(related[upper])))
+    a, b = int(upper[0][worst]), int(upper[1][worst])
+    products = z[:, a] * z[:, b]
+    spread = max(float(products.std(ddof=1)), 1.0) / math.sqrt(runs)
+    found = student_interval(float(related[upper][worst]), spread, runs, level / len(upper[0]))
+    return deviation_interval(0.0, found), (int(kept[a]), int(kept[b]))
+
+
+def _promises(clocks: Clocks, group: Group, words: dict[str, str]) -> list[Promise]:
+    """Return the promises about one group of clocks, with a sentence for each test."""
+    rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _rates, False)]
+    if clocks.poisson:
+        rows += [("exponential", _gaps, False), ("apart", _clocks_apart, False)]
+    elif all(ticks_on_lattice(stated) for stated in clocks.group.stated):
+        rows.append(("lattice", _lattice, True))
+    if not clocks.poisson and clocks.counts.cells.any():
+        rows.append(("law", _gaps, False))
+    return [
+        Promise(words[name], "the scenario", (), partial(test, group), exact)
+        for name, test, exact in rows
+    ]
+
+
+NETWORK_WORDS = {
+    "rates": "clocks tick at the rates of the scenario",
+    "exponential": "gaps between ticks are exponential, and independent of those before",
+    "apart": "clocks tick independently of each other",
+    "lattice": "clocks tick at the times of the scenario",
+    "law": "ticks follow the law of their clocks, and do not depend on those before",
+}
+SAMPLING_WORDS = {
+    "rates": "sensors sample at the rates of the scenario",
+    "exponential": "gaps between samples are exponential, and independent of those before",
+    "apart": "sensors sample independently of each other",
+    "lattice": "sensors sample at the times of the scenario",
+    "law": "samples follow the law of their clocks, and do not depend on those before",
+}
+
+
+def clock_promises(samples: PartSamples) -> list[Promise]:
+    """Return the promises about clocks that have a stated law and were seen in the runs."""
+    found: list[Promise] = []
+    for counts, group, words in (
+        (samples.ticks, _network, NETWORK_WORDS),
+        (samples.sampling, _sampling, SAMPLING_WORDS),
+    ):
+        if counts is not None:
+            clocks = group(samples)
+            if np.isfinite(clocks.rates).all():
+                found += _promises(clocks, group, words)
+    return found
