@@ -324,8 +324,6 @@ class Hurried(Poisson):
 
 OWN = "tests.testing.sound_parts"
 LAPLACE, UNIFORM = f"{OWN}:LaplaceSensor", f"{OWN}:UniformNoise"
-    f"tests.testing.sound_parts:{name}" for name in ("LaplaceSensor", "UniformNoise")
-)
 OWN_PARTS = {
     # By design: what a class states is what it is held to.
     "Laplace noise": (GOSSIP, {"sensors": [{**GOSSIP["sensors"][0], "kind": LAPLACE}]}),

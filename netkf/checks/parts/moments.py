@@ -217,10 +217,10 @@ def with_best(
 
     A part that is off is the finding; else what is known of everything, which is more precise.
     """
-    off = [item for item in intervals if item[0].low > 0.0]
-    if off:
-        return find_largest(intervals, tolerance, message)
     finding = find_largest(intervals[:whole], tolerance, message)
+    if any(apart.low > 0.0 for apart, _ in intervals):
+        everything = finding.detectable
+        return find_largest(intervals, tolerance, message)._replace(detectable=everything)
     if len(intervals) == whole:
         return finding
     worst, label = max(intervals[whole:], key=lambda item: item[0].value)
