@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.kernels.slots import whitened
+from netkf.algorithms.kernels.slots import whiten_reading
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
@@ -150,7 +150,7 @@ class BeliefPropagation(Filter):
         """Add a reading to the own ones."""
         if not len(reading.y):
             return state
-        own = merged([state.own, Evidence(*whitened(reading.y, reading.H, reading.R))])
+        own = merged([state.own, Evidence(*whiten_reading(reading.y, reading.H, reading.R))])
         return believing(state._replace(own=own))
 
     def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:

@@ -38,7 +38,7 @@ from netkf.algorithms.kernels.slots import (
     rebase,
     show,
     slot_room,
-    whitened,
+    whiten_reading,
 )
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.pairs import weighted_pairs
@@ -339,7 +339,7 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
     n, (y, H, R) = len(state.xhat), reading[:3]
     if len(y):
         # The kernel takes readings whose noise has variance 1.
-        y, H = whitened(y, H, R)
+        y, H = whiten_reading(y, H, R)
     nodes = SlotNodes(
         state.xhat.reshape(1, 1, n, 1),
         np.ascontiguousarray(state.root).reshape(1, 1, n, n, 1),

@@ -89,7 +89,7 @@ class FlowModel:
         return _shared_flow_table(self.A, self.Q, self.H, self.R, self.horizon)
 
     @cached_property
-    def blind_flow(self) -> FlowTable:
+    def unobserved_flow(self) -> FlowTable:
         """Table of the flow of the root of P without readings."""
         nothing = np.zeros((0, len(self.A)))
         return _shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
@@ -119,7 +119,7 @@ class FlowModel:
         """Return estimate and root ``age`` seconds later, without readings."""
         if age <= 0.0:
             return xhat, root
-        root, xhat = flow_root(self.blind_flow, root, xhat, age)
+        root, xhat = flow_root(self.unobserved_flow, root, xhat, age)
         return xhat, root
 
     def gain_update(

@@ -14,7 +14,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.kernels.slots import whitened
+from netkf.algorithms.kernels.slots import whiten_reading
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
 from netkf.linalg.arrays import FloatArray
@@ -79,7 +79,7 @@ class OneBit(Filter):
         """Send the reading as bits in the node's turn, and use them."""
         if state.reading is None or exchange.slot % state.nodes != state.turn:
             return state, None
-        y, H = whitened(*state.reading[:3])
+        y, H = whiten_reading(*state.reading[:3])
         signs = np.empty(len(y))
         for k in range(len(y)):
             # Each row refers to the estimate that has used the bits of those before it.

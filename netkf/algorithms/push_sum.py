@@ -39,7 +39,7 @@ from netkf.algorithms.kernels.slots import (
     rebase,
     show,
     slot_room,
-    whitened,
+    whiten_reading,
 )
 from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, has_stopped
 from netkf.algorithms.models import SlotModel, first_root
@@ -82,7 +82,7 @@ class NetworkInformation(NamedTuple):
     root: FloatArray | None = None
 
 
-class Sums(NamedTuple):
+class NodeSums(NamedTuple):
     """Running sums of one node: the total (2 + n^2,) that it has ever ``offered`` to each of its
     neighbours, and the last totals that it ``heard``, by sender.
     """
@@ -105,7 +105,7 @@ class PushSumState(NamedTuple):
     network: NetworkInformation
     stopped: bool
     degree: int
-    sums: Sums | None = None
+    sums: NodeSums | None = None
 
     @property
     def P(self) -> FloatArray:
@@ -542,7 +542,7 @@ class PushSum(Filter):
         if self.asymptotic:
             root = asymptotic_root(model.F, model.Q, node.information)
             known = NetworkInformation(node.information, float(node.nodes), root)
-        sums = Sums(np.zeros(mass.shape), {}) if self._keeps_totals else None
+        sums = NodeSums(np.zeros(mass.shape), {}) if self._keeps_totals else None
         return PushSumState(mean, first_root(cov), model, mass, known, False, node.degree, sums)
 
     @property
@@ -726,7 +726,7 @@ class PushSum(Filter):
         )
 
 
-def _heard_totals(state: PushSumState, sums: Sums, messages: Sequence[Message]) -> PushSumState:
+def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Message]) -> PushSumState:
     """Return the state whose mass is its own share and what has grown of the totals it hears."""
     heard, nothing = dict(sums.heard), np.zeros(state.mass.shape)
     gained = [message.payload - heard.get(message.sender, nothing) for message in messages]
@@ -749,7 +749,7 @@ def corrected(
     n, x = len(predicted), np.array(predicted, dtype=np.float64)
     if len(y):
         # The kernel takes readings whose noise has variance 1.
-        y, H = whitened(y, H, R)
+        y, H = whiten_reading(y, H, R)
         add_gain_to_one(
             x.reshape(1, 1, n, 1),
             np.ascontiguousarray(root).reshape(1, 1, n, n, 1),

@@ -48,7 +48,7 @@ from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.ensembles.replicas import replicate
 from netkf.runs.simulate import LOAD, choose_engine, simulate
-from netkf.scenario.registry import spoken
+from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
 from netkf.theory.common.evidence import NONLINEAR
@@ -110,7 +110,7 @@ def find_checks(scenario: Scenario) -> PaperChecks:
         raise TheoryError(f"nothing is promised here: {NONLINEAR}")
     promised = promised_filter(scenario.filter.algorithm)
     if not promised.paper:
-        name = spoken(promised)
+        name = kind_name(promised)
         raise TheoryError(f"nothing is promised of the {name} filter that could be checked")
     checks: PaperChecks = importlib.import_module(f"netkf.checks.{promised.paper}").CHECKS
     return UNDER_CLOCKS if checks.slots_only and not scenario.slotted else checks

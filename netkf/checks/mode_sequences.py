@@ -2,7 +2,7 @@
 
 A mode is a set of readings that a covariance can get in one slot. A covariance of a gossip filter
 has met the nodes that its pair visited, one of an intermittent filter the sets of readings that
-arrived: both are sequences of modes, and :func:`netkf.algorithms.kernels.chains.advance` applies
+arrived: both are sequences of modes, and :func:`netkf.algorithms.kernels.chains.move_roots` applies
 them to a start covariance.
 """
 
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.chains import Letters, advance, alphabet
+from netkf.algorithms.kernels.chains import ReadingModes, move_roots, reading_modes
 from netkf.checks.evidence import Finding
 from netkf.checks.points import MAX_NODES, check_slots, sampled_nodes
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
@@ -32,11 +32,11 @@ class ModeTable(NamedTuple):
 
     F: FloatArray
     root_Q: FloatArray
-    modes: Letters
+    modes: ReadingModes
 
     def apply(self, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
         """Return the roots (K, n, n) after mode sequences (K, T), one per row."""
-        return advance(roots, sequences, self.F, self.root_Q, self.modes)
+        return move_roots(roots, sequences, self.F, self.root_Q, self.modes)
 
     def covariances(
         self, roots: FloatArray, sequences: np.ndarray, lengths: list[int]
@@ -152,7 +152,7 @@ def gossip_modes(scenario: Scenario) -> ModeTable:
     """Return the modes of a gossip filter: mode k is the reading of the k-th node, G (11)."""
     F, Q = scenario.slot_belief
     readings = [(model.H, model.R) for model in scenario.slot_models]
-    return ModeTable(F, square_root(Q), alphabet(readings, len(F)))
+    return ModeTable(F, square_root(Q), reading_modes(readings, len(F)))
 
 
 class Arrivals(NamedTuple):
@@ -184,7 +184,7 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
         models = [scenario.slot_models[index[node]] for node in nodes]
         H = np.concatenate([np.empty((0, len(F))), *(model.H for model in models)])
         readings.append((H, block_diagonal([model.R for model in models])))
-    return ModeTable(F, square_root(Q), alphabet(readings, len(F)))
+    return ModeTable(F, square_root(Q), reading_modes(readings, len(F)))
 
 
 def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:

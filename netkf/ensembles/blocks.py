@@ -14,7 +14,7 @@ from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.imports import forget_other
-from netkf.scenario.plugins import in_words, plugged_in, unnamed_class
+from netkf.scenario.plugins import describe_error, plugged_in, unnamed_class
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]
@@ -86,7 +86,7 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
     try:
         payload = pickle.dumps(scenario, protocol=pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
-        words = f"the scenario cannot be sent to workers ({in_words(error)})"
+        words = f"the scenario cannot be sent to workers ({describe_error(error)})"
         remedy = "classes and functions must be those of modules; or use workers=1"
         raise EngineError(f"{words}; {remedy}") from None
     digest = hashlib.sha256(payload).hexdigest()
@@ -140,7 +140,7 @@ def _unpickled(travelling: PackedScenario) -> Scenario:
     try:
         scenario: Scenario = pickle.loads(travelling.payload)
     except (AttributeError, ImportError) as error:
-        words = f"a class of the scenario cannot be imported by a worker ({in_words(error)})"
+        words = f"a class of the scenario cannot be imported by a worker ({describe_error(error)})"
         remedy = "put it into a module that can be imported there, or use workers=1"
         raise EngineError(f"{words}; {remedy}") from error
     return scenario

@@ -42,7 +42,7 @@ def error_figure(subject: Subject) -> Picture:
     if subject.shows_errors:
         draw_covariances(below, subject)
         above.set_xlabel("")
-        sentences = _interval_words(subject)
+        sentences = _interval_notes(subject)
     else:
         sentences = _draw_innovations(below, subject)
     finish_figure(
@@ -51,7 +51,7 @@ def error_figure(subject: Subject) -> Picture:
     return figure
 
 
-def _interval_words(subject: Subject) -> list[str]:
+def _interval_notes(subject: Subject) -> list[str]:
     if subject.runs > 1:
         return ["Bands: 95% intervals of the means (1.96 standard errors)."]
     if subject.promised.bound is None:

@@ -103,7 +103,7 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
 
 
 def _draw_curve(axes: Any, table: Any, keys: list[str]) -> str:
-    places, labels = _places(axes.set_xscale, table[keys[0]])
+    places, labels = _axis_positions(axes.set_xscale, table[keys[0]])
     order = np.argsort(places, kind="stable")
     series = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
     for (name, label), look in zip(series, SERIES, strict=False):
@@ -126,7 +126,7 @@ def _draw_curve(axes: Any, table: Any, keys: list[str]) -> str:
     axes.set(xlabel=keys[0], ylabel="RMS error, units of the state")
     axes.set_ylim(bottom=0.0)
     draw_legend(axes)
-    return _best_words(table, keys)
+    return _describe_best(table, keys)
 
 
 def _draw_map(axes: Any, table: Any, keys: list[str]) -> str:
@@ -159,10 +159,10 @@ def _draw_map(axes: Any, table: Any, keys: list[str]) -> str:
     axes.set(xlabel=keys[0], ylabel=keys[1])
     axes.figure.colorbar(image, ax=axes, label="largest RMS error, units of the state")
     draw_legend(axes)
-    return _best_words(table, keys)
+    return _describe_best(table, keys)
 
 
-def _best_words(table: Any, keys: Sequence[str]) -> str:
+def _describe_best(table: Any, keys: Sequence[str]) -> str:
     finite = table[np.isfinite(table["worst_rms"])]
     diverged = int(table["status"].astype(str).str.contains("diverged").sum())
     if not len(finite):
@@ -173,7 +173,7 @@ def _best_words(table: Any, keys: Sequence[str]) -> str:
     return words + (f"; runs diverge at {diverged} of {len(table)} points" if diverged else "")
 
 
-def _places(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
+def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
     """Return places on the axis: numbers on a scale, others side by side with labels."""
     if values.dtype.kind in "iuf":
         places = values.to_numpy(dtype=np.float64)

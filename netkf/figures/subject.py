@@ -111,7 +111,7 @@ class Subject:
             raise UnavailableError(f"{NO_COVARIANCE[0].upper()}{NO_COVARIANCE[1:]}.")
 
     @property
-    def count_words(self) -> str:
+    def count_text(self) -> str:
         """The number of runs and their seed in words."""
         if self.runs == 1:
             replica = f", replica {self.run.replica}" if self.run and self.run.replica else ""
@@ -123,7 +123,7 @@ class Subject:
         differs from the papers where the figure shows the "bound", "nees", or "both".
         """
         n = len(self.nodes)
-        about = f"{self.scenario.name}: {n} node{'s' if n > 1 else ''}, {self.count_words}."
+        about = f"{self.scenario.name}: {n} node{'s' if n > 1 else ''}, {self.count_text}."
         left_out = ""
         if np.isfinite(self.rounding_from) and self.shows_errors:
             left_out = f"Rounding of a large state blurs errors from {self.rounding_from:g} s on."

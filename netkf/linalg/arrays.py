@@ -17,7 +17,7 @@ __all__ = [
     "block_diagonal",
     "readonly_array",
     "is_semidefinite",
-    "plain",
+    "as_kernel_array",
     "square_root",
     "symmetric",
 ]
@@ -64,7 +64,7 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
     return whole
 
 
-def plain(matrix: FloatArray) -> FloatArray:
+def as_kernel_array(matrix: FloatArray) -> FloatArray:
     """Return a matrix of the one layout for which kernels are compiled."""
     if matrix.flags.c_contiguous and matrix.flags.writeable:
         return matrix

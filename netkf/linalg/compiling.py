@@ -220,13 +220,13 @@ def _folder(chosen: str) -> Path:
     # A kernel may hold constants and kernels of any of these rooms, and a change of any byte makes
     # a new folder: compiled code is never out of date.
     name = f"netkf-{source_digest(*ROOMS)}"
-    kept = _kept_in(chosen, ROOT)
+    kept = _cache_folder_for(chosen, ROOT)
     if not (kept / name).exists():
         _make_room(kept)
     return kept / name
 
 
-def _kept_in(chosen: str, root: Path) -> Path:
+def _cache_folder_for(chosen: str, root: Path) -> Path:
     """Return numba's folder if it was set, else one beside the sources or in the user's cache."""
     # The user's choice, NUMBA_CACHE_DIR.
     if chosen:

@@ -189,7 +189,7 @@ def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     begin, zero = context.cast(builder, args[3], sig.args[3], types.intp), ir.Constant(I64, 0)
     found = []
     for k in range(count):
-        place = _place_of(context, builder, sig, args, 2, k)
+        place = _entry_of(context, builder, sig, args, 2, k)
         known = builder.select(builder.icmp_signed("<", place, zero), zero, place)
         found.append(builder.load(array.place(known, begin, count), align=8))
     for k, value in enumerate(_turned(builder, found)):
@@ -219,14 +219,14 @@ def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     name = f"llvm.masked.store.v{count}f64.p0v{count}f64"
     masked = cgutils.get_or_insert_function(builder.module, kinds, name)
     for k, value in enumerate(_turned(builder, found)):
-        place = _place_of(context, builder, sig, args, 4, k)
+        place = _entry_of(context, builder, sig, args, 4, k)
         there = _splat(builder, builder.icmp_signed(">=", place, zero), count)
         where = array.place(place, begin, count)
         builder.call(masked, [value, where, I32(8), builder.and_(wanted, there)])
     return context.get_dummy_value()
 
 
-def _place_of(context: Any, builder: Any, sig: Any, args: Any, which: int, k: int) -> Any:
+def _entry_of(context: Any, builder: Any, sig: Any, args: Any, which: int, k: int) -> Any:
     """Entry k of an argument, an array of int64."""
     kind = sig.args[which]
     array = context.make_array(kind)(context, builder, args[which])

@@ -88,7 +88,7 @@ class KernelLower(Lower):
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         """Return ``value[index]``."""
-        kind, places = self.typeof(value.name), self._places(value, index)
+        kind, places = self.typeof(value.name), self._indices(value, index)
         if places is None or not isinstance(kind.dtype, ENTRIES):
             return super().lower_getitem(resty, expr, value, index, signature)
         array = self.loadvar(value.name)
@@ -101,7 +101,7 @@ class KernelLower(Lower):
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
         """Write ``target[index] = value``."""
         kind, given = self.typeof(target_var.name), self.typeof(value_var.name)
-        places = self._places(target_var, index_var)
+        places = self._indices(target_var, index_var)
         known = places is not None and isinstance(kind.dtype, NUMBERS)
         if not (known and len(places) == kind.ndim and isinstance(given, NUMBERS)):
             return super().lower_setitem(target_var, index_var, value_var, signature)
@@ -110,7 +110,7 @@ class KernelLower(Lower):
         pointer = entry_pointer(self.builder, kind, array, places)
         return store_item(self.context, self.builder, kind, number, pointer)
 
-    def _places(self, array: Any, index: Any) -> Any:
+    def _indices(self, array: Any, index: Any) -> Any:
         """Indices as integers that are not negative: one for each axis, or the first one alone.
         None where they are something else.
         """

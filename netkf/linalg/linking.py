@@ -75,12 +75,12 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
     library: Any = CPUCodeLibrary
     return [
         # Depths tell the outermost function from those compiled on its way.
-        (Dispatcher, "compile", _counted("compile", Dispatcher.compile)),
-        (library, "finalize", _counted("finalize", _linked_flat(library.finalize))),
+        (Dispatcher, "compile", _count_depth("compile", Dispatcher.compile)),
+        (library, "finalize", _count_depth("finalize", _linked_flat(library.finalize))),
         (
             CPUContext,
             "get_executable",
-            _only_outermost("compile", _counted("load", CPUContext.get_executable), _stub),
+            _only_outermost("compile", _count_depth("load", CPUContext.get_executable), _stub),
         ),
         *(
             (CPUContext, name, _only_outermost("compile", getattr(CPUContext, name), _nothing))
@@ -100,7 +100,7 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
     ]
 
 
-def _counted(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
+def _count_depth(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
     def counted(*args: Any, **kwargs: Any) -> Any:
         # Threads have depths of their own; numba's compiler itself is locked.
         setattr(_DEPTH, what, getattr(_DEPTH, what) + 1)

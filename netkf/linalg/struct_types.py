@@ -104,7 +104,7 @@ class Fields(AttributeTemplate):
         return next((kind for known, _, kind in struct.fields if known == name), None)
 
 
-def _place(builder: Any, address: Any, offset: int, kind: Any) -> Any:
+def _field_pointer(builder: Any, address: Any, offset: int, kind: Any) -> Any:
     place = builder.gep(address, [ir.Constant(I64, offset)])
     return builder.bitcast(place, ir.PointerType(kind))
 
@@ -118,11 +118,11 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
         return context.get_constant_null(kind)
     # Numbers are loaded; a struct inside a struct is the address that is stored.
     if not isinstance(kind, types.Array):
-        return builder.load(_place(builder, address, offset, context.get_value_type(kind)))
+        return builder.load(_field_pointer(builder, address, offset, context.get_value_type(kind)))
     itemsize = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     array = context.make_array(kind)(context, builder)
-    data = builder.load(_place(builder, address, offset, array.data.type))
-    first = _place(builder, address, offset + WORD, I64)
+    data = builder.load(_field_pointer(builder, address, offset, array.data.type))
+    first = _field_pointer(builder, address, offset + WORD, I64)
     shape = [builder.load(builder.gep(first, [ir.Constant(I64, k)])) for k in range(kind.ndim)]
     # Row-major strides from the last dimension to the first.
     strides = [ir.Constant(I64, itemsize)]
@@ -147,7 +147,7 @@ def store_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> N
     offset, kind = struct.field(name)
     # numba may have typed the value as another number: convert it to the field's type.
     number = context.cast(builder, value, sig.args[1], kind)
-    builder.store(number, _place(builder, address, offset, number.type))
+    builder.store(number, _field_pointer(builder, address, offset, number.type))
 
 
 class ClassType(types.Type):

@@ -86,13 +86,13 @@ class Struct(metaclass=StructClass):
         # The first instance decides the types of fields.
         if not cls.struct_offsets:
             cls._lay_out(values)
-        object.__setattr__(self, "memory", np.zeros(cls.struct_words(), dtype=np.int64))
+        object.__setattr__(self, "memory", np.zeros(cls.struct_size(), dtype=np.int64))
         object.__setattr__(self, "address", self.memory.ctypes.data)
         for name, value in values.items():
             setattr(self, name, value)
 
     @classmethod
-    def struct_words(cls) -> int:
+    def struct_size(cls) -> int:
         """Words of memory."""
         last = cls.struct_fields[-1]
         kind = cls.struct_kinds[last]

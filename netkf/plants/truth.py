@@ -123,7 +123,7 @@ class SampledTruth:
                 moves, self.frame_times, self.offsets, self._times, self._local
             )
 
-    def _place(self, time: float) -> int:
+    def _index_of(self, time: float) -> int:
         k = int(np.searchsorted(self._times, time))
         assert k < len(self._times), f"{time} is no sample, probe or frame time"
         assert self._times[k] == time, f"{time} is no sample, probe or frame time"
@@ -131,11 +131,11 @@ class SampledTruth:
 
     def local(self, time: float) -> FloatArray:
         """(n,) x in the present frame."""
-        return np.asarray(self._local[self._place(time)])
+        return np.asarray(self._local[self._index_of(time)])
 
     def absolute(self, time: float) -> FloatArray:
         """(n,) x."""
-        return np.asarray(self._absolute[self._place(time)])
+        return np.asarray(self._absolute[self._index_of(time)])
 
     def rebase(self, k: int) -> FloatArray:
         """(n,) the local state just before ``frame_times[k]``."""

@@ -53,7 +53,7 @@ def read_numbers(
         return pd.DataFrame(table.to_pandas())
 
 
-def read_words(path: Path, column: str, run: int | None = None) -> pd.Series[str]:
+def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str]:
     """Return a column of texts of a Parquet file, of one ``run`` if it is given; raises
     DamagedError for any other file.
     """

@@ -38,7 +38,7 @@ from netkf.runs.summary import (
     summarise,
 )
 from netkf.runs.transmissions import SentPerLink
-from netkf.scenario.plugins import in_words
+from netkf.scenario.plugins import describe_error
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
 from netkf.trace.recorder import Recorder, Sink
@@ -272,7 +272,7 @@ class Manifest:
             **totals,
         }
         if status == "failed" and error is not None:
-            manifest["error"] = in_words(error)
+            manifest["error"] = describe_error(error)
             manifest["traceback"] = traceback.format_exception(error)
         others = [name for name in names if name != "manifest.json"]
         if others:

@@ -23,7 +23,7 @@ from netkf.runs.documents import (
     read_document,
     require,
 )
-from netkf.runs.parquet_files import column_names, read_numbers, read_words
+from netkf.runs.parquet_files import column_names, read_numbers, read_texts
 from netkf.runs.summary import PromisedTraces, promise_traces
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -205,7 +205,7 @@ def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:
         return np.empty(0, dtype=EVENT)
     columns = [name for name in EVENT.names or () if name != "kind"]
     table = read_numbers(path, columns, replica, missing=True)
-    kinds = read_words(path, "kind", replica)
+    kinds = read_texts(path, "kind", replica)
     codes = kinds.cat.categories.map(CODES)
     if codes.hasnans:
         raise DamagedError(f"{path.name} has events of an unknown kind")

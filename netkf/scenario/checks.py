@@ -21,7 +21,7 @@ from netkf.scenario.combination import (
 from netkf.scenario.compatibility import check_activation, check_readings, check_time
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import check_records
-from netkf.scenario.registry import spoken
+from netkf.scenario.registry import kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.shapes import demand_shape
 
@@ -193,7 +193,7 @@ def _check_network(scenario: DerivedScenario) -> None:
                 raise error.under(key) from None
     if not algorithm.talks:
         return
-    name = spoken(scenario.filter.algorithm)
+    name = kind_name(scenario.filter.algorithm)
     if network.activation is None:
         example = "broadcast" if scenario.slotted else "poisson"
         raise ScenarioError(
@@ -377,7 +377,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
     activation = scenario.network.activation
     if not algorithm.talks:
         return
-    name = spoken(scenario.filter.algorithm)
+    name = kind_name(scenario.filter.algorithm)
     pairs = isinstance(activation, Matching) or (
         isinstance(activation, RecordedSlots) and activation.matching
     )
@@ -401,7 +401,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
 
 def _describe(activation: Component) -> str:
     """Return the kind of an activation, with the columns of a recorded one."""
-    name = spoken(activation, "activation")
+    name = kind_name(activation, "activation")
     if not isinstance(activation, RecordedSlots):
         return name
     columns = "slot,node,peer: a matching" if activation.matching else "phase,step: broadcasts"

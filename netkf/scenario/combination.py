@@ -8,7 +8,7 @@ from netkf.core.errors import ScenarioError
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.registry import spoken
+from netkf.scenario.registry import kind_name
 from netkf.scenario.shapes import demand_shape
 
 
@@ -77,7 +77,7 @@ def check_invertible(scenario: DerivedScenario) -> None:
         reached = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
         regular = whole or np.linalg.matrix_rank(np.concatenate(reached, axis=1)) == n
     if not regular:
-        name = spoken(scenario.filter.algorithm)
+        name = kind_name(scenario.filter.algorithm)
         raise ScenarioError(
             "filter.cov",
             f"must be positive definite for the {name} filter, which inverts covariances, where "

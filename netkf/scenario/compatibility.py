@@ -10,7 +10,7 @@ from netkf.network.matchings import SlotActivation
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import takes_samples
-from netkf.scenario.registry import spoken, time_words
+from netkf.scenario.registry import explain_kind_of_time, kind_name
 
 SAMPLING = 'sampling = { kind = "periodic", period = ... }'
 
@@ -18,17 +18,17 @@ SAMPLING = 'sampling = { kind = "periodic", period = ... }'
 def check_time(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if the filter or the activation belongs to the other kind of time."""
     given, hosted, slotted = scenario.filter.algorithm, scenario.hosted, scenario.slotted
-    name = spoken(given)
+    name = kind_name(given)
     only_clocks = isinstance(given, FlowFilter) or hosted.schedule is None
     only_slots = isinstance(given, SlotFilter) or (hosted.talks and not hosted.clocks)
     if only_clocks if slotted else only_slots:
         remedy = "change the plant or choose another kind"
-        raise ScenarioError("filter.kind", time_words(slotted), name, remedy)
+        raise ScenarioError("filter.kind", explain_kind_of_time(slotted), name, remedy)
     activation = scenario.network.activation
     if activation is not None and isinstance(activation, SlotActivation) != slotted:
-        kind = spoken(activation, "activation")
+        kind = kind_name(activation, "activation")
         remedy = "change the plant or choose another kind"
-        raise ScenarioError("network.activation.kind", time_words(slotted), kind, remedy)
+        raise ScenarioError("network.activation.kind", explain_kind_of_time(slotted), kind, remedy)
 
 
 def check_activation(scenario: DerivedScenario) -> None:
@@ -36,7 +36,7 @@ def check_activation(scenario: DerivedScenario) -> None:
     clock, hosted, topology = scenario.network.activation, scenario.hosted, scenario.topology
     if not isinstance(clock, LinkClock) or not hosted.talks:
         return
-    name = spoken(scenario.filter.algorithm)
+    name = kind_name(scenario.filter.algorithm)
     if topology.directed and (clock.at == "links" or hosted.clocks == ("links",)):
         others = [f'at = "{at}"' for at in ("directions", "nodes") if at in hosted.clocks]
         raise ScenarioError(
@@ -74,7 +74,7 @@ def check_readings(scenario: DerivedScenario) -> None:
 
 def _readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
     algorithm, hosted = scenario.filter.algorithm, scenario.hosted
-    name = spoken(algorithm)
+    name = kind_name(algorithm)
     if isinstance(algorithm, FlowFilter) and takes_samples(sensor):
         raise ScenarioError(
             f"{key}.sampling" if isinstance(sensor, LinearSensor) else f"{key}.kind",

@@ -75,9 +75,11 @@ def blame(scenario: Any, error: Exception) -> str | None:
         mine = [p for p in parts if frame.f_locals.get("self") is p]
         if mine:
             part, where = mine[0], f" in {frame.f_code.co_name}"
-    return f"{type(part).__module__}:{type(part).__qualname__} failed{where}: {in_words(error)}"
+    return (
+        f"{type(part).__module__}:{type(part).__qualname__} failed{where}: {describe_error(error)}"
+    )
 
 
-def in_words(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Return the type and text of an exception on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300].rstrip(": ")

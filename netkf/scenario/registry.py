@@ -122,10 +122,10 @@ def other_time(family: str, kind: object) -> str | None:
     other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
     if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
         return None
-    return time_words(slotted=family.startswith("slot "))
+    return explain_kind_of_time(slotted=family.startswith("slot "))
 
 
-def time_words(slotted: bool) -> str:
+def explain_kind_of_time(slotted: bool) -> str:
     """Words about a part that belongs to the other kind of time than that of the plant."""
     slots, flow = "in slots (linear)", "in continuous time (diffusion)"
     needs, has = (flow, slots) if slotted else (slots, flow)
@@ -190,7 +190,7 @@ def name_of(family: str, part: Component) -> str:
     return f"{type(part).__module__}:{type(part).__qualname__}"
 
 
-def spoken(part: Component, family: str = "filter") -> str:
+def kind_name(part: Component, family: str = "filter") -> str:
     """The kind of a part in a sentence: its name, or that of a user's class."""
     name = name_of(family, part)
     return type(part).__name__.lower() if ":" in name else name

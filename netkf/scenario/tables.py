@@ -14,7 +14,7 @@ from netkf.network.channels import Channel
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
-from netkf.scenario.plugins import blame, in_words, is_ours
+from netkf.scenario.plugins import blame, describe_error, is_ours
 from netkf.scenario.registry import KINDS, SLOTTED, find
 from netkf.scenario.writing import as_table, part_as_table
 
@@ -187,7 +187,7 @@ def _made(cls: type[Any], values: dict[str, Any]) -> Any:
         raise
     except Exception as error:
         # A class of the user's failed, this one or one that the scenario asked.
-        words = f"{cls.__name__} could not be made ({in_words(error)})"
+        words = f"{cls.__name__} could not be made ({describe_error(error)})"
         if is_ours(cls):
             words = blame(tuple(values.values()), error) or ""
         if not words:

@@ -117,15 +117,15 @@ def _fields(part: Component, defaults: bool) -> dict[str, Any]:
             value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
         )
         if value is not None and (defaults or not is_default):
-            table[field.name] = _plain(value)
+            table[field.name] = _toml_value(value)
     return table
 
 
-def _plain(value: Any) -> Any:
+def _toml_value(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, tuple):
-        return [_plain(item) for item in value]
+        return [_toml_value(item) for item in value]
     return value
 
 

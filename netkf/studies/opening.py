@@ -14,7 +14,7 @@ from netkf.core.printable import shorten
 from netkf.core.shown import Shown
 from netkf.ensembles.stored import StoredEnsemble, read_ensemble
 from netkf.runs.documents import TEXT, DamagedError, check_files, require
-from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbers, read_words
+from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbers, read_texts
 from netkf.runs.stored import MANIFEST, StoredRun, read_form, read_run
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
@@ -120,5 +120,5 @@ def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
     if not {*RESULTS, "runs"} <= set(numeric):
         raise DamagedError(f"{path.name} has texts in columns of numbers")
     columns: dict[str, Any] = dict(read_numbers(path, numeric, missing=True))
-    columns |= {n: read_words(path, n).astype(str) for n in names if n not in numeric}
+    columns |= {n: read_texts(path, n).astype(str) for n in names if n not in numeric}
     return pd.DataFrame({name: columns[name] for name in names})

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.printable import one_line
 from netkf.core.shown import Shown
 from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, DamagedError, check_files, require
-from netkf.runs.parquet_files import read_flags, read_numbers, read_words
+from netkf.runs.parquet_files import read_flags, read_numbers, read_texts
 from netkf.runs.stored import read_form
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
@@ -65,7 +65,7 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     numbers = read_numbers(path, [*QUANTITIES, *parts, *TRAFFIC], missing=True)
     columns: dict[str, Any] = {str(name): values.tolist() for name, values in numbers.items()}
     columns |= {name: read_flags(path, name).tolist() for name in FLAGS}
-    columns |= {name: read_words(path, name).astype(str).tolist() for name in WORDS}
+    columns |= {name: read_texts(path, name).astype(str).tolist() for name in WORDS}
     rows = [
         _compared({name: values[k] for name, values in columns.items()})
         for k in range(len(numbers))

@@ -71,8 +71,8 @@ def check_made_channel(part: Any, topology: Topology | None, seed: int) -> None:
     for link, table_probability in links.items():
         _chances(watched, link, table_probability)
     _check_pure(watched, links)
-    _check_links_alike(watched, tuple(links))
-    _weather(watched)
+    _check_identical_links(watched, tuple(links))
+    _check_channel_state(watched)
     _fractions(watched, links, seed)
 
 
@@ -93,14 +93,14 @@ def _check_pure(watched: Watched, links: dict[Link, float]) -> None:
     for one in asked:
         demand(
             there[one] == back[one],
-            f"{watched.name}.{watched.spoken('delivery_probability')}",
+            f"{watched.name}.{watched.defined_name('delivery_probability')}",
             "must not depend on which links and messages were asked for before",
             f"{there[one]:.4g} and {back[one]:.4g} for message {one[1]} of link {list(one[0])}",
             "use nothing but the arguments",
         )
 
 
-def _check_links_alike(watched: Watched, links: tuple[Link, ...]) -> None:
+def _check_identical_links(watched: Watched, links: tuple[Link, ...]) -> None:
     """Check that links with equal entries of the table are treated alike, unless the class that
     defines the delivery probabilities says otherwise by ``mean_delivery``.
     """
@@ -119,7 +119,7 @@ def _check_links_alike(watched: Watched, links: tuple[Link, ...]) -> None:
             for link, chance in zip(links, chances, strict=True):
                 demand(
                     abs(chance - usual) <= EQUAL,
-                    f"{watched.name}.{watched.spoken('delivery_probability')}",
+                    f"{watched.name}.{watched.defined_name('delivery_probability')}",
                     "must be the same for links with equal entries in the graph's table",
                     f"{chance:.4g} for link {list(link)} and {usual:.4g} for others",
                     "define mean_delivery beside it if links differ by design",
@@ -127,7 +127,7 @@ def _check_links_alike(watched: Watched, links: tuple[Link, ...]) -> None:
 
 
 def _chances(watched: Watched, link: Link, table_probability: float) -> None:
-    part, where = watched.part, f"{watched.name}.{watched.spoken('delivery_probability')}"
+    part, where = watched.part, f"{watched.name}.{watched.defined_name('delivery_probability')}"
     for bad in (False, True):
         for message in (0, 1, 2, 1000):
             chance = watched.call("delivery_probability", link, message, bad, table_probability)
@@ -146,8 +146,8 @@ def _chances(watched: Watched, link: Link, table_probability: float) -> None:
     demand(known, f"{watched.name}.mean_delivery", "must be a number from 0 to 1, or nan", mean)
 
 
-def _weather(watched: Watched) -> None:
-    part, where = watched.part, f"{watched.name}.{watched.spoken('next_state')}"
+def _check_channel_state(watched: Watched) -> None:
+    part, where = watched.part, f"{watched.name}.{watched.defined_name('next_state')}"
     seen: dict[bool, list[Any]] = {}
     for twin in range(2):
         random, bad, history = RecordingGenerator(5), None, []

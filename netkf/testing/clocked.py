@@ -96,7 +96,7 @@ class ClockTrial(Trial):
         if self._increments and len(self.models[node].H):
             method = "max_measurement_interval"
             seconds = watched.call(method, state)
-            where = f"{watched.name}.{watched.spoken(method)}"
+            where = f"{watched.name}.{watched.defined_name(method)}"
             demand(seconds > 0.0, where, "must be above 0 seconds", seconds)
 
     def _compare(
@@ -104,7 +104,7 @@ class ClockTrial(Trial):
     ) -> None:
         apart = float(np.abs(one - other).max())
         size = max(float(np.abs(one).max()), float(np.abs(other).max()), 1e-300)
-        method = self.watched.spoken("predict")
+        method = self.watched.defined_name("predict")
         demand(
             apart <= COMPOSES * size,
             f"{self.watched.name}.{method}",

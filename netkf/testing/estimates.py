@@ -17,7 +17,7 @@ def check_estimate(
     watched: Watched, state: Any, n: int, after: str
 ) -> tuple[FloatArray, FloatArray | None]:
     """``estimate`` after a method: shapes, finite; P None, or symmetric, positive semidefinite."""
-    where = f"{watched.name}.estimate after {watched.spoken(after)}"
+    where = f"{watched.name}.estimate after {watched.defined_name(after)}"
     pair = watched.call("estimate", state)
     demand(isinstance(pair, tuple) and len(pair) == 2, where, "must be (xhat, P)", pair)
     xhat = np.asarray(pair[0])

@@ -94,7 +94,7 @@ def _class_variables(watched: Watched) -> None:
 
 
 def _schedule(watched: Watched) -> None:
-    part, where = watched.part, f"{watched.name}.{watched.spoken('schedule')}"
+    part, where = watched.part, f"{watched.name}.{watched.defined_name('schedule')}"
     schedule = part.schedule
     if isinstance(part, SlotAdapter):
         sound = set(schedule) <= {"exchange", "sense"} and schedule.count("sense") == 1
@@ -111,7 +111,7 @@ def _schedule(watched: Watched) -> None:
         whole = isinstance(steps, int) and steps >= 1
         demand(whole, f"{watched.name}.steps", "must be a whole number of at least 1", steps)
         fresh = watched.call("redraws_links", phase, 0)
-        redraws = f"{watched.name}.{watched.spoken('redraws_links')}"
+        redraws = f"{watched.name}.{watched.defined_name('redraws_links')}"
         demand(fresh is True, redraws, "must be True in step 0", fresh, "links have no outcome yet")
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
-from netkf.scenario.plugins import in_words
+from netkf.scenario.plugins import describe_error
 
 Leaves = dict[str, Any]
 MERSENNE_BYTES = 4 * 625
@@ -62,7 +62,7 @@ def made(part: Any, contracts: tuple[type[Component], ...], settings: Mapping[st
     except Exception as error:
         words = f"could not be made with the settings {dict(settings)!r}"
         remedy = "hand over an object, or the class with its settings as keywords"
-        fail(name, words, in_words(error), remedy)
+        fail(name, words, describe_error(error), remedy)
 
 
 def leaves(value: Any, path: str = "", seen: frozenset[int] = frozenset()) -> Iterator[Any]:
@@ -174,7 +174,7 @@ class Watched:
         self._former = former or {}
         self._kept: list[tuple[str, Any, Leaves]] = []
 
-    def spoken(self, method: str) -> str:
+    def defined_name(self, method: str) -> str:
         """Return the name by which the user's class defines a method or property."""
         if method in self._former:
             return self._former[method]
@@ -186,7 +186,7 @@ class Watched:
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """The result of a method; ``repeatable`` where it draws nothing."""
-        where = f"{self.name}.{self.spoken(method)}"
+        where = f"{self.name}.{self.defined_name(method)}"
         before = [dict(leaves(argument)) for argument in arguments]
         itself = self.attributes()
         results = [self._result(where, method, arguments) for _ in range(1 + repeatable)]
@@ -241,7 +241,7 @@ class Watched:
         except Exception as error:
             singular = isinstance(error, np.linalg.LinAlgError)
             remedy = "; set inverts = True where covariances must not be singular"
-            words = f"{where}: failed with {in_words(error)}{remedy if singular else ''}"
+            words = f"{where}: failed with {describe_error(error)}{remedy if singular else ''}"
             raise AssertionError(words) from error
         demand(
             global_randomness() == before,
@@ -287,7 +287,7 @@ class Watched:
             fail(
                 self.name,
                 "must be picklable, for worker processes",
-                in_words(error),
+                describe_error(error),
                 "define the class at the top level of a module and keep no open files or lambdas",
             )
         path = difference(dict(leaves(self._owner)), dict(leaves(copy)))
@@ -300,7 +300,7 @@ class _Once(Watched):
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """The result of a method."""
-        return self._result(f"{self.name}.{self.spoken(method)}", method, arguments)
+        return self._result(f"{self.name}.{self.defined_name(method)}", method, arguments)
 
 
 @contextmanager
@@ -312,7 +312,7 @@ def user_code(where: str) -> Iterator[None]:
     except AssertionError:
         raise
     except Exception as error:
-        raise AssertionError(f"{where}: failed with {in_words(error)}") from error
+        raise AssertionError(f"{where}: failed with {describe_error(error)}") from error
     demand(
         global_randomness() == before,
         where,

@@ -20,13 +20,13 @@ Q = HALF @ HALF.T
 
 @pytest.mark.parametrize("size", [1.0, 1e12])
 def test_words_are_steps_one_after_the_other(size):
-    words = RANDOM.integers(3, size=(7, 40))
+    sequences = RANDOM.integers(3, size=(7, 40))
     starts = size * np.array([np.diag(d) for d in RANDOM.uniform(0.5, 2.0, (7, 3))])
-    letters = chains.alphabet(READINGS, 3)
-    roots = chains.advance(np.sqrt(starts), words, F, HALF, letters)
-    for k, word in enumerate(words):
+    modes = chains.reading_modes(READINGS, 3)
+    roots = chains.move_roots(np.sqrt(starts), sequences, F, HALF, modes)
+    for k, sequence in enumerate(sequences):
         P = starts[k]
-        for m in word:
+        for m in sequence:
             P = theory.riccati_step(P, F, Q, *READINGS[m]) if m else theory.lyapunov_step(P, F, Q)
         np.testing.assert_allclose(roots[k] @ roots[k].T, P, rtol=1e-9, atol=1e-12 * size)
 
@@ -40,11 +40,11 @@ def test_the_kernel_is_the_formula(seed, n):
         noise = random.normal(size=(p, p))
         readings.append((random.normal(size=(p, n)), noise @ noise.T + 0.1 * np.eye(p)))
     A, half = random.normal(size=(n, n)) / np.sqrt(n), random.normal(size=(n, n))
-    words, start = random.integers(n + 1, size=(5, 12)), np.eye(n)
-    roots = chains.advance(
-        np.broadcast_to(start, (5, n, n)), words, A, half, chains.alphabet(readings, n)
+    sequences, start = random.integers(n + 1, size=(5, 12)), np.eye(n)
+    roots = chains.move_roots(
+        np.broadcast_to(start, (5, n, n)), sequences, A, half, chains.reading_modes(readings, n)
     )
-    for root, modes in zip(roots, words, strict=True):
+    for root, modes in zip(roots, sequences, strict=True):
         expected = reference.switched_riccati(start, modes, A, half @ half.T, readings)
         scale = np.abs(expected).max()
         np.testing.assert_allclose(root @ root.T, expected, rtol=0, atol=1e-10 * scale)

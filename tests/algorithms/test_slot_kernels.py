@@ -96,7 +96,7 @@ def test_update_with_a_whitened_reading(seed, n, p):
 def test_whitening(seed, n):
     random = np.random.default_rng(seed)
     y, H, R = random.standard_normal(2), random.standard_normal((2, n)), _covariance(random, 2)
-    white, seen = slots.whitened(y, H, R)
+    white, seen = slots.whiten_reading(y, H, R)
     np.testing.assert_allclose(seen.T @ seen, H.T @ np.linalg.inv(R) @ H, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(seen.T @ white, H.T @ np.linalg.inv(R) @ y, rtol=1e-10, atol=1e-12)
 

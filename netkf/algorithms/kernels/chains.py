@@ -1,6 +1,6 @@
 """Random Riccati recursions of many chains side by side, in square-root form.
 
-A letter says which of several readings a chain gets in a slot: ``f_m(P) = F P F' + Q - F P H_m'
+A mode says which of several readings a chain gets in a slot: ``f_m(P) = F P F' + Q - F P H_m'
 (H_m P H_m' + R_m)^-1 H_m P F'``, R (17) and G (11); a reading of no rows is ``f_0``, R (16).
 """
 
@@ -21,9 +21,9 @@ from netkf.linalg.compiling import kernel
 FEW = 4096  # chain steps for which threads do not pay
 
 
-class Letters(NamedTuple):
-    """The alphabet: ``H`` (M, p, n) and ``root_R`` (M, p, p), of which the first ``rows[m]`` rows
-    mean something.
+class ReadingModes(NamedTuple):
+    """Readings of M modes: ``H`` (M, p, n) and ``root_R`` (M, p, p), of which the first ``rows[m]``
+    rows count.
     """
 
     H: FloatArray
@@ -31,42 +31,43 @@ class Letters(NamedTuple):
     rows: np.ndarray
 
 
-def alphabet(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> Letters:
-    """The letters of readings ``(H, R)``, each (p, n) and (p, p) with a p of its own, also 0."""
+def reading_modes(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> ReadingModes:
+    """The modes of readings ``(H, R)``, each (p, n) and (p, p) with a p of its own, also 0."""
     most = max((len(H) for H, _ in readings), default=0)
     rows = np.array([len(H) for H, _ in readings], dtype=np.int64)
     H_, root_R = np.zeros((len(readings), most, n)), np.zeros((len(readings), most, most))
     for m, (H, R) in enumerate(readings):
-        # Padding with zero rows keeps one array for all letters; kernels read the first rows[m]
+        # Padding with zero rows keeps one array for all modes; kernels read the first rows[m]
         # only.
         H_[m, : len(H)] = H
         if len(H):
             root_R[m, : len(H), : len(H)] = np.linalg.cholesky(R)
-    return Letters(H_, root_R, rows)
+    return ReadingModes(H_, root_R, rows)
 
 
-def advance(
-    roots: FloatArray, words: np.ndarray, F: FloatArray, root_Q: FloatArray, letters: Letters
+def move_roots(
+    roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
-    """Return roots (K, n, n) after each chain's word: row k of ``words`` (K, T), first letter
+    """Return roots (K, n, n) after each chain's sequence: row k of ``sequences`` (K, T), first mode
     first.
 
     Works on all cores where there is enough to do.
     """
     moved = np.ascontiguousarray(lower_triangular(roots))
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
-    # One byte per letter where it suffices, an eighth of an int64.
-    spelled = np.ascontiguousarray(words, dtype=np.uint8 if len(letters.rows) < 256 else np.int64)
+    # One byte per mode where it suffices, an eighth of an int64.
+    kind = np.uint8 if len(modes.rows) < 256 else np.int64
+    sequences = np.ascontiguousarray(sequences, dtype=kind)
     # More threads than chains or cores would only wait.
     workers = min(os.cpu_count() or 1, len(roots))
-    if words.size < FEW or workers < 2:
-        run_words(moved, spelled, F, low_Q, *letters)
+    if sequences.size < FEW or workers < 2:
+        run_sequences(moved, sequences, F, low_Q, *modes)
         return moved
     # Threads own contiguous blocks of chains, as views of one array, so nothing is copied back.
     cuts = np.linspace(0, len(roots), workers + 1).astype(int)
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
-            pool.submit(run_words, moved[a:b], spelled[a:b], F, low_Q, *letters)
+            pool.submit(run_sequences, moved[a:b], sequences[a:b], F, low_Q, *modes)
             for a, b in itertools.pairwise(cuts)
         ]
         for job in jobs:
@@ -76,20 +77,20 @@ def advance(
 
 
 def trace_path(
-    root: FloatArray, word: np.ndarray, F: FloatArray, root_Q: FloatArray, letters: Letters
+    root: FloatArray, sequence: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
-    """Return the roots (T, n, n) of one chain after each letter of its word (T,)."""
-    n, path = len(F), np.empty((len(word), *root.shape))
+    """Return the roots (T, n, n) of one chain after each mode of its sequence (T,)."""
+    n, path = len(F), np.empty((len(sequence), *root.shape))
     lows = [np.ascontiguousarray(lower_triangular(one)) for one in (root, root_Q)]
-    work = np.empty((letters.H.shape[1] + n, 2 * n + letters.H.shape[1]))
-    run_path(lows[0][None], word, F, lows[1], *letters, work, path)
+    work = np.empty((modes.H.shape[1] + n, 2 * n + modes.H.shape[1]))
+    run_path(lows[0][None], sequence, F, lows[1], *modes, work, path)
     return path
 
 
 @kernel
 def run_path(
     roots: FloatArray,
-    word: np.ndarray,
+    sequence: np.ndarray,
     F: FloatArray,
     root_Q: FloatArray,
     H: FloatArray,
@@ -98,31 +99,32 @@ def run_path(
     work: FloatArray,
     path: FloatArray,
 ) -> None:
-    """Move one root (1, n, n) in place along its word (T,) and keep every step in ``path``."""
-    for step in range(len(word)):
-        step_root(roots, 0, word[step], F, root_Q, H, root_R, rows, work)
+    """Move one root (1, n, n) in place along its sequence (T,) and keep every step in ``path``."""
+    for step in range(len(sequence)):
+        step_root(roots, 0, sequence[step], F, root_Q, H, root_R, rows, work)
         for i in range(len(F)):
             for j in range(len(F)):
                 path[step, i, j] = roots[0, i, j]
 
 
 @kernel(allocates=True)
-def run_words(
+def run_sequences(
     roots: FloatArray,
-    words: np.ndarray,
+    sequences: np.ndarray,
     F: FloatArray,
     root_Q: FloatArray,
     H: FloatArray,
     root_R: FloatArray,
     rows: np.ndarray,
 ) -> None:
-    """Move the roots (K, n, n) in place along their words; roots and root_Q are lower triangular.
+    """Move the roots (K, n, n) in place along their sequences; roots and root_Q are lower
+    triangular.
 
     square_root's triangularisation without its zeros: some 300 operations a step at n = 4.
     """
     # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]] of the largest reading, reused by all
     # steps.
     work = np.empty((H.shape[1] + len(F), 2 * len(F) + H.shape[1]))
-    for chain in range(words.shape[0]):
-        for step in range(words.shape[1]):
-            step_root(roots, chain, words[chain, step], F, root_Q, H, root_R, rows, work)
+    for chain in range(sequences.shape[0]):
+        for step in range(sequences.shape[1]):
+            step_root(roots, chain, sequences[chain, step], F, root_Q, H, root_R, rows, work)

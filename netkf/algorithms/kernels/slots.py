@@ -146,7 +146,7 @@ def slot_room(H: int, n: int, lanes: Lanes = MANY) -> SlotRoom:
     return SlotRoom._make([lanes, *scratch, np.zeros(L, dtype=np.int64)])
 
 
-def whitened(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A reading y (p,) and its H (p, n) times ``L^-1``, with ``L L' = R``."""
     # One solve for y and H together.
     made = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))

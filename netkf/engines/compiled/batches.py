@@ -18,7 +18,7 @@ from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
 from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
-from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_shown
+from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_samples
 from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.poisson import all_ticks, window_of
 from netkf.engines.compiled.sample_tables import SampleTables
@@ -90,7 +90,7 @@ def _run_by_run(
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
     """Simulate all runs in one call, or nearly so."""
     start, runs = workspace.filters, len(draws.replicas)
-    shown = empty_shown((runs, len(scenario.times), *start.xhat.shape))
+    shown = empty_samples((runs, len(scenario.times), *start.xhat.shape))
     arrays = _batch_arrays(scenario, start, draws)
     if is_immediate(scenario):
         group = together(len(start.nodes), runs)

@@ -80,7 +80,7 @@ def event_loop(state: Simulation, totals: Totals | None, history: History | None
             # The next events, unless there are others at this instant.
             alone = totals is None and history is None and ends_instant(state, now)
             if alone:
-                absorb_mail(state, totals, history, now)
+                absorb_messages(state, totals, history, now)
         elif event == ON_ABSORB:
             on_absorb(state, totals, history, now)
         elif event == ON_SENSE:
@@ -376,7 +376,7 @@ def ends_instant(state: Simulation, now: float) -> bool:
 
 
 @kernel
-def absorb_mail(
+def absorb_messages(
     state: Simulation, totals: Totals | None, history: History | None, now: float
 ) -> None:
     """Let all receivers absorb their mail."""
@@ -429,7 +429,7 @@ def on_absorb(
     if totals is not None:
         hear(state, totals, h, now)
     elif history is not None:
-        use_mail(state, history, h, now)
+        use_messages(state, history, h, now)
     else:
         combine(state, h, now)
     # Messages go back to the pool only now, because handlers read them through the inbox.
@@ -447,7 +447,7 @@ def on_absorb(
 
 
 @kernel
-def use_mail(state: Simulation, history: History, h: int, now: float) -> None:
+def use_messages(state: Simulation, history: History, h: int, now: float) -> None:
     """Readings of other nodes."""
     m = state.nodes[h].inbox
     while m != -1:

@@ -42,8 +42,8 @@ from netkf.engines.compiled.state import (
     Filters,
     Instants,
     PathBlock,
+    SampleBuffer,
     Sensing,
-    Shown,
     Simulation,
     Ticks,
     add_messages,
@@ -183,7 +183,7 @@ class Workspace:
         terms = 2 * size + len(self._senders.ways) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
         room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
-        self._shown = empty_shown((1, room, size, n), terms)
+        self._shown = empty_samples((1, room, size, n), terms)
         self._visits: Visits | None = None
 
     @property
@@ -200,7 +200,7 @@ class Workspace:
         return self._visits
 
     def begin(
-        self, draws: Draws, traced: bool, shown: Shown | None = None, together: int = 1
+        self, draws: Draws, traced: bool, shown: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
         """The state of a run at time 0, or of runs of which so many are simulated together and
         which are ``shown`` there.
@@ -278,10 +278,10 @@ def ticks_of(window: Window) -> Ticks:
     return Ticks(**window._replace(heard=heard)._asdict())
 
 
-def empty_shown(shape: tuple[int, int, int, int], terms: int = 0) -> Shown:
+def empty_samples(shape: tuple[int, int, int, int], terms: int = 0) -> SampleBuffer:
     """Space for samples, ``shape`` (R, B, N, n), with so many terms of sums."""
     runs, count, _, n = shape
-    return Shown(
+    return SampleBuffer(
         xhat=np.zeros(shape),
         P=np.zeros((*shape, n)),
         rows=np.zeros((runs, count), dtype=np.int64),

@@ -18,7 +18,7 @@ from netkf.engines.compiled.schedule import (
     Schedule,
     Window,
     delivery_chances,
-    plain,
+    has_table_law,
     whole_schedules,
 )
 from netkf.engines.compiled.senders import Senders, senders_of
@@ -199,7 +199,7 @@ def is_poisson(scenario: Scenario) -> bool:
     """Return True if kernels can draw the schedules of a scenario."""
     network = scenario.network
     talks = scenario.hosted.talks and bool(scenario.topology.links)
-    return talks and type(network.activation) is Poisson and plain(network.channel)
+    return talks and type(network.activation) is Poisson and has_table_law(network.channel)
 
 
 @once_per_scenario

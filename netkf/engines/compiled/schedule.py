@@ -152,7 +152,7 @@ class Clocks:
         return next_ticks(self._clock, entity, position, random, int(count))
 
 
-def plain(channel: Channel) -> bool:
+def has_table_law(channel: Channel) -> bool:
     """Return True if each directed link has one probability and all messages one delay."""
     delay = channel.delay
     fixed = delay.fixed is not None and not delay.is_random and not delay_depends_on_message(delay)
@@ -185,12 +185,15 @@ class Outcomes:
         self._first, self._hearing = senders.first, senders.hearing
         self._count, self._sources = len(senders.entities), len(senders.sources)
         self._measured = np.array([scenario.table_probability(way) for way in senders.ways])
-        self._identical, self._plain = identical_per_link(channel.loss), plain(channel)
+        self._identical, self._has_table_law = (
+            identical_per_link(channel.loss),
+            has_table_law(channel),
+        )
         # Probabilities that depend on the link only are tabulated.
         if self._identical:
             self._chances = delivery_chances(scenario, senders.ways)
         # Channels with memory or random delays keep a sampler for each stream.
-        if not self._plain:
+        if not self._has_table_law:
             self._fates = [
                 ChannelSampler(channel, partial(_stream, made, source))
                 for made in (
@@ -231,7 +234,7 @@ class Outcomes:
     def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
         """(K,) uniform draws, whether the link is in its bad state, and delays as drawn."""
         total = int(counts.sum())
-        if not self._plain:
+        if not self._has_table_law:
             parts = [self._fates[k].draws(n) for k, n in zip(sources, counts.tolist(), strict=True)]
             columns = zip(*parts, strict=True)
             return tuple(np.concatenate([np.empty(0), *column]) for column in columns)

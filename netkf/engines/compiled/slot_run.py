@@ -52,7 +52,7 @@ from netkf.trace.schema import EVENT, KINDS
 NEVER = np.iinfo(np.int64).max
 
 
-class Shown(NamedTuple):
+class SampledStates(NamedTuple):
     """Samples of R runs in the coordinates of the plant: x (R, T, n), xhat (R, T, H, n), P
     (R, T, H, n, n), and errors (R, T, H, n).
     """
@@ -69,7 +69,7 @@ class SlotBlock(NamedTuple):
     """
 
     sampled: np.ndarray
-    shown: Shown
+    shown: SampledStates
     times: SlotTimes
     drawn: Drawn
 
@@ -222,7 +222,7 @@ class SlotRuns:
         self._slot += count
         return SlotBlock(sampled, shown, times, drawn)
 
-    def _space(self, count: int) -> Shown:
+    def _space(self, count: int) -> SampledStates:
         """Space for so many samples."""
         runs, hosts, n = self.runs, self.setup.hosts, self.setup.n
         shape = runs, count, hosts, n
@@ -230,7 +230,9 @@ class SlotRuns:
         ends = np.cumsum([math.prod(each) for each in shapes])
         # One piece of memory: numpy asks for huge pages for large ones, which cost little to get.
         parts = np.split(np.empty(int(ends[-1])), ends[:-1])
-        return Shown(*(part.reshape(each) for part, each in zip(parts, shapes, strict=True)))
+        return SampledStates(
+            *(part.reshape(each) for part, each in zip(parts, shapes, strict=True))
+        )
 
     @property
     def broken(self) -> np.ndarray:

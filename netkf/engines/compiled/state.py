@@ -168,7 +168,7 @@ class Ticks(Struct):
     heard: IntArray
 
 
-class Shown(Struct):
+class SampleBuffer(Struct):
     """Space for B samples of all N nodes in R runs: xhat (R, B, N, n), P (R, B, N, n, n), how many
     ``rows`` (R, B) or events by kind (R, B, len(KINDS)) came before, in which ``piece`` (R, B) of
     the path each is, and ``terms`` (B, T) of sums that are conserved, of one run. They are handed
@@ -224,7 +224,7 @@ class Simulation(Struct):
     ticks: Ticks
     frames: FloatArray
     probes: FloatArray
-    shown: Shown
+    shown: SampleBuffer
     rows: np.ndarray
     counts: IntArray
     scratch: Scratch
@@ -310,7 +310,7 @@ def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
         series[k, :count, :entries], reach[k, :count] = gain.series[:, :-1], gain.series[:, -1:]
     moments = np.array([gain.moments for gain in gains], dtype=np.int64)
     # The last model of the stack has no sensors: it predicts messages under way.
-    return stack_tables([*(model.flow for model in models), models[0].blind_flow]), Gains(
+    return stack_tables([*(model.flow for model in models), models[0].unobserved_flow]), Gains(
         series=series, reach=reach, moments=moments
     )
 

@@ -67,7 +67,7 @@ class Node:
         else:
             known.append(envelope)
 
-    def take_mail(self) -> tuple[list[Envelope], list[Message]]:
+    def take_messages(self) -> tuple[list[Envelope], list[Message]]:
         """Empty the inbox and return its envelopes and messages, ordered by sender."""
         # A floating-point sum must not depend on the order of arrival.
         envelopes = [envelope for peer in sorted(self.inbox) for envelope in self.inbox[peer]]
@@ -182,7 +182,7 @@ class ClockedNode(Node):
     def _absorb(self, _: simpy.Event) -> None:
         time = self._timeline.now
         self.predict_to(time)
-        messages = self.take_mail()[1]
+        messages = self.take_messages()[1]
         self.state = self.algorithm.absorb(self.state, messages, Exchange(time=time))
         oldest = max(message.age for message in messages)
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))

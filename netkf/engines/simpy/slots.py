@@ -208,7 +208,7 @@ class SlotNode(Node):
     def _close(self, stage: Stage, slot: int) -> None:
         """Close the inbox and absorb its messages."""
         append, now, phase = self._recorder.append, stage.time, stage.phase
-        envelopes, messages = self.take_mail()
+        envelopes, messages = self.take_messages()
         # From now on a message of this exchange is late.
         self._open = -1
         exchange = Exchange(now, phase, stage.step, slot)

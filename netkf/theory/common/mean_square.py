@@ -14,7 +14,7 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.scenario.registry import spoken
+from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.alone import slot_jumps as silent_jumps
 from netkf.theory.common.errors import diagonal_blocks
@@ -91,9 +91,10 @@ def linear_errors(scenario: Scenario) -> SlotJumps | ClockJumps:
         raise TheoryError("the filters' plant is not the true one: errors follow the state")
     make = _maker(scenario)
     if make is None:
+        given = kind_name(scenario.filter.algorithm)
         raise TheoryError(
-            f"exact steady mean squares are not known for the {spoken(scenario.filter.algorithm)} "
-            f"filter {'in slots' if scenario.slotted else 'under clocks'}, whose gains follow what "
+            f"exact steady mean squares are not known for the {given} filter "
+            f"{'in slots' if scenario.slotted else 'under clocks'}, whose gains follow what "
             "happens"
         )
     made: SlotJumps | ClockJumps = make(scenario)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, plain
+from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import (
     sample_path,
@@ -35,7 +35,10 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
     """Return the assumed R (p, p) of each ``[[sensors]]`` entry and a root of the true one."""
     # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
     return [
-        (plain(scenario.noise(k, True)), np.asarray(np.linalg.cholesky(scenario.noise(k, False))))
+        (
+            as_kernel_array(scenario.noise(k, True)),
+            np.asarray(np.linalg.cholesky(scenario.noise(k, False))),
+        )
         for k in range(len(scenario.sensors))
     ]
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, plain, square_root
+from netkf.linalg.arrays import FloatArray, as_kernel_array, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.numerics.prediction import ErrorFlow, Prediction, Predictor, propagate_state
@@ -161,7 +161,7 @@ class StackedErrors:
         """Update an estimate; the noise is ``observation.root`` times the inputs in ``columns``."""
         if not len(observation.H):
             return
-        stack, (H, R, root) = self.stack, map(plain, observation)
+        stack, (H, R, root) = self.stack, map(as_kernel_array, observation)
         place, first = stack.place(name), columns.start
         update_estimate(stack.table, stack.matrices, place, stack.used, H, R, root, first)
 
@@ -192,9 +192,9 @@ class StackedErrors:
             stack.matrices,
             places,
             stack.used,
-            plain(step.error),
-            plain(noise),
-            plain(step.root),
+            as_kernel_array(step.error),
+            as_kernel_array(noise),
+            as_kernel_array(step.root),
             columns.start,
         )
         if x is not None:

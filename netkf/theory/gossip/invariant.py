@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.chains import advance, alphabet
+from netkf.algorithms.kernels.chains import move_roots, reading_modes
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.rng.streams import Streams
@@ -47,7 +47,7 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
     samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)
     F, Q = scenario.slot_belief
     n, N = len(F), len(scenario.nodes)
-    modes = alphabet([(model.H, model.R) for model in scenario.slot_models], n)
+    modes = reading_modes([(model.H, model.R) for model in scenario.slot_models], n)
     random, root_Q = Streams(seed).generator("switched chain"), square_root(Q)
     # Abar is symmetric, so the reversed chain has the same transition probabilities.
     rows = np.cumsum(matching, axis=1)
@@ -59,7 +59,7 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
         part = slice(first, min(first + MAX_SAMPLES_AT_ONCE, samples))
         P[part], last[part] = couple_from_the_past(
             lambda following, T: _draw_before(rows, following, T, random),
-            lambda roots, words: advance(roots, words, F, root_Q, modes),
+            lambda roots, words: move_roots(roots, words, F, root_Q, modes),
             starts,
             np.zeros((part.stop - first, 0), dtype=kind),
         )

@@ -23,7 +23,7 @@ from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
-from netkf.scenario.registry import spoken
+from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import NONLINEAR
 from netkf.theory.common.observations import increment_observations
@@ -97,7 +97,9 @@ def reason_without_bound(scenario: Scenario) -> str | None:
         return _reason_of_samples(scenario)
     name = type(algorithm).__name__
     if scenario.hosted.paper != "hybrid":
-        return f"H(12) is about the hybrid filter in continuous time, not about {spoken(algorithm)}"
+        return (
+            f"H(12) is about the hybrid filter in continuous time, not about {kind_name(algorithm)}"
+        )
     own = overridden(algorithm)  # built-in resets by intersection give no larger P
     if own:
         return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
@@ -226,7 +228,9 @@ def left_weights(scenario: Scenario) -> FloatArray:
     if len(scenario.nodes) == 1:
         return np.ones(1)
     if not algorithm.talks:
-        raise TheoryError(f"the {spoken(algorithm)} filter does not talk, links mean nothing to it")
+        raise TheoryError(
+            f"the {kind_name(algorithm)} filter does not talk, links mean nothing to it"
+        )
     if has_balanced_rates(scenario) is None:
         raise TheoryError("how often messages arrive is not known beforehand (a recorded table?)")
     # The coupling has the left null vector w of its Laplacian D - C: w_j = share of node j's

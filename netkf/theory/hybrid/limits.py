@@ -8,7 +8,7 @@ import scipy.sparse
 from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal
-from netkf.scenario.registry import name_of, spoken
+from netkf.scenario.registry import kind_name, name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import (
     CoupledRiccati,
@@ -57,9 +57,9 @@ def _require_limit(scenario: Scenario) -> None:
     if not algorithm.talks:
         return
     if scenario.hosted.combination != "convex":
-        raise TheoryError(f"H(13) is about the hybrid filter, not about {spoken(algorithm)}")
+        raise TheoryError(f"H(13) is about the hybrid filter, not about {kind_name(algorithm)}")
     if own := overridden(algorithm):
-        name = spoken(algorithm)
+        name = kind_name(algorithm)
         if ":" in name_of("filter", algorithm):
             name = f"{type(algorithm).__name__}, which defines {own[0]} itself"
         raise TheoryError(f"H(13) is about the hybrid filter, not about {name}")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.chains import alphabet, trace_path
+from netkf.algorithms.kernels.chains import reading_modes, trace_path
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.rng.streams import Streams
@@ -78,7 +78,7 @@ def _evaluate(
 ) -> list[FloatArray]:
     """Return the values of the function at P_0, P_1, ..., in pieces of limited size."""
     F, Q, H, R = system
-    modes, root_Q = alphabet([(H[:0], R[:0, :0]), (H, R)], len(F)), square_root(Q)
+    modes, root_Q = reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F)), square_root(Q)
     piece, found = max(1, MAX_ENTRIES // len(F) ** 2), []
     for first in range(0, len(arrived), piece):
         word = arrived[first : first + piece].astype(np.uint8)

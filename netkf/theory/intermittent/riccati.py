@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from netkf.algorithms.kernels.chains import advance, alphabet
+from netkf.algorithms.kernels.chains import move_roots, reading_modes
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.rng.streams import Streams
@@ -80,9 +80,11 @@ def riccati_step(
     """
     system = check_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
-    modes = alphabet([(system.H, system.R)], len(start))
+    modes = reading_modes([(system.H, system.R)], len(start))
     first = np.zeros((1, 1), dtype=np.uint8)
-    root = advance(covariance_root(start)[None], first, system.F, square_root(system.Q), modes)[0]
+    root = move_roots(covariance_root(start)[None], first, system.F, square_root(system.Q), modes)[
+        0
+    ]
     return symmetric(root @ root.T)
 
 
@@ -345,10 +347,10 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     depth = as_whole("depth", depth, 0, MAX_DEPTH)
     F, Q, H, R = check_system(F, Q, H, R)
     roots = covariance_root(steady_covariance(F, Q, H, R))[None]
-    root_Q, modes = square_root(Q), alphabet([(H[:0], R[:0, :0]), (H, R)], len(F))
+    root_Q, modes = square_root(Q), reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F))
     for _ in range(depth):
         each = np.zeros((len(roots), 1), dtype=np.uint8), np.ones((len(roots), 1), dtype=np.uint8)
-        roots = np.concatenate([advance(roots, mode, F, root_Q, modes) for mode in each])
+        roots = np.concatenate([move_roots(roots, mode, F, root_Q, modes) for mode in each])
     return symmetric(roots @ np.swapaxes(roots, -1, -2))
 
 
@@ -375,7 +377,7 @@ def invariant_samples(
     samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)
     n, P = len(F), steady_covariance(F, Q, H, R)
     random = Streams(seed).generator("arrivals")
-    modes = alphabet([(H[:0], R[:0, :0]), (H, R)], n)
+    modes = reading_modes([(H[:0], R[:0, :0]), (H, R)], n)
     # f_0 and f_1 are monotone: every start between these two ends between their ends.
     starts = np.stack([covariance_root(P), 1e3 * covariance_root(P + np.trace(P) * np.eye(n))])
     drawn = np.empty((samples, n, n))
@@ -383,7 +385,7 @@ def invariant_samples(
         some = min(MAX_SAMPLES_AT_ONCE, samples - first)
         drawn[first : first + some], _ = couple_from_the_past(
             lambda following, T: random.random((len(following), T)) < delivery,
-            lambda roots, arrivals: advance(roots, arrivals, F, square_root(Q), modes),
+            lambda roots, arrivals: move_roots(roots, arrivals, F, square_root(Q), modes),
             starts,
             np.zeros((some, 0), dtype=bool),
         )

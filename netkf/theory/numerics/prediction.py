@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, plain
+from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.theory.numerics.roots import discretise, flow_estimates, triangular
 from netkf.theory.numerics.stack import GaussianStack
 
@@ -114,7 +114,7 @@ class _LinearSDE:
     """The equation dz = A z dt + B dw, discretised over any gap by doubling."""
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
-        self._exp, self._B = ShortExponential(A), plain(B)
+        self._exp, self._B = ShortExponential(A), as_kernel_array(B)
 
     def discretise(self, gap: float) -> tuple[FloatArray, FloatArray]:
         """Return ``exp(A gap)`` (d, d) and a root (d, d) of the covariance that the noise adds."""
@@ -172,11 +172,11 @@ class ErrorFlow:
         self._exp = ShortExponential(M)
         gain = self._weight @ self._root_R
         self._tables = (
-            plain(self._whitened),
-            plain(gain),
-            plain(self._noise),
-            plain(B),
-            plain(plant[1]),
+            as_kernel_array(self._whitened),
+            as_kernel_array(gain),
+            as_kernel_array(self._noise),
+            as_kernel_array(B),
+            as_kernel_array(plant[1]),
         )
         self._difference = plant[0] - A
         self._state = ShortExponential(plant[0]) if self._difference.any() else None

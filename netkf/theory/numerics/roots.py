@@ -293,7 +293,7 @@ def fade_totals(
 
 
 @kernel(allocates=True)
-def intersect_roots(weights: FloatArray, roots: FloatArray) -> tuple[FloatArray, FloatArray]:
+def intersect_with_factors(weights: FloatArray, roots: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the root (n, n) of P and the factors (J, n, n) ``w_j P P_j^-1`` of the errors, where
     ``P^-1 = sum_j w_j P_j^-1``; nan if one of the roots (J, n, n) is singular.
     """
@@ -461,7 +461,7 @@ def _add_product(out: FloatArray, first: int, a: FloatArray, b: FloatArray, scal
 
 
 @kernel(allocates=True)
-def closed_flow(
+def flow_over_gap(
     F: FloatArray, Gamma: FloatArray, start: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return ``F J`` and ``F J P`` (n, n) with ``J = (I + P G)^-1``, ``G = Gamma' Gamma``, and the
@@ -534,7 +534,7 @@ def flow_estimates(
     own = np.zeros((n, max(n, count * p)))
     for e in range(len(places)):
         form = forms[places[e]]
-        FJ, FC, root = closed_flow(F, Gamma, start, matrices[places[e]])
+        FJ, FC, root = flow_over_gap(F, Gamma, start, matrices[places[e]])
         multiply_form(form, FJ, used, scratch)
         for i in range(n):
             for j in range(own.shape[1]):

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, block_diagonal, plain
+from netkf.linalg.arrays import FloatArray, as_kernel_array, block_diagonal
 from netkf.theory.numerics.roots import (
     add_information,
     average_roots,
-    intersect_roots,
+    intersect_with_factors,
     update_root,
 )
 
@@ -51,7 +51,7 @@ def update_covariance_root(
     p, n = observation.H.shape
     if not p:
         return np.eye(n), np.zeros((n, 0)), root
-    return update_root(root, *(plain(part) for part in observation[:2]))
+    return update_root(root, *(as_kernel_array(part) for part in observation[:2]))
 
 
 def average_covariances(
@@ -74,7 +74,7 @@ def intersect_covariances(
 
     ``P^-1 = sum_j w_j P_j^-1``; error j is multiplied by ``w_j P P_j^-1``.
     """
-    found: tuple[FloatArray, FloatArray] = intersect_roots(
+    found: tuple[FloatArray, FloatArray] = intersect_with_factors(
         np.array(weights, dtype=float), np.stack(roots)
     )
     return found

@@ -19,7 +19,7 @@ import scipy.linalg
 
 from netkf.algorithms.push_sum import PushSum
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray, plain
+from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
@@ -169,7 +169,7 @@ class RunningTotalsRule(ErrorRule):
         fading, stack = math.exp(-2.0 * self._rate * gap), self.errors.stack
         fade_totals(
             *(stack.table, stack.matrices, stack.places(self._totals), stack.used),
-            *(inverse, fading, plain(noise), columns.start),
+            *(inverse, fading, as_kernel_array(noise), columns.start),
         )
 
     def sense(self, time: float, observations: HostObservations) -> None:
