@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 import netkf
 from netkf.engines.compiled.agenda import simulate_agenda
@@ -12,6 +13,10 @@ from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.ensembles import pools
 from netkf.linalg import compiling
 from netkf.scenario.reading import from_table
+
+# The same examples each time; `--hypothesis-profile default` looks for new ones.
+settings.register_profile("fixed", derandomize=True)
+settings.load_profile("fixed")
 
 ROOT = Path(__file__).parent.parent
 SCENARIOS = ROOT / "scenarios"
