@@ -12,7 +12,13 @@ from netkf import theory
 from netkf.algorithms.kernels.pair_fusion import fused_pair
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.theory.common.errors import error_law
-from tests.algorithms.test_literature import clocked, heard_by_slot, scenario_of, textbook
+from tests.algorithms.test_literature import (
+    LOSSY,
+    clocked,
+    heard_by_slot,
+    scenario_of,
+    textbook,
+)
 from tests.theory.test_replay import close, engine_covariance
 
 BEST = "optimised-covariance-intersection"
@@ -174,6 +180,58 @@ def test_two_tracks_have_the_cross_covariance_of_a_lyapunov_equation(tmp_path):
     # Without the common process noise tracks would be taken for independent: too sure.
     naive = np.linalg.inv(np.linalg.inv(A) + np.linalg.inv(B))
     assert np.trace(naive) < 0.97 * np.trace(expected)
+
+
+def fused_tracks(scenario, run):
+    """Best linear unbiased combinations ``(E' J^-1 E)^-1 E' J^-1`` of the tracks that a node has in
+    a slot, with the covariance J of their errors by the recursion of the paper.
+    """
+    heard, F, Q = heard_by_slot(scenario, run, 1), scenario.plant.F, scenario.plant.Q
+    N, n = len(scenario.nodes), len(F)
+    tracks, own = [np.zeros(n)] * N, [scenario.plant.cov] * N
+    P = {(i, j): scenario.plant.cov for i in range(N) for j in range(N)}
+
+    def step(slot, x, C, readings):
+        nonlocal tracks, own, P
+        tracks, own = [F @ one for one in tracks], [F @ one @ F.T + Q for one in own]
+        P = {pair: F @ one @ F.T + Q for pair, one in P.items()}
+        closed = [np.eye(n)] * N
+        for i, (y, H, R) in readings.items():
+            K = own[i] @ H.T @ np.linalg.inv(H @ own[i] @ H.T + R)
+            closed[i] = np.eye(n) - K @ H
+            tracks[i], own[i] = tracks[i] + K @ (y - H @ tracks[i]), closed[i] @ own[i]
+        P = {(i, j): closed[i] @ one @ closed[j].T for (i, j), one in P.items()}
+        P |= {(i, i): own[i] for i in range(N)}
+        found = []
+        for i in range(N):
+            near = [i, *np.flatnonzero(heard.get(slot, np.zeros((1, N, N)))[0][i]).tolist()]
+            J = np.linalg.inv(np.block([[P[a, b] for b in near] for a in near]))
+            E = np.tile(np.eye(n), (len(near), 1))
+            best = np.linalg.inv(E.T @ J @ E)
+            found.append((best @ E.T @ J @ np.concatenate([tracks[j] for j in near]), best))
+        return [one for one, _ in found], [one for _, one in found]
+
+    states = list(textbook(scenario, run, step))
+    return np.stack([x for x, _ in states]), np.stack([C for _, C in states])
+
+
+@pytest.mark.parametrize("network", ["several tracks", "two tracks"])
+def test_estimates_of_tracks_by_the_plain_formula(network, tmp_path):
+    """For two tracks it is Bar-Shalom and Campo's ``x_i + (P_i - P_ij) S^-1 (x_j - x_i)``."""
+    more = {"network": {**PAIR, "channel": LOSSY}} if network == "two tracks" else {}
+    sensors = [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.3]]},
+        {"nodes": [1], "H": [[0.4, 1.0]], "R": [[0.6]]},
+    ]
+    if more:
+        more["sensors"] = sensors
+    for seed in range(2):
+        scenario = scenario_of(TRACKS, tmp_path, seed, **more)
+        run = netkf.simulate(scenario)
+        xhat, P = fused_tracks(scenario, run)
+        assert run.count("lost") > 1
+        np.testing.assert_allclose(run.P, P, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(run.xhat, xhat, rtol=1e-10, atol=1e-10)
 
 
 def test_tracks_know_their_errors_and_checks_say_so(tmp_path):

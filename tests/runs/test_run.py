@@ -333,7 +333,10 @@ def test_directories_are_never_overwritten(tmp_path, monkeypatch):
         new_directory(first, "x")
 
 
-@pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
+NONLINEAR = scenario_files()[0].parent / "nonlinear" / "range_tracking.toml"
+
+
+@pytest.mark.parametrize("file", [*scenario_files(), NONLINEAR], ids=lambda f: f.stem)
 def test_every_scenario_ends_in_its_expected_summary(file, tmp_path, capsys):
     """The file beside the scenario; numbers to 6 digits, counts exactly."""
     options = ["--out", str(tmp_path / "out"), "--no-plot"]
