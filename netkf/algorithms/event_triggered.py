@@ -66,6 +66,8 @@ class EventTriggeredCi(Filter):
     alpha: float = field(number(low=0.0), default=1.0)
     delta: float = field(number(low=0.0), default=1.0)
 
+    paper: ClassVar[str] = "event_triggered"
+    P_by_design: ClassVar[tuple[str, str]] = ("larger", "")
     clocks: ClassVar[tuple[str, ...]] = ()
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True

@@ -58,6 +58,7 @@ class OneBit(Filter):
     estimate, to which later bits do not refer. Readings enter as bits only, one's own too.
     """
 
+    paper: ClassVar[str] = "one_bit"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
     first_slot: ClassVar[int] = 1

@@ -56,6 +56,8 @@ class StochasticTrigger(Filter):
 
     strength: float = field(positive, default=1.0)
 
+    paper: ClassVar[str] = "stochastic_trigger"
+    combination: ClassVar[str] = "scheduled readings"
     clocks: ClassVar[tuple[str, ...]] = ()
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True

@@ -4,17 +4,23 @@ P of tracks with known cross-covariances is that covariance.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from netkf.checks.clocked import PROMISES, REACH, UPPER_BOUND
-from netkf.checks.evidence import Finding, Promise
+from netkf.checks.evidence import Finding, Promise, find_identity
 from netkf.checks.exact import most_replayed, with_promised_filter
 from netkf.checks.kalman_consensus import EquationChecks
+from netkf.checks.points import check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import RunSamples
 from netkf.scenario.scenario import Scenario
+from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 
 EXACT_TOLERANCE = 1e-8
+START_FACTOR, STEADY_TOLERANCE = 10.0, 1e-3
+"""What a start may matter beyond its size and the radius, and how little of it is called steady."""
 
 
 def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
@@ -35,7 +41,35 @@ EXACT = Promise(
     check_exact_covariance,
     exact=True,
 )
-BY_COMBINATION = {"best intersection": (UPPER_BOUND,), "tracks": (EXACT,)}
+
+
+def check_steady(samples: RunSamples, level: float) -> Finding:
+    """Compare P at the end of the runs with that of steady tracks."""
+    radius, steady = tracks_in_slots(samples.scenario)
+    expected = steady[sampled_indices(samples.scenario)]
+    # What is left of the start shrinks by the radius in each slot.
+    left = radius ** check_slots(samples.scenario)[-1]
+    gap = np.abs(samples.runs.P[:, -1] - expected).max(axis=(-1, -2))
+    size = np.trace(expected, axis1=-2, axis2=-1)
+    terms = samples.first_trace + float(np.trace(steady, axis1=-2, axis2=-1).max())
+    allowed = EXACT_TOLERANCE + START_FACTOR * left * terms / float(size.min())
+    message = f"P at the end of {samples.count} runs"
+    found = find_identity(float((gap / size).max()), allowed, message)
+    if allowed < STEADY_TOLERANCE:
+        return found
+    wanted = STEADY_TOLERANCE * float(size.min()) / (2.0 * START_FACTOR * terms)
+    slots = math.log(wanted) / math.log(radius)
+    return found._replace(early=True, horizon=slots * samples.scenario.slot_plant.period)
+
+
+STEADY = Promise(
+    "P tends to that of steady tracks, whose P12 solves a Lyapunov equation",
+    "Bar-Shalom and Campo 1986",
+    ("the filters know", "no message is lost"),
+    check_steady,
+    exact=True,
+)
+BY_COMBINATION = {"best intersection": (UPPER_BOUND,), "tracks": (EXACT, STEADY)}
 
 
 class FusionChecks(EquationChecks):

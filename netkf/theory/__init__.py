@@ -30,6 +30,7 @@ from netkf.theory.intermittent.riccati import (
 )
 from netkf.theory.intermittent.scalar_law import scalar_law
 from netkf.theory.numerics.matrices import riccati_flow
+from netkf.theory.one_bit.covariances import one_bit_update
 from netkf.theory.push_sum.broadcasts import leader_agreement, mass_totals
 from netkf.theory.push_sum.certified_gamma import (
     CorollaryTwo,
@@ -48,6 +49,7 @@ from netkf.theory.push_sum.large_gamma import (
 )
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
 from netkf.theory.push_sum.mean_square import push_sum_radius, push_sum_stability
+from netkf.theory.stochastic_trigger.rates import trigger_rate
 
 __all__ = [
     "CorollaryTwo",
@@ -84,6 +86,7 @@ __all__ = [
     "mean_matching",
     "mean_square_radius",
     "minimum_gamma",
+    "one_bit_update",
     "path_average",
     "push_sum_covariances",
     "push_sum_error_covariance",
@@ -100,6 +103,7 @@ __all__ = [
     "support",
     "switched_samples",
     "tracking_level",
+    "trigger_rate",
     "true_limit_covariance",
 ]
 

@@ -67,3 +67,16 @@ def test_a_row_costs_a_bit(tmp_path):
     # Rows of the nodes whose turn it is in slots 1 to 6: 2, 3, 2, none, 1, 2.
     assert row.transmissions == 5
     assert row.bytes == pytest.approx((2 + 3 + 2 + 1 + 2) / 8.0)
+
+
+def test_what_a_bit_is_worth(tmp_path):
+    """2/pi of what the reading would take from P, of one row; with losses in `check` too."""
+    P, H, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[1.0, 0.4]]), np.array([[0.5]])
+    whole = P - P @ H.T @ np.linalg.inv(H @ P @ H.T + R) @ H @ P
+    found = netkf.theory.one_bit_update(P, H, R)
+    np.testing.assert_allclose(P - found, 2.0 / math.pi * (P - whole), rtol=1e-12)
+    promise = "a bit lowers P by 2/pi of what its reading would, along the bits of each run"
+    for more in ({"network": COMPLETE}, {}):
+        scenario = scenario_of(ONE_BIT, tmp_path, 1, horizon=9.0, **more)
+        table = netkf.check(scenario, 10, workers=1).table.set_index("promise")
+        assert table.loc[promise, "verdict"] == "holds"

@@ -177,6 +177,17 @@ def test_two_tracks_have_the_cross_covariance_of_a_lyapunov_equation(tmp_path):
     expected = A - G @ (A - P12).T
     run = netkf.simulate(scenario)
     np.testing.assert_allclose(run.P[0], [expected, expected], rtol=1e-9)
+    steady = theory.steady_error_covariance(scenario)
+    np.testing.assert_allclose(steady, [expected, expected], rtol=1e-10)
+    # With probability 0.3 a node shows its own track.
+    lossy = scenario_of(TRACKS, tmp_path, 3, sensors=sensors, network={**PAIR, "channel": LOSSY})
+    mixed = [0.7 * expected + 0.3 * P for P in filtered]
+    np.testing.assert_allclose(theory.steady_error_covariance(lossy), mixed, rtol=1e-10)
+    promise = "P tends to that of steady tracks, whose P12 solves a Lyapunov equation"
+    short = scenario.replace({"horizon": 91.0, "probe": [90.0]})
+    for one, verdict in ((short, "holds"), (lossy, "not promised")):
+        table = netkf.check(one, 10, workers=1).table.set_index("promise")
+        assert table.loc[promise, "verdict"] == verdict
     # Without the common process noise tracks would be taken for independent: too sure.
     naive = np.linalg.inv(np.linalg.inv(A) + np.linalg.inv(B))
     assert np.trace(naive) < 0.97 * np.trace(expected)

@@ -184,3 +184,64 @@ def test_the_compiled_engine_says_that_it_has_no_code(tmp_path):
             netkf.simulate(scenario, engine="compiled")
     lossy = scenario_of(EVENT, tmp_path)
     assert any("messages may be lost" in note for note in lossy.notes)
+
+
+def table_of(scenario, runs=10):
+    found = netkf.check(scenario, runs, confidence=0.999, workers=1)
+    return found.table.set_index("promise")
+
+
+RATE = "nodes send with probability 1 - det(I + Pi Y)^-1/2"
+SILENCE = "P is the covariance of the error, given the events"
+
+
+def test_theory_follows_silence_and_checks_the_rate(tmp_path):
+    """A reading with the noise R + Y^-1 more stands for silence; losses break what is promised."""
+    scenario = scenario_of(
+        STOCHASTIC, tmp_path, 1, network=ALL, horizon=15.0, probe=[2.0, 9.0, 14.0]
+    )
+    run = netkf.simulate(scenario)
+    np.testing.assert_allclose(netkf.theory.error_covariance(scenario, run), run.P, rtol=1e-9)
+    table = table_of(scenario, 40)
+    assert set(table["verdict"]) <= {"holds", "undecided"}
+    assert table.loc[SILENCE, "verdict"] == "holds"
+    assert table.loc[RATE, "seen"] == pytest.approx(1.0, abs=0.2)
+    lossy = scenario_of(STOCHASTIC, tmp_path, 1, horizon=9.0)
+    verdicts = table_of(lossy)["verdict"]
+    assert verdicts[[SILENCE, RATE]].tolist() == ["not promised", "not promised"]
+
+
+def test_nodes_that_send_too_often_break_the_rate(tmp_path, monkeypatch):
+    """Coins that fall on silence half as often as they should."""
+    from netkf.algorithms.stochastic_trigger import StochasticTrigger
+
+    emit = StochasticTrigger.emit
+
+    def eager(self, state, exchange):
+        return emit(self, state, exchange._replace(uniform=0.5 + 0.5 * exchange.uniform))
+
+    monkeypatch.setattr(StochasticTrigger, "emit", eager)
+    scenario = scenario_of(STOCHASTIC, tmp_path, 1, network=ALL, horizon=15.0)
+    assert table_of(scenario, 20).loc[RATE, "verdict"] == "broken"
+
+
+def test_the_rate_in_closed_form():
+    """Han et al. for one row, ``1 - (1 + pi y)^-1/2``, and by integration for two."""
+    assert netkf.theory.trigger_rate([[2.0]], [[1.0]], [[0.5]], [[3.0]]) == pytest.approx(
+        1.0 - 1.0 / math.sqrt(1.0 + 2.5 * 3.0), rel=1e-12
+    )
+    H, R, Y = np.array([[1.0], [0.3]]), np.array([[0.5, 0.1], [0.1, 0.4]]), np.diag([2.0, 0.5])
+    L = np.linalg.cholesky(2.0 * H @ H.T + R)
+    x, w = np.polynomial.hermite_e.hermegauss(160)
+    z = np.stack(np.meshgrid(x, x), axis=-1) @ L.T
+    silent = (np.outer(w, w) * np.exp(-0.5 * np.einsum("abi,ij,abj->ab", z, Y, z))).sum()
+    expected = 1.0 - silent / (2.0 * math.pi)
+    assert netkf.theory.trigger_rate([[2.0]], H, R, Y) == pytest.approx(expected, rel=1e-10)
+
+
+def test_what_is_promised_of_event_triggers(tmp_path):
+    bound = "P is at least the second moment of the error: the mean NEES is at most n"
+    for network, verdicts in ((SURE, ("holds", "undecided")), ({}, ("not promised",))):
+        more = {"network": network} if network else {}
+        table = table_of(scenario_of(EVENT, tmp_path, 1, horizon=9.0, **more), 30)
+        assert table.loc[bound, "verdict"] in verdicts

@@ -46,7 +46,8 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
     and clocks, in the order of the nodes; in slots as samples show it.
 
     By one generalised Lyapunov equation, for filters whose gains are constant: ``constant-gain``,
-    ``kcf`` in slots with its own readings or without losses, ``local`` and ``central`` in slots.
+    ``kcf`` in slots with its own readings or without losses, ``bar-shalom-campo``, ``local`` and
+    ``central`` in slots.
     Losses may be independent, by link or bursty (Gilbert-Elliott, few links), delays fixed (in
     slots) or none, clocks Poisson; at most 200 errors of all nodes together. Raises TheoryError
     with the reason where there is no such mean, or it is not known.
@@ -63,6 +64,11 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 @lru_cache(maxsize=8)
 def _solved(scenario: Scenario) -> tuple[float, FloatArray | None]:
     """Return the radius, and the covariances (N, n, n) if it is below 1."""
+    solve = _solver(scenario)
+    if solve is not None:
+        _require_known_law(scenario)
+        solved: tuple[float, FloatArray | None] = solve(scenario)
+        return solved
     system = linear_errors(scenario)
     _require_size(system.shape)
     T, Q = _slots(system) if isinstance(system, SlotJumps) else _clocks(system)
@@ -79,16 +85,7 @@ def linear_errors(scenario: Scenario) -> SlotJumps | ClockJumps:
     """Return the errors of a scenario's filter as a linear system with jumps; raises TheoryError
     where they are not.
     """
-    require_known_filter(scenario)
-    if not scenario.is_random:
-        raise TheoryError("the state or readings are recorded: their law is not known")
-    believed, true = (
-        (scenario.slot_belief[0], scenario.slot_plant.F)
-        if scenario.slotted
-        else (scenario.belief[0], scenario.truth.A)
-    )
-    if not np.array_equal(believed, true):
-        raise TheoryError("the filters' plant is not the true one: errors follow the state")
+    _require_known_law(scenario)
     make = _maker(scenario)
     if make is None:
         given = kind_name(scenario.filter.algorithm)
@@ -101,15 +98,39 @@ def linear_errors(scenario: Scenario) -> SlotJumps | ClockJumps:
     return made
 
 
+def _require_known_law(scenario: Scenario) -> None:
+    """Raise TheoryError where errors have no law that is known here."""
+    require_known_filter(scenario)
+    if not scenario.is_random:
+        raise TheoryError("the state or readings are recorded: their law is not known")
+    believed, true = (
+        (scenario.slot_belief[0], scenario.slot_plant.F)
+        if scenario.slotted
+        else (scenario.belief[0], scenario.truth.A)
+    )
+    if not np.array_equal(believed, true):
+        raise TheoryError("the filters' plant is not the true one: errors follow the state")
+
+
 def has_linear_errors(scenario: Scenario) -> bool:
     """Return True if the class of the filter is one whose gains are constant in some scenarios."""
-    return _maker(scenario) is not None
+    return _maker(scenario) is not None or _solver(scenario) is not None
 
 
 def is_quickly_solved(scenario: Scenario) -> bool:
     """Return True if the mean squares of a scenario with constant gains take a second or so."""
+    if _solver(scenario) is not None:
+        return len(scenario.nodes) * scenario.plant.n <= MAX_ERRORS
     S, M, _ = linear_errors(scenario).shape
     return S * M * M <= QUICK_NUMBERS
+
+
+def _solver(scenario: Scenario) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
+    """Return the function of a paper that solves for radius and covariances itself, if any."""
+    found: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
+        scenario, "steady_errors", f"{scenario.hosted.combination}_in_slots".replace(" ", "_")
+    )
+    return found if scenario.slotted else None
 
 
 def _maker(scenario: Scenario) -> Callable[[Scenario], SlotJumps | ClockJumps] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, true_model_row
 from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.random_links import messages_are_sure
 
 SOURCES = {
     "best intersection": "Julier and Uhlmann 1997",
@@ -16,4 +17,9 @@ SOURCES = {
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model and the first covariances."""
     source = SOURCES[scenario.hosted.combination]
-    return [true_model_row(scenario, source, "same F, Q and R"), *start_rows(scenario, source)]
+    rows = [true_model_row(scenario, source, "same F, Q and R"), *start_rows(scenario, source)]
+    if scenario.hosted.combination != "tracks":
+        return rows
+    sure = messages_are_sure(scenario)
+    words = "every message arrives in its slot" if sure else "P depends on who is heard"
+    return [*rows, ("no message is lost", source, sure, words)]

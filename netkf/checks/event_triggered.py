@@ -1,0 +1,66 @@
+"""Promises about event-triggered consensus on information: P is no smaller than the errors are."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+
+from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing
+from netkf.checks.laws import NEES_TOLERANCE, exact_start
+from netkf.checks.paper import PaperChecks
+from netkf.checks.samples import RunSamples
+from netkf.checks.statistics import student_interval
+from netkf.scenario.scenario import Scenario
+
+
+def check_nees_bound(samples: RunSamples, level: float) -> Finding:
+    """Test that the mean of NEES / n is at most 1 at every time and node.
+
+    Decisions depend on data, so that errors given the events are not Gaussian: means over runs.
+    """
+    n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
+    known = np.flatnonzero(np.isfinite(nees).all(axis=0))
+    if not len(known):
+        return find_nothing(NEES_TOLERANCE)
+    ratios, share = nees[:, known] / n, level / len(known)
+    means, spreads = ratios.mean(axis=0), ratios.std(axis=0, ddof=1) / math.sqrt(samples.count)
+    k = int(np.argmax(means + 2.0 * spreads))
+    found = [
+        student_interval(float(mean), float(spread), samples.count, share)
+        for mean, spread in zip(means, spreads, strict=True)
+    ]
+    highest = max(one.high for one in found)
+    # A promise is broken if some interval lies above 1 as a whole.
+    lowest = max(one.low for one in found)
+    label = samples.point_labels[int(known[k])]
+    message = f"NEES / n, at most 1, the largest of {len(known)} points at {label}"
+    message += samples.blurred_note
+    margin = 1.0 - float(means[k]), 1.0 - highest, 1.0 - lowest
+    return Finding(margin, NEES_TOLERANCE, message, seen=float(means[k]), expected=1.0)
+
+
+BOUND = Promise(
+    "P is at least the second moment of the error: the mean NEES is at most n",
+    "Battistelli et al. 2018, derived",
+    ("the filters know", "no message is lost", "the filters start"),
+    check_nees_bound,
+)
+
+
+class TriggeredChecks(PaperChecks):
+    """That P bounds the errors, whatever the thresholds."""
+
+    slots_only: ClassVar[bool] = True
+
+    def assumptions(self, scenario: Scenario) -> list[Assumption]:
+        """Return the assumptions of the tests."""
+        return [exact_start(scenario)]
+
+    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
+        """Return the promises about a scenario."""
+        return (BOUND,)
+
+
+CHECKS = TriggeredChecks()

@@ -1,0 +1,1 @@
+"""Theory of event-triggered consensus on information: its assumptions."""

@@ -1,0 +1,1 @@
+"""Theory of the sign-of-innovations filter: its covariances along the bits of a run."""

@@ -1,0 +1,1 @@
+"""Theory of the stochastic event trigger: exact errors, rates and assumptions."""

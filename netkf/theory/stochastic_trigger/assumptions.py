@@ -1,0 +1,22 @@
+"""Assumptions under which errors under the stochastic event trigger are as large as P says."""
+
+from __future__ import annotations
+
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import AssumptionRow, true_model_row
+from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.stochastic_trigger.errors import everyone_hears
+
+SOURCE = "Han et al. 2015"
+HEARD = "every node hears every other, without losses"
+
+
+def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows about the model, the network and the first covariances."""
+    heard = everyone_hears(scenario)
+    words = "silence is a decision" if heard else "who misses a message takes it for silence"
+    return [
+        true_model_row(scenario, SOURCE, "same F, Q and R"),
+        (HEARD, SOURCE, heard, words),
+        *start_rows(scenario, SOURCE),
+    ]

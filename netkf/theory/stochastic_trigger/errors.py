@@ -1,0 +1,87 @@
+"""Exact errors under the stochastic event trigger, given who sent in which slot.
+
+A node is silent with probability ``exp(-z' Y z / 2)``, which is up to a factor the likelihood of
+``z + u = 0`` with noise u of covariance Y^-1. Given its silence errors therefore have the law that
+they would have after a reading with that noise more, and given that it sends that after its
+reading: neither depends on what was read (Han et al. 2015, Theorem 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from netkf.algorithms.stochastic_trigger import StochasticTrigger
+from netkf.core.errors import TheoryError
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import require_traced_exchanges
+from netkf.theory.common.error_rules import ErrorRule, SentMessage
+from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.random_links import messages_are_sure
+from netkf.theory.common.stacked_errors import StackedErrors
+from netkf.theory.numerics.updates import Observation
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+Decisions = set[tuple[int, int]]
+"""Slots and the indices of the nodes that sent in them."""
+
+
+def everyone_hears(scenario: Scenario) -> bool:
+    """Return True if every node hears every other, without losses."""
+    N = len(scenario.nodes)
+    return len(scenario.topology.directions) == N * (N - 1) and messages_are_sure(scenario)
+
+
+def decisions(scenario: Scenario, run: Run) -> Decisions:
+    """Return who sent in which slot of a run."""
+    index, rows = scenario.topology.index, run.log[run.log["kind"] == CODES["send"]]
+    slots = scenario.slot_plant.slots_of(rows["t"])
+    return {(slot, index[node]) for slot, node in zip(slots, rows["node"].tolist(), strict=True)}
+
+
+class ScheduleRule(ErrorRule):
+    """Readings that were sent, and the silence of all other sensors."""
+
+    takes_messages = False
+
+    def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
+        super().__init__(scenario, errors)
+        algorithm = scenario.filter.algorithm
+        assert isinstance(algorithm, StochasticTrigger)
+        self._strength, self._sent = algorithm.strength, decisions(scenario, run)
+        self._seen: HostObservations = {}
+
+    def sense(self, time: float, observations: HostObservations) -> None:
+        """Keep the readings for the exchange of the slot."""
+        self._seen = observations
+
+    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
+        """Update all nodes by all sensors."""
+        columns = self.errors.reading_noises(self._seen)
+        for host, one in self._seen.items():
+            used = one if (slot, host) in self._sent else silence(one, self._strength)
+            for hearer in range(self.errors.hosts):
+                self.errors.update(hearer, used, columns[host])
+
+
+def silence(reading: Observation, strength: float) -> Observation:
+    """Return the reading that silence stands for, with the noise R + Y^-1."""
+    more = reading.R / strength
+    root = np.asarray(np.linalg.cholesky(reading.root @ reading.root.T + more))
+    return Observation(reading.H, reading.R + more, root)
+
+
+def rule(
+    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
+) -> ErrorRule:
+    """Return the rule of this filter for the errors of a run; raises TheoryError where silence may
+    be a loss, or the filters do not know the law of innovations.
+    """
+    require_traced_exchanges(scenario, run)
+    if not everyone_hears(scenario):
+        raise TheoryError("who misses a message takes it for silence: errors follow the data")
+    if not scenario.filters_know_the_truth:
+        raise TheoryError("the filters take silence for what their model says, which is not true")
+    return ScheduleRule(scenario, errors, run)

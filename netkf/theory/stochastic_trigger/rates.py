@@ -1,0 +1,57 @@
+"""How often nodes send under the stochastic event trigger."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.algorithms.stochastic_trigger import StochasticTrigger
+from netkf.linalg.arrays import ArrayLike, square_root
+from netkf.scenario.scenario import Scenario
+from netkf.theory.intermittent.riccati import check_system, lyapunov_step
+from netkf.theory.numerics.matrices import as_covariance
+from netkf.theory.numerics.updates import Observation, update_covariance_root
+from netkf.theory.stochastic_trigger.errors import decisions, silence
+from netkf.trace.run import Run
+
+
+def trigger_rate(P: ArrayLike, H: ArrayLike, R: ArrayLike, Y: ArrayLike) -> float:
+    """Return the probability ``1 - det(I + Pi Y)^-1/2`` with which a node sends its reading.
+
+    P (n, n) is the covariance of the prediction, H (p, n) and R (p, p) are those of the sensor,
+    ``Pi = H P H' + R``, and Y (p, p) is the matrix of the trigger, which is silent with probability
+    ``exp(-z' Y z / 2)`` (Han et al. 2015). Raises TheoryError if shapes or definiteness are wrong.
+    """
+    spread = np.asarray(P, dtype=np.float64)
+    _, C, H_, R_ = check_system(np.eye(len(np.atleast_2d(spread))), P, H, R)
+    Pi = H_ @ C @ H_.T + R_
+    return float(1.0 - np.linalg.det(np.eye(len(R_)) + Pi @ as_covariance("Y", Y, len(R_))) ** -0.5)
+
+
+def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
+    """Return how often nodes sent in a run whose nodes all hear each other, and the sum of the
+    probabilities of that, each given all that happened before.
+
+    The first slot, in which every node with a sensor sends, is left out.
+    """
+    algorithm, sent = scenario.filter.algorithm, decisions(scenario, run)
+    assert isinstance(algorithm, StochasticTrigger)
+    (F, Q), strength = scenario.slot_belief, algorithm.strength
+    P = np.asarray(scenario.start(scenario.nodes[0])[1])
+    sensors = {
+        k: Observation(H, R, np.asarray(np.linalg.cholesky(R)))
+        for k, (H, R) in enumerate(map(scenario.observation, scenario.nodes))
+        if len(H)
+    }
+    count, expected, slot = 0, 0.0, 1
+    while not scenario.slot_plant.over(slot, scenario.horizon):
+        P = lyapunov_step(P, F, Q)
+        if slot > 1:
+            for k, (H, R, _) in sensors.items():
+                count += (slot, k) in sent
+                expected += trigger_rate(P, H, R, strength * np.linalg.inv(R))
+        root = square_root(P)
+        for k, one in sensors.items():
+            used = one if (slot, k) in sent else silence(one, strength)
+            root = update_covariance_root(root, used)[2]
+        P, slot = root @ root.T, slot + 1
+    return count, expected

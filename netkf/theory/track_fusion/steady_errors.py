@@ -1,0 +1,107 @@
+"""Steady errors of fused tracks by Lyapunov equations, Bar-Shalom and Campo 1986.
+
+Tracks of steady Kalman filters have ``P_ij = C_i (F P_ij F' + Q) C_j'`` for i and j apart, with
+``C_i = I - K_i H_i``. What a node shows depends on whom it hears in a slot, which is independent of
+all errors: the mean is over all sets of neighbours.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import scipy.linalg
+
+from netkf.algorithms.track_fusion import best_combination
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.network.matchings import Broadcast
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import RECORDED_CHANNEL, is_recorded
+from netkf.theory.intermittent.riccati import steady_covariance
+
+MAX_NEIGHBOURS = 10
+"""Neighbours whose messages may be lost, all sets of which are looked at."""
+
+
+def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
+    """Return the largest spectral radius of ``C F (x) C F`` of a track, and the steady covariances
+    (N, n, n) of the errors of what nodes show, over noises and losses.
+
+    Raises TheoryError where a track has no steady state or losses have no law.
+    """
+    if not isinstance(scenario.network.activation, Broadcast):
+        raise TheoryError("the exchanges are recorded: one outcome, not a law")
+    if is_recorded(scenario.network.channel):
+        raise TheoryError(RECORDED_CHANNEL)
+    if not scenario.filters_know_the_truth:
+        raise TheoryError("the filters' model is not the true one")
+    joint, radius = steady_tracks(scenario)
+    N, n = len(scenario.nodes), scenario.plant.n
+    blocks = joint.reshape(N, n, N, n)
+    return radius, np.stack([_shown(scenario, blocks, i) for i in range(N)])
+
+
+def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
+    """Return the joint covariance (N n, N n) of the errors of all steady tracks, and the radius."""
+    (F, Q), n = scenario.slot_belief, scenario.plant.n
+    closed, noises = [], []
+    for node in scenario.nodes:
+        H, R = scenario.observation(node)
+        M = steady_covariance(F, Q, H, R)
+        K = np.linalg.solve(H @ M @ H.T + R, H @ M).T if len(H) else np.zeros((n, 0))
+        closed.append(np.eye(n) - K @ H)
+        noises.append(K @ R @ K.T)
+    joint = np.zeros((len(closed), n, len(closed), n))
+    for (i, C), (j, D) in itertools.combinations_with_replacement(enumerate(closed), 2):
+        driven = C @ Q @ D.T + (noises[i] if i == j else 0.0)
+        block = np.linalg.solve(np.eye(n * n) - np.kron(C @ F, D @ F), driven.reshape(-1))
+        joint[i, :, j] = block.reshape(n, n)
+        joint[j, :, i] = block.reshape(n, n).T
+    radius = max(float(np.abs(scipy.linalg.eigvals(C @ F)).max()) for C in closed)
+    return joint.reshape(len(closed) * n, -1), radius**2
+
+
+def _shown(scenario: Scenario, blocks: FloatArray, i: int) -> FloatArray:
+    """Return the mean covariance (n, n) of what node i shows; ``blocks`` (N, n, N, n)."""
+    chances = _chances(scenario, scenario.nodes[i])
+    sure = [j for j, p in chances.items() if p == 1.0]
+    unsure = [j for j, p in chances.items() if 0.0 < p < 1.0]
+    if len(unsure) > MAX_NEIGHBOURS:
+        raise TheoryError(
+            f"node {scenario.nodes[i]} hears {len(unsure)} nodes with losses; at most "
+            f"{MAX_NEIGHBOURS} are looked at, in all combinations"
+        )
+    total = np.zeros_like(blocks[i, :, i])
+    for up in itertools.product((True, False), repeat=len(unsure)):
+        fates = list(zip(unsure, up, strict=True))
+        chance = math.prod(chances[j] if one else 1.0 - chances[j] for j, one in fates)
+        order = [i, *sure, *(j for j, one in fates if one)]
+        total += chance * _fused(blocks[order][:, :, order])
+    return total
+
+
+def _chances(scenario: Scenario, node: int) -> dict[int, float]:
+    """Return the probability with which a node hears each other, by their indices."""
+    topology, channel = scenario.topology, scenario.network.channel
+    delay = channel.delay.fixed
+    if delay is None:
+        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
+    if delay > scenario.phase_length:
+        return {}
+    return {
+        topology.index[j]: float(
+            channel.loss.mean_delivery((j, node), scenario.table_probability((j, node)))
+        )
+        for j in topology.senders(node)
+    }
+
+
+def _fused(blocks: FloatArray) -> FloatArray:
+    """Return the covariance (n, n) of the best combination of tracks, the first one the own."""
+    own = blocks[0, :, 0]
+    if len(blocks) == 1:
+        return own
+    root = best_combination(blocks, range(1, len(blocks)), square_root(own))[1]
+    return np.asarray(root @ root.T)
