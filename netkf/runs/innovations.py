@@ -15,6 +15,7 @@ from scipy.special import gammaincinv
 from netkf.algorithms.filter import Filter, Reading
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.increments import Interval, noting_increments
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
@@ -31,7 +32,9 @@ class Innovations(NamedTuple):
     """Innovations v = y - H xhat of M readings in their order, with S = H P H' + R.
 
     times (M,); nodes (M,); ``rows`` (M,): the length p of v; nis (M,): v' S^-1 v; ``whitened``: a
-    list of M arrays (p,), the roots of S^-1 times v.
+    list of M arrays (p,), the roots of S^-1 times v; ``increments``: how many of the readings are
+    increments of an interval between two events of a node, whose v is what they are beyond those
+    expected from the estimate at its beginning.
     """
 
     times: FloatArray
@@ -39,30 +42,31 @@ class Innovations(NamedTuple):
     rows: np.ndarray
     nis: FloatArray
     whitened: list[FloatArray]
+    increments: int = 0
 
 
 def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
-    """Return the innovations of the samples of a run, by a replay.
+    """Return the innovations of the samples and increments of a run, by a replay.
 
-    Raises NetkfError with a sentence if there are none: readings are increments, the filter has its
-    own form of readings or gives no covariance, the run has more than ``most`` events, or a replay
-    makes other events, as another version may.
+    Raises NetkfError with a sentence if there are none: the filter has its own form of readings or
+    gives no covariance, the run has more than ``most`` events, or a replay makes other events, as
+    another version may.
     """
     scenario: Scenario = run.scenario
     if not isinstance(scenario.filter.algorithm, Filter):
         raise NetkfError("filters of the former contracts keep their readings to themselves")
-    if not scenario.slotted and not scenario.sampled_sensors:
-        raise NetkfError("sensors give increments and no samples")
     if len(run.log) > most:
         raise NetkfError(f"a run of more than {most:,} events is not replayed")
+    algorithm: Filter = scenario.filter.algorithm
     noted: list[tuple[Reading, FloatArray, FloatArray | None]] = []
-    filtering = dataclasses.replace(
-        scenario.filter, algorithm=_noting(scenario.filter.algorithm, noted)
-    )
+    intervals: list[Interval] = []
+    if not scenario.slotted and scenario.increment_sensors:
+        algorithm = noting_increments(algorithm, intervals)
+    filtering = dataclasses.replace(scenario.filter, algorithm=_noting(algorithm, noted))
     again = simulate(_with_filter(scenario, filtering), run.seed, run.replica, "simpy")
     if len(run.log) and first_difference(run, again) is not None:
         raise NetkfError("a replay makes other events than the run: it is of another version")
-    return _collect(again, noted)
+    return _collect(again, noted, intervals)
 
 
 def _with_filter(scenario: Scenario, filtering: Any) -> Scenario:
@@ -93,18 +97,21 @@ def _noting(algorithm: Filter, noted: list[Any]) -> Filter:
     return made  # type: ignore[no-any-return]
 
 
-def _collect(run: Run, noted: list[Any]) -> Innovations:
-    """Return the innovations of what was noted, in the order of the events ``sense``."""
+def _collect(run: Run, noted: list[Any], intervals: list[Interval]) -> Innovations:
+    """Return the innovations of what was noted, in the order of time."""
     nodes, kept = _matched(run, [one for one in noted if len(one[0].y)])
-    whitened = [_whiten(*one) for one in kept]
+    whitened = [_whiten(*one) for one in kept] + [one.whitened for one in intervals]
     nis = np.array([float(v @ v) for v in whitened])
     if not np.isfinite(nis).any():
         raise NetkfError(
             "there are no readings, or the filter gives no covariance to judge them by"
         )
-    times = np.array([reading.time for reading, *_ in kept])
-    rows = np.array([len(reading.y) for reading, *_ in kept])
-    return Innovations(times, nodes, rows, nis, whitened)
+    times = np.array([*(reading.time for reading, *_ in kept), *(one.end for one in intervals)])
+    nodes = np.concatenate([nodes, np.array([one.node for one in intervals], dtype=np.int64)])
+    order = np.argsort(times, kind="stable")
+    rows = np.array([len(values) for values in whitened])
+    ordered = [whitened[k] for k in order.tolist()]
+    return Innovations(times[order], nodes[order], rows[order], nis[order], ordered, len(intervals))
 
 
 def _matched(run: Run, noted: list[Any]) -> tuple[np.ndarray, list[Any]]:

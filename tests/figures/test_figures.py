@@ -82,7 +82,7 @@ SAYS = {
     "no samples": ("error", "There are no samples"),
     "interrupted": ("error", "Interrupted: "),
     "diverged": ("error", "Diverged: "),
-    "ring": ("nis", "sensors give increments and no samples"),
+    "ring": ("nis", "NIS per row of a reading is"),
     "ensemble": ("age", "Events are those of single runs"),
     "slots": ("stability", "There is no map of the bound H(12)"),
 }

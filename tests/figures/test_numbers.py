@@ -1,11 +1,15 @@
 """The numbers behind figures, against plain loops over events and replays of textbook filters."""
 
+import math
+
 import numpy as np
 import pytest
 import scipy.stats
 
 import netkf
+from netkf.algorithms.models import FlowModel
 from netkf.figures.traffic import age_at, directions_of, freshest, wilson
+from netkf.runs.increments import Expectations
 from netkf.runs.innovations import autocorrelation, innovations
 from netkf.studies.consistency import run_consistency
 from tests.conftest import SCENARIOS
@@ -69,6 +73,33 @@ def test_innovations_are_those_of_a_plain_kalman_filter(results):
             np.testing.assert_allclose(run.xhat[k, 0, 0], gap * xhat, atol=1e-9)
     np.testing.assert_allclose(found.nis, nis, rtol=1e-9)
     np.testing.assert_array_equal(again.nis, found.nis)
+
+
+def test_increments_have_the_innovations_of_an_integrated_ornstein_uhlenbeck_process():
+    """dx = a x ds + b dw and dy = h x ds + dv in closed form, over an interval of g seconds."""
+    a, b, h, R, g, P, xhat, y = -0.7, 1.3, 0.8, 0.4, 0.6, 0.5, 2.0, 1.1
+    model = FlowModel(*(np.array([[v]]) for v in (a, b * b, h, R)), 10.0, 1.0)
+    found = Expectations(model).innovation(np.array([xhat]), np.array([[P]]), np.array([y]), g)
+    J = (math.exp(a * g) - 1.0) / a
+    # int_0^g ((e^{a (g - s)} - 1) / a)^2 ds
+    noise = ((math.exp(2.0 * a * g) - 1.0) / (2.0 * a) - 2.0 * J + g) / a**2
+    S = h * h * (J * J * P + b * b * noise) + R * g
+    np.testing.assert_allclose(found, (y - h * J * xhat) / math.sqrt(S), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("believed", "expected"), [(1.0, 1.0), (0.5, 2.0)])
+def test_increments_are_as_far_from_expectations_as_exact_covariances_say(believed, expected):
+    """With half of the true R the noise, which is most of a short interval's, looks doubled."""
+    sensors = [{"nodes": [0], "H": [[1.0, 0.2]], "R": [[2.0]]}]
+    changes = {"sensors": sensors, "filter": {"kind": "local", "model": {"R": [[2.0 * believed]]}}}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 300.0, "probe": 0.5})
+    found = innovations(netkf.simulate(scenario.replace(changes)))
+    assert found.increments == len(found.nis) > 500
+    deviation = math.sqrt(2.0 / len(found.nis))
+    assert abs(found.nis.mean() / expected - 1.0) < 4.0 * deviation + (expected - 1.0) * 0.15
+    if believed == 1.0:
+        first = np.concatenate(found.whitened)
+        assert np.abs(autocorrelation(first, 5)).max() < 4.0 / math.sqrt(len(first))
 
 
 def test_innovations_of_slots_have_the_nis_of_netkf_consistency():

@@ -83,12 +83,12 @@ class Predictor:
 
     def __init__(self, A: FloatArray, B: FloatArray, A_f: FloatArray, B_f: FloatArray) -> None:
         self._n = n = len(A)
-        self._belief = _LinearSDE(A_f, B_f)
+        self._belief = LinearSDE(A_f, B_f)
         # State and error together, driven by the same noise: de = (A_f e + (A - A_f) x) dt + B dw.
         self._truth = None
         if not (np.array_equal(A, A_f) and np.array_equal(B, B_f)):
             both = np.block([[A, np.zeros((n, n))], [A - A_f, A_f]])
-            self._truth = _LinearSDE(both, np.concatenate([B, B], axis=0))
+            self._truth = LinearSDE(both, np.concatenate([B, B], axis=0))
         self._known: dict[float, Prediction] = {}
 
     def __call__(self, gap: float) -> Prediction:
@@ -110,7 +110,7 @@ class Predictor:
         return Prediction(F[:n, :n], F[n:, n:], F[n:, :n], noise[:n], noise[n:], root)
 
 
-class _LinearSDE:
+class LinearSDE:
     """The equation dz = A z dt + B dw, discretised over any gap by doubling."""
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
