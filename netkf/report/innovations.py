@@ -72,13 +72,11 @@ def innovation_claim(found: Innovations) -> str:
     count = int(np.isfinite(found.nis).sum())
     said = f"Over {count:,} readings"
     if found.increments:
-        among = (
-            "which are" if found.increments == len(found.nis) else f"{found.increments:,} of them"
-        )
+        some = found.increments < len(found.nis)
+        among = f"{found.increments:,} of them" if some else "which are"
         said += f", {among} increments between two events of a node,"
-    said += (
-        " the squared innovation in units of its covariance (NIS per row; 1 where P is exact) is "
-    )
+    said += " the squared innovation in units of its covariance (NIS per row; "
+    said += "1 where P is exact) is "
     if len(nodes) == 1:
         where = f"at node {nodes[0]}" if nodes[0] >= 0 else "of the filter of all readings"
         return f"{said}{format_number(means[0])} {where}, {_judged(means[0], low[0], high[0])}"
