@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.baselines import Central
 from netkf.core.errors import NetkfError
+from netkf.network.clocks import LinkClock
 from netkf.report.directories import Opened
 from netkf.report.markup import bullets, paragraph, table_box
 from netkf.report.worst import Worst
+from netkf.runs.innovations import with_filter
+from netkf.runs.simulate import simulate
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
@@ -61,6 +67,54 @@ def mending_claim(found: Explanation) -> str:
         change += f" and {error}" if math.isfinite(best.error) else ""
         change += _cost(found)
     return f"To mend it: with no message missing, a replay gives {change}"
+
+
+class CentralSample(NamedTuple):
+    """Trace of P and error of the centralised filter at the worst sample of a run."""
+
+    trace: float
+    error: float
+
+
+def central_sample(source: Opened) -> CentralSample | None:
+    """Return what the centralised filter with the same truth and readings had at the worst sample
+    after the start-up; None where there is no such filter or run.
+    """
+    run = source.run
+    if source.worst is None or run is None or not run.scenario.filter.algorithm.talks:
+        return None
+    filtering = dataclasses.replace(run.scenario.filter, algorithm=Central())
+    try:
+        scenario = with_filter(run.scenario, filtering)
+        other = simulate(scenario, run.seed, run.replica, "simpy")
+    except NetkfError:
+        return None
+    at = int(np.searchsorted(run.times, source.worst.explained.time))
+    if at >= len(other.times):
+        return None
+    error = float(np.linalg.norm(other.x[at] - other.xhat[at, 0])) if run.truth_known else math.nan
+    return CentralSample(float(np.trace(other.P[at, 0])), error)
+
+
+def price_claim(source: Opened, found: Explanation, central: CentralSample) -> str:
+    """Return a sentence on what even all messages would leave: the price of the network."""
+    best = found.what_ifs[-1]
+    had = [f"trace P {format_number(central.trace)}"] if math.isfinite(central.trace) else []
+    had += [f"error {format_number(central.error)}"] if math.isfinite(central.error) else []
+    said = (
+        "With all readings at once: the centralised filter, on the same truth and readings, had "
+        f"{' and '.join(had)} then"
+    )
+    if not central.trace < best.trace * (1.0 - SAME):
+        return f"{said}, no less than this node with no message missing"
+    what = "how rarely nodes exchange, and of how they combine what they hear"
+    clock = source.scenario.network.activation
+    rates = isinstance(clock, LinkClock) and hasattr(clock, "rate")
+    ask = "netkf size finds the rate that would do, " if rates else ""
+    return (
+        f"{said}. The rest of trace P {format_number(best.trace)} is the price of {what}: {ask}"
+        "netkf compare-filters a filter that loses less"
+    )
 
 
 def _change(name: str, was: float, now: float) -> str:

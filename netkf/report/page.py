@@ -20,7 +20,13 @@ from netkf.report.data import Budget, run_data, thinning_rules
 from netkf.report.directories import Opened, read_source
 from netkf.report.innovations import read_innovations
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
-from netkf.report.mending import explain_worst, mending_claim, mending_section
+from netkf.report.mending import (
+    central_sample,
+    explain_worst,
+    mending_claim,
+    mending_section,
+    price_claim,
+)
 from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
 from netkf.runs.documents import ENDED, DamagedError
@@ -230,7 +236,11 @@ def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
         lines = findings(source, messages, readings)
         if isinstance(worst, Explanation):
             why = (k for k, line in enumerate(lines, 1) if line.startswith("Why: "))
-            lines.insert(next(why, len(lines)), mending_claim(worst))
+            place = next(why, len(lines))
+            lines.insert(place, mending_claim(worst))
+            central = central_sample(source)
+            if central is not None:
+                lines.insert(place + 1, price_claim(source, worst, central))
         parts.append(bullets((line + "." for line in lines), "findings"))
     heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
     if comparison is not None:

@@ -91,8 +91,20 @@ def _bound_notes(source: Opened) -> list[str]:
         traces = {label: summary["limit"], "centralised filter": summary["central"]}
         known = [f"{name} {format_number(value)}" for name, value in traces.items() if value]
         found += [f"traces to compare: {', '.join(known)}"] if known else []
+        found += [_limit_note(label)] if summary["limit"] else []
         found += source.promised.notes
     return found
+
+
+def _limit_note(label: str) -> str:
+    """Return what the limit of the bound is, and why it is not the centralised covariance."""
+    weights = "1/N" if label.startswith("limit S") else "their weights"
+    return (
+        f"{label}: what the bound of every node tends to as links tick ever faster. It solves the "
+        f"Riccati equation with {weights} of the information of all N nodes' readings, because "
+        "nodes average covariances as if they shared one error; the centralised filter uses all of "
+        "it. Errors tend to less than this limit: the filters do better than they claim"
+    )
 
 
 def _count(value: Any) -> str:

@@ -63,13 +63,13 @@ def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
     if not scenario.slotted and scenario.increment_sensors:
         algorithm = noting_increments(algorithm, intervals)
     filtering = dataclasses.replace(scenario.filter, algorithm=_noting(algorithm, noted))
-    again = simulate(_with_filter(scenario, filtering), run.seed, run.replica, "simpy")
+    again = simulate(with_filter(scenario, filtering), run.seed, run.replica, "simpy")
     if len(run.log) and first_difference(run, again) is not None:
         raise NetkfError("a replay makes other events than the run: it is of another version")
     return _collect(again, noted, intervals)
 
 
-def _with_filter(scenario: Scenario, filtering: Any) -> Scenario:
+def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
     """Return a scenario with another filter that keeps its topology and folder."""
     found = dataclasses.replace(scenario, filter=filtering)
     for name in ("_folder", "_trust", "topology"):

@@ -221,6 +221,29 @@ def test_the_table_of_replays_has_the_changes_of_the_command_line(ring):
     assert limit in str(found)
 
 
+@pytest.mark.parametrize("name", ["ring", "slots"])
+def test_the_price_of_the_network_is_the_centralised_filter_on_the_same_truth(name, request):
+    """By a run of that filter from the command line's table, at the sample that is explained."""
+    directory = request.getfixturevalue(name)
+    source, page = read_source(directory), Page(make_page([directory]))
+    run, at = netkf.open(directory), source.worst.explained.time
+    other = netkf.simulate(
+        netkf.load(directory / "scenario.toml").replace({"filter": {"kind": "central"}}),
+        seed=run.seed,
+    )
+    k = other.times.tolist().index(at)
+    trace, error = np.trace(other.P[k, 0]), np.linalg.norm(other.x[k] - other.xhat[k, 0])
+    np.testing.assert_array_equal(other.x[k], run.x[run.times.tolist().index(at)])
+    assert f"had trace P {trace:.4g} and error {error:.4g} then" in page.shown
+    assert ("netkf size finds the rate" in page.shown) == (name == "ring")
+
+
+def test_what_the_limit_of_the_bound_is_stands_below_the_averages(ring):
+    shown = Page(make_page([ring])).shown
+    assert "what the bound of every node tends to as links tick ever faster" in shown
+    assert "with 1/N of the information of all N nodes' readings" in shown
+
+
 def test_ages_of_information_are_means_over_links(delayed):
     run = netkf.open(delayed)
     messages, links = plain_messages(run.events), {}
