@@ -11,6 +11,7 @@ from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.checks import exact, statistics
 from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
+from netkf.checks.parts.network_rows import _share_of_bounded_runs
 from netkf.checks.rounding import compare_identities
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError, TheoryError
@@ -351,3 +352,33 @@ def test_squares_of_other_noises_are_not_taken_for_chi_square(tmp_path):
     reasons = [row.assumptions for row in rows if "noises are Gaussian" in row.assumptions]
     assert reasons
     assert all("the noise of the sensors is not" in reason for reason in reasons)
+
+
+RARE = {"kind": "gilbert-elliott", "to_bad": 0.001, "to_good": 0.01}
+HEAVY = {"kind": "renewal", "distribution": "weibull", "shape": 0.2, "mean": 0.5}
+SHORT = {
+    # Laws that few or short runs hardly show.
+    "links that are held": (PUSH_SUM, {"filter.links": "held", "horizon": 20.0}),
+    "rare bursts": (INTERMITTENT, {"network.channel.loss": RARE}),
+    "gaps that vary widely": (RING, {"network.activation": HEAVY}),
+    "seldom": (RING, {"network.activation": {"kind": "poisson", "rate": 1e-3}}),
+}
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_parts_that_show_little_are_not_accused(name, tmp_path):
+    table, changes = SHORT[name]
+    assert not broken_rows(scenario_of(table, tmp_path, **changes), runs=25)
+
+
+def test_limits_for_runs_of_any_law_hold():
+    """Every message of a run is lost, or none: the hardest case."""
+    random, level, runs, q = np.random.default_rng(9), 0.05, 25, 0.1
+    missed = 0
+    for _ in range(500):
+        lost, sent = 12.0 * (random.random(runs) < q), np.full(runs, 12)
+        found = _share_of_bounded_runs(lost - 12.0 * q, sent, q, level)
+        missed += not found.low <= q <= found.high
+    assert missed <= 0.05 * 500
+    found = _share_of_bounded_runs(np.full(runs, 12.0 * 0.6), np.full(runs, 12), 0.2, level)
+    assert found.low > 0.2

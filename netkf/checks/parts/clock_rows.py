@@ -24,6 +24,7 @@ from netkf.checks.parts.ticks import (
     draw_samples,
     draw_ticks,
     network_clocks,
+    relative_variance,
     sampling_clocks,
     ticks_on_lattice,
 )
@@ -39,8 +40,10 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
 RATE_TOLERANCE, DISPERSION_TOLERANCE = 0.05, 0.25
-FIRST_TICK = 1.0
-"""Ticks by which a clock that is not memoryless may be off its rate in a run: it has begun."""
+FIRST_TICK, SPREAD = 1.0, 2.0
+"""Ticks by which a clock that is not memoryless may be off its rate in a run, because it has begun
+with it; and factor on what the spread of its counts says of that, where its law is not known.
+"""
 WANTED_RATE = 0.02
 """Error of the rate of one clock that should be found."""
 ENOUGH_TICKS, MAX_DRAWN, MAX_DRAWN_TICKS, DRAWN_PER_RUN = 80_000, 20_000, 3e6, 4
@@ -126,10 +129,10 @@ def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
     windows, each = clocks.counts.ticks, _counts_of_each(clocks)
     expected, poisson = clocks.rates * clocks.scenario.horizon, clocks.poisson
     total = windows.sum(axis=(1, 2))
-    together = FIRST_TICK * len(expected)
+    begun = _ticks_of_start(clocks, each)
     intervals = [
         (
-            _count_interval(total, float(expected.sum()), level / 3.0, poisson, together),
+            _count_interval(total, float(expected.sum()), level / 3.0, poisson, begun.sum()),
             "all clocks together",
         )
     ]
@@ -137,7 +140,7 @@ def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
         intervals += _rates_by_window(windows, float(expected.sum()), level / 3.0)
     share = level / (3.0 * len(expected))
     singles = [
-        _count_interval(each[:, k], float(expected[k]), share, poisson, FIRST_TICK)
+        _count_interval(each[:, k], float(expected[k]), share, poisson, begun[k])
         for k in range(len(expected))
     ]
     intervals += zip(singles, clocks.group.labels, strict=True)
@@ -145,6 +148,18 @@ def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
     finding = with_best(intervals, RATE_TOLERANCE, message)
     note = _limit_of_one_clock(clocks, each, singles, level)
     return finding._replace(message=finding.message + note)
+
+
+def _ticks_of_start(clocks: Clocks, counts: np.ndarray) -> FloatArray:
+    """Return by how many ticks (E,) the mean count of each clock in a run may be off its rate.
+
+    A renewal process that begins with a run has between rate T - 1 and rate T + c^2 ticks in T
+    seconds, c the standard deviation of its gaps over their mean (Lorden 1970). Of other clocks c^2
+    is known from the spread of their counts (R, E) alone.
+    """
+    spread = SPREAD * counts.var(axis=0, ddof=1) / np.maximum(counts.mean(axis=0), 1e-300)
+    known = np.array([relative_variance(stated) for stated in clocks.group.stated])
+    return np.asarray(np.maximum(np.where(np.isnan(known), spread, known), FIRST_TICK))
 
 
 def _rates_by_window(windows: np.ndarray, mean: float, level: float) -> list[tuple[Interval, str]]:

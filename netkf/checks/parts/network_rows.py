@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from netkf.checks.evidence import Finding, Promise
 from netkf.checks.laws import find_largest
@@ -37,8 +38,8 @@ from netkf.network.recorded import RecordedLoss
 from netkf.scenario.scenario import Scenario
 
 PROBABILITY_TOLERANCE = 0.05
-MIN_RUNS = 10
-"""Runs from whose spread an interval is computed."""
+MIN_RUNS, MIN_EVENTS = 10, 20
+"""Runs from whose spread an interval is computed, and those in which something has to happen."""
 
 
 def _stated_loss(scenario: Scenario) -> Any:
@@ -91,18 +92,67 @@ def _loss_interval(
     """Return an interval for the distance of the lost share from the stated one.
 
     Independent losses of one direction have exact limits. Otherwise runs are: what is lost of the
-    messages of a run beyond their expected loss has the mean 0.
+    messages of a run beyond their expected loss has the mean 0. Where few runs lost any, or few
+    delivered any, their spread says little, and limits hold for every law of a run.
     """
     total, runs = float(sent[:, which].sum()), len(sent)
     excess = (lost[:, which] - sent[:, which] * q[which]).sum(axis=1)
     expected = float((sent[:, which] * q[which]).sum()) / total
-    if len(which) == 1 and _stated_loss(scenario).independent:
+    if len(which) == 1 and _is_independent(scenario):
         found = probability_interval(int(lost[:, which].sum()), int(total), level)
+        return deviation_interval(expected, found)
+    some = lost[:, which].sum(axis=1), (sent[:, which] - lost[:, which]).sum(axis=1)
+    if min(np.count_nonzero(part) for part in some) < MIN_EVENTS:
+        found = _share_of_bounded_runs(excess, sent[:, which].sum(axis=1), expected, level)
         return deviation_interval(expected, found)
     # A spread of at least one message of all: a few rare losses may show none.
     spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, 1.0))
     seen = expected + float(excess.sum()) / total
     return deviation_interval(expected, student_interval(seen, spread / total, runs, level))
+
+
+def _share_of_bounded_runs(
+    excess: FloatArray, sent: np.ndarray, expected: float, level: float
+) -> Interval:
+    """Return an interval for a lost share from what is lost in each run beyond the mean, (R,), of
+    so many messages ``sent`` (R,), by the bound of Hoeffding: of numbers from 0 to 1 and mean m, R
+    have the mean f with a probability of at most exp(-R KL(f, m)).
+    """
+    runs, most = len(sent), float(sent.max())
+    scale = most * runs / float(sent.sum())
+    # From 0 to 1 in each run, up to directions that lose unequal shares.
+    found = min(max(expected + float(excess.mean()) / most, 0.0), 1.0)
+    limit = math.log(2.0 / level) / runs
+    ends = [_share_at(found, end, limit) for end in (0.0, 1.0)]
+    low, high = (expected + scale * (end - expected) for end in ends)
+    reach = max(expected - low, high - expected)
+    return Interval(expected + scale * (found - expected), low, high, reach)
+
+
+def _share_at(found: float, end: float, limit: float) -> float:
+    """Return the mean from ``found`` towards ``end``, 0 or 1, whose divergence is ``limit``."""
+    near, far = found, end
+    for _ in range(60):
+        middle = 0.5 * (near + far)
+        parts = scipy.special.rel_entr([found, 1.0 - found], [middle, 1.0 - middle])
+        if float(parts.sum()) > limit:
+            far = middle
+        else:
+            near = middle
+    return near
+
+
+def _is_independent(scenario: Scenario) -> bool:
+    """Return True if messages are lost independently of each other: by what is stated, and because
+    each has an outcome of its own; a filter may hold those of a link for several exchanges.
+    """
+    filter_ = scenario.hosted
+    if scenario.slotted:
+        phases = range((filter_.schedule or ()).count("exchange"))
+        steps = [(phase, k) for phase in phases for k in range(filter_.exchange_steps(phase))]
+        if not all(filter_.redraws_links(*step) for step in steps):
+            return False
+    return bool(_stated_loss(scenario).independent)
 
 
 def _losses_apart(samples: PartSamples, level: float) -> Finding:
@@ -141,7 +191,7 @@ def _bursts(samples: PartSamples, level: float) -> Finding:
     loss, q = _stated_loss(scenario), loss_probabilities(scenario)
     runs, followed = len(fates.sent), fates.followed.sum(axis=1)
     total = float(followed.sum())
-    if total < MIN_COUNT or runs < MIN_RUNS:
+    if total < MIN_COUNT or np.count_nonzero(followed) < MIN_EVENTS:
         return nothing_to_see(PROBABILITY_TOLERANCE)
     again = loss_twice(loss) / float(q.mean())
     excess = fates.repeated.sum(axis=1) - again * followed
@@ -330,8 +380,8 @@ def network_promises(samples: PartSamples) -> list[Promise]:
         q = loss_probabilities(scenario)
         if np.isfinite(q).all():
             found.append(LOSSES)
-            if _stated_loss(scenario).independent and ((q > 0.0) & (q < 1.0)).any():
+            if _is_independent(scenario) and ((q > 0.0) & (q < 1.0)).any():
                 found.append(LOSSES_APART)
-            if isinstance(_stated_loss(scenario), GilbertElliott) and _one_step_a_message(scenario):
+            if type(_stated_loss(scenario)) is GilbertElliott and _one_step_a_message(scenario):
                 found.append(BURSTS)
     return found + delay_promises(samples)

@@ -6,6 +6,7 @@ however short the run, so that ticks of all clocks and runs add up in a few cell
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -224,6 +225,23 @@ def gap_law(clock: Any, gaps: np.ndarray) -> np.ndarray:
         assert clock.high is not None
         return np.clip((gaps - clock.low) / (clock.high - clock.low), 0.0, 1.0)
     return np.full(len(gaps), np.nan)
+
+
+def relative_variance(clock: Any) -> float:
+    """Return the variance of gaps over the square of their mean; nan if their law is not known."""
+    if ticks_on_lattice(clock):
+        return 0.0
+    if type(clock) is not Renewal:
+        return math.nan
+    shape = clock.shape or 1.0
+    if clock.distribution == "gamma":
+        return 1.0 / shape
+    if clock.distribution == "weibull":
+        first, second = (math.gamma(1.0 + k / shape) for k in (1.0, 2.0))
+        return second / first**2 - 1.0
+    assert clock.low is not None
+    assert clock.high is not None
+    return (clock.high - clock.low) ** 2 / (3.0 * (clock.high + clock.low) ** 2)
 
 
 def _lattice(clock: Any, number: np.ndarray) -> np.ndarray:

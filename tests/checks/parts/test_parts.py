@@ -28,7 +28,7 @@ from netkf.checks.parts.network_rows import (
 from netkf.checks.parts.noises import start_states
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
-from netkf.checks.parts.ticks import ClockGroup, _count
+from netkf.checks.parts.ticks import ClockGroup, _count, relative_variance
 from netkf.checks.statistics import probability_interval, scale_interval
 from netkf.parts import (
     ConstantDelay,
@@ -234,6 +234,12 @@ GAPS = {
         scipy.stats.uniform(0.2, 0.7),
     ),
 }
+
+
+@pytest.mark.parametrize("name", ["gamma", "weibull", "uniform"])
+def test_spreads_of_gaps_are_those_of_scipy(name):
+    clock, law = GAPS[name]
+    assert relative_variance(clock) == pytest.approx(law.var() / law.mean() ** 2, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", GAPS)
