@@ -47,10 +47,11 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
     By one generalised Lyapunov equation, for filters whose gains are constant: ``constant-gain``,
     ``kcf`` in slots with its own readings or without losses, ``bar-shalom-campo``, ``local`` and
-    ``central`` in slots.
-    Losses may be independent, by link or bursty (Gilbert-Elliott, few links), delays fixed (in
-    slots) or none, clocks Poisson; at most 200 errors of all nodes together. Raises TheoryError
-    with the reason where there is no such mean, or it is not known.
+    ``central`` in slots. Losses may be independent, by link or bursty (Gilbert-Elliott, few links),
+    delays none or fixed (in slots, or below the period of periodic clocks), clocks Poisson, or
+    periodic and all together (the mean is then that at exchanges, after them); at most 200 errors
+    of all nodes together. Raises TheoryError with the reason where there is no such mean, or it is
+    not known.
     """
     radius, covariance = _solved(scenario)
     if covariance is None:

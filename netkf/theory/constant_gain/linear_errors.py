@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import scipy.linalg
 
 from netkf.algorithms.constant_gain import ConstantGain
+from netkf.core.clock import Clock
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray, block_diagonal
-from netkf.network.clocks import LinkClock
+from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
+from netkf.network.clocks import LinkClock, Periodic
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
@@ -39,34 +43,135 @@ def slot_ways(scenario: Scenario) -> Ways | None:
     return ways_of(scenario, weights, scenario.phase_length) if weights else None
 
 
-def clock_jumps(scenario: Scenario) -> ClockJumps:
-    """Return the system under Poisson clocks of links, directions or nodes."""
-    gains, nodes, truth = _gains(scenario), scenario.nodes, scenario.truth
-    drift, samples = [np.array(truth.A) for _ in nodes], []
-    noise = np.tile(truth.B @ truth.B.T, (len(nodes), len(nodes)))
-    n = len(truth.A)
-    for k, node in enumerate(nodes):
-        own, (H, R), L = slice(k * n, (k + 1) * n), scenario.observation(node), gains[k]
+class Flow(NamedTuple):
+    """Errors between ticks: ``drift`` (N, n, n) of each node's, ``noise`` (N n, N n) a second."""
+
+    drift: FloatArray
+    noise: FloatArray
+
+
+class SampledNode(NamedTuple):
+    """A sensor that takes samples: the node's index, its ``clock`` and place among the node's
+    sensors, ``lost`` = L H (n, n) of the error, and the covariance ``noise`` (n, n) that it adds.
+    """
+
+    node: int
+    clock: Clock | None
+    entity: tuple[int, int]
+    lost: FloatArray
+    noise: FloatArray
+
+
+def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
+    """Return the system under Poisson clocks of links, directions or nodes, or that from tick to
+    tick of clocks that all tick together.
+    """
+    flow, samples, weights = _flow(scenario), _samples(scenario), link_weights(scenario)
+    clock = scenario.network.activation
+    talks = bool(weights) and isinstance(clock, LinkClock)
+    delay = scenario.network.channel.delay.fixed if talks else 0.0
+    if isinstance(clock, Periodic) and talks and delay is not None:
+        together = ways_of(scenario, weights, clock.period)
+        return _from_tick_to_tick(clock, flow, samples, together, delay)
+    if delay != 0.0:
+        raise TheoryError("exact mean squares under clocks are known where messages take no time")
+    ways = ways_of(scenario, weights, 0.0) if talks else None
+    N, n = len(scenario.nodes), scenario.plant.n
+    noise, found = flow.noise.copy(), []
+    for one in samples:
+        if one.clock is None or not one.clock.memoryless:
+            raise TheoryError(f"node {scenario.nodes[one.node]} does not sample by a Poisson clock")
+        rate, own = float(one.clock.mean_rate(one.entity)), _own(one.node, n)
+        noise[own, own] += rate * one.noise
+        found.append((one.node, rate, one.lost))
+    drift = block_diagonal(list(flow.drift))
+    ticks = poisson_ticks(scenario, list(weights)) if talks else ()
+    return ClockJumps(N, drift, noise, tuple(found), ways, ticks)
+
+
+def _own(k: int, n: int) -> slice:
+    return slice(k * n, (k + 1) * n)
+
+
+def _flow(scenario: Scenario) -> Flow:
+    """Return the errors between events; increments are used all the time."""
+    gains, truth = _gains(scenario), scenario.truth
+    N, n = len(gains), len(truth.A)
+    drift, noise = np.tile(truth.A, (N, 1, 1)), np.tile(truth.B @ truth.B.T, (N, N))
+    for k, node in enumerate(scenario.nodes):
+        (H, R), L = scenario.observation(node), gains[k]
         if len(H):
             drift[k] -= L @ H
-            noise[own, own] += L @ R @ L.T
+            noise[_own(k, n), _own(k, n)] += L @ R @ L.T
+    return Flow(drift, noise)
+
+
+def _samples(scenario: Scenario) -> list[SampledNode]:
+    """Return the sensors that take samples."""
+    gains, found = _gains(scenario), []
+    for k, node in enumerate(scenario.nodes):
         for place in scenario.sampled_sensors.get(node, ()):
-            sensor = scenario.sensors[place.entry]
-            sampling = sampling_clock(sensor)
-            if sampling is None or not sampling.memoryless:
-                raise TheoryError(f"node {node} does not sample by a Poisson clock")
-            rate = float(sampling.mean_rate((node, place.ordinal)))
-            samples.append((k, rate, L @ sensor.H))
-            noise[own, own] += rate * L @ sensor.R @ L.T
-    weights = link_weights(scenario)
-    clock = scenario.network.activation
-    if not weights or not isinstance(clock, LinkClock):
-        return ClockJumps(len(nodes), block_diagonal(drift), noise, tuple(samples), None)
-    if scenario.network.channel.delay.fixed != 0.0:
-        raise TheoryError("exact mean squares under clocks are known where messages take no time")
-    ways = ways_of(scenario, weights, 0.0)
-    ticks = poisson_ticks(scenario, list(weights))
-    return ClockJumps(len(nodes), block_diagonal(drift), noise, tuple(samples), ways, ticks)
+            sensor, L = scenario.sensors[place.entry], gains[k]
+            clock, entity = sampling_clock(sensor), (node, place.ordinal)
+            noise = L @ sensor.R @ L.T
+            found.append(SampledNode(k, clock, entity, L @ sensor.H, noise))
+    return found
+
+
+def _from_tick_to_tick(
+    clock: Periodic, flow: Flow, samples: list[SampledNode], ways: Ways, delay: float
+) -> SlotJumps:
+    """Return the system from one exchange of clocks that all tick together to the next.
+
+    Messages that take ``delay`` seconds are predicted to their arrival. Where no node reads in
+    between its error is then that of the message, as if it had been sent there. Raises TheoryError
+    where clocks are apart, sensors do not sample at the ticks, or that is not so.
+    """
+    _require_one_clock(clock, samples)
+    N, n, _ = flow.drift.shape
+    if delay > 0.0 and (delay >= clock.period or not all_equal(flow.drift)):
+        raise TheoryError(
+            "periodic clocks with a delay are known where it is below the period and sensors take "
+            "samples"
+        )
+    closed, added = np.tile(np.eye(n), (N, 1, 1)), np.zeros_like(flow.noise)
+    for one in samples:
+        closed[one.node] -= one.lost
+        added[_own(one.node, n), _own(one.node, n)] += one.noise
+    # To the tick, its samples, and to the arrival of what was sent at it.
+    (before, noise), (after, rest) = (_moved(flow, gap) for gap in (clock.period - delay, delay))
+    C = block_diagonal(list(closed))
+    noise = after @ (C @ noise @ C.T + added) @ after.T + rest
+    whole = after @ C @ before
+    steps = np.stack([whole[_own(k, n), _own(k, n)] for k in range(N)])
+    return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), ways)
+
+
+def all_equal(drift: FloatArray) -> bool:
+    """Return True if the errors of all nodes (N, n, n) move alike."""
+    return bool((drift == drift[0]).all())
+
+
+def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
+    """Raise TheoryError unless all links tick together, and sensors sample then."""
+    if clock.jitter or isinstance(clock.phase, str):
+        raise TheoryError("periodic clocks are known where all tick together, without jitter")
+    for one in samples:
+        other, alike = one.clock, False
+        if isinstance(other, Periodic) and not other.jitter:
+            alike = (other.period, other.phase) == (clock.period, clock.phase)
+        if not alike:
+            raise TheoryError("sensors do not sample at the ticks of the network's periodic clock")
+
+
+def _moved(flow: Flow, gap: float) -> tuple[FloatArray, FloatArray]:
+    """Return the transition (N n, N n) of errors over a gap, and the covariance that it adds."""
+    drift = block_diagonal(list(flow.drift))
+    M = len(drift)
+    # exp [[-D, N], [0, D']] g has the blocks e^{-D g} N_g and e^{D' g} on the right, Van Loan 1978.
+    E = scipy.linalg.expm(gap * np.block([[-drift, flow.noise], [np.zeros_like(drift), drift.T]]))
+    moved = E[M:, M:].T
+    return moved, symmetric(moved @ E[:M, M:])
 
 
 def _gains(scenario: Scenario) -> list[FloatArray]:
