@@ -58,9 +58,11 @@ class ScenarioError(NetkfError, ValueError):
 
     def __str__(self) -> str:
         got = "" if self.value is None else f"; got {quote(self.value)}"
-        remedy = f"; {self.remedy}" if self.remedy else ""
+        # Rules and remedies name keys and classes, which may be of any length.
+        rule, remedy = shorten(self.rule, 1000), shorten(self.remedy, 700)
         where = ": ".join(filter(None, (shorten(self.file, 1000), shorten(self.key, 120))))
-        return f"{where}: {self.rule}{got}{remedy}" if where else f"{self.rule}{got}{remedy}"
+        words = f"{rule}{got}; {remedy}" if remedy else f"{rule}{got}"
+        return f"{where}: {words}" if where else words
 
 
 LONGEST_WORD = 100

@@ -212,7 +212,7 @@ def _candidates(
     scenario: Scenario, filters: Sequence[Choice], engine: str
 ) -> tuple[FilterEntry, ...]:
     """Return the filters with their scenarios; raises ScenarioError if none can run."""
-    if isinstance(filters, (str, Mapping, Filter)) or not filters:
+    if isinstance(filters, str) or not isinstance(filters, Sequence) or not filters:
         rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
         raise ScenarioError("filters", rule, filters, remedy)
     if len(filters) > MAX_FILTERS:
@@ -282,6 +282,9 @@ def _label(kind: str, settings: Mapping[str, Any]) -> str:
 
 def _filter_table(scenario: Scenario, choice: str | Mapping[str, Any]) -> dict[str, Any]:
     """Return the table [filter] of a choice; raises ScenarioError for a kind that is unknown."""
+    if not isinstance(choice, (str, Mapping)):
+        remedy = "give kinds, tables {kind = ...} or filters"
+        raise ScenarioError("filters", "must hold filters", choice, remedy)
     own = as_table(scenario)["filter"]
     table = {"kind": choice} if isinstance(choice, str) else dict(choice)
     kind = table.get("kind")

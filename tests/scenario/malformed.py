@@ -118,6 +118,24 @@ DOCUMENTS = (
 )
 
 
+FILTERS: tuple[dict[str, Any], ...] = (
+    {"kind": "hcmci", "steps": 2, "consensus": "information", "novelty_weight": 3.0},
+    {"kind": "icf", "steps": 2},
+    {"kind": "kcf", "epsilon": 0.1, "share_readings": False},
+    {"kind": "diffusion-kalman", "weights": "metropolis"},
+    {"kind": "one-bit"},
+    {"kind": "optimised-covariance-intersection", "minimise": "trace"},
+    {"kind": "inverse-covariance-intersection", "minimise": "determinant"},
+    {"kind": "bar-shalom-campo"},
+    {"kind": "belief-propagation", "steps": 2, "memory": "slot"},
+    {"kind": "consensus-innovations"},
+    {"kind": "event-triggered-ci", "alpha": 1.0, "delta": 1.0},
+    {"kind": "stochastic-trigger", "strength": 1.0},
+    {"kind": "constant-gain", "gain": [[0.1], [0.1], [0.1], [0.1]]},
+)
+"""Filters to compare with, with their keys; seeds that are odd put them into scenarios."""
+
+
 class Case(NamedTuple):
     """A command line without ``netkf``, and the text of its file if it is not one of scenarios/."""
 
@@ -138,6 +156,8 @@ class Ended(NamedTuple):
 def draw(seed: int) -> Case:
     """Return the case of a seed."""
     rng = random.Random(seed)
+    if seed % 2:
+        return draw_comparison(rng)
     base = rng.choice(scenario_files())
     text: str | None = None
     settings: list[str] = []
@@ -160,6 +180,40 @@ def draw(seed: int) -> Case:
         settings = [setting(base, rng) for _ in range(rng.choice((1, 1, 2)))]
     file = base.name if text is None else "case.toml"
     return Case(command(file, settings, base, rng), text)
+
+
+def draw_comparison(rng: random.Random) -> Case:
+    """Return a case with a filter to compare with, often with sensors that are not linear."""
+    bases = [file for file in sorted(SCENARIOS.glob("*/*.toml")) if ".csv" not in file.read_text()]
+    table = copy.deepcopy(_tables(rng.choice(bases)))
+    chosen = table["filter"] = {**rng.choice(FILTERS)}
+    keys = [key for key in chosen if key != "kind"]
+    if keys and rng.random() < 0.6:
+        key = rng.choice(keys)
+        chosen[key] = rng.choice((*NUMBERS, chosen[key], anything(rng)))
+    if rng.random() < 0.5:
+        sensor = rng.choice(table["sensors"])
+        sensor["kind"] = rng.choice(("range", "bearing", "range-bearing"))
+        sensor.pop("H", None)
+        numbers = [rng.choice(NUMBERS) for _ in range(rng.randrange(4))]
+        values = (numbers, [numbers], [[x, 1.0] for x in numbers], [[1.0, 0.0], [0.0, 1.0]])
+        odd = rng.choice((*values, anything(rng)))
+        sensor[rng.choice(("states", "positions", "R", "nodes"))] = odd
+    elif rng.random() < 0.5:
+        mutate(table, rng)
+    short = ["--set", "horizon=4.0", "--set", "probe=1.0"]
+    kinds = ",".join(rng.choice(FILTERS)["kind"] for _ in "ab")
+    more = {
+        "theory": ["--json"],
+        "run": [*short, "--no-plot", "--out", "out"],
+        "check": [*short, "--runs", "10", "--workers", "1"],
+        "compare-filters": [
+            *(*short, "--runs", "2", "--workers", "1"),
+            *("--filters", rng.choice((_toml(anything(rng)), kinds, kinds))),
+        ],
+    }
+    name = rng.choice(("theory", "run", "run", "check", "compare-filters"))
+    return Case([name, "case.toml", *more[name]], to_toml(table))
 
 
 @functools.cache

@@ -188,3 +188,13 @@ def test_a_regressor_that_overflows_is_named():
     A = (1e20 * regression.sensors[0].A).tolist()
     with pytest.raises(netkf.TheoryError, match="regressor sensor overflows"):
         netkf.theory.information_level(regression.replace({"sensors.0.A": A}))
+
+
+@pytest.mark.parametrize("option", ["--set", "--vary"])
+def test_lines_about_long_keys_are_short(option, capsys):
+    command = "run" if option == "--set" else "sweep"
+    for value in ("[", "[[1,", "x" * 2000, ""):
+        assert malformed.attempt([command, RING, option, f"{'x' * 50_000}={value}"])[0] == 2
+        _, _, err = malformed.attempt([command, RING, option, f"{'x' * 50_000}={value}"])
+        assert len(err) < 2500
+        assert err.count("\n") == 1

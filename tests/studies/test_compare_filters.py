@@ -148,6 +148,12 @@ def test_what_cannot_run_says_why(found, scenario):
         netkf.compare_filters(scenario, ["gossip"], runs=2)
     with pytest.raises(netkf.ScenarioError, match="must be at most 200 filters; got 201"):
         netkf.compare_filters(scenario, ["hybrid"] * 201)
+    for odd in (5, {"kind": "icf"}, parts.Icf(), "icf", []):
+        with pytest.raises(netkf.ScenarioError, match="filters: must be a list of filters"):
+            netkf.compare_filters(scenario, odd, runs=2)
+    for odd in (1, None, ["icf"], 2.0, True):
+        with pytest.raises(netkf.ScenarioError, match="filters: must hold filters"):
+            netkf.compare_filters(scenario, ["icf", odd], runs=2)
     with pytest.raises(netkf.ScenarioError, match="must differ from each other"):
         netkf.compare_filters(scenario, ["icf", "icf"], runs=2)
 
