@@ -68,3 +68,21 @@ def test_a_verdict_has_no_picture_of_fewer_runs(tmp_path):
     assert (tmp_path / "out" / "verdict.png").exists()
     assert main([*command, "--runs", "12", "--resume", "--no-plot"]) == 0
     assert not (tmp_path / "out" / "verdict.png").exists()
+
+
+def test_a_check_that_was_stopped_after_its_verdict_is_done_when_it_is_given_again(
+    tmp_path, capsys
+):
+    out = tmp_path / "out"
+    command = [*COMMANDS["check"], "--runs", "11", "--out", str(out), "--resume"]
+    assert main([*command, "--no-plot"]) == 0
+    first = capsys.readouterr().out
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    assert main(command) == 0
+    again = capsys.readouterr()
+    assert again.out == first.replace("written to", "nothing left to do in")
+    assert again.err == ""
+    assert (out / "verdict.png").exists()
+    assert before == {name: (out / name).read_bytes() for name in before}
+    assert main([*command, "--runs", "10"]) == 2
+    assert "must be more: the verdict has 11 runs already" in capsys.readouterr().err

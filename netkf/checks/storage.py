@@ -43,6 +43,8 @@ from netkf.scenario.scenario import Scenario
 RESULTS, VERDICT, PICTURE = "results.npz", "verdict.json", "verdict.png"
 FILES = (RESULTS, "verdict.csv", "verdict.txt", PICTURE)
 """Files that a check writes before the verdict itself."""
+NUMBERS = ("margin", "low", "high", "tolerance", "seen", "expected", "off", "detectable")
+"""Numbers of a row, which may be nan or infinite."""
 
 
 def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str = "") -> None:
@@ -71,6 +73,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
         "versions": versions(),
         "looks": verdict.looks,
         "spent": verdict.spent,
+        "infinite": _infinite(verdict),
         "machine": machine(),
         "files": file_digests(directory, [RESULTS, "scenario.toml"]),
     }
@@ -110,7 +113,7 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
         check_seal(found)
         check_files(directory, found)
         looks, spent = int(found["looks"]), float(found["spent"])
-        rows = tuple(_row(row) for row in found["rows"])
+        rows = _rows(found)
         results = _results(directory / RESULTS, scenario)
         count, confidence = int(found["runs"]), float(found["confidence"])
     except Exception as error:  # whatever is in the files, which may be anybody's
@@ -127,11 +130,24 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
     return Verdict(scenario.name, count, seed, confidence, rows, tuple(results), looks, spent)
 
 
-def _row(found: dict[str, Any]) -> Evidence:
-    """Return a row; JSON has null for numbers that are not finite."""
-    numbers = ("margin", "low", "high", "tolerance", "seen", "expected", "off", "detectable")
-    missing = {name: np.nan for name in numbers if found[name] is None}
-    return Evidence(**{**found, **missing})
+def _infinite(verdict: Verdict) -> list[tuple[int, str, bool]]:
+    """Return which numbers of which rows are infinite, and if they are positive: in JSON they are
+    null, as those that do not exist.
+    """
+    values = (
+        (k, name, getattr(row, name)) for k, row in enumerate(verdict.rows) for name in NUMBERS
+    )
+    return [(k, name, bool(value > 0.0)) for k, name, value in values if np.isinf(value)]
+
+
+def _rows(found: dict[str, Any]) -> tuple[Evidence, ...]:
+    """Return the rows of a document."""
+    rows = [dict(row) for row in found["rows"]]
+    for row in rows:
+        row |= {name: np.nan for name in NUMBERS if row[name] is None}
+    for k, name, positive in found.get("infinite", ()):
+        rows[k][str(name)] = np.inf if positive else -np.inf
+    return tuple(Evidence(**row) for row in rows)
 
 
 def _columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:

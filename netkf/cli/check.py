@@ -69,14 +69,35 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(scenario: Scenario, options: argparse.Namespace) -> int:
-    from netkf.checks.check import check
-    from netkf.checks.looks import MOST_RUNS
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 
     earlier = _prepare(scenario, options)
+    # A command that was stopped after it had written its verdict is given again.
+    done = earlier is not None and options.until is None and earlier.runs == options.runs
+    verdict = earlier if earlier is not None and done else _judge(scenario, options, earlier)
+    text = verdict_text(verdict, scenario.claim, _replay_command(options))
+    print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
+    try:
+        if options.out is not None:
+            _save(scenario, verdict, "" if done else text, options)
+    finally:  # a verdict whose files cannot be written is an answer too
+        if options.json:
+            print_json(verdict_json(verdict))
+        else:
+            print(text)
+    if options.out is not None and not options.json:
+        print(f"nothing left to do in {options.out}" if done else f"written to {options.out}")
+    return 0 if verdict else FAILED
+
+
+def _judge(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
+    """Return the verdict on --runs runs, those of an ``earlier`` one included."""
+    from netkf.checks.check import check
+    from netkf.checks.looks import MOST_RUNS
+
     with _explain_interrupt(options, earlier), ProgressLine() as line:
-        verdict = check(
+        return check(
             scenario,
             options.runs,
             confidence=options.confidence,
@@ -87,19 +108,6 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
             most=options.most or MOST_RUNS,
             earlier=earlier,
         )
-    text = verdict_text(verdict, scenario.claim, _replay_command(options))
-    print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
-    try:
-        if options.out is not None:
-            _save(scenario, verdict, text, options)
-    finally:  # a verdict whose files cannot be written is an answer too
-        if options.json:
-            print_json(verdict_json(verdict))
-        else:
-            print(text)
-    if options.out is not None and not options.json:
-        print(f"written to {options.out}")
-    return 0 if verdict else FAILED
 
 
 @contextlib.contextmanager
@@ -132,13 +140,14 @@ def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
 
 
 def _save(scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace) -> None:
-    """Write the files of a verdict, and its picture if that is possible."""
-    from netkf.checks.storage import save_verdict
+    """Write the files of a verdict unless ``text`` is empty, and its picture if it is missing."""
+    from netkf.checks.storage import PICTURE, save_verdict
 
-    save_verdict(options.out, scenario, verdict, text)
-    if not options.no_plot:
-        path = options.out / "verdict.png"
-        pictures.draw_picture(pictures.VERDICT, path, verdict, scenario.claim)
+    if text:
+        save_verdict(options.out, scenario, verdict, text)
+    picture = options.out / PICTURE
+    if not options.no_plot and not picture.exists():
+        pictures.draw_picture(pictures.VERDICT, picture, verdict, scenario.claim)
 
 
 def _replay_command(options: argparse.Namespace) -> str:

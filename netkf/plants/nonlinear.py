@@ -178,7 +178,11 @@ class PositionedSensor(NonlinearSensor):
                 None,
                 "write positions = [[x, y], ...], one for each of nodes",
             )
-        return replace(self, positions=np.array([positions[node] for node in self.nodes]))
+        # Nodes that the graph does not have are refused by name when the sensors are placed.
+        nowhere = (0.0, 0.0)
+        return replace(
+            self, positions=np.array([positions.get(node, nowhere) for node in self.nodes])
+        )
 
     def check_state(self, n: int) -> None:
         """Raise ScenarioError if places, states or R do not fit."""

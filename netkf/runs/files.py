@@ -27,6 +27,8 @@ def writing(path: Path) -> Iterator[None]:
     """Raise a WriteError about ``path`` in place of the body's OSErrors, and for a NUL in it."""
     if "\0" in str(path):
         raise WriteError(OSError(errno.EINVAL, ""), path)
+    if not path.name:
+        raise WriteError(OSError(errno.EISDIR, ""), path)
     try:
         yield
     except WriteError:
@@ -58,7 +60,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
     A reader never sees half a file; if the body raises, the temporary file is removed. Raises
     WriteError where the body or the system fails to write.
     """
-    part = path.with_name(path.name + ".part")
+    part = path.parent / f"{path.name}.part"
     try:
         with writing(path):
             yield part

@@ -208,10 +208,10 @@ def _row(
     )
 
 
-def _candidates(
-    scenario: Scenario, filters: Sequence[Choice], engine: str
-) -> tuple[FilterEntry, ...]:
-    """Return the filters with their scenarios; raises ScenarioError if none can run."""
+def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEntry, ...]:
+    """Return the filters with their scenarios; raises ScenarioError for what is no list of filters,
+    and if none can run.
+    """
     if isinstance(filters, str) or not isinstance(filters, Sequence) or not filters:
         rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
         raise ScenarioError("filters", rule, filters, remedy)
@@ -280,8 +280,10 @@ def _label(kind: str, settings: Mapping[str, Any]) -> str:
     return " ".join([kind, *(f"{key}={value}" for key, value in settings.items())])
 
 
-def _filter_table(scenario: Scenario, choice: str | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table [filter] of a choice; raises ScenarioError for a kind that is unknown."""
+def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
+    """Return the table [filter] of a choice; raises ScenarioError for a kind that is unknown and
+    for what is neither a kind nor a table.
+    """
     if not isinstance(choice, (str, Mapping)):
         remedy = "give kinds, tables {kind = ...} or filters"
         raise ScenarioError("filters", "must hold filters", choice, remedy)

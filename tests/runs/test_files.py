@@ -1,6 +1,7 @@
 """Text of JSON files, against the standard library; names that no file can have."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,3 +30,6 @@ def test_json_text_is_that_of_the_standard_library(value):
 def test_a_name_that_no_file_can_have_is_a_write_error(tmp_path):
     with pytest.raises(WriteError, match="cannot write: Invalid argument"):
         write_text(tmp_path / "a\0b", "text")
+    for name in ("", ".", "/"):
+        with pytest.raises(WriteError, match="cannot write: Is a directory"):
+            write_text(Path(name), "text")
