@@ -18,6 +18,7 @@ from netkf.report import tables
 from netkf.report.claims import difference_findings, findings
 from netkf.report.data import Budget, run_data, thinning_rules
 from netkf.report.directories import Opened, read_source
+from netkf.report.filter_figure import filters_figure
 from netkf.report.innovations import read_innovations
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
 from netkf.report.mending import (
@@ -266,6 +267,9 @@ def _main(
         parts.append(section("comparison", "What differs", _differences(comparison)))
     if any(source.kind not in ("filters", "verdict") for source in sources):
         parts.append(section("figures", "Figures", _figures(entries)))
+    drawn = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
+    if drawn:
+        parts.append(section("figures", "Errors of the filters", drawn))
     parts.append(section("verdicts", "Verdicts and averages", "".join(map(_results, sources))))
     parts.append(section("scenario", "Scenario", "".join(map(_scenario, sources))))
     parts.append(section("origin", "Versions and command", _origin(sources, command, rules)))

@@ -401,8 +401,8 @@ def test_a_comparison_of_filters_has_a_page(tmp_path):
     filters = ["push-sum", {"kind": "hcmci", "steps": 2}, "local", "hybrid"]
     found = compare_filters(scenario, filters, 8, workers=1)
     folder = write_comparison(scenario, found, tmp_path / "filters").directory
-    page = Page(make_page([folder]))
-    ran = [row for row in found.rows if row.ran]
+    text = make_page([folder])
+    page, ran = Page(text), [row for row in found.rows if row.ran]
     best = min(ran, key=lambda row: row.quantities["rms_error"].value)
     assert f"{best.filter} had the smallest RMS error" in page.shown
     assert "hybrid: cannot run here" in page.shown
@@ -414,6 +414,13 @@ def test_a_comparison_of_filters_has_a_page(tmp_path):
         assert (certain in page.shown) == q.real
         assert f"{q.value:.4g}" in page.shown
     assert """--filters 'push-sum,{kind="hcmci", steps=2},local,hybrid'""" in page.shown
+    # Dots of the figure stand as far from the axis as errors are large, relative to each other.
+    places = [float(x) for x in re.findall(r'<circle cx="([0-9.]+)"', text)]
+    errors = [row.quantities["rms_error"].value for row in ran]
+    axis = float(re.search(r'<line x1="(\d+)" x2="\1"', text)[1])
+    np.testing.assert_allclose(
+        (np.array(places) - axis) / (places[0] - axis), np.array(errors) / errors[0], rtol=1e-3
+    )
     assert page.data["runs"] == []
 
 
