@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 import netkf
-from netkf.algorithms.kernels.chains import advance, alphabet
+from netkf.algorithms.kernels.chains import move_roots, reading_modes
 from tests.benchmarks import bare_simpy, cases, jobs, peers
 from tests.benchmarks.table import Row, Side
 
@@ -86,10 +86,10 @@ def random_riccati():
     F, Q, H, R = peers.random_system()
     words = np.random.default_rng(1).random((200, 64)) < 0.7
     roots = np.broadcast_to(np.eye(4), (200, 4, 4))
-    maps = alphabet([(H[:0], R[:0, :0]), (H, R)], 4)
+    maps = reading_modes([(H[:0], R[:0, :0]), (H, R)], 4)
 
     def mine(_):
-        advance(roots, words, F, np.linalg.cholesky(Q), maps)
+        move_roots(roots, words, F, np.linalg.cholesky(Q), maps)
 
     def theirs(_):
         peers.plain_chains(roots, words, F, Q, H, R)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.algorithms.kernels.chains import advance, alphabet
+from netkf.algorithms.kernels.chains import move_roots, reading_modes
 from tests.benchmarks import cases, peers
 
 
@@ -67,8 +67,8 @@ def test_plain_chains_end_where_compiled_ones_do():
     F, Q, H, R = peers.random_system()
     words = np.random.default_rng(1).random((5, 40)) < 0.6
     roots = np.broadcast_to(np.eye(4), (5, 4, 4))
-    ends = advance(
-        roots, words, F, np.linalg.cholesky(Q), alphabet([(H[:0], R[:0, :0]), (H, R)], 4)
+    ends = move_roots(
+        roots, words, F, np.linalg.cholesky(Q), reading_modes([(H[:0], R[:0, :0]), (H, R)], 4)
     )
     plain = peers.plain_chains(roots, words, F, Q, H, R)
     np.testing.assert_allclose(ends @ np.swapaxes(ends, 1, 2), plain, rtol=1e-8)
