@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -177,9 +177,16 @@ def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str
     )
 
 
+@cache
+def _upper_indices(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the upper triangle of a matrix (n, n), row by row."""
+    i, j = np.triu_indices(n)
+    return i, j
+
+
 def _unpacked(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(T, N, 2 u + 1) as two stacks of symmetric matrices (T, N, n, n) and (T, N)."""
-    i, j = np.triu_indices(n)
+    i, j = _upper_indices(n)
     matrices = np.empty((2, *values.shape[:2], n, n))
     for matrix, upper in zip(matrices, np.split(values[..., :-1], 2, axis=-1), strict=True):
         matrix[..., i, j] = upper

@@ -89,8 +89,9 @@ class Here(Pool):
 
     def _measured(self, job: Job, seconds: float) -> None:
         """Take note of how long a block took, without what was compiled meanwhile."""
+        # Blocks may be larger than was asked for: of several that take as long as one.
         if seconds < QUICK and len(job.replicas) >= self._size:
-            self._size = min(2 * self._size, LARGEST_HERE)
+            self._size = min(2 * job.size, LARGEST_HERE)
 
 
 class Adaptive(Here):

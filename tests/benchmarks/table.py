@@ -42,15 +42,18 @@ class Measured(NamedTuple):
         )
 
 
-def seconds(work, count):
-    """Processor time of ``work(count)``, all threads."""
+def seconds(work, count, repeats=1):
+    """Processor time of ``work(count)``, all threads, the mean of so many calls."""
     began = time.process_time()
-    work(count)
-    return time.process_time() - began
+    for _ in range(repeats):
+        work(count)
+    return (time.process_time() - began) / repeats
 
 
 def pieces(side):
-    """How many pieces of work make a measurement; what is compiled gets loaded by the way."""
+    """How many pieces of work one call does, and how many calls make a measurement; what is
+    compiled gets loaded by the way.
+    """
     work, count, most = side
     work(count)
     while count < most:  # what a call costs whatever it does makes the first estimates too small
@@ -59,7 +62,8 @@ def pieces(side):
         if wanted < 2 * count:
             break
         count = wanted
-    return count
+    # Some milliseconds alone would say more about what the other side left in the caches.
+    return count, max(1, int(0.2 * BUDGET / max(seconds(work, count), 1e-9)))
 
 
 def measured(row, runs):
@@ -67,7 +71,7 @@ def measured(row, runs):
     sides = row.sides()
     counts = [pieces(side) for side in sides]
     pairs = [
-        [seconds(side.work, count) / count for side, count in zip(sides, counts, strict=True)]
+        [seconds(side.work, *count) / count[0] for side, count in zip(sides, counts, strict=True)]
         for _ in range(runs)
     ]
     ratios = [mine / theirs if row.slower else theirs / mine for mine, theirs in pairs]

@@ -290,18 +290,20 @@ class SlotSetup:
         return int(min(max(whole, LANES), max(1, MOST_BATCH_BYTES // samples)))
 
     def quick_runs(self) -> int:
-        """A power of two of runs, a block of lanes at least, that take a few milliseconds."""
+        """A power of two of runs, a block of lanes at least, that take some ten milliseconds."""
         flops = self.hosts * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MOST_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
 
 
-BLOCK_BYTES = 1 << 21
-"""Of what is drawn for one call of a filter's kernel: about what a core keeps close by."""
-BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 23, 1 << 29, 512
+BLOCK_BYTES = 1 << 22
+"""Of what is drawn for one call of a filter's kernel: more leaves the caches of a core, and of less
+the time between calls is a larger part.
+"""
+BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 25, 1 << 29, 1024
 """Of the samples of a batch, those of a block of lanes, and the largest number of runs."""
-QUICK_FLOPS = 1 << 22
-"""Of runs that are worth doing together from the first one on: some milliseconds."""
+QUICK_FLOPS = 1 << 25
+"""Of runs that are worth doing together from the first one on: some ten milliseconds."""
 
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
