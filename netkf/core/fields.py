@@ -119,6 +119,9 @@ class Component:
 
 
 def _are_equal(one: Any, other: Any) -> bool:
+    # Scenarios that are made from each other share most parts: caches look them up often.
+    if one is other:
+        return True
     if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
         return one is not None and other is not None and np.array_equal(one, other)
     if isinstance(one, tuple) and isinstance(other, tuple):

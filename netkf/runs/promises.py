@@ -16,7 +16,6 @@ from netkf.runs.tables import MAX_NODES, format_number, table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
-    assumptions,
     central_covariance,
     covariance_bound,
     limit_covariance,
@@ -27,6 +26,7 @@ from netkf.theory import (
     steady_error_covariance,
     true_limit_covariance,
 )
+from netkf.theory.assumptions import assumption_rows
 from netkf.theory.common.mean_square import has_linear_errors, is_quickly_solved
 from netkf.theory.common.papers import paper_function
 from netkf.theory.hybrid.steady import steady_by_node
@@ -48,14 +48,13 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
 
     The values are plain JSON; if a number does not exist, ``reason`` says why.
     """
-    rows = assumptions(scenario)
     found: dict[str, Any] = {
         "scenario": scenario.name,
         "filter": name_of("filter", scenario.filter.algorithm),
         "nodes": list(scenario.nodes),
         "assumptions": [
             {"assumption": a, "source": s, "holds": None if h is None else bool(h), "evidence": e}
-            for a, s, h, e in rows.itertuples(index=False)
+            for a, s, h, e in assumption_rows(scenario)
         ],
     }
     own = paper_function(scenario, "promises", "slot_promises") if scenario.slotted else None

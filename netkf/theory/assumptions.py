@@ -41,10 +41,15 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
     """
     import pandas as pd
 
+    return pd.DataFrame(assumption_rows(scenario), columns=COLUMNS)
+
+
+def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows of the table of ``assumptions``."""
     rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
     if not scenario.is_linear:
         rows = [("readings are linear in the state", "all papers", False, NONLINEAR), *rows]
-    return pd.DataFrame(rows, columns=COLUMNS)
+    return rows
 
 
 def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:

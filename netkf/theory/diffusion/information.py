@@ -12,7 +12,6 @@ import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.optimize
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
@@ -200,6 +199,9 @@ def _search(
     x = np.concatenate([np.zeros(0), *(start[k] for k in moving)])
     found = [level(x)]
     if 0 < len(x) <= MAX_SEARCHED and found[0] > 0.0:
+        # It takes 0.3 s to import.
+        import scipy.optimize
+
         search = scipy.optimize.minimize(
             level, x, method="Nelder-Mead", bounds=bounds, options={"maxfev": MAX_EVALUATIONS}
         )

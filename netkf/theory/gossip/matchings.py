@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-import networkx
 import numpy as np
 
 from netkf.core.errors import ScenarioError, TheoryError
@@ -83,6 +82,8 @@ def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
     Both are decided on the graph of its positive entries: the period is the greatest common divisor
     of the lengths of its cycles.
     """
+    import networkx
+
     graph = networkx.from_numpy_array((matrix > 1e-15).astype(int), create_using=networkx.DiGraph)
     if not networkx.is_strongly_connected(graph):
         return False, False, 0

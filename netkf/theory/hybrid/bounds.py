@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import scipy.integrate
 
 from netkf.algorithms.kernels.riccati import RiccatiTable, propagate_riccati, riccati_table
 from netkf.core.errors import TheoryError
@@ -244,6 +243,9 @@ class _PiecewiseSolution:
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
+        # It takes 0.4 s to import.
+        import scipy.integrate
+
         return scipy.integrate.solve_ivp(
             slope,
             (begin, end),

@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
@@ -79,6 +78,9 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
         low, high = low - step, low if low != high else high
         if low < -math.log(MAX_FACTOR):
             return _with_rate(scenario, 0.0)
+    # It takes 0.3 s to import.
+    import scipy.optimize
+
     root = scipy.optimize.brentq(excess, low, high, xtol=FACTOR_TOLERANCE)
     return _with_rate(scenario, math.exp(float(root)))
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from netkf.algorithms.kernels.chains import move_roots, reading_modes
 from netkf.core.errors import TheoryError
@@ -221,6 +220,9 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
         return lower, lower
     if not radius(1.0) < 1.0:
         raise TheoryError("R (32) was not found: the system is too close to an undetectable one")
+    # It takes 0.3 s to import.
+    import scipy.optimize
+
     root = scipy.optimize.brentq(lambda g: np.log(radius(g)), lower, 1.0, xtol=1e-14)
     return lower, float(root)
 

@@ -13,9 +13,8 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import networkx
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
@@ -25,6 +24,9 @@ from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    import networkx
 
 MAX_PARTITIONS = 120_000
 MAX_ROOTS = 12  # first nodes that are tried
@@ -131,20 +133,25 @@ def _link_probabilities(
 
 def _nodes_and_links(graph: Any) -> tuple[list[Any], list[Edge]]:
     """Return the nodes and links of a graph; raises TheoryError if it is directed or empty."""
-    directed = False
     if isinstance(graph, Topology):
         names, links, directed = list(graph.nodes), list(graph.links), graph.directed
-    elif isinstance(graph, networkx.Graph):
-        names, links = list(graph.nodes), [(i, j) for i, j in graph.edges()]
-        directed = graph.is_directed()
     else:
-        links = [(i, j) for i, j in graph]
-        names = list(dict.fromkeys(node for link in links for node in link))
+        names, links, directed = _read_graph(graph)
     if directed:
         raise TheoryError("the graph must be undirected")
     if not names:
         raise TheoryError("the graph must have a node")
     return names, links
+
+
+def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
+    """Return nodes and links of a networkx graph or of pairs of nodes, and if it is directed."""
+    import networkx
+
+    if isinstance(graph, networkx.Graph):
+        return list(graph.nodes), [(i, j) for i, j in graph.edges()], graph.is_directed()
+    links = [(i, j) for i, j in graph]
+    return list(dict.fromkeys(node for link in links for node in link)), links, False
 
 
 def _link_probability(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
