@@ -39,7 +39,8 @@ MOST_STATES = 4
 """Of the sources, whose compiled code is kept."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_OPTIONS: Any = {"nogil": True, "error_model": "numpy"}
+# Nobody calls a kernel from C: the wrapper would be a seventh of what is compiled.
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _said: set[Callable[..., Any]] = set()
 _spent: list[float] = []
 
