@@ -2,6 +2,7 @@
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import networkx
@@ -12,6 +13,7 @@ from tests import conftest
 ROOT = Path(netkf.__file__).parent
 
 
+@cache
 def modules():
     """Every module of the package by its name, parsed."""
     found = {}

@@ -1,10 +1,13 @@
 """What is kept of a stopped ensemble is proved before it is used."""
 
+import contextlib
 import io
 import json
 import os
 import random
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -383,26 +386,48 @@ def test_contents_reach_the_disk_before_names(tmp_path, monkeypatch):
                 assert calls[k - 1][1] == os.stat(path).st_ino
 
 
-@pytest.mark.parametrize("bytes_left", [0, 300, 3000, 20_000])
-@pytest.mark.parametrize("runs", ["1", "5"])
-def test_a_full_disk_leaves_nothing_behind(tmp_path, bytes_left, runs):
-    """Files of a process may be limited: writing fails as on a full disk."""
-    resource = pytest.importorskip("resource")
-    import subprocess
-    import sys
+FULL = ["run", RING, "--set", "horizon=20.0", "--no-plot", "--trace", "full", "--workers", "1"]
 
-    line = ["run", RING, "--set", "horizon=20.0", "--no-plot", "--runs", runs, "--trace", "full"]
+
+@contextlib.contextmanager
+def small_files(size):
+    """Files of this process may be limited: writing fails as on a full disk."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("runs", ["1", "5"])
+def test_a_full_disk_leaves_nothing_behind(tmp_path, capsys, runs):
+    # What is compiled has been kept on disk before there is no space.
+    assert main([*FULL, "--runs", runs, "--out", str(tmp_path / "whole")]) == 0
+    for bytes_left in (0, 300, 3000, 20_000):
+        capsys.readouterr()
+        with small_files(bytes_left):
+            status = main([*FULL, "--runs", runs, "--out", str(tmp_path / str(bytes_left))])
+        error = capsys.readouterr().err
+        assert status == 2
+        assert error.startswith("netkf: cannot write: File too large (")
+        assert len(error.splitlines()) == 1
+        assert not list(tmp_path.rglob("*.part"))
+
+
+def test_a_full_disk_ends_a_process_in_one_line(tmp_path):
+    resource = pytest.importorskip("resource")
     done = subprocess.run(
-        [sys.executable, "-m", "netkf", *line, "--out", str(tmp_path / "out"), "--workers", "1"],
+        [sys.executable, "-m", "netkf", *FULL, "--runs", "5", "--out", str(tmp_path / "out")],
         capture_output=True,
         text=True,
         check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_left, bytes_left)),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000)),
     )
     assert done.returncode == 2
     assert done.stderr.startswith("netkf: cannot write: File too large (")
     assert len(done.stderr.splitlines()) == 1
-    assert not list(tmp_path.rglob("*.part"))
 
 
 def test_an_error_of_writing_is_an_oserror_too(tmp_path):
