@@ -2,13 +2,16 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
 from netkf.checks.exact import _compare_pooled, check_expected_nees, most_replayed
+from netkf.checks.parts.clock_rows import _count_interval
 from netkf.checks.points import check_times, errors_at_once, sample_times
 from netkf.checks.samples import stack_summaries
 from netkf.scenario.reading import load
@@ -25,7 +28,7 @@ FOUND = {
     "the plant follows its equation without a bias": 0.1,
     "noises of the sensors are white": 0.2,
     "the plant's noise is white": 0.2,
-    "clocks tick at the rates": 0.04,
+    "clocks tick at the rates": 0.02,
 }
 
 
@@ -47,6 +50,33 @@ def test_rows_would_have_found_small_errors_at_the_default(ring):
     for name, size in FOUND.items():
         (row,) = [row for row in rows if name in row.promise]
         assert 0.0 < row.detectable <= size, name
+        # Of a single clock too, or the row would say what no test could find.
+        assert "of one clock, no test" not in row.evidence
+
+
+def test_one_clock_that_is_off_is_found_as_stated():
+    """A rate that is 2 % off, among six clocks, in the ticks that are drawn for that."""
+    random, mean, runs, level = np.random.default_rng(4), 40.0, 2000, 1.5e-4 / 6.0
+    size = _count_interval(random.poisson(mean, runs), mean, level, True, 0.0).detectable
+    assert size <= 0.02
+    for factor in (1.0 + size, 1.0 - size):
+        off = [
+            _count_interval(random.poisson(factor * mean, runs), mean, level, True, 0.0).low
+            for _ in range(300)
+        ]
+        assert np.mean(np.array(off) > 0.0) == pytest.approx(0.9, abs=0.06)
+
+
+def test_what_no_test_could_find_is_stated(ring):
+    """In few runs: the bound is that of the most powerful test, by its power at that error."""
+    scenario, results = ring
+    rows = judge_replicas(scenario, results, 5, 0.99).rows
+    (row,) = [row for row in rows if row.promise.startswith("clocks tick at the rates")]
+    found = re.search(r"finds less than ([0-9.e-]+) in ([0-9,]+) ticks", row.evidence)
+    least, ticks = float(found[1]), int(found[2].replace(",", ""))
+    assert ticks == pytest.approx(5 * FEW * 40.0)
+    limit = scipy.stats.poisson(ticks).isf(0.005 / 12.0)
+    assert scipy.stats.poisson(ticks * (1.0 + 0.8 * least)).sf(limit) < 0.9
 
 
 def test_errors_have_the_freedom_to_find_five_per_cent(ring):
