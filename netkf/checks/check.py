@@ -181,7 +181,9 @@ def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
     if np.isnan(differences).all():
         return find_nothing(0.0)
     message = f"{min(TWIN_RUNS, len(results))} runs beside those of the filter that it should be"
-    return find_identity(float(np.nanmax(differences)), TWIN_TOLERANCE, message)
+    found = find_identity(float(np.nanmax(differences)), TWIN_TOLERANCE, message)
+    off = np.flatnonzero(np.nan_to_num(differences) > TWIN_TOLERANCE).tolist()
+    return found._replace(replica=off[0] if off else None)
 
 
 def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:

@@ -56,5 +56,6 @@ def test_weights_that_change_nothing_hold(tmp_path):
 def test_what_should_be_the_same_and_is_not_is_broken(name, own, tmp_path):
     verdict, row = beside(GOSSIP, name, tmp_path)
     assert row.verdict == BROKEN
+    assert row.replica == 0
     assert own in row.evidence
     assert not verdict

@@ -50,12 +50,6 @@ def _start_mean(samples: PartSamples, level: float) -> Finding:
     return compare_means(found, _labels("direction", len(found.first)), level)
 
 
-def _start_law(samples: PartSamples, level: float) -> Finding:
-    found = _starts(samples.scenario, samples.seed)
-    labels = _labels("direction", len(found.first))
-    return compare_cells(found.cells, labels, level, "directions of x(0)")
-
-
 def _steps(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
     found = total(samples.steps)
     return found, _labels("direction", len(found.first))
@@ -75,11 +69,6 @@ def _step_correlation(samples: PartSamples, level: float) -> Finding:
     return compare_correlations(*_steps(samples), level)
 
 
-def _step_law(samples: PartSamples, level: float) -> Finding:
-    found, labels = _steps(samples)
-    return compare_cells(found.cells, labels, level, "directions of the noise")
-
-
 def _reading_variance(samples: PartSamples, level: float) -> Finding:
     labels = reading_labels(samples.scenario)
     gaussian = not _own_sensors(samples.scenario)
@@ -92,11 +81,6 @@ def _reading_mean(samples: PartSamples, level: float) -> Finding:
 
 def _reading_correlation(samples: PartSamples, level: float) -> Finding:
     return compare_correlations(total(samples.readings), reading_labels(samples.scenario), level)
-
-
-def _reading_law(samples: PartSamples, level: float) -> Finding:
-    cells = total(samples.readings).cells
-    return compare_cells(cells, reading_labels(samples.scenario), level, "readings")
 
 
 def _own_sensors(scenario: Scenario) -> bool:
@@ -131,13 +115,11 @@ START_ROWS = (
     Promise("the state starts with its covariance", "the scenario", (), _start_variance),
     Promise("the state starts with its mean", "the scenario", (), _start_mean),
 )
-START_LAW = Promise("the state starts with a Gaussian law", "the scenario", (), _start_law)
 PLANT_ROWS = (
     Promise("the plant's noise has its covariance", "the scenario", (), _step_variance),
     Promise("the plant follows its equation without a bias", "the scenario", (), _step_mean),
     Promise("the plant's noise is white", "the scenario", (), _step_correlation),
 )
-STEP_LAW = Promise("the plant's noise is Gaussian", "the scenario", (), _step_law)
 SENSOR_ROWS = (
     Promise("noises of the sensors have their covariance", "the scenario", (), _reading_variance),
     Promise("readings have no bias", "the scenario", (), _reading_mean),
@@ -150,18 +132,14 @@ SENSOR_ROWS = (
 )
 
 
-READING_LAW = Promise("noises of the sensors are Gaussian", "the scenario", (), _reading_law)
-
-
 def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
     """Return the promises about the parts that these samples can be held to."""
     scenario = samples.scenario
     found: list[Promise] = []
-    own_plant = is_own_class(scenario.plant, "plant")
     if scenario.plant.is_random and np.any(scenario.plant.start_cov):
-        found += START_ROWS if own_plant else (*START_ROWS, START_LAW)
+        found += START_ROWS
     if samples.steps is not None and path_law(scenario) is not None:
-        found += PLANT_ROWS if own_plant else (*PLANT_ROWS, STEP_LAW)
+        found += PLANT_ROWS
     if samples.readings is not None:
-        found += SENSOR_ROWS if _own_sensors(scenario) else (*SENSOR_ROWS, READING_LAW)
+        found += SENSOR_ROWS
     return (*found, *network_promises(samples))
