@@ -6,6 +6,7 @@ turned into lanes, columns are computed, turned back and merged, all in the near
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -35,6 +36,8 @@ from netkf.trace.run import BLUR, ROUNDING
 
 TOGETHER = 512
 """Numbers of a run that are looked at together: some lines of the cache."""
+MOST_KEPT = 1 << 15
+"""Entries of all P of a sample up to which scratch is kept: some 10 MB."""
 
 
 class Reduced(NamedTuple):
@@ -164,6 +167,24 @@ def reduction_room(filters: int, n: int, largest: int) -> Room:
     )
 
 
+class _Rooms(threading.local):
+    """The scratch of each thread for the batch before, which the next one may use again."""
+
+    def __init__(self) -> None:
+        self._sizes, self._room = (0, 0, 0), reduction_room(1, 1, 1)
+
+    def of(self, filters: int, n: int, largest: int) -> Room:
+        """Scratch as ``reduction_room`` makes it, with anything in it."""
+        if filters * n * n > MOST_KEPT:
+            return reduction_room(filters, n, largest)
+        if self._sizes[:2] != (filters, n) or self._sizes[2] < largest:
+            self._sizes, self._room = (filters, n, largest), reduction_room(filters, n, largest)
+        return self._room
+
+
+_rooms = _Rooms()
+
+
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     """Values of all runs of a batch, samples by ``pieces``, which are neighbours and hold all runs;
     the last sample of a run that diverged is left out.
@@ -180,7 +201,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
         regular=np.ones(runs, dtype=np.bool_),
     )
     given = _given(batch)
-    room = reduction_room(filters, n, most)
+    room = _rooms.of(filters, n, most)
     reduce_runs(MANY, given, bounds, sums, room)
     if not sums.regular.all():
         # Some P is exactly singular: those that are singular up to rounding are left out as well.

@@ -45,7 +45,7 @@ def replicate_blocks(
     progress: Progress | None = None,
     first: int = 0,
     block: int | None = None,
-    together: int = LANES,
+    together: int | None = None,
     known: Mapping[int, Callable[[], Any]] | None = None,
     received: Callable[[int, Any], Any] | None = None,
 ) -> Any:
@@ -63,11 +63,11 @@ def replicate_blocks(
     ``executor`` of concurrent.futures, or by the Dask ``scheduler`` at an address; a ``pool`` of
     make_pool stands for all of them, and is closed at the end. ``seed`` defaults to the scenario's.
 
-    ``together`` replicas of a scenario in slots, a power of two, are one block at least where
-    blocks are done here. ``block`` is the number of replicas handed out together, a power of two;
-    by default the pool chooses. With ``block``, blocks are numbered from 0; those that are
-    ``known`` are not done again but called for, and ``received(number, result)`` sees each of the
-    others when it comes and returns what to merge.
+    ``together`` replicas, a power of two, are one block at least where blocks are done here; by
+    default several of a scenario in slots, where runs are side by side. ``block`` is the number of
+    replicas handed out together, a power of two; by default the pool chooses. With ``block``,
+    blocks are numbered from 0; those that are ``known`` are not done again but called for, and
+    ``received(number, result)`` sees each of the others when it comes and returns what to merge.
 
     Raises ScenarioError for arguments that are wrong, EngineError where workers die again and again
     or a plugged-in class fails, and what ``task`` raises.
@@ -106,7 +106,7 @@ def _quiet(done: int, wanted: int) -> None:
 def _gathered(
     pool: Pool,
     job: Job,
-    together: int,
+    together: int | None,
     merge: Merge,
     known: Mapping[int, Callable[[], Any]],
     received: Callable[[int, Any], Any],
@@ -129,7 +129,7 @@ def _gathered(
 
 
 def _blocks(
-    pool: Pool, job: Job, together: int, known: Mapping[int, Callable[[], Any]]
+    pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
 ) -> Iterator[Job]:
     """Yield the blocks that are not known, in order; the pool chooses sizes as it is asked."""
     if job.size:
@@ -137,12 +137,13 @@ def _blocks(
             if number not in known:
                 yield job._replace(start=number * job.size)
         return
-    start = 0
+    # Runs in slots are side by side in lanes: fewer of them take as long.
+    slotted = isinstance(job.scenario, Scenario) and job.scenario.slotted
+    start, least = 0, together or (LANES if slotted else 1)
     while start < job.stop:
         size = pool.next_size(job.stop - start, job.stop)
-        # Runs in slots are side by side in lanes: fewer of them take as long.
-        if pool.ahead == 1 and isinstance(job.scenario, Scenario) and job.scenario.slotted:
-            size = max(size, together)
+        if pool.ahead == 1:
+            size = max(size, least)
         if start:
             size = min(size, start & -start)  # a block is a node of the tree
         yield job._replace(start=start, size=size)

@@ -46,11 +46,14 @@ def kernel_compiler(lean: bool) -> Any:
     """Return numba's compiler without the passes that are not needed, and with short code for loops
     and entries of arrays if ``lean``.
     """
+    from numba.core import config
     from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
     from netkf.linalg.lean_lowering import KernelLowering
 
     builder: Any = DefaultPassBuilder
+    # Bounds are checked by numba's own code.
+    short = lean and not getattr(config, "BOUNDSCHECK", None)
 
     class KernelCompiler(CompilerBase):
         """Compiles kernels."""
@@ -59,7 +62,7 @@ def kernel_compiler(lean: bool) -> Any:
             pipeline = builder.define_nopython_pipeline(self.state)
             steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
             pipeline.passes = [
-                (KernelLowering if lean and step.__name__ == "NativeLowering" else step, said)
+                (KernelLowering if short and step.__name__ == "NativeLowering" else step, said)
                 for step, said in steps
             ]
             pipeline.finalize()
@@ -73,10 +76,12 @@ def shortcuts() -> list[Patch]:
     from numba.core import config, event
     from numba.core.codegen import CPUCodeLibrary
     from numba.core.types.functions import BaseFunction
+    from numba.np import arrayobj
 
     return [
         (BaseFunction, "get_call_type", _found_once(BaseFunction.get_call_type)),
         (event, "install_timer", _no_timer),
+        (arrayobj, "fix_integer_index", _in_order(arrayobj.fix_integer_index)),
         (
             CPUCodeLibrary,
             "_optimize_functions",
@@ -101,6 +106,20 @@ def _found_once(find: Callable[..., Any]) -> Callable[..., Any]:
         return known[call]
 
     return found
+
+
+def _in_order(wrapped: Callable[..., Any]) -> Callable[..., Any]:
+    """Ask of no place that is computed if it is negative, see ``lean_lowering.is_in_order``."""
+    from numba import types
+
+    from netkf.linalg.lean_lowering import is_in_order
+
+    def place_of(context: Any, builder: Any, kind: Any, place: Any, size: Any) -> Any:
+        if is_in_order(place):
+            return context.cast(builder, place, kind, types.intp)
+        return wrapped(context, builder, kind, place, size)
+
+    return place_of
 
 
 def _no_timer(*_: Any) -> AbstractContextManager[None]:

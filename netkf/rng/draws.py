@@ -115,6 +115,30 @@ def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
     return float(scrambled(high, low) >> S11) * TO_UNIT
 
 
+@kernel(inlined=True)
+def next_state(high: Any, low: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
+    """``following`` of a stream that has registers to itself: its increment is ``more``."""
+    return following(high, low, high_word(low, CHEAP), more_high, more_low)
+
+
+@kernel(inlined=True)
+def exponential_of(
+    states: np.ndarray, k: int, high: Any, low: Any, ziggurat: Ziggurat
+) -> tuple[float, Any, Any]:
+    """``next_exponential`` of stream ``k``, whose state is in registers; return the state after it
+    too. Numbers of one stream wait for each other's state, and memory makes them wait longer.
+    """
+    word = scrambled(high, low) >> S3
+    layer = int(word & LAYER)
+    word >>= S8
+    if word < ziggurat.inside[layer]:
+        high, low = next_state(high, low, states[k, 2], states[k, 3])
+        return float(word) * ziggurat.width[layer], high, low
+    states[k, 0], states[k, 1] = high, low
+    x = next_exponential(states, k, ziggurat)
+    return x, states[k, 0], states[k, 1]
+
+
 @kernel
 def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
     """The next number of stream ``k`` from the exponential law of mean 1."""

@@ -10,7 +10,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.rng.draws import seed_states
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.numbers import NormalZiggurat, normal_of, normal_ziggurat
 
 
 class Normals(Protocol):
@@ -49,5 +49,7 @@ class StreamNormals:
 def fill_normals_of_all(states: np.ndarray, ziggurat: NormalZiggurat, out: FloatArray) -> None:
     """Write the next numbers of each stream of ``states`` (K, >= 4) into its row of ``out``."""
     for k in range(out.shape[0]):
+        high, low = states[k, 0], states[k, 1]
         for m in range(out.shape[1]):
-            out[k, m] = next_normal(states, k, ziggurat)
+            out[k, m], high, low = normal_of(states, k, high, low, ziggurat)
+        states[k, 0], states[k, 1] = high, low

@@ -17,10 +17,10 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.rng.draws import HALF, LAYER, ONE, S8, S32, next_unit, next_word
+from netkf.rng.draws import HALF, LAYER, ONE, S8, S32, next_state, next_unit, next_word, scrambled
 
 _U = np.uint64
-MANTISSA, S1 = _U(0x000FFFFFFFFFFFFF), _U(1)
+MANTISSA, S1, S9 = _U(0x000FFFFFFFFFFFFF), _U(1), _U(9)
 TAIL_START = 3.6541528853610087963519472518
 INVERSE_TAIL_START = 0.27366123732975827203338247596
 HAS_HALF, KEPT_HALF = 4, 5
@@ -40,6 +40,25 @@ def normal_ziggurat() -> NormalZiggurat:
     """The layers that numpy uses."""
     with np.load(Path(__file__).with_name("ziggurat_normal.npz")) as kept:
         return NormalZiggurat(kept["fi"], kept["wi"], kept["ki"])
+
+
+@kernel(inlined=True)
+def normal_of(
+    states: np.ndarray, k: int, high: Any, low: Any, ziggurat: NormalZiggurat
+) -> tuple[float, Any, Any]:
+    """``next_normal`` of stream ``k``, whose state is in registers; return the state after it too,
+    see ``exponential_of``.
+    """
+    word = scrambled(high, low)
+    layer = int(word & LAYER)
+    size = (word >> S9) & MANTISSA
+    if size < ziggurat.inside[layer]:
+        x: float = float(size) * ziggurat.width[layer]
+        high, low = next_state(high, low, states[k, 2], states[k, 3])
+        return -x if (word >> S8) & ONE == ONE else x, high, low
+    states[k, 0], states[k, 1] = high, low
+    x = next_normal(states, k, ziggurat)
+    return x, states[k, 0], states[k, 1]
 
 
 @kernel

@@ -1,8 +1,15 @@
 """Loops and entries of arrays in kernels are those of Python."""
 
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import netkf
 from netkf.linalg.compiling import kernel
 
 PAIR = np.dtype([("number", np.int64), ("value", np.float64)])
@@ -70,28 +77,86 @@ def put(a, i, j, k, value):
 
 @pytest.mark.parametrize("dtype", [np.float64, np.int64, np.uint8, np.uint64, np.int32])
 def test_entries_are_those_of_numpy(dtype):
-    """Negative places count from the end."""
     a = np.arange(24).astype(dtype).reshape(2, 3, 4)
     for place in np.ndindex(2, 3, 4):
-        for given in (place, np.subtract(place, a.shape)):
-            assert entry(a, *map(int, given)) == a[place]
-            assert entry_of_row(a, *map(int, given)) == 2 * int(a[place])
+        assert entry(a, *map(int, place)) == a[place]
+        assert entry_of_row(a, *map(int, place)) == 2 * int(a[place])
         assert entry(a, *map(np.uint64, place)) == a[place]
         assert entry(a, *map(np.int32, place)) == a[place]
+
+
+@kernel
+def near_the_end(a):
+    return a[-1, -3, 2] + 100 * a[-2, 1, -1] + 10000 * a[-1][1][-1]
+
+
+def test_places_that_are_written_as_negative_numbers_count_from_the_end():
+    """Those that are computed never do: kernels do not ask them."""
+    a = np.arange(24).reshape(2, 3, 4)
+    assert near_the_end(a) == a[-1, -3, 2] + 100 * a[-2, 1, -1] + 10000 * a[-1][1][-1]
+
+
+def indices(function):
+    """What a function writes between brackets, apart from slices."""
+    for part in ast.walk(function):
+        if isinstance(part, ast.Subscript):
+            yield from part.slice.elts if isinstance(part.slice, ast.Tuple) else [part.slice]
+
+
+def test_no_kernel_of_the_package_counts_from_the_end():
+    """Those that are inlined cannot."""
+    found = []
+    for file in Path(netkf.__file__).parent.rglob("*.py"):
+        for part in ast.walk(ast.parse(file.read_text())):
+            marks = map(ast.unparse, getattr(part, "decorator_list", []))
+            if isinstance(part, ast.FunctionDef) and any(m.startswith("kernel") for m in marks):
+                signed = [i for i in indices(part) if isinstance(i, ast.UnaryOp)]
+                found += [f"{file.name}: {part.name}[{ast.unparse(i)}]" for i in signed]
+    assert not found
+
+
+CHECKED = """
+import numpy as np
+from netkf.linalg.compiling import kernel
+@kernel(inlined=True)
+def inner(a, k):
+    return a[k]
+@kernel
+def outer(a, k):
+    return inner(a, k)
+@kernel
+def entry(a, k):
+    return a[k]
+for function in (outer, entry):
+    for place in (-1, 3):
+        try:
+            function(np.zeros(3), place)
+        except IndexError:
+            print("refused")
+"""
+
+
+def test_kernels_look_at_bounds_where_numba_is_told_to(tmp_path):
+    given = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    script = tmp_path / "checked.py"
+    script.write_text(CHECKED)
+    command, env = [sys.executable, str(script)], os.environ | given
+    found = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["refused"] * 4
 
 
 @pytest.mark.parametrize("value", [7, 7.0, True])
 def test_entries_are_written_where_numpy_writes_them(value):
     a, expected = np.zeros((2, 3, 4)), np.zeros((2, 3, 4))
-    put(a, 1, -1, 2, value)
-    expected[1, -1, 2] = value + 342.0
+    put(a, 1, 2, 2, value)
+    expected[1, 2, 2] = value + 342.0
     np.testing.assert_array_equal(a, expected)
 
 
 @kernel
 def exchange(records, i, flags):
     record = records[i]
-    other = records[i - 1]
+    other = records[(i + 2) % 3]
     record.value, other.value = other.value, record.value
     record.number += records[i].number
     flags[i] = record.number > 4

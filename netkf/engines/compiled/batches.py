@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.core.memory import keep_freed_memory
 from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
 from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
@@ -36,12 +37,15 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.schema import KINDS
 
 LARGEST_BATCH = 256
+QUICK_VISITS = 1 << 15
+"""Visits of nodes that take some milliseconds."""
 MOST_BYTES = 1 << 24
 """Bytes that are drawn for a batch, and that its samples take."""
 
 
 def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
     """Yield the runs of consecutive replicas, as many at a time as memory allows."""
+    keep_freed_memory()
     size = batch_size(scenario)
     workspace = _workspace(scenario) if size > 1 else Workspace(scenario)
     for first in range(replicas.start, replicas.stop, size):
@@ -154,6 +158,20 @@ def batch_size(scenario: Scenario) -> int:
     samples = len(scenario.times) * filters * n * (n + 2)
     # At least one run, however large it is.
     return max(1, int(min(LARGEST_BATCH, MOST_BYTES / (8.0 * (drawn + samples)))))
+
+
+@once_per_scenario
+def quick_runs(scenario: Scenario) -> int:
+    """Return a number of runs, a power of two, that take milliseconds together: what it costs to
+    prepare a batch is shared by so many at least.
+    """
+    if not (drawn_together(scenario) and is_immediate(scenario)):
+        return 1
+    steps, nodes = steps_to_the_end(scenario), len(scenario.nodes)
+    visits = steps * len(scenario.increment_sensors) + nodes * len(scenario.times)
+    most = int(QUICK_VISITS / (visits + _expected_ticks(scenario)))
+    most = min(most, batch_size(scenario), together(nodes, LARGEST_BATCH))
+    return 1 << max(0, most.bit_length() - 1)
 
 
 def _expected_ticks(scenario: Scenario) -> float:

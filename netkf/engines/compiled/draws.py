@@ -19,7 +19,7 @@ from netkf.plants.laws import course_width, grid_time
 from netkf.plants.paths import BLOCK, Block
 from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.numbers import NormalZiggurat, normal_of, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
@@ -221,8 +221,11 @@ def fill_noise(
     for k in range(len(out)):
         # Streams are numbered run by run, so the sensor is the remainder.
         p = rows[k % len(rows)]
+        high, low = states[k, 0], states[k, 1]
         # Rows beyond p draw nothing: a stream gives what it gives without padding.
         for c in range(out.shape[1]):
             for half in range(2):
                 for i in range(p):
-                    out[k, c, half, i] = scales[half] * next_normal(states, k, ziggurat)
+                    normal, high, low = normal_of(states, k, high, low, ziggurat)
+                    out[k, c, half, i] = scales[half] * normal
+        states[k, 0], states[k, 1] = high, low

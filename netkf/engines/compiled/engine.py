@@ -13,7 +13,7 @@ from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.agenda import is_immediate, simulate_agenda
 from netkf.engines.compiled.batch_loop import simulate_runs
-from netkf.engines.compiled.batches import flow_batches
+from netkf.engines.compiled.batches import flow_batches, quick_runs
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
@@ -90,10 +90,10 @@ class CompiledEngine(Engine):
             return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
 
     def together(self, scenario: Scenario) -> int:
-        """Runs in slots are side by side: few of them take as long as several."""
-        if not scenario.slotted or not slot_setup(scenario).is_drawn:
-            return 1
-        return slot_setup(scenario).quick_runs()
+        """Runs are side by side: few of them take as long as several."""
+        if not scenario.slotted:
+            return quick_runs(scenario)
+        return slot_setup(scenario).quick_runs() if slot_setup(scenario).is_drawn else 1
 
     def run_many(
         self, scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False

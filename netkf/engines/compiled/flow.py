@@ -27,6 +27,7 @@ from netkf.engines.compiled.event_loop import (
     WANT_TICKS,
     event_loop,
 )
+from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.late_readings import History, add_past, empty_history
 from netkf.engines.compiled.origins import move_origin
 from netkf.engines.compiled.poisson import schedule
@@ -171,8 +172,9 @@ class Workspace:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, self._senders = scenario, senders_of(scenario)
-        self._start = filters_at_start(scenario)
-        self._records = entity_records(scenario, self._senders)
+        self._start, (entities, ways) = filters_at_start(scenario), entity_records(scenario)
+        # Directed links count their messages, which are those of this workspace.
+        self._records = entities, ways.copy()
         self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
         size, n = self._start.xhat.shape
         self._pool = empty_pool(FIRST_MESSAGES, n)
@@ -195,8 +197,8 @@ class Workspace:
         """Space for the visits of so many runs."""
         places = together * len(self._start.nodes)
         if self._visits is None or len(self._visits.level) < places:
-            period = float(self._scenario.truth.sensing_period or 0.0)
-            self._visits = empty_visits(self._start, self._records[1]["weight"], places, period)
+            series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
+            self._visits = empty_visits(self._start, weights, places, series)
         return self._visits
 
     def begin(

@@ -13,7 +13,7 @@ from netkf.linalg.lanes import ONE
 from netkf.linalg.small import copy_matrix
 from netkf.plants.paths import fill_course, fill_seen
 from netkf.plants.sensors import divide, fill_reading
-from netkf.rng.numbers import NormalZiggurat, next_normal
+from netkf.rng.numbers import NormalZiggurat, normal_of
 
 
 @kernel
@@ -54,10 +54,12 @@ def begin_step(sensing: Sensing, run: int, s: int, step: int) -> int:
 def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
     """The next standard normals (2, p) that cut a step of sensor ``s``."""
     ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
-    stream = run * len(sensing.rows) + s
+    states, stream = sensing.cuts, run * len(sensing.rows) + s
+    high, low = states[stream, 0], states[stream, 1]
     for half in range(2):
         for i in range(sensing.rows[s]):
-            normals[half, i] = next_normal(sensing.cuts, stream, ziggurat)
+            normals[half, i], high, low = normal_of(states, stream, high, low, ziggurat)
+    states[stream, 0], states[stream, 1] = high, low
 
 
 @kernel(inlined=True)

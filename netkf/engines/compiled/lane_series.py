@@ -12,11 +12,13 @@ import math
 
 import numpy as np
 
-from netkf.engines.compiled.state import Filters
+from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.state import Filters, filters_at_start
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.lanes import LANES, aligned
 from netkf.linalg.series import MANY_TERMS, NOTHING
 from netkf.linalg.structs import Struct
+from netkf.scenario.scenario import Scenario
 
 ROUNDING = 2.0**-52
 """Of the largest term of an entry, what may be left out."""
@@ -31,6 +33,14 @@ class LaneSeries(Struct):
     series: FloatArray
     place: IntArray
     row: IntArray
+
+
+@once_per_scenario
+def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
+    """Return the series of nodes that read nothing, and of those that read increments."""
+    filters = filters_at_start(scenario)
+    period = float(scenario.truth.sensing_period or 0.0)
+    return blind_series(filters), sensing_series(filters, period)
 
 
 def most_moments(filters: Filters) -> int:

@@ -25,7 +25,7 @@ from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Poisson
-from netkf.rng.draws import StreamBatch, Ziggurat, next_exponential, next_unit, ziggurat
+from netkf.rng.draws import StreamBatch, Ziggurat, exponential_of, next_unit, ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
@@ -79,37 +79,74 @@ def draw_ticks(
     """Write the ticks before ``end`` of a run behind those that are there; ``used`` (2,) counts
     them and their outcomes. False where the room ended first.
     """
-    coming, first, count = drawing.coming, drawing.first, len(drawing.first) - 1
     # Entity by entity, each from its own stream; the order of time is made afterwards.
-    for e in range(count):
-        k = run * count + e
-        while coming[k] < end:
-            # The room is checked before a tick is written, so that a stop leaves the streams where
-            # they are for this tick.
-            if used[0] == len(found.t) or used[1] + first[e + 1] - first[e] > len(found.delay):
-                return False
-            found.t[used[0]], found.entity[used[0]] = coming[k], e
-            at, luck, drawn = 0 if drawing.bits else used[1], 0.0, -1
-            # One uniform number for each source of outcomes: directions that share a source follow
-            # one another.
-            for m in range(first[e], first[e + 1]):
-                w = drawing.hearing[m]
-                if drawing.streams > 0 and drawing.source[w] != drawn:
-                    drawn = drawing.source[w]
-                    # The number is below 1, so that a link with probability 1 never loses.
-                    luck = next_unit(drawing.luck, run * drawing.streams + drawn)
-                arrives = luck < drawing.chance[w]
-                if drawing.bits:
-                    at |= np.int64(arrives) << (m - first[e])
-                else:
-                    found.delay[used[1]] = delay if arrives else LOST
-                    used[1] += 1
-            found.at[used[0]] = at
-            used[0] += 1
-            # The next tick is drawn now: it may lie in the next window.
-            gap: float = next_exponential(drawing.ticks, k, exponential)
-            coming[k] += gap / drawing.rate[k]
+    for e in range(len(drawing.first) - 1):
+        if not draw_ticks_of(drawing, run, e, end, delay, exponential, found, used):
+            return False
     return True
+
+
+@kernel
+def draw_ticks_of(
+    drawing: Drawing,
+    run: int,
+    e: int,
+    end: float,
+    delay: float,
+    exponential: Ziggurat,
+    found: Found,
+    used: np.ndarray,
+) -> bool:
+    """``draw_ticks`` of one entity."""
+    states, first, after = drawing.ticks, drawing.first[e], drawing.first[e + 1]
+    k = run * (len(drawing.first) - 1) + e
+    now, rate, high, low = drawing.coming[k], drawing.rate[k], states[k, 0], states[k, 1]
+    m, room, ended = used[0], len(found.delay) - (after - first), True
+    while now < end:
+        # The room is checked before a tick is written, so that a stop leaves the streams where they
+        # are for this tick.
+        if m == len(found.t) or used[1] > room:
+            ended = False
+            break
+        found.t[m], found.entity[m] = now, e
+        found.at[m] = draw_outcomes(drawing, run, first, after, delay, found, used)
+        m += 1
+        # The next tick is drawn now: it may lie in the next window.
+        gap, high, low = exponential_of(states, k, high, low, exponential)
+        now += gap / rate
+    drawing.coming[k], states[k, 0], states[k, 1], used[0] = now, high, low, m
+    return ended
+
+
+@kernel(inlined=True)
+def draw_outcomes(
+    drawing: Drawing,
+    run: int,
+    first: int,
+    after: int,
+    delay: float,
+    found: Found,
+    used: np.ndarray,
+) -> int:
+    """Draw which messages of a tick arrive, on the ways ``hearing`` from ``first`` up to ``after``;
+    return where their outcomes begin, or a bit for each.
+    """
+    at, luck, drawn = 0 if drawing.bits else used[1], 0.0, -1
+    # One uniform number for each source of outcomes: directions that share a source follow one
+    # another.
+    for m in range(first, after):
+        w = drawing.hearing[m]
+        if drawing.streams > 0 and drawing.source[w] != drawn:
+            drawn = drawing.source[w]
+            # The number is below 1, so that a link with probability 1 never loses.
+            luck = next_unit(drawing.luck, run * drawing.streams + drawn)
+        arrives = luck < drawing.chance[w]
+        if drawing.bits:
+            at |= np.int64(arrives) << (m - first)
+        else:
+            found.delay[used[1]] = delay if arrives else LOST
+            used[1] += 1
+    return at
 
 
 @kernel

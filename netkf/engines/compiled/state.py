@@ -19,7 +19,8 @@ from netkf.algorithms.kernels.root_flow import (
 )
 from netkf.algorithms.kernels.root_update import UpdateScratch, update_scratch
 from netkf.algorithms.models import FlowModel, first_root
-from netkf.engines.compiled.senders import Senders
+from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.senders import senders_of
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.structs import Size, Struct
 from netkf.plants.laws import course_width
@@ -270,6 +271,7 @@ class Filters(NamedTuple):
     gains: Gains
 
 
+@once_per_scenario
 def filters_at_start(scenario: Scenario) -> Filters:
     """Return the filters at time 0; if they are pooled, one stands for all."""
     # A pooled filter is one node with the id -1 and the sensors of all.
@@ -315,9 +317,10 @@ def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     )
 
 
-def entity_records(scenario: Scenario, senders: Senders) -> tuple[np.ndarray, np.ndarray]:
+@once_per_scenario
+def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """ENTITY and WAY records of a run that has not begun."""
-    index = scenario.topology.index
+    senders, index = senders_of(scenario), scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
     # (i, j) of a link or direction, (i, -1) of a node.
     ends = np.array([(*e, -1)[:2] for e in senders.entities], dtype=np.int64).reshape(-1, 2)

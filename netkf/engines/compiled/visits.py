@@ -42,9 +42,7 @@ from netkf.engines.compiled.lane_readings import (
 )
 from netkf.engines.compiled.lane_series import (
     LaneSeries,
-    blind_series,
     most_moments,
-    sensing_series,
 )
 from netkf.engines.compiled.state import Filters, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -128,14 +126,15 @@ class Visits(Struct):
     added: int
 
 
-def empty_visits(filters: Filters, weights: FloatArray, places: int, period: float) -> Visits:
-    """No visits, of filters at so many ``places``; ``weights`` (W,) of directed links, ``period``
-    of the sensing grid.
+def empty_visits(
+    filters: Filters, weights: FloatArray, places: int, series: tuple[LaneSeries, LaneSeries]
+) -> Visits:
+    """No visits, of filters at so many ``places``; ``weights`` (W,) of directed links, ``series``
+    of nodes without sensors and with them.
     """
     n, most = filters.xhat.shape[1], max(MOST_VISITS, 4 * places)
     own = np.maximum(0.0, 1.0 - weights)
-    blind, sensing = blind_series(filters), sensing_series(filters, period)
-    q = most_moments(filters)
+    (blind, sensing), q = series, most_moments(filters)
     shapes = {
         "gains": (3 * n * q, LANES),
         **dict.fromkeys(("x", "other_x", "moved"), (n, LANES)),
