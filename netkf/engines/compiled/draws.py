@@ -27,8 +27,8 @@ from netkf.scenario.scenario import Scenario
 MOST_BLOCKS = 16  # of steps that are drawn at once
 MOST_NORMALS = 1 << 20  # of all sensors
 COURSES = 16
-"""Pieces of a run whose courses are kept at a time: nodes are at much the same time, and all of
-them would not fit the processor's cache.
+"""Pieces of a run whose courses are kept at a time, a power of two: nodes are at much the same
+time, and all of them would not fit the processor's cache.
 """
 
 

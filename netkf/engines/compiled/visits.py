@@ -55,7 +55,7 @@ from netkf.linalg.structs import Struct
 MOST_VISITS = 1 << 14
 """Visits that wait: their records fit the processor's cache."""
 
-NOBODY, EVERYBODY, NOT_HEARD = -1, -2, -1
+NOBODY, EVERYBODY, NOT_HEARD, SENSES, UNKNOWN = -1, -2, -1, -1, -1
 BLIND, SENSING = 0, 1
 
 _NUMBERS = ("next", "first", "second", "to_first", "to_second", "run", "piece")
@@ -86,12 +86,16 @@ class Visits(Struct):
     ``records`` (C,), of which ``count`` are used; the ``level`` (F,) of each place's last visit,
     the ``first`` visit of each level (C + 2,) or -1, and the highest level, ``top``. Those of a
     level that combine, ``pairs`` (C,), and the stretches that sensing nodes still have before them,
-    ``stretches`` (F,), a ring of ``begun`` up to ``added``. ``shares`` (W, 4) of directed links:
-    own weight and that of the message, and their roots.
+    ``stretches`` (2^k >= F,), a ring of ``begun`` up to ``added``. ``model`` (F,) of the nodes at
+    places, SENSES of those with sensors, and the ``longest`` gap (M,) that one step of a model
+    spans. ``shares`` (K, 4), own weight and that of the message, and their roots: row
+    ``share[w]`` (W,) is that of directed link w.
 
     Predictions side by side, of nodes without sensors, of which some are ``waiting`` for company,
     and with them: ``lanes`` (2, L), their ``places`` (2, L), what their series give, ``blind_rows``
-    and ``sensing_rows`` (L, W), and ``readings``. The same by entry, of all lanes: ``columns``
+    and ``sensing_rows`` (L, W), and ``readings``. Pairs side by side: the places ``hearing`` (2, L)
+    of those that hear the other, and the shares of both ends ``in_lanes`` (8, L), those of the rows
+    ``known`` (2, L). The same by entry, of all lanes: ``columns``
     (W, L), ``values`` (E, L) and ``gains`` (3 n q, L), states ``x`` and ``other_x`` (n, L), ``S``
     and ``other_S`` (n, n, L); V, T (n, n, L) and ``moved`` (n, L) are scratch.
     """
@@ -101,9 +105,15 @@ class Visits(Struct):
     first: IntArray
     pairs: IntArray
     stretches: np.ndarray
+    model: IntArray
+    longest: FloatArray
+    share: IntArray
     shares: FloatArray
     lanes: np.ndarray
     places: IntArray
+    hearing: IntArray
+    known: IntArray
+    in_lanes: FloatArray
     blind: LaneSeries
     sensing: LaneSeries
     blind_rows: FloatArray
@@ -133,31 +143,39 @@ def empty_visits(
     of nodes without sensors and with them.
     """
     n, most = filters.xhat.shape[1], max(MOST_VISITS, 4 * places)
-    own = np.maximum(0.0, 1.0 - weights)
+    distinct, share = np.unique(weights, return_inverse=True)
+    own, table = np.maximum(0.0, 1.0 - distinct), filters.table
     (blind, sensing), q = series, most_moments(filters)
     shapes = {
         "gains": (3 * n * q, LANES),
         **dict.fromkeys(("x", "other_x", "moved"), (n, LANES)),
         **dict.fromkeys(("S", "other_S", "V", "T"), (n, n, LANES)),
+        "in_lanes": (8, LANES),
     }
-    for name, table in (("blind", blind), ("sensing", sensing)):
-        width = table.series.shape[3]
-        shapes[f"{name}_rows"] = (LANES, width)
+    for name, lane_table in (("blind", blind), ("sensing", sensing)):
+        shapes[f"{name}_rows"] = (LANES, lane_table.series.shape[3])
     width = max(blind.series.shape[3], sensing.series.shape[3])
-    shapes |= {"columns": (width, LANES), "values": (max(8, n * (n + 1) + 2 * n * n), LANES)}
+    shapes |= {"columns": (width, LANES), "values": (n * (n + 1) + 2 * n * n, LANES)}
+    nodes = filters.nodes
+    model = np.where(nodes["sensors"] > nodes["sensor"], SENSES, nodes["model"])
     return Visits(
         records=np.zeros(most, dtype=VISIT),
         level=np.zeros(places, dtype=np.int64),
         first=np.full(most + 2, -1, dtype=np.int64),
         pairs=np.zeros(most, dtype=np.int64),
-        shares=np.stack([own, weights, np.sqrt(own), np.sqrt(weights)], axis=1),
+        model=np.tile(model, places // len(nodes)),
+        longest=table.unit * 2.0 ** table.sizes[:, 4],
+        share=share.astype(np.int64).reshape(-1),
+        shares=np.stack([own, distinct, np.sqrt(own), np.sqrt(distinct)], axis=1),
         readings=empty_readings(filters),
         lanes=np.zeros((2, LANES), dtype=LANE),
         places=np.zeros((2, LANES), dtype=np.int64),
+        hearing=np.zeros((2, LANES), dtype=np.int64),
+        known=np.full((2, LANES), UNKNOWN, dtype=np.int64),
         blind=blind,
         sensing=sensing,
         **{name: with_spare(shape) for name, shape in shapes.items()},
-        stretches=np.zeros(places, dtype=STRETCH),
+        stretches=np.zeros(1 << (places - 1).bit_length(), dtype=STRETCH),
         waiting=0,
         count=0,
         top=0,
@@ -253,14 +271,12 @@ def join(state: Simulation, visits: Visits, v: int, place: int) -> None:
     if not now < visit.time:
         return
     state.now[place] = visit.time
-    node = state.nodes[node_at(state, visit.run, place)]
-    if node.sensors > node.sensor:
+    m, gap = visits.model[place], visit.time - now
+    if m == SENSES:
         add_stretch(visits, place, v, now, 0.0)
         return
-    # Nothing is observed, so that P may be as wide as it is.
-    m = node.model
-    if not is_quick(state.table, m, visit.time - now, 0.0):
-        gap = visit.time - now
+    # Nothing is observed, so that P may be as wide as it is: one step moves it if the gap is short.
+    if not gap < visits.longest[m]:
         move_root(state.table, m, state.root, state.xhat, place, gap, state.flow_scratch)
         return
     q = visits.waiting
@@ -276,11 +292,17 @@ def node_at(state: Simulation, run: int, place: int) -> int:
     return place - (run - state.first_run) * len(state.nodes)
 
 
+@kernel(inlined=True)
+def in_ring(visits: Visits, number: int) -> int:
+    """Return the place of a stretch: the remainder by a power of two, without a division."""
+    return number & (len(visits.stretches) - 1)
+
+
 @kernel
 def add_stretch(visits: Visits, place: int, v: int, now: float, least: float) -> None:
     """A node has come to ``now`` on its way to visit ``v``."""
     # A node is on its way to one visit of a level only, so the ring has space for all.
-    stretch = visits.stretches[visits.added % len(visits.stretches)]
+    stretch = visits.stretches[in_ring(visits, visits.added)]
     stretch.place, stretch.visit, stretch.now, stretch.least = place, v, now, least
     visits.added += 1
 
@@ -292,7 +314,7 @@ def use_stretches(state: Simulation, visits: Visits) -> None:
         # What follows a stretch is added while it is used.
         count = min(LANES, visits.added - visits.begun)
         for q in range(count):
-            stretch = visits.stretches[(visits.begun + q) % len(visits.stretches)]
+            stretch = visits.stretches[in_ring(visits, visits.begun + q)]
             visits.places[SENSING, q] = stretch.place
         take_states(state, visits.places[SENSING], count, visits.x, visits.S)
         fill_rates(state, visits, count)
@@ -306,7 +328,7 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
     """Write trace(P G) and trace(P) of the nodes in lanes, of which so many are used."""
     size, readings = state.size, visits.readings
     for q in range(count):
-        stretch = visits.stretches[(visits.begun + q) % len(visits.stretches)]
+        stretch = visits.stretches[in_ring(visits, visits.begun + q)]
         visit = visits.records[stretch.visit]
         h = node_at(state, visit.run, stretch.place)
         know_model(readings, q, state.nodes[h].model, state.table.seen)
@@ -319,7 +341,7 @@ def begin_stretch(state: Simulation, visits: Visits, q: int) -> None:
     """Take the next stretch, whose node is in lane q: let it use the lane, or use it at once where
     it is to be used alone.
     """
-    stretch, readings = visits.stretches[visits.begun % len(visits.stretches)], visits.readings
+    stretch, readings = visits.stretches[in_ring(visits, visits.begun)], visits.readings
     place, now, v = stretch.place, stretch.now, stretch.visit
     visits.begun += 1
     visit = visits.records[v]
@@ -479,35 +501,39 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
 def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None:
     """Let the nodes of ``count`` visits hear each other, from place ``k`` of ``pairs`` on."""
     records, places = visits.records, visits.places
-    for q in range(count):
-        visit = records[visits.pairs[k + q]]
-        places[0, q], places[1, q] = visit.first, visit.second
-    # Both are as they were before either hears the other.
-    take_states(state, places[0], count, visits.x, visits.S)
-    take_states(state, places[1], count, visits.other_x, visits.other_S)
     heard_0, heard_1 = False, False
     for q in range(count):
         visit = records[visits.pairs[k + q]]
-        heard_0 = set_shares(visits, 0, q, visit.to_first) or heard_0
-        heard_1 = set_shares(visits, 1, q, visit.to_second) or heard_1
+        places[0, q], places[1, q] = visit.first, visit.second
+        heard_0 = hear_in_lane(visits, 0, q, visit.to_first, visit.first) or heard_0
+        heard_1 = hear_in_lane(visits, 1, q, visit.to_second, visit.second) or heard_1
+    for q in range(count, LANES):
+        visits.hearing[0, q] = visits.hearing[1, q] = NOBODY
+    # Both are as they were before either hears the other.
+    take_states(state, places[0], count, visits.x, visits.S)
+    take_states(state, places[1], count, visits.other_x, visits.other_S)
     if heard_0:
         combine_lanes(state, visits, 0, visits.x, visits.S, visits.other_x, visits.other_S)
-        put_states(state, places[0], visits.moved, visits.V)
+        put_states(state, visits.hearing[0], visits.moved, visits.V)
     if heard_1:
         combine_lanes(state, visits, 1, visits.other_x, visits.other_S, visits.x, visits.S)
-        put_states(state, places[1], visits.moved, visits.V)
+        put_states(state, visits.hearing[1], visits.moved, visits.V)
 
 
 @kernel
-def set_shares(visits: Visits, side: int, lane: int, way: int) -> bool:
-    """Write the shares of what is heard on a directed link into a lane; False, and nobody's lane,
-    where nothing is heard.
+def hear_in_lane(visits: Visits, side: int, lane: int, way: int, place: int) -> bool:
+    """Note in a lane that the node at a place hears something on a directed link, and by which
+    shares; False, and nobody's lane, where nothing is heard.
     """
     if way == NOT_HEARD:
-        visits.places[side, lane] = NOBODY
+        visits.hearing[side, lane] = NOBODY
         return False
-    for k in range(4):
-        visits.values[4 * side + k, lane] = visits.shares[way, k]
+    visits.hearing[side, lane] = place
+    share = visits.share[way]
+    if visits.known[side, lane] != share:
+        visits.known[side, lane] = share
+        for k in range(4):
+            visits.in_lanes[4 * side + k, lane] = visits.shares[share, k]
     return True
 
 
@@ -522,7 +548,7 @@ def combine_lanes(
     other_S: FloatArray,
 ) -> None:
     """Write H (7) and (9) into ``moved`` and ``V``: of x and S with what they hear of others."""
-    size, n, values = state.size, len(state.size), visits.values
+    size, n, values = state.size, len(state.size), visits.in_lanes
     total, wide = local_lanes_matrix(size, MANY, visits.V), local_lanes_matrix(size, MANY, visits.T)
     own, weight = load(MANY, values, 4 * side), load(MANY, values, 4 * side + 1)
     own_root, root = load(MANY, values, 4 * side + 2), load(MANY, values, 4 * side + 3)
