@@ -97,9 +97,10 @@ class DiffusionPaths:
         self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
 
-    def following(self, blocks: int = 1) -> Block:
-        """The next steps of the sensing grid, ``blocks`` times BLOCK."""
-        laws, (count, n), total = self.laws, self._x.shape, blocks * BLOCK
+    def following(self, blocks: int = 1, most: int | None = None) -> Block:
+        """The next steps of the sensing grid, ``blocks`` times BLOCK, but ``most`` at most."""
+        laws, (count, n) = self.laws, self._x.shape
+        total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
         x_start, x_end = (np.empty((count, total, n)) for _ in range(2))
         moments, cubic = np.empty((count, total, 2, n)), np.empty((count, total, 4, n))
         # One kernel call draws all steps of all runs: end, moments and cubic.

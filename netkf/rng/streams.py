@@ -40,8 +40,13 @@ class Streams:
         return np.random.SeedSequence(entropy=self.seed, spawn_key=key)
 
     @property
+    def runs(self) -> int:
+        """Number of runs, of which ``ReplicaStreams`` has several."""
+        return 1
+
+    @property
     def per_replica(self) -> tuple[Streams, ...]:
-        """The source of each run, as ``ReplicaStreams`` has several."""
+        """The source of each run."""
         return (self,)
 
     def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
@@ -84,6 +89,11 @@ class ReplicaStreams:
     seed: int
     replica: int
     count: int
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.count
 
     @property
     def per_replica(self) -> tuple[Streams, ...]:

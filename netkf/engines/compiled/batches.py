@@ -194,8 +194,9 @@ class BatchDraws:
         # Runs that are simulated one by one, where origins move, look at outcomes themselves.
         at_once = is_immediate(scenario) and not len(self.paths.frame_times)
         self.ticks = all_ticks(scenario, streams, at_once)
-        self._block = self.paths.following()
-        noise = Noise(scenario, streams, steps_to_the_end(scenario))
+        steps = steps_to_the_end(scenario)
+        self._block = self.paths.following(steps)
+        noise = Noise(scenario, streams, steps)
         # One stretch of noise reaches the horizon: it is drawn once.
         noise.following()
         self.sensing = noise.sensing

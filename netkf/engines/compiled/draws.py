@@ -99,9 +99,11 @@ class Paths:
             times = np.array([grid_time(laws.period, steps * k) for k in range(1, count)])
             self.frame_times = times[times < scenario.horizon]
 
-    def following(self) -> Block:
-        """The next steps of all runs together; the last ones reach beyond the horizon."""
-        return self._paths.following(self._blocks)
+    def following(self, most: int | None = None) -> Block:
+        """The next steps of all runs together, ``most`` of them at most; the last ones reach the
+        horizon, or beyond it.
+        """
+        return self._paths.following(self._blocks, most)
 
     def block(self, block: Block, together: int = 1) -> PathBlock:
         """The same for the event loop, which simulates so many runs ``together``."""
@@ -182,7 +184,7 @@ class Noise:
         cuts = StreamNormals(streams.seed_words("cut", keys))
         # Without increment sensors the period is not used; it only must not be None.
         self._period = float(scenario.truth.sensing_period or 1.0) if keys else 1.0
-        runs, ziggurat = len(streams.per_replica), normal_ziggurat()
+        runs, ziggurat = streams.runs, normal_ziggurat()
         count, most = shared["H"].shape[:2]
         even = bool((shared["rows"] == most).all())
         self.sensing = Sensing(

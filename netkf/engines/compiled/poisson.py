@@ -258,7 +258,7 @@ class PoissonSchedules:
         senders: Senders | None = None,
         bits: bool = False,
     ) -> None:
-        runs = len(streams.per_replica)
+        runs = streams.runs
         senders = senders_of(scenario) if senders is None else senders
         ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs
         # No states where nothing is random: draw_ticks() then draws no number.

@@ -87,7 +87,7 @@ class Clocks:
     ) -> None:
         clock, runs, entities = (
             scenario.network.activation,
-            len(streams.per_replica),
+            streams.runs,
             senders.entities,
         )
         assert isinstance(clock, LinkClock) or not entities
@@ -180,7 +180,7 @@ class Outcomes:
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
         self._channel = channel = scenario.network.channel
-        runs = len(streams.per_replica)
+        runs = streams.runs
         self._senders, self._ways = senders, len(senders.ways)
         self._first, self._hearing = senders.first, senders.hearing
         self._count, self._sources = len(senders.entities), len(senders.sources)
@@ -303,7 +303,7 @@ class EntityDraws:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
-        self.count = len(senders.entities) * len(streams.per_replica)
+        self.count = len(senders.entities) * streams.runs
         self._clocks = Clocks(scenario, streams, senders)
         self._outcomes = Outcomes(scenario, streams, senders)
         self.sizes = self._outcomes.sizes
@@ -415,7 +415,7 @@ class ReadingsSchedule:
 
 def whole_schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
     """All ticks of each of several runs, as one window."""
-    senders, runs = senders_of(scenario), len(streams.per_replica)
+    senders, runs = senders_of(scenario), streams.runs
     draws = EntityDraws(scenario, streams, senders)
     if not draws.count:
         return [NO_TICKS.window(math.inf, draws.sizes)] * runs
