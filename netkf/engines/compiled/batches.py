@@ -36,10 +36,10 @@ from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import KINDS
 
-LARGEST_BATCH = 256
+LARGEST_BATCH = 512
 QUICK_VISITS = 1 << 15
 """Visits of nodes that take some milliseconds."""
-MOST_BYTES = 1 << 24
+MOST_BYTES = 1 << 25
 """Bytes that are drawn for a batch, and that its samples take."""
 
 
