@@ -66,7 +66,7 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
 def know_course(state: Simulation, run: int, piece: int) -> int:
     """Make the course of x in a piece known; returns its place among those of the run."""
     path, k = state.path, run - state.first_run
-    place = piece & (path.known.shape[1] - 1)
+    place: int = piece & (path.known.shape[1] - 1)
     # The same for all nodes that read a part of the piece.
     if path.known[k, place] != piece:
         path.known[k, place] = piece
