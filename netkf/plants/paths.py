@@ -171,7 +171,9 @@ class DiffusionPaths:
             laws = np.unique(np.stack([lengths, lefts]), axis=1, return_inverse=True)[1].ravel()
             for law in range(int(laws.max()) + 1):
                 same = np.flatnonzero(chosen)[laws == law]
-                self._split(pieces, rows[same], stops[same], shown[same], normals[:, same])
+                self._split(
+                    pieces, rows[same], stops[same], shown[same], np.take(normals, same, axis=1)
+                )
         return pieces
 
     def _split(

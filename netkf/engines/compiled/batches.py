@@ -27,6 +27,7 @@ from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.state import Filters, PathBlock, Sensing
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.lanes import LANES
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -156,8 +157,10 @@ def batch_size(scenario: Scenario) -> int:
     # per step the two moments of each sensor's noise.
     drawn = steps * (8 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
     samples = len(scenario.times) * filters * n * (n + 2)
-    # At least one run, however large it is.
-    return max(1, int(min(LARGEST_BATCH, MOST_BYTES / (8.0 * (drawn + samples)))))
+    # At least one run, however large it is. Statistics take L runs side by side: as long for some
+    # as for all.
+    size = max(1, int(min(LARGEST_BATCH, MOST_BYTES / (8.0 * (drawn + samples)))))
+    return min(LARGEST_BATCH, -(-size // LANES) * LANES) if size > LANES // 2 else size
 
 
 @once_per_scenario
