@@ -204,7 +204,21 @@ def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
 
 
 @kernel
-def draw_messages(
+def draw_broadcasts(
+    lanes: Lanes, c: Channels, exchanged: np.ndarray, fresh: np.ndarray, up: np.ndarray
+) -> None:
+    """Fill ``up`` (B, S, E, W, L), zeros before, in the slots that are ``exchanged`` (S,), where
+    every link is used in every step; links draw anew in steps that are ``fresh`` (E,).
+    """
+    for b in range(up.shape[0]):
+        for s in range(up.shape[1]):
+            for e in range(up.shape[2] if exchanged[s] else 0):
+                for link in range(len(c.ends)):
+                    draw_link(lanes, c, b, link, fresh[e], up, s, e)
+
+
+@kernel
+def draw_matched(
     lanes: Lanes,
     c: Channels,
     m: Matchings,
@@ -214,19 +228,13 @@ def draw_messages(
     active: np.ndarray,
     count: np.ndarray,
 ) -> None:
-    """Fill ``up`` (B, S, E, W, L), zeros before, in the slots that are ``exchanged`` (S,); links
-    draw anew in steps that are ``fresh`` (E,). Of matchings, ``active`` (R, S, E, A) are the links
-    in their order and ``count`` (R, S, E) is their number.
+    """``draw_broadcasts`` for the links of matchings: ``active`` (R, S, E, A) gets them in their
+    order and ``count`` (R, S, E) their number.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
             for e in range(up.shape[2] if exchanged[s] else 0):
-                if m.protocol >= 0:
-                    draw_pairs(lanes, c, m, fresh[e], up, active, count, b, s, e)
-                    continue
-                # Broadcast: every link is used in every step.
-                for link in range(len(c.ends)):
-                    draw_link(lanes, c, b, link, fresh[e], up, s, e)
+                draw_pairs(lanes, c, m, fresh[e], up, active, count, b, s, e)
 
 
 @kernel

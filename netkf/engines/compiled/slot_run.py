@@ -33,7 +33,8 @@ from netkf.engines.compiled.slot_messages import (
     Rows,
     SlotTimes,
     count_events,
-    draw_messages,
+    draw_broadcasts,
+    draw_matched,
     make_rows,
 )
 from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
@@ -273,10 +274,14 @@ class SlotRuns:
             np.empty((matched, *steps, pairs), dtype=np.int64),
             np.zeros((matched, *steps), dtype=np.int64),
         )
-        if len(setup.directions):
-            draw_messages(
-                MANY, self._channels, self._matchings, times.exchanged, setup.fresh, *drawn
-            )
+        if not len(setup.directions):
+            return drawn
+        channels, exchanged, fresh = self._channels, times.exchanged, setup.fresh
+        # Two kernels: a run compiles only the one that it needs.
+        if matched:
+            draw_matched(MANY, channels, self._matchings, exchanged, fresh, *drawn)
+        else:
+            draw_broadcasts(MANY, channels, exchanged, fresh, drawn.up)
         return drawn
 
     def _states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
