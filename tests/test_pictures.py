@@ -1,6 +1,9 @@
 """Commands whose pictures, or whose files, cannot be written: their answers and statuses stay."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -60,6 +63,14 @@ def test_a_directory_in_use_is_refused_before_anything_runs(name, tmp_path, caps
     (tmp_path / "mine").write_text("")
     assert main([*COMMANDS[name], "--out", str(tmp_path)]) == 2
     assert "must be a new or empty directory" in capsys.readouterr().err
+
+
+def test_the_name_of_a_window_does_not_matter(tmp_path):
+    words = [sys.executable, "-m", "netkf", *COMMANDS["run"], "--out", str(tmp_path / "out")]
+    env = {**os.environ, "MPLBACKEND": "nonsense"}
+    done = subprocess.run(words, env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "run.png").exists()
 
 
 def test_a_verdict_has_no_picture_of_fewer_runs(tmp_path):

@@ -46,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Processes that Python starts for workers would import from the current folder before they
         # are told the path of this one; it may be that of a scenario of someone else.
         os.environ["PYTHONSAFEPATH"] = "1"
+        # Figures go to files; for the name of a window that it lacks matplotlib raises ValueError.
+        os.environ["MPLBACKEND"] = "agg"
         run_as_process(partial(_run_command, sys.argv[1:]))
     with Interruption() as interruption:
         return _run_command(arguments, interruption)

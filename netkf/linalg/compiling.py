@@ -6,10 +6,12 @@ on disk, so that the next process starts at once; numba itself is imported with 
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from functools import cache, cached_property, update_wrapper
@@ -228,19 +230,30 @@ def _folder(chosen: str) -> Path:
 
 
 def _cache_folder_for(chosen: str, root: Path) -> Path:
-    """Return numba's folder if it was set, else one beside the sources or in the user's cache."""
-    # The user's choice, NUMBA_CACHE_DIR.
-    if chosen:
-        return Path(chosen)
-    beside = root / "__pycache__"
+    """Return the first folder of these that can be written: numba's if it was set, else one beside
+    the sources and that of the user's cache; then one of this process alone.
+    """
+    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    # The user's choice, NUMBA_CACHE_DIR. An installation may be read-only.
+    places = [Path(chosen)] if chosen else [root / "__pycache__", home / "netkf"]
+    # numba would look for a folder of its own, where code may be out of date.
+    return next((place for place in places if _is_writable(place)), None) or _folder_of_process()
+
+
+def _is_writable(folder: Path) -> bool:
     try:
-        beside.mkdir(exist_ok=True)
-        writable = os.access(beside, os.W_OK)
-    except OSError:
-        writable = False
-    # An installation may be read-only.
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return beside if writable else home / "netkf"
+        folder.mkdir(parents=True, exist_ok=True)
+        return os.access(folder, os.R_OK | os.W_OK | os.X_OK)
+    except (OSError, ValueError):  # ValueError: a name that no folder can have
+        return False
+
+
+def _folder_of_process() -> Path:
+    """Return a new folder, which is removed when the process ends."""
+    # Kept code is executed when it is read: a folder with a fixed name could be another user's.
+    made = Path(tempfile.mkdtemp(prefix="netkf-"))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made
 
 
 def _make_room(folder: Path) -> None:

@@ -50,7 +50,8 @@ def read_numbers(
         empty = [name for name in columns if table[name].null_count]
         if not all(missing and pa.types.is_floating(known[name]) for name in empty):
             raise DamagedError(f"{path.name} has missing values")
-        return pd.DataFrame(table.to_pandas())
+        # Types that pandas has noted in the file are not netkf's: plain numbers only.
+        return pd.DataFrame(table.to_pandas(ignore_metadata=True))
 
 
 def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str]:

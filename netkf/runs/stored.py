@@ -211,6 +211,9 @@ def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:
         raise DamagedError(f"{path.name} has events of an unknown kind")
     rows = np.empty(len(table), dtype=EVENT)
     for name in columns:
+        whole = EVENT[name].kind == "i"
+        if whole and table[name].dtype.kind != "i":
+            raise DamagedError(f"{path.name} has no column {name} of integers")
         rows[name] = table[name]
     rows["kind"] = np.asarray(codes, dtype=np.uint8)[kinds.cat.codes]
     known = [-1, *scenario.nodes]

@@ -1,11 +1,13 @@
 """Kernels: called alike from Python and from kernels, compiled once for given types."""
 
 import pickle
+import stat
 
 import numba
 import numpy as np
 import pytest
 
+from netkf.linalg import compiling
 from netkf.linalg.compiling import kernel
 
 
@@ -58,3 +60,20 @@ def test_kernels_are_found_by_name():
     assert pickle.loads(pickle.dumps(power)) is power
     assert power.__name__ == "power"
     assert power.__doc__.startswith("Return scale")
+
+
+def test_compiled_code_is_kept_where_it_can_be_written_or_by_the_process_alone(
+    tmp_path, monkeypatch
+):
+    file = tmp_path / "file"
+    file.touch()
+    find = compiling._cache_folder_for
+    assert find(str(tmp_path / "mine"), tmp_path) == tmp_path / "mine"
+    assert find("", tmp_path) == tmp_path / "__pycache__"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert find("", file) == tmp_path / "cache" / "netkf"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))
+    for chosen in (str(file), str(file / "in"), "a\0b", ""):
+        own = find(chosen, file)
+        assert stat.S_IMODE(own.stat().st_mode) == 0o700
+        assert not any(own.iterdir())
