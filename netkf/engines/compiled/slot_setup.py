@@ -296,11 +296,11 @@ class SlotSetup:
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
 
 
-BLOCK_BYTES = 1 << 22
-"""Of what is drawn for one call of a filter's kernel: more leaves the caches of a core, and of less
-the time between calls is a larger part.
+BLOCK_BYTES = 1 << 24
+"""Of what is drawn for one call of a filter's kernel. Kernels go through it once, in order: that it
+leaves the caches of a core costs less than more calls would.
 """
-BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 25, 1 << 29, 1024
+BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 26, 1 << 29, 1024
 """Of the samples of a batch, those of a block of lanes, and the largest number of runs."""
 QUICK_FLOPS = 1 << 25
 """Of runs that are worth doing together from the first one on: some ten milliseconds."""
