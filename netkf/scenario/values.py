@@ -8,10 +8,13 @@ from netkf.core.errors import ScenarioError
 from netkf.scenario.reading import parse_toml
 
 LONGEST_WORD = 1000
+LONGEST_SETTING = 100_000
+"""Characters of a setting; Linux passes no argument of more than 131,071."""
 
 
 def split_setting(option: str, setting: str) -> tuple[str, str]:
     """Return key path and text of ``key.path=value``; raises ScenarioError at the ``option``."""
+    _require_short(option, setting)
     key, equals, text = (part.strip() for part in setting.partition("="))
     if not equals or not key or not text:
         remedy = "write it that way"
@@ -35,11 +38,18 @@ def typed_value(option: str, key: str, text: str) -> Any:
 
 def typed_values(option: str, key: str, text: str) -> list[Any]:
     """Return the values of ``v1,v2,...``; commas inside brackets and quotes separate nothing."""
+    _require_short(option, text)
     try:
         values = _toml(f"[{text}]")
     except (ValueError, RecursionError):
         return [typed_value(option, key, part.strip() or " ") for part in _parts(text)]
     return list(values)
+
+
+def _require_short(option: str, text: str) -> None:
+    if len(text) > LONGEST_SETTING:
+        rule = f"must have at most {LONGEST_SETTING:,} characters"
+        raise ScenarioError(option, rule, len(text), "write long values into the file")
 
 
 def _toml(text: str) -> Any:

@@ -94,6 +94,7 @@ def test_grids_are_lists_ranges_tables_and_words():
         (["sweep", RING, "--vary", f"{RATE}=a:b:3"], "must be START:STOP:COUNT"),
         (["sweep", RING, "--vary", f"{RATE}=1:2:9999", "--vary", "horizon=1:2:9"], "is a grid of"),
         (["sweep", RING, "--vary", f"{RATE}=[1,"], "is not valid TOML"),
+        (["sweep", RING, "--vary", f"{RATE}={'1,' * 60_000}"], "must have at most 100,000 char"),
         (["size", RING, "--vary", f"{RATE}=1", "--target", "mean_rms<=1"], "must be LOW:HIGH"),
         (["size", RING, "--vary", f"{RATE}=5:1", "--target", "mean_rms<=1"], "lower to a higher"),
         (["size", RING, "--vary", f"{RATE}=1:nan", "--target", "mean_rms<=1"], "must be LOW:HIGH"),
