@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from netkf.algorithms.belief_propagation import is_forest
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import AssumptionRow, true_model_row
-from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.evidence import AssumptionRow
+from netkf.theory.common.plant_assumptions import model_and_start_rows
 
 SOURCE = "Weiss and Freeman 2001"
 TREE = "the graph has no loops"
@@ -13,11 +13,7 @@ TREE = "the graph has no loops"
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the graph and the first covariances."""
-    return [
-        true_model_row(scenario, SOURCE, "same F, Q and R"),
-        *weight_rows(scenario),
-        *start_rows(scenario, SOURCE),
-    ]
+    return model_and_start_rows(scenario, SOURCE, *weight_rows(scenario))
 
 
 def weight_rows(scenario: Scenario) -> list[AssumptionRow]:

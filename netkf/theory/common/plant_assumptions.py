@@ -53,3 +53,16 @@ def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
             ),
         )
     ]
+
+
+def model_and_start_rows(
+    scenario: Scenario, source: str, *between: AssumptionRow
+) -> list[AssumptionRow]:
+    """Return the rows of a filter in slots of which little is assumed: that it knows the model,
+    those about its network, ``between``, and its first covariances.
+    """
+    return [
+        true_model_row(scenario, source, "same F, Q and R"),
+        *between,
+        *start_rows(scenario, source),
+    ]

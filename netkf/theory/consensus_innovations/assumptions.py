@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import AssumptionRow, true_model_row
-from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.evidence import AssumptionRow
+from netkf.theory.common.plant_assumptions import model_and_start_rows
 from netkf.theory.common.random_links import messages_are_sure
 
 SOURCE = "Das and Moura 2017"
@@ -15,8 +15,4 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the messages and the first covariances."""
     sure = messages_are_sure(scenario)
     words = "every message arrives in its slot" if sure else "gains are those without losses"
-    return [
-        true_model_row(scenario, SOURCE, "same F, Q and R"),
-        (SURE, SOURCE, sure, words),
-        *start_rows(scenario, SOURCE),
-    ]
+    return model_and_start_rows(scenario, SOURCE, (SURE, SOURCE, sure, words))

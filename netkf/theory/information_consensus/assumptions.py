@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import AssumptionRow, true_model_row
-from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.evidence import AssumptionRow
+from netkf.theory.common.plant_assumptions import model_and_start_rows
 from netkf.theory.information_consensus.errors import effective_weights, step_weights
 
 SOURCE = "Battistelli and Chisci 2014"
@@ -23,11 +23,8 @@ TOLERANCE = 1e-12
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the weights of readings and the first covariances."""
-    return [
-        true_model_row(scenario, SOURCE, "same F, Q and R"),
-        (ONCE, "derived", *_judge_counts(scenario)),
-        *start_rows(scenario, SOURCE),
-    ]
+    once: AssumptionRow = (ONCE, "derived", *_judge_counts(scenario))
+    return model_and_start_rows(scenario, SOURCE, once)
 
 
 def _judge_counts(scenario: Scenario) -> tuple[bool, str]:

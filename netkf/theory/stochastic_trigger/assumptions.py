@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import AssumptionRow, true_model_row
-from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.evidence import AssumptionRow
+from netkf.theory.common.plant_assumptions import model_and_start_rows
 from netkf.theory.stochastic_trigger.errors import everyone_hears
 
 SOURCE = "Han et al. 2015"
@@ -15,8 +15,4 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the network and the first covariances."""
     heard = everyone_hears(scenario)
     words = "silence is a decision" if heard else "who misses a message takes it for silence"
-    return [
-        true_model_row(scenario, SOURCE, "same F, Q and R"),
-        (HEARD, SOURCE, heard, words),
-        *start_rows(scenario, SOURCE),
-    ]
+    return model_and_start_rows(scenario, SOURCE, (HEARD, SOURCE, heard, words))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import AssumptionRow, true_model_row
-from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.evidence import AssumptionRow
+from netkf.theory.common.plant_assumptions import model_and_start_rows
 from netkf.theory.common.random_links import messages_are_sure
 
 SOURCES = {
@@ -17,7 +17,7 @@ SOURCES = {
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model and the first covariances."""
     source = SOURCES[scenario.hosted.combination]
-    rows = [true_model_row(scenario, source, "same F, Q and R"), *start_rows(scenario, source)]
+    rows = model_and_start_rows(scenario, source)
     if scenario.hosted.combination != "tracks":
         return rows
     sure = messages_are_sure(scenario)
