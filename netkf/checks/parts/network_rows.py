@@ -93,7 +93,8 @@ def _loss_interval(
 
     Independent losses of one direction have exact limits. Otherwise runs are: what is lost of the
     messages of a run beyond their expected loss has the mean 0. Where few runs lost any, or few
-    delivered any, their spread says little, and limits hold for every law of a run.
+    delivered any, their spread says little: limits are those of independent messages if that is
+    what is stated, else they hold for every law of a run.
     """
     total, runs = float(sent[:, which].sum()), len(sent)
     excess = (lost[:, which] - sent[:, which] * q[which]).sum(axis=1)
@@ -102,7 +103,14 @@ def _loss_interval(
         found = probability_interval(int(lost[:, which].sum()), int(total), level)
         return deviation_interval(expected, found)
     some = lost[:, which].sum(axis=1), (sent[:, which] - lost[:, which]).sum(axis=1)
-    if min(np.count_nonzero(part) for part in some) < MIN_EVENTS:
+    few = min(np.count_nonzero(part) for part in some) < MIN_EVENTS
+    if few and _is_independent(scenario):
+        # The sum of independent losses of unequal probabilities has lighter tails than that of
+        # equal ones (Hoeffding 1956). Both directions of a link may share one loss.
+        each = 2 if scenario.network.channel.symmetric else 1
+        found = probability_interval(int(some[0].sum()) // each, int(total) // each, level)
+        return deviation_interval(expected, found)
+    if few:
         found = _share_of_bounded_runs(excess, sent[:, which].sum(axis=1), expected, level)
         return deviation_interval(expected, found)
     # A spread of at least one message of all: a few rare losses may show none.
