@@ -495,3 +495,17 @@ def test_a_node_that_nobody_can_follow_takes_seconds_or_is_refused(build):
         np.testing.assert_allclose(one, other, rtol=1e-6)
     with pytest.raises(netkf.TheoryError, match=r"cannot be integrated beyond 3\.\d+ s: the covar"):
         theory.covariance_bound(scenario, [8.0])
+
+
+def test_a_bound_that_begins_at_0_beside_a_precise_sensor_ends(build):
+    """Implicit steps ended as soon as a covariance had grown by a factor of 0, again and again."""
+    scenario = build(
+        horizon=40.0,
+        plant={"kind": "diffusion", "A": [[-0.5]], "B": [[1.0]], "cov": [[0.0]]},
+        sensors=[{"nodes": [0], "H": [[1.0]], "R": [[1e-7]]}],
+    )
+    times, one = [1.0, 40.0], np.ones((1, 1))
+    found = theory.covariance_bound(scenario, times)
+    gains = [1e7 * one, 0.0 * one]
+    expected = plain_bound(-0.5 * one, one, gains, 1.0 - np.eye(2), 0.0 * one, times)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)

@@ -141,6 +141,8 @@ class _PiecewiseSolution:
             slope = self._slope(begin)
             if delay == 0.0 or end - begin <= delay * (1.0 + 1e-12):
                 output, end = self._integrate(begin, end, slope, math.inf if delay else GROWTH)
+                if not end > begin:
+                    raise TheoryError(f"H(12) could not be integrated beyond {begin:g} s")
                 self._append(end, output)
             else:
                 self._iterate(begin, end, slope)
@@ -239,7 +241,7 @@ class _PiecewiseSolution:
                 method="Radau",
                 jac=self._jacobian,
                 max_step=max_step,
-                events=_grown(growth * float(np.abs(self._first).max())),
+                events=_grown(growth * float(self._sizes().max())),
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
@@ -263,7 +265,7 @@ class _PiecewiseSolution:
         of the root of the other's, whose inflow is rounded: a solver that is asked for more makes
         ever smaller steps. Raises TheoryError where rounding exceeds DEFECT_TOLERANCE.
         """
-        sizes = np.maximum(np.abs(self._first).max(axis=1), _scale(self._packed))
+        sizes = self._sizes()
         rounding = ROUNDING * sizes.max()
         if rounding > DEFECT_TOLERANCE * sizes.min():
             raise TheoryError(
@@ -273,6 +275,10 @@ class _PiecewiseSolution:
             )
         tolerance = 1e-3 * TOLERANCE * sizes + rounding
         return np.repeat(tolerance, self._first.shape[1])
+
+    def _sizes(self) -> FloatArray:
+        """Return the size (N,) of the covariance of each node, also where it begins at 0."""
+        return np.asarray(np.maximum(np.abs(self._first).max(axis=1), _scale(self._packed)))
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
         """Return the sparse Jacobian (N m, N m) of the right-hand side at ``y``."""
