@@ -90,6 +90,7 @@ def near_the_end(a):
     return a[-1, -3, 2] + 100 * a[-2, 1, -1] + 10000 * a[-1][1][-1]
 
 
+@pytest.mark.skipif("NUMBA_BOUNDSCHECK" in os.environ, reason="literals in tuples are refused then")
 def test_places_that_are_written_as_negative_numbers_count_from_the_end():
     """Those that are computed never do: kernels do not ask them."""
     a = np.arange(24).reshape(2, 3, 4)

@@ -43,7 +43,7 @@ def walk_on_at(memory: np.ndarray, k: int, j: int) -> float:
 def make():
     return Walk(
         position=np.zeros((2, 3)),
-        points=np.zeros(2, dtype=POINT),
+        points=np.zeros(4, dtype=POINT),
         steps=0,
         length=0.5,
         clock=Clock(times=np.arange(10.0), next=1),
@@ -59,7 +59,7 @@ def test_kernels_read_and_write_fields(call):
     assert (walk.steps, walk.clock.next) == (2, 3)
     assert walk.position[3, 4] == 3.0
     assert walk.position.sum() == 22.0
-    assert walk.points["mark"].tolist() == [0, 1]
+    assert walk.points["mark"].tolist() == [0, 1, 0, 2]
     walk.clock = Clock(times=np.full(3, 7.0), next=-1)
     assert call(walk, 0, 0) == 7.0
 
