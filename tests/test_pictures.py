@@ -40,7 +40,11 @@ def test_a_picture_that_cannot_be_written_is_a_note(name, tmp_path, capsys, monk
 
 @pytest.mark.parametrize(
     ("name", "writer"),
-    [("check", "netkf.checks.storage"), ("compare-filters", "netkf.studies.compare_filters")],
+    [
+        ("check", "netkf.checks.storage"),
+        ("compare-filters", "netkf.studies.compare_filters"),
+        ("sweep", "netkf.studies.sweep"),
+    ],
 )
 def test_an_answer_whose_files_cannot_be_written_is_printed(
     name, writer, tmp_path, capsys, monkeypatch

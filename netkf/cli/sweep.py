@@ -52,36 +52,45 @@ def _run(options: argparse.Namespace) -> int:
 
     grid, scenario = parse_grid(options.vary), load_scenario(options)
     draw = partial(pictures.draw_picture, pictures.SWEEP, scenario.name)
-    with only_writer(options.out), ProgressLine() as line:
-        completed = sweep_to_directory(
-            scenario,
-            grid,
-            options.runs,
-            options.out,
-            options.engine,
-            options.workers,
-            options.scheduler,
-            progress=line.counter("points"),
-            finish=None if options.no_plot else draw,
-        )
-    if options.json:
-        rows = completed.table.to_dict("records")
-        print_json({"directory": str(completed.directory), "rows": rows})
-    else:
-        _print_sweep(scenario, completed, options.runs)
+    completed: list[CompletedSweep] = []
+    try:
+        with only_writer(options.out), ProgressLine() as line:
+            sweep_to_directory(
+                scenario,
+                grid,
+                options.runs,
+                options.out,
+                options.engine,
+                options.workers,
+                options.scheduler,
+                progress=line.counter("points"),
+                finish=None if options.no_plot else draw,
+                take=completed.append,
+            )
+    finally:  # a sweep whose files cannot be written is an answer too
+        for one in completed:
+            _print_sweep(scenario, one, options)
+    if not options.json:
+        print(f"written to {completed[0].directory}")
     return 0
 
 
-def _print_sweep(scenario: Scenario, completed: CompletedSweep, runs: int) -> None:
+def _print_sweep(
+    scenario: Scenario, completed: CompletedSweep, options: argparse.Namespace
+) -> None:
     from netkf.studies.tables import sweep_text
 
+    if options.json:
+        rows = completed.table.to_dict("records")
+        print_json({"directory": str(completed.directory), "rows": rows})
+        return
+    runs = options.runs
     print_title(scenario)
     print(f"\n{sweep_text(completed.table, completed.keys)}\n")
     points = len(completed.table)
     line = f"{points:,} point{'s' if points > 1 else ''} of {runs:,} run{'s' if runs > 1 else ''}"
     line += f" in {completed.seconds:.2f} s, all with the same random draws"
     print(line + ("; +- one standard error" if runs > 1 else ""))
-    print(f"written to {completed.directory}")
 
 
 COMMAND = Command(

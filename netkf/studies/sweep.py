@@ -170,13 +170,17 @@ def sweep_to_directory(
     scheduler: str | None = None,
     progress: Progress | None = None,
     finish: Callable[[CompletedSweep], None] | None = None,
+    take: Callable[[CompletedSweep], None] | None = None,
 ) -> CompletedSweep:
     """Sweep and write sweep.parquet, sweep.csv, the base scenario.toml and manifest.json.
 
-    ``finish`` adds its files to the directory before the manifest says that the sweep is complete.
-    A sweep that is interrupted keeps the rows that it had. Raises ScenarioError before anything
-    runs, InterruptedRunError when interrupted.
+    ``take`` is given a complete sweep before its files are written, which may fail; ``finish`` adds
+    its files to the directory before the manifest says that the sweep is complete. A sweep that is
+    interrupted keeps the rows that it had. Raises ScenarioError before anything runs,
+    InterruptedRunError when interrupted.
     """
+    import pandas as pd
+
     plan, began = _make_plan(scenario, vary, runs, None, engine), time.perf_counter()
     check_sources(scenario)
     directory = new_directory(out, f"{scenario.name}-sweep")
@@ -194,24 +198,24 @@ def sweep_to_directory(
         status = "failed"
         raise
     finally:
-        table = _write_rows(directory, rows)
-        completed = CompletedSweep(directory, table, tuple(vary), time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(vary), seconds)
+        if status == "complete" and take is not None:
+            take(completed)
+        _write_rows(completed)
         if status == "complete" and finish is not None:
             finish(completed)
         _write_manifest(directory, scenario, vary, plan, len(rows), status)
     return completed
 
 
-def _write_rows(directory: Path, rows: list[Row]) -> pd.DataFrame:
-    """Write sweep.parquet and sweep.csv if there are rows, and return the table."""
-    import pandas as pd
-
-    table = pd.DataFrame(rows)
-    if rows:
+def _write_rows(completed: CompletedSweep) -> None:
+    """Write sweep.parquet and sweep.csv if there are rows."""
+    directory, table = completed.directory, completed.table
+    if len(table):
         columns = {str(name): column for name, column in table.items()}
         write_table(directory / "sweep.parquet", columns)
         write_text(directory / "sweep.csv", table.to_csv(index=False))
-    return table
 
 
 def _write_manifest(
