@@ -96,13 +96,12 @@ class GainSequence:
         F, Q, cov = (np.frombuffer(one).reshape(n, n) for one in (design.F, design.Q, design.cov))
         self._information = np.frombuffer(design.information).reshape(N, n, n)
         self._pseudo = p = pseudo_states(F, self._information.sum(axis=0))
-        self._noises = [square_root(one) for one in self._information]
+        # Nodes without a sensor add no noise, and columns of zeros cost as much as others.
+        self._noises = [without_zeros(square_root(one)) for one in self._information]
         # All estimates start at one mean, and the plant's noise is one.
         alike = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(p.G, (N, 1))])
         self._driven, self._errors = alike @ square_root(Q), alike @ square_root(cov)
-        one = np.block([[F, np.zeros((n, n))], [p.rest, p.A]])
-        blocks = np.einsum("aibj,kl->akiblj", one.reshape(2, n, 2, n), np.eye(N))
-        self._step = blocks.reshape(2 * N * n, 2 * N * n)
+        self._F = F
         self._found: list[tuple[NodeGains, ...]] = []
         self._settled = False
 
@@ -123,7 +122,7 @@ class GainSequence:
     def _advance(self) -> tuple[NodeGains, ...]:
         """Carry the errors through a slot, and return its gains."""
         nodes = range(len(self._heard))
-        self._errors = np.hstack([self._step @ self._errors, self._driven])
+        self._errors = np.hstack([self._predict(), self._driven])
         predicted = [self._root(i) for i in nodes]
         gains = self._correct_pseudo_states()
         K = [self._correct_state(i) for i in nodes]
@@ -132,6 +131,12 @@ class GainSequence:
         return tuple(
             NodeGains(B, M, K[i], predicted[i], self._root(i)) for i, (B, M) in enumerate(gains)
         )
+
+    def _predict(self) -> FloatArray:
+        """Return the errors after F, (2 N n, inputs): those of all xhat, and then of all yhat."""
+        x, y = self._errors.reshape(2, len(self._heard), self._n, -1)
+        predicted = np.stack([self._F @ x, self._pseudo.rest @ x + self._pseudo.A @ y])
+        return predicted.reshape(self._errors.shape)
 
     def _x(self, i: int) -> FloatArray:
         """Return the error (n, inputs) of a node's xhat, which may be written to."""
@@ -146,14 +151,16 @@ class GainSequence:
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
         """Correct all yhat at once; return B (d, n, n) and M (n, n) of each node."""
-        n, N, width = self._n, len(self._heard), self._errors.shape[1]
-        self._errors = np.hstack([self._errors, np.zeros((len(self._errors), N * n))])
+        n, N, first = self._n, len(self._heard), self._errors.shape[1]
+        inputs = sum(noise.shape[1] for noise in self._noises)
+        self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
         gains, corrected = [], []
         for i, heard in enumerate(self._heard):
             e, seen = self._y(i), self._information[i] @ self._pseudo.inverse
             innovation = seen @ e
             # The noise of the pseudo-observation has the covariance H' R^-1 H.
-            innovation[:, width + i * n : width + (i + 1) * n] = self._noises[i]
+            stop = first + self._noises[i].shape[1]
+            innovation[:, first:stop], first = self._noises[i], stop
             theta = np.concatenate([*(e - self._y(j) for j in heard), innovation])
             sizes = [variances(e) + variances(self._y(j)) for j in heard]
             sizes.append(np.square(seen) @ variances(e) + np.diag(self._information[i]))
@@ -171,6 +178,11 @@ class GainSequence:
         K = optimal_gain(e, theta, np.square(G) @ variances(e) + variances(e_y))
         e -= K @ theta
         return K
+
+
+def without_zeros(matrix: FloatArray) -> FloatArray:
+    """Return the columns of a matrix that are not zero."""
+    return np.asarray(matrix[:, matrix.any(axis=0)])
 
 
 def variances(errors: FloatArray) -> FloatArray:
