@@ -25,7 +25,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, field, integer
 from netkf.linalg.arrays import FloatArray
 
-MOST_STEPS = 10_000
+MAX_STEPS = 10_000
 SLOT, ALL = "slot", "all"
 
 
@@ -92,7 +92,7 @@ class BeliefPropagation(Filter):
     independent, and are not kept.
     """
 
-    steps: int = field(integer(low=1, high=MOST_STEPS), default=1)  # type: ignore[assignment]
+    steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
     memory: str = field(choice(SLOT, ALL), default=SLOT)
 
     paper: ClassVar[str] = "belief_propagation"

@@ -49,7 +49,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, load, store
 
-MOST_STEPS = 10_000
+MAX_STEPS = 10_000
 INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
 
 
@@ -194,7 +194,7 @@ class InformationConsensus(Filter):
     that does not come stays with the node itself, so that weights always sum to one.
     """
 
-    steps: int = field(integer(low=1, high=MOST_STEPS), default=1)  # type: ignore[assignment]
+    steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
 
     paper: ClassVar[str] = "information_consensus"
     combination: ClassVar[str] = "intersection"

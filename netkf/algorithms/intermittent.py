@@ -29,7 +29,7 @@ from netkf.linalg.compiling import kernel
 SLACK = 1.0 + 1e-6
 """Ages are rounded."""
 
-SAME = 1e-14
+TIME_TOLERANCE = 1e-14
 """Times that differ by less, relative to now, are one: a state's own time is a sum of gaps."""
 
 
@@ -209,7 +209,7 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
     again: list[Past] = []
     past = state.past
     # Entries after the reading's time are taken off; times that differ by rounding count as equal.
-    while past.time > reading.time + SAME * now and past.before is not None:
+    while past.time > reading.time + TIME_TOLERANCE * now and past.before is not None:
         again.append(past)
         past = past.before
     model = state.model

@@ -66,8 +66,8 @@ from netkf.linalg.lanes import (
 MASS, AVERAGE = 0, 1
 """The two exchanges of a slot."""
 
-MOST_STEPS = 100_000
-MOST_DOUBLINGS = 60
+MAX_STEPS = 100_000
+MAX_DOUBLINGS = 60
 MAX_SPREAD = 1e14
 """The largest ``|G| |P|`` at which double precision still tells a steady covariance."""
 
@@ -452,7 +452,7 @@ class PushSum(Filter):
                that one that is lost, in one direction alone too, only postpones
     """
 
-    gamma: int = field(integer(low=1, high=MOST_STEPS), default=None)
+    gamma: int = field(integer(low=1, high=MAX_STEPS), default=None)
     delta: float = field(positive, default=None)
     leader: int = field(integer(low=0), default=0)
     asymptotic: bool = field(boolean, default=False)
@@ -667,8 +667,8 @@ class PushSum(Filter):
         self._check_leader(scenario)
         for name in ("gamma", "delta"):
             if getattr(self, name) is None:
-                words = "is missing for a plant in slots"
-                raise ScenarioError(f"filter.{name}", words, None, f"add {name} = ...")
+                rule = "is missing for a plant in slots"
+                raise ScenarioError(f"filter.{name}", rule, None, f"add {name} = ...")
         self._check_gain(scenario.topology.laplacian_radius)
         if self.running_sums and self.stop != "never":
             rule = "must be never with running sums, which a node that stops would freeze"
@@ -695,8 +695,8 @@ class PushSum(Filter):
         nodes = scenario.nodes
         if self.leader not in scenario.topology.index:
             ids = ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
-            words, remedy = "must be a node of the graph", f"node ids here are {ids}"
-            raise ScenarioError("filter.leader", words, self.leader, remedy)
+            rule, remedy = "must be a node of the graph", f"node ids here are {ids}"
+            raise ScenarioError("filter.leader", rule, self.leader, remedy)
 
     def _check_gain(self, radius: float) -> None:
         # Averaging contracts if and only if all eigenvalues of I - L / delta but one lie inside
@@ -714,8 +714,8 @@ class PushSum(Filter):
         if not scenario.slotted:
             fields = dataclasses.fields(self)
             given = [f"filter.{f.name}" for f in fields if getattr(self, f.name) != f.default]
-            words = "not used under clocks, where push-sum keeps running sums"
-            return (f"{', '.join(given)}: {words}",) if given else ()
+            reason = "not used under clocks, where push-sum keeps running sums"
+            return (f"{', '.join(given)}: {reason}",) if given else ()
         # Contraction is enough to run; the theorems ask for more.
         radius = scenario.topology.laplacian_radius
         if self.delta >= radius:
@@ -818,7 +818,7 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
     # The iterates of the doubling, which begin with F', the information G and P = Q.
     A, G, P = F.T, information, Q
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(MOST_DOUBLINGS):
+        for _ in range(MAX_DOUBLINGS):
             try:
                 # One solve for (I + G P)^-1 [A, G].
                 solved = np.linalg.solve(np.eye(len(F)) + G @ P, np.concatenate([A, G], axis=1))

@@ -119,8 +119,8 @@ def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> 
         if options.out is None:
             raise
         kept = f"{options.out} has the verdict on {earlier.runs:,} runs" if earlier else ""
-        words = f"new runs are kept with their verdict only; {kept or 'nothing was written'}"
-        raise KeyboardInterrupt(words) from None
+        message = f"new runs are kept with their verdict only; {kept or 'nothing was written'}"
+        raise KeyboardInterrupt(message) from None
 
 
 def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
@@ -152,14 +152,14 @@ def _save(scenario: Scenario, verdict: Verdict, text: str, options: argparse.Nam
 
 def _replay_command(options: argparse.Namespace) -> str:
     """Return the command that runs a replica of this check, without the number of the replica."""
-    words = ["netkf", "run", str(options.scenario)]
+    command = ["netkf", "run", str(options.scenario)]
     for change in options.set:
-        words += ["--set", change]
+        command += ["--set", change]
     if options.seed is not None:
-        words += ["--seed", str(options.seed)]
+        command += ["--seed", str(options.seed)]
     if options.trust:
-        words.append("--trust")
-    return shlex.join([*words, "--replica"])
+        command.append("--trust")
+    return shlex.join([*command, "--replica"])
 
 
 COMMAND = Command("check", "compare simulations with theory, one row per promise", _declare, _run)

@@ -1,1 +1,1 @@
-"""Shared words: types, errors, settings, random streams, small matrix helpers."""
+"""The lowest room: errors, checked fields, clocks and CSV files."""

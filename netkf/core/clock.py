@@ -20,7 +20,7 @@ Entity = Any
 Any, so that a subclass may say ``tuple[int, int]`` where it is for links only.
 """
 
-FIRST_BLOCK, LONGEST_BLOCK = 8, 1 << 16
+FIRST_BLOCK, MAX_BLOCK = 8, 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +113,6 @@ def all_ticks(
         found.append(block)
         number = position.number + len(block)
         position = position._replace(number=number, now=float(block[-1]))
-        count = min(2 * count, LONGEST_BLOCK)
+        count = min(2 * count, MAX_BLOCK)
     times = np.concatenate(found)
     return times[: int(np.searchsorted(times, horizon))]

@@ -61,11 +61,11 @@ class ScenarioError(NetkfError, ValueError):
         # Rules and remedies name keys and classes, which may be of any length.
         rule, remedy = shorten(self.rule, 1000), shorten(self.remedy, 700)
         where = ": ".join(filter(None, (shorten(self.file, 1000), shorten(self.key, 120))))
-        words = f"{rule}{got}; {remedy}" if remedy else f"{rule}{got}"
-        return f"{where}: {words}" if where else words
+        message = f"{rule}{got}; {remedy}" if remedy else f"{rule}{got}"
+        return f"{where}: {message}" if where else message
 
 
-LONGEST_WORD = 100
+MAX_WORD = 100
 """Characters of a word that is compared with the known ones."""
 
 
@@ -73,7 +73,7 @@ def nearest(word: object, known: Iterable[str]) -> str:
     """Return ``did you mean "..."?`` and a space if a known word is close, else an empty text."""
     import difflib
 
-    if len(str(word)) > LONGEST_WORD:
+    if len(str(word)) > MAX_WORD:
         return ""
     found = difflib.get_close_matches(str(word), list(known), n=1)
     return f'did you mean "{found[0]}"? ' if found else ""

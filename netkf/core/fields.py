@@ -175,19 +175,19 @@ def _bounds(**given: float) -> dict[str, float]:
 
 
 positive = number(above=0.0)
-SHORTEST, LONGEST = 1e-9, 1e15
+MIN_SECONDS, MAX_SECONDS = 1e-9, 1e15
 """Durations in seconds: times have 16 digits, and some are rounded to 1e-12 s."""
 
 
 def _seconds(value: Any) -> float:
     result: float = positive.convert(value)
-    if not SHORTEST <= result <= LONGEST:
-        requirement = f"must be from {SHORTEST:g} to {LONGEST:g} seconds"
+    if not MIN_SECONDS <= result <= MAX_SECONDS:
+        requirement = f"must be from {MIN_SECONDS:g} to {MAX_SECONDS:g} seconds"
         raise _SpecificError(requirement, "choose another unit of time")
     return result
 
 
-_DURATION = {"type": "number", "minimum": SHORTEST, "maximum": LONGEST}
+_DURATION = {"type": "number", "minimum": MIN_SECONDS, "maximum": MAX_SECONDS}
 seconds = Rule(positive.requirement, _seconds, positive.remedy, _DURATION)
 probability = number(low=0.0, high=1.0)
 

@@ -81,14 +81,14 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
     """A scenario for other processes; raises EngineError where it cannot be pickled."""
     unnamed = unnamed_class(scenario)
     if unnamed is not None:
-        words = f"workers cannot import the class {unnamed} of a notebook, a prompt or a function"
-        raise EngineError(f"{words}; put it into a module (a .py file), or use workers=1")
+        message = f"workers cannot import the class {unnamed} of a notebook, a prompt or a function"
+        raise EngineError(f"{message}; put it into a module (a .py file), or use workers=1")
     try:
         payload = pickle.dumps(scenario, protocol=pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
-        words = f"the scenario cannot be sent to workers ({describe_error(error)})"
+        message = f"the scenario cannot be sent to workers ({describe_error(error)})"
         remedy = "classes and functions must be those of modules; or use workers=1"
-        raise EngineError(f"{words}; {remedy}") from None
+        raise EngineError(f"{message}; {remedy}") from None
     digest = hashlib.sha256(payload).hexdigest()
     return PackedScenario(digest, payload, tuple(sorted(_modules(scenario))))
 
@@ -126,8 +126,8 @@ def _check_versions(wanted: tuple[tuple[str, str], ...]) -> None:
     other = [(name, found.get(name, "none"), own) for name, own in wanted if found.get(name) != own]
     if other:
         listed = ", ".join(f"{name} {there} instead of {here}" for name, there, here in other)
-        words = f"a worker of the scheduler has other versions than this computer: {listed}"
-        raise EngineError(f"{words}; install the same there, or use --workers")
+        message = f"a worker of the scheduler has other versions than this computer: {listed}"
+        raise EngineError(f"{message}; install the same there, or use --workers")
 
 
 def _unpickled(travelling: PackedScenario) -> Scenario:
@@ -140,7 +140,9 @@ def _unpickled(travelling: PackedScenario) -> Scenario:
     try:
         scenario: Scenario = pickle.loads(travelling.payload)
     except (AttributeError, ImportError) as error:
-        words = f"a class of the scenario cannot be imported by a worker ({describe_error(error)})"
+        message = (
+            f"a class of the scenario cannot be imported by a worker ({describe_error(error)})"
+        )
         remedy = "put it into a module that can be imported there, or use workers=1"
-        raise EngineError(f"{words}; {remedy}") from error
+        raise EngineError(f"{message}; {remedy}") from error
     return scenario

@@ -71,7 +71,7 @@ class BlockCheckpoints:
         """Return the number of runs in a block, as the first block says that can be read."""
         for file in self._files():
             with contextlib.suppress(DamagedError), _opened(file) as arrays:
-                size = _words(arrays)["identity"]["block"]
+                size = _read_texts(arrays)["identity"]["block"]
                 if is_block_size(size):
                     return int(size)
         return None
@@ -131,7 +131,7 @@ class BlockCheckpoints:
         for number in sorted(self._numbers):
             file = self._file(number)
             with self._expected(number), _opened(file, verified=False) as arrays:
-                for k in range(_words(arrays)["traces"]):
+                for k in range(_read_texts(arrays)["traces"]):
                     yield self._trace(arrays, k)
 
     def remove(self) -> None:
@@ -148,7 +148,7 @@ class BlockCheckpoints:
     def _check(self, file: Path, identity: dict[str, Any]) -> None:
         """Raise DamagedError unless a file is whole, has this identity and fits the scenario."""
         with _opened(file, verified=False) as arrays:
-            found = _words(arrays).get("identity")
+            found = _read_texts(arrays).get("identity")
             for key, value in identity.items():
                 if not isinstance(found, dict) or found.get(key) != value:
                     raise DamagedError(f"is of another {key}")
@@ -191,8 +191,8 @@ class BlockCheckpoints:
         except DamagedError as error:
             with contextlib.suppress(OSError):
                 self._file(number).unlink()
-            words, remedy = f"{self._file(number)} {error}", "go on with --resume"
-            raise EngineError(f"{words}; {remedy}, which does it again") from None
+            message, remedy = f"{self._file(number)} {error}", "go on with --resume"
+            raise EngineError(f"{message}; {remedy}, which does it again") from None
 
 
 def is_block_size(value: object) -> bool:
@@ -262,17 +262,18 @@ def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str,
         arrays |= {f"{name}_{field}": getattr(found, field) for field in Moments._fields}
     for k, trace in enumerate(statistics.traces):
         arrays |= {f"trace_{k}_{field}": getattr(trace, field) for field in Trace._fields}
-    words = {
+    texts = {
         "identity": identity,
         "conserved": {name: drift for name, (_, drift) in statistics.conserved.items()},
         "rounding_from": statistics.rounding_from,
         "fingerprint": statistics.fingerprint,
         "traces": len(statistics.traces),
     }
-    return {**arrays, "words": np.array(json.dumps(words))}
+    return {**arrays, "words": np.array(json.dumps(texts))}
 
 
-def _words(arrays: Any) -> dict[str, Any]:
+def _read_texts(arrays: Any) -> dict[str, Any]:
+    """Return the values of a block that are texts and numbers, not arrays."""
     found: dict[str, Any] = json.loads(str(arrays["words"]))
     return found
 
@@ -281,13 +282,13 @@ def _statistics(arrays: Any) -> RunStatistics:
     def moments(name: str) -> Moments:
         return Moments(*(arrays[f"{name}_{field}"] for field in Moments._fields))
 
-    words = _words(arrays)
+    texts = _read_texts(arrays)
     return RunStatistics(
         moments("samples"),
         moments("averages"),
         moments("messages"),
         arrays["totals"],
-        {name: (moments(f"conserved_{name}"), float(d)) for name, d in words["conserved"].items()},
-        float(words["rounding_from"]),
-        str(words["fingerprint"]),
+        {name: (moments(f"conserved_{name}"), float(d)) for name, d in texts["conserved"].items()},
+        float(texts["rounding_from"]),
+        str(texts["fingerprint"]),
     )

@@ -35,7 +35,7 @@ from netkf.runs.summary import PromisedTraces, promise_traces
 from netkf.scenario.scenario import Scenario
 
 TRACES = ("full", "first", "none")
-LARGEST_TRACED = 8
+MAX_TRACED_BLOCK = 8
 NOTE_SECONDS = 1.0
 """Seconds between two manifests that say how many runs are done."""
 
@@ -120,7 +120,7 @@ def _begin(
 ) -> _Keeper | None:
     """Return the keeper of a new directory or of one to go on in, None if all is done there."""
     size = block_size(runs, width)
-    size = min(size, LARGEST_TRACED) if trace == "full" else size
+    size = min(size, MAX_TRACED_BLOCK) if trace == "full" else size
     digest, seed = scenario_digest(scenario), scenario.seed
     plan = RunIdentity(digest, seed, runs, trace, engine, installation(), size)
     begun = ensemble_to_resume(out, scenario, plan) if resume else None

@@ -22,7 +22,7 @@ from netkf.scenario.scenario import Scenario
 AHEAD = 1024
 """Most blocks that are handed out and not yet back."""
 
-QUICK, LARGEST_HERE = 0.2, 1024
+QUICK_SECONDS, MAX_BLOCK_HERE = 0.2, 1024
 """Blocks done in this process grow to at most so many runs, while they take fewer seconds."""
 
 WARM, SAVING = 0.2, 2.0
@@ -30,8 +30,8 @@ WARM, SAVING = 0.2, 2.0
 here, show after so many seconds. Starting them costs about as much.
 """
 
-LARGEST_BLOCK = 64
-MOST_BLOCKS = 4096
+MAX_BLOCK = 64
+MAX_BLOCKS = 4096
 ROUNDS = 16
 
 PATIENCE = 8
@@ -90,8 +90,8 @@ class Here(Pool):
     def _measured(self, job: Job, seconds: float) -> None:
         """Take note of how long a block took, without what was compiled meanwhile."""
         # Blocks may be larger than was asked for: of several that take as long as one.
-        if seconds < QUICK and len(job.replicas) >= self._size:
-            self._size = min(2 * job.size, LARGEST_HERE)
+        if seconds < QUICK_SECONDS and len(job.replicas) >= self._size:
+            self._size = min(2 * job.size, MAX_BLOCK_HERE)
 
 
 class Adaptive(Here):
@@ -200,8 +200,8 @@ class Cluster(Elsewhere):
         try:
             import distributed
         except ImportError:
-            words = "a Dask scheduler needs the extra cluster; pip install 'netkf[cluster]'"
-            raise EngineError(words) from None
+            message = "a Dask scheduler needs the extra cluster; pip install 'netkf[cluster]'"
+            raise EngineError(message) from None
         # An address inside of this process cannot be asked from another one.
         if not (address.startswith("inproc://") or scheduler_answers(address, PATIENCE)):
             raise _unreachable(address, "no Dask scheduler answers there")
@@ -235,8 +235,8 @@ class Cluster(Elsewhere):
             if self._client.status == "running":
                 answered = now
             if lost or now - answered > PATIENCE:
-                words = f"the scheduler at {shorten(self._address)} does not answer any more"
-                raise EngineError(f"{words}, and the runs on it are lost")
+                message = f"the scheduler at {shorten(self._address)} does not answer any more"
+                raise EngineError(f"{message}, and the runs on it are lost")
             if done:
                 return done
 
@@ -287,9 +287,9 @@ def cores() -> int:
 def block_size(runs: int, width: int) -> int:
     """A power of two that leaves every worker several blocks, so that all end together."""
     size = 1
-    while size < LARGEST_BLOCK and 2 * size * width * ROUNDS <= runs:
+    while size < MAX_BLOCK and 2 * size * width * ROUNDS <= runs:
         size *= 2
-    while size * MOST_BLOCKS < runs:
+    while size * MAX_BLOCKS < runs:
         size *= 2
     return size
 
@@ -309,8 +309,8 @@ def make_pool(
     asked = {"workers": workers, "executor": executor, "scheduler": scheduler}
     given = [name for name, value in asked.items() if value is not None]
     if len(given) > 1:
-        words = f"cannot go together with {given[1]}"
-        raise ScenarioError(given[0], words, asked[given[0]], "give one of them")
+        rule = f"cannot go together with {given[1]}"
+        raise ScenarioError(given[0], rule, asked[given[0]], "give one of them")
     if executor is not None:
         if not hasattr(executor, "submit"):
             remedy = "give a ThreadPoolExecutor, a ProcessPoolExecutor, or one like them"

@@ -36,7 +36,7 @@ from netkf.trace.run import BLUR, ROUNDING
 
 TOGETHER = 512
 """Numbers of a run that are looked at together: some lines of the cache."""
-MOST_KEPT = 1 << 15
+MAX_SCRATCH_ENTRIES = 1 << 15
 """Entries of all P of a sample up to which scratch is kept: some 10 MB."""
 
 
@@ -175,7 +175,7 @@ class _Rooms(threading.local):
 
     def of(self, filters: int, n: int, largest: int) -> Room:
         """Scratch as ``reduction_room`` makes it, with anything in it."""
-        if filters * n * n > MOST_KEPT:
+        if filters * n * n > MAX_SCRATCH_ENTRIES:
             return reduction_room(filters, n, largest)
         if self._sizes[:2] != (filters, n) or self._sizes[2] < largest:
             self._sizes, self._room = (filters, n, largest), reduction_room(filters, n, largest)

@@ -165,9 +165,9 @@ def _completed(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
             for future in pool.wait(waiting):
                 yield waiting.pop(future), future.result()
     except BrokenExecutor as error:
-        words = "workers ended again and again before their runs were done; perhaps the memory is"
+        message = "workers ended again and again before their runs were done; perhaps the memory is"
         raise EngineError(
-            f"{words} too small, or a class of the scenario ends the process"
+            f"{message} too small, or a class of the scenario ends the process"
         ) from error
     finally:
         for future in waiting:

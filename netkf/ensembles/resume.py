@@ -69,8 +69,8 @@ def ensemble_to_resume(
         return BegunEnsemble(out, size, False)
     found = read_manifest(out)
     if found["runs"]["wanted"] != plan.runs:
-        words, value = "the run was begun with another number of runs", found["runs"]["wanted"]
-        raise ScenarioError("--resume", words, value, "give the same --runs")
+        rule, value = "the run was begun with another number of runs", found["runs"]["wanted"]
+        raise ScenarioError("--resume", rule, value, "give the same --runs")
     same = {
         "scenario": (plan.scenario, "give the same scenario, seed and settings"),
         "trace": (plan.trace, "give the same --trace"),
@@ -80,8 +80,8 @@ def ensemble_to_resume(
     }
     for key, (wanted, remedy) in same.items():
         if found.get(key) != wanted:
-            words = f"{out} holds a run of another {key.removesuffix('s')}"
-            raise ScenarioError("--resume", words, _difference(found.get(key), wanted), remedy)
+            rule = f"{out} holds a run of another {key.removesuffix('s')}"
+            raise ScenarioError("--resume", rule, _difference(found.get(key), wanted), remedy)
     blocks_prove = "remove it: the blocks prove themselves"
     _prove(out / "manifest.json", lambda: check_seal(found), blocks_prove)
     _check_scenario(out, scenario)
@@ -199,6 +199,6 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         found = read_document(directory / "manifest.json")
         require(found, MANIFEST)
     except DamagedError as error:
-        words = f"must be a directory that netkf run left: manifest.json {error}"
-        raise ScenarioError("--resume", words, str(directory), "give another --out") from None
+        rule = f"must be a directory that netkf run left: manifest.json {error}"
+        raise ScenarioError("--resume", rule, str(directory), "give another --out") from None
     return found

@@ -225,8 +225,8 @@ def _pickled_error(error: Exception) -> bytes:
         found = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
         pickle.loads(found)
     except Exception:
-        words = f"a worker failed with {type(error).__name__}: {error}"
-        return pickle.dumps(EngineError(words), pickle.HIGHEST_PROTOCOL)
+        message = f"a worker failed with {type(error).__name__}: {error}"
+        return pickle.dumps(EngineError(message), pickle.HIGHEST_PROTOCOL)
     return found
 
 

@@ -49,18 +49,18 @@ def nees_figure(subject: Subject) -> Picture:
     draw_nees(figure.add_subplot(), subject)
     inside = float(((values >= low) & (values <= high)).mean())
     over = f" over {subject.runs:,} runs" if subject.runs > 1 else ""
-    words = f"Band: chi-square with {subject.runs * n:,} degrees of freedom{over}."
+    note = f"Band: chi-square with {subject.runs * n:,} degrees of freedom{over}."
     finish_figure(
         figure,
         subject.claim(_nees_claim(inside, float(values.mean()), n)),
-        subject.caption(words, notes="nees"),
+        subject.caption(note, notes="nees"),
     )
     return figure
 
 
 def _nees_claim(inside: float, mean: float, n: int) -> str:
-    words = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
-    return f"{words}; their mean is {mean:.3g} where exact covariances give {n}"
+    claim = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
+    return f"{claim}; their mean is {mean:.3g} where exact covariances give {n}"
 
 
 def innovations_of(subject: Subject) -> Innovations:
@@ -86,8 +86,8 @@ def nis_figure(subject: Subject) -> Picture:
     share, mean = draw_nis(figure.add_subplot(), found)
     claim = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
     claim += f"{share:.0%} of {len(found.nis):,} readings lie in their {CONFIDENCE:.0%} interval"
-    words = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
-    finish_figure(figure, subject.claim(claim), subject.caption(words))
+    note = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
+    finish_figure(figure, subject.claim(claim), subject.caption(note))
     return figure
 
 
@@ -148,10 +148,8 @@ def whiteness_figure(subject: Subject) -> Picture:
     share = outside / (lags * len(curves))
     white = "as white noise would" if share <= 0.1 else "so innovations are not white"
     claim = f"{share:.0%} of autocorrelations are outside their 95% band, {white}"
-    words = (
-        f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
-    )
-    finish_figure(figure, subject.claim(claim), subject.caption(words))
+    note = f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
+    finish_figure(figure, subject.claim(claim), subject.caption(note))
     return figure
 
 

@@ -161,7 +161,7 @@ def _mark_worst(
     used = used if len(used) else np.arange(len(times))
     shown = np.where(np.isfinite(values[used]), values[used], -np.inf)
     order = np.argsort(-shown.max(axis=0), kind="stable")[:WORST]
-    words = ""
+    claim = ""
     for rank, k in enumerate(order.tolist()):
         at = int(used[int(np.argmax(shown[:, k]))])
         t, value = times[at], values[at, k]
@@ -178,9 +178,9 @@ def _mark_worst(
             label=f"worst of node {subject.nodes[k]}: {value:.3g} at {t:g} s",
         )
         of_node = f"of node {subject.nodes[k]} at {t:g} s"
-        words = words or f"The largest {name} after the start is {value:.3g}, {of_node}"
+        claim = claim or f"The largest {name} after the start is {value:.3g}, {of_node}"
     typical = float(np.nanmedian(values[used]))
-    return f"{words}, {value_ratio(values[used], typical)}" if words else "No error is finite"
+    return f"{claim}, {value_ratio(values[used], typical)}" if claim else "No error is finite"
 
 
 def value_ratio(values: FloatArray, typical: float) -> str:
@@ -238,14 +238,14 @@ def _draw_ratios(
     widths = scale * LEVEL * np.array([_number(row.get(f"{key}_se")) for row in rows])
     axes.hlines(places, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
     has = np.array([row["node"] in subject.scenario.placed for row in rows])
-    for group, colour, marker, words in (
+    for group, colour, marker, label in (
         (has, SENSING, "s", "with a sensor"),
         (~has, RELAY, "o", "without a sensor"),
     ):
         if group.any():
             bars = widths[group] if subject.runs > 1 else None
             style = {"fmt": marker, "color": colour, "mec": INK, "mew": 0.5, "ms": 4.5, "lw": 1.2}
-            axes.errorbar(values[group], places[group], xerr=bars, label=words, **style)
+            axes.errorbar(values[group], places[group], xerr=bars, label=label, **style)
     axes.set_yticks(places, [str(row["node"]) for row in rows], fontsize=6.5)
     axes.margins(x=0.08)
     axes.set_ylim(-0.7, len(rows) - 0.3)

@@ -90,10 +90,10 @@ def _claim(subject: Subject) -> str:
     worst, best = max(shades, key=lambda n: shades[n]), min(shades, key=lambda n: shades[n])
     if len(shades) == 1:
         return f"The only node, {worst}, has the {what} {shades[worst]:.3g}"
-    words = (
+    claim = (
         f"Node {worst} has the largest {what}, {shades[worst]:.3g}, and node {best} the smallest"
     )
-    return f"{words}, {shades[best]:.3g}"
+    return f"{claim}, {shades[best]:.3g}"
 
 
 def _aspect(positions: Positions) -> float:

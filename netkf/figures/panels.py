@@ -46,7 +46,7 @@ def draw_nodes(axes: Any, subject: Subject, values: FloatArray, se: FloatArray |
         (subject.sensing, SENSING, 2, "with a sensor"),
     )
     several = subject.sensing.any() and not subject.sensing.all()
-    for group, colour, order, words in groups:
+    for group, colour, order, which in groups:
         indices = select_evenly(np.flatnonzero(group))
         if not len(indices):
             continue
@@ -58,7 +58,7 @@ def draw_nodes(axes: Any, subject: Subject, values: FloatArray, se: FloatArray |
             for k in indices:
                 low, high = interval_of_root(values[:, k], se[:, k])
                 axes.fill_between(subject.times, low, high, color=colour, alpha=0.2, lw=0)
-        label = f"nodes {words}" if several else ("nodes" if len(indices) > 1 else "the node")
+        label = f"nodes {which}" if several else ("nodes" if len(indices) > 1 else "the node")
         axes.plot([], [], color=colour, lw=1.4, label=label)
     if len(subject.times) == 1:  # a line of one sample is invisible
         count = len(subject.nodes)

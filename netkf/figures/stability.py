@@ -34,7 +34,7 @@ RATE, DELIVERY = "network.activation.rate", "network.channel.loss.delivery"
 FACTORS = tuple(2.0**k for k in range(-4, 5))
 DELIVERIES = tuple(k / 8 for k in range(1, 9))
 LAW_SAMPLES = 2000
-LARGEST = 1e100
+MAX_TRACE = 1e100
 """Traces of P that are drawn; logarithmic axes overflow beyond."""
 SPREAD = 20.0
 """Ratio of the largest to the smallest value beyond which an axis is logarithmic."""
@@ -169,8 +169,8 @@ def _describe_best(table: Any, keys: Sequence[str]) -> str:
         return "No point has a finite error"
     best = finite.loc[finite["worst_rms"].idxmin()]
     where = ", ".join(f"{key.rpartition('.')[2]} = {_short(best[key])}" for key in keys)
-    words = f"The largest RMS error is smallest, {best['worst_rms']:.3g}, at {where}"
-    return words + (f"; runs diverge at {diverged} of {len(table)} points" if diverged else "")
+    claim = f"The largest RMS error is smallest, {best['worst_rms']:.3g}, at {where}"
+    return claim + (f"; runs diverge at {diverged} of {len(table)} points" if diverged else "")
 
 
 def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
@@ -190,7 +190,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 24 else text[:21] + "..."
 
 
-SAME = 1e-6
+EQUAL_TRACES = 1e-6
 """Relative range of traces of P below which they are one value."""
 
 
@@ -203,9 +203,9 @@ def law_figure(subject: Subject) -> Picture:
     if subject.runs > 1:
         raise UnavailableError("The law of P is that of single runs, and these are means of many.")
     late = subject.times >= 0.2 * subject.times[-1]
-    values = np.where(subject.trace[late] < LARGEST, subject.trace[late], np.nan)
+    values = np.where(subject.trace[late] < MAX_TRACE, subject.trace[late], np.nan)
     if not np.isfinite(values).any():
-        raise UnavailableError(f"All traces of P are above {LARGEST:g} or not finite.")
+        raise UnavailableError(f"All traces of P are above {MAX_TRACE:g} or not finite.")
     figure = new_figure(7.4, 4.4)
     axes = figure.add_subplot()
     groups = (
@@ -213,11 +213,11 @@ def law_figure(subject: Subject) -> Picture:
         (~subject.sensing, INK, "-", "without"),
     )
     several = subject.sensing.any() and not subject.sensing.all()
-    for group, colour, dashes, words in groups:
+    for group, colour, dashes, which in groups:
         sample = values[:, group].ravel()
         sample = np.sort(sample[np.isfinite(sample)])
         if sample.size:
-            label = f"run, nodes {words}" if several else "run, all nodes"
+            label = f"run, nodes {which}" if several else "run, all nodes"
             _draw_tail(axes, sample, colour, dashes, label)
     claim = _tail_claim(values)
     laws = _invariant_law(subject)
@@ -230,13 +230,13 @@ def law_figure(subject: Subject) -> Picture:
     shown = values[np.isfinite(values) & (values > 0.0)]
     if shown.size and shown.max() > SPREAD * shown.min():
         axes.set_xscale("log")
-    elif shown.size and shown.max() - shown.min() < SAME * shown.max():  # rounding alone
+    elif shown.size and shown.max() - shown.min() < EQUAL_TRACES * shown.max():  # rounding alone
         axes.set_xlim(0.9 * shown.min(), 1.1 * shown.max())
     axes.set_yscale("log")
     axes.set(xlabel="trace of P, squared units of the state", ylabel="share of samples above")
     draw_legend(axes)
-    words = "The first fifth of the samples is left out. Samples of one run are not independent."
-    finish_figure(figure, subject.claim(claim), subject.caption(words))
+    note = "The first fifth of the samples is left out. Samples of one run are not independent."
+    finish_figure(figure, subject.claim(claim), subject.caption(note))
     return figure
 
 

@@ -136,10 +136,10 @@ class Subject:
         last = f"{self.times[-1]:g}" if len(self.times) else "0"
         horizon = f"{self.scenario.horizon:g} s"
         if self.runs > 1:
-            words = f"{self.diverged:,} of {self.runs:,} runs diverged and ended early."
+            note = f"{self.diverged:,} of {self.runs:,} runs diverged and ended early."
             stopped = f"The ensemble was {self.status}: these are the runs that were kept."
             early = self.status in ("interrupted", "failed")
-            return " ".join([words] * bool(self.diverged) + [stopped] * early)
+            return " ".join([note] * bool(self.diverged) + [stopped] * early)
         if self.status == "diverged":
             return f"It diverged and ended at {last} s of {horizon}."
         if self.status in ("interrupted", "failed"):
@@ -151,12 +151,12 @@ class Subject:
         notes = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
         return [f"Note: {note}." for note, kind in notes if about in (kind, "both")]
 
-    def claim(self, words: str) -> str:
+    def claim(self, statement: str) -> str:
         """Return a title that says first if the run did not end as planned."""
         broken = {"diverged": "Diverged: ", "interrupted": "Interrupted: ", "failed": "Failed: "}
         if self.status == "diverged" and self.runs > 1:
-            return words  # the caption says how many
-        return broken.get(self.status, "") + words
+            return statement  # the caption says how many
+        return broken.get(self.status, "") + statement
 
 
 def subject_of(result: Any) -> Subject:

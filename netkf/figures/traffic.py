@@ -73,8 +73,8 @@ def age_figure(subject: Subject) -> Picture:
     claim = f"On average the freshest message that a node has heard is {values.mean():.3g} s old"
     if len(means) > 1:
         claim += f"; node {worst} waits longest, {means[worst]:.3g} s"
-    words = "Age of information: time since the freshest message that a node has heard was sent."
-    finish_figure(figure, subject.claim(claim), subject.caption(words))
+    note = "Age of information: time since the freshest message that a node has heard was sent."
+    finish_figure(figure, subject.claim(claim), subject.caption(note))
     return figure
 
 
@@ -239,10 +239,10 @@ def delivery_figure(subject: Subject) -> Picture:
     claim = f"{arrived / total:.1%} of {total:,} messages arrived"
     if shares.min() < shares.max():
         claim += f"; by direction between {shares.min():.0%} and {shares.max():.0%}"
-    words = "Intervals: Wilson, 95%."
+    note = "Intervals: Wilson, 95%."
     if outside is not None:
-        words += f" {outside} of {len(found)} intervals miss what the channel of the scenario says."
-    finish_figure(figure, subject.claim(claim), subject.caption(words))
+        note += f" {outside} of {len(found)} intervals miss what the channel of the scenario says."
+    finish_figure(figure, subject.claim(claim), subject.caption(note))
     return figure
 
 

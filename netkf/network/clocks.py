@@ -163,8 +163,8 @@ class Poisson(LinkClock):
             entity = self._named(given)
             if entity not in known or entity in named:
                 again = f"names a {what} again"
-                words = again if entity in named else f"must name a {what} of the graph"
-                raise ScenarioError(f"rates[{k}]", words, list(given[:-1]), "remove or mend it")
+                rule = again if entity in named else f"must name a {what} of the graph"
+                raise ScenarioError(f"rates[{k}]", rule, list(given[:-1]), "remove or mend it")
             named.add(entity)
         bare = sorted(known - self._own.keys())
         if self.rate is None and bare:
@@ -177,7 +177,7 @@ class Poisson(LinkClock):
             )
 
 
-SHORTEST = 1e-9
+MIN_GAP = 1e-9
 """The shortest allowed gap in seconds; shorter ones could not be told from rounding."""
 
 PARAMETERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -212,20 +212,20 @@ class Renewal(LinkClock):
         for name in ("shape", "low", "high", "mean", "rate", "scale"):
             value = getattr(self, name)
             if value is None and name in needed:
-                words = f"is missing for {self.distribution} gaps"
-                raise ScenarioError(name, words, None, f"add {name} = ...")
+                rule = f"is missing for {self.distribution} gaps"
+                raise ScenarioError(name, rule, None, f"add {name} = ...")
             if value is not None and name not in needed + one_of:
-                words = f"means nothing for {self.distribution} gaps"
-                raise ScenarioError(name, words, value, "remove it")
+                rule = f"means nothing for {self.distribution} gaps"
+                raise ScenarioError(name, rule, value, "remove it")
         given = [name for name in one_of if getattr(self, name) is not None]
         if one_of and len(given) != 1:
-            words = f"exactly one of {', '.join(one_of)} must be given"
-            raise ScenarioError("mean", words, given, "keep or add one")
+            rule = f"exactly one of {', '.join(one_of)} must be given"
+            raise ScenarioError("mean", rule, given, "keep or add one")
         if self.low is not None and self.high is not None and self.high < self.low:
             raise ScenarioError("high", "must be at least low", self.high, "swap the two")
-        if self._mean < SHORTEST:
-            words = f"gaps must be at least {SHORTEST:g} s on average"
-            raise ScenarioError("high" if not one_of else given[0], words, self._mean, "lengthen")
+        if self._mean < MIN_GAP:
+            rule = f"gaps must be at least {MIN_GAP:g} s on average"
+            raise ScenarioError("high" if not one_of else given[0], rule, self._mean, "lengthen")
 
     @property
     def _mean(self) -> float:
@@ -284,7 +284,7 @@ class Periodic(LinkClock):
     ``phase`` is a time in [0, period) or "random", one draw a link; nothing ticks at time 0.
     """
 
-    period: float = field(number(low=SHORTEST))
+    period: float = field(number(low=MIN_GAP))
     phase: float | str = field(
         either(number(low=0.0), choice("random"), lambda value: isinstance(value, str)), default=0.0
     )

@@ -17,7 +17,7 @@ from netkf.plants.transitions import Transitions, frame_period
 from netkf.plants.truth import SampledTruth, TruthTimes, multiples
 from netkf.rng.normals import GeneratorNormals, Normals
 
-LONGEST_STEP = 8.0
+MAX_STEP = 8.0
 NO_TIMES = np.empty(0)
 
 
@@ -52,7 +52,7 @@ class Diffusion(Plant):
     def longest_period(self) -> float:
         """Seconds; the longest sensing period for which the path is exact."""
         norm = float(np.abs(self.A).sum(axis=0).max())
-        return LONGEST_STEP / norm if norm > 0.0 else math.inf
+        return MAX_STEP / norm if norm > 0.0 else math.inf
 
     @cached_property
     def moves(self) -> Transitions:

@@ -122,8 +122,8 @@ class RecordedDiffusion(Diffusion):
         times, states = times[order], states[order]
         twice = np.flatnonzero(np.diff(times) <= TOLERANCE)
         if twice.size:
-            words = f"{self.path.name}: there may be one row a time"
-            raise ScenarioError("path", words, f"two at t = {times[twice[0]]:g}", "remove one")
+            rule = f"{self.path.name}: there may be one row a time"
+            raise ScenarioError("path", rule, f"two at t = {times[twice[0]]:g}", "remove one")
         return times, states
 
     @property
@@ -258,8 +258,8 @@ class RecordedSensor(Sensor):
     ) -> None:
         for place in beyond:
             if entries[place].strip().lower() not in ("", "nan", "0", "0.0"):
-                words = f"{self.path.name} line {line}: {header[place]} has no row in H"
-                raise ScenarioError("path", words, entries[place], "leave it empty or mend H")
+                rule = f"{self.path.name} line {line}: {header[place]} has no row in H"
+                raise ScenarioError("path", rule, entries[place], "leave it empty or mend H")
 
     def table(self, node: int, period: float) -> Table:
         """The readings (p,) of a node, with their regressors where there are any, by slot of
@@ -298,12 +298,12 @@ class RecordedSensor(Sensor):
             len(given), self._outputs + len(self._regressors)
         )
         if len(times) and times[0] < 0.0:
-            words = f"{self.path.name}: t must be at least 0"
-            raise ScenarioError("path", words, float(times[0]), "mend the row")
+            rule = f"{self.path.name}: t must be at least 0"
+            raise ScenarioError("path", rule, float(times[0]), "mend the row")
         twice = np.flatnonzero(np.diff(times) <= 0.0)
         if twice.size:
-            words = f"{self.path.name}: there may be one row of node {node} a time"
-            raise ScenarioError("path", words, f"two at t = {times[twice[0]]:g}", "remove one")
+            rule = f"{self.path.name}: there may be one row of node {node} a time"
+            raise ScenarioError("path", rule, f"two at t = {times[twice[0]]:g}", "remove one")
         return times, values
 
     def samples(
@@ -363,11 +363,11 @@ def by_slot(
     for t, values in rows:
         slot = round(t / period)
         if slot < 0 or abs(t - slot * period) > 1e-9 * max(period, abs(t)):
-            words = f"{source.name}: t must be a slot, a multiple of the period {period:g}"
-            raise ScenarioError("path", words, t, "mend the row")
+            rule = f"{source.name}: t must be a slot, a multiple of the period {period:g}"
+            raise ScenarioError("path", rule, t, "mend the row")
         if slot in table:
-            words = f"{source.name}: there may be one row{whose} a slot"
-            raise ScenarioError("path", words, f"two at t = {t:g}", "remove one")
+            rule = f"{source.name}: there may be one row{whose} a slot"
+            raise ScenarioError("path", rule, f"two at t = {t:g}", "remove one")
         table[slot] = values
     return table
 
@@ -377,5 +377,5 @@ def _demand(
 ) -> None:
     missing = next((slot for slot in slots if slot not in table), None)
     if missing is not None:
-        words = f"{source.name} has no {what} for slot {missing}, t = {missing * period:g}"
-        raise ScenarioError("path", words, None, "add the row or shorten the horizon")
+        rule = f"{source.name} has no {what} for slot {missing}, t = {missing * period:g}"
+        raise ScenarioError("path", rule, None, "add the row or shorten the horizon")

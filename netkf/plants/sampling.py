@@ -84,9 +84,9 @@ class RecordedSampling(Clock):
         nodes = np.array(whole(self.path, "node", table["node"]), dtype=np.int64)
         early = np.flatnonzero(table["t"] <= 0.0)
         if early.size:
-            words = f"{self.path.name}: t must be above 0, the first sample comes after the start"
+            rule = f"{self.path.name}: t must be above 0, the first sample comes after the start"
             remedy = "shift the times or remove the row"
-            raise ScenarioError("path", words, float(table["t"][early[0]]), remedy)
+            raise ScenarioError("path", rule, float(table["t"][early[0]]), remedy)
         return {node: np.unique(table["t"][nodes == node]) for node in np.unique(nodes).tolist()}
 
     @property

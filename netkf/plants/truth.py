@@ -250,5 +250,5 @@ def demand_rows(source: SourceFile, times: FloatArray, wanted: FloatArray, what:
     """Raise ScenarioError for the first of the ``wanted`` times that has no row."""
     for time in wanted.tolist():
         if nearest_row(times, time) is None:
-            words = f"{source.name} has no state for {what}, t = {time:.9g}"
-            raise ScenarioError("path", words, None, "add the row, or ask for no state then")
+            rule = f"{source.name} has no state for {what}, t = {time:.9g}"
+            raise ScenarioError("path", rule, None, "add the row, or ask for no state then")

@@ -292,8 +292,8 @@ def _of_bound(source: Opened) -> list[str]:
         f"{format_number(top['bound'])} at node {top['node']}, ratio {format_number(ratio)}"
     )
     if source.runs > 1:
-        sure = float(top.get("mean_trace_se") or 0.0)
-        above = float(top["mean_trace"]) - 2.0 * sure > float(top["bound"])
+        error = float(top.get("mean_trace_se") or 0.0)
+        above = float(top["mean_trace"]) - 2.0 * error > float(top["bound"])
         held = "is exceeded by more than two standard errors" if above else "holds"
         return [f"The bound {summary['bound'].split(',')[0]} {held}; closest: {numbers}{PAPER}"]
     side = "below" if ratio <= 1.0 else "above"

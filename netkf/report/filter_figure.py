@@ -12,7 +12,7 @@ from netkf.studies.stored import StoredComparison
 
 WIDTH, ROW, LABELS, VALUES = 620, 26, 190, 130
 """Pixels: the whole figure, the height of a filter, the columns of labels and of numbers."""
-LONGEST_LABEL = 26
+MAX_LABEL = 26
 
 
 def filters_figure(found: StoredComparison) -> str:
@@ -27,19 +27,19 @@ def filters_figure(found: StoredComparison) -> str:
     scale = (WIDTH - LABELS - VALUES) / min(max(ends), 10.0 * min(ends)) if min(ends) > 0 else 0.0
     lines = "".join(_row(row, k, scale) for k, row in enumerate(rows))
     height = ROW * len(rows) + 8
-    words = (
+    label = (
         f"RMS error of {len(rows)} filters over {found.runs:,} runs of each on the same draws; "
         "bars: two standard errors, the axis begins at 0. Which differences are certain stands in "
         "the table"
     )
     picture = (
         f'<svg id="filters-figure" width="{WIDTH}" height="{height}" role="img" '
-        f'aria-label="{text(words)}" fill="currentColor" stroke="none" font-size="13">'
+        f'aria-label="{text(label)}" fill="currentColor" stroke="none" font-size="13">'
         f'<line x1="{LABELS}" x2="{LABELS}" y1="0" y2="{height}" stroke="currentColor"/>'
         f"{lines}</svg>"
     )
     return (
-        f'<div class="scroll" role="group" tabindex="0">{picture}</div>{paragraph(words, "note")}'
+        f'<div class="scroll" role="group" tabindex="0">{picture}</div>{paragraph(label, "note")}'
     )
 
 
@@ -59,7 +59,7 @@ def _row(row: ComparedFilter, k: int, scale: float) -> str:
     number = format_number(found.value) + (" (off the axis)" if outside else "")
     return (
         f'<text x="{LABELS - 8}" y="{y + 4}" text-anchor="end">'
-        f"{text(shorten(row.filter, LONGEST_LABEL))}</text>"
+        f"{text(shorten(row.filter, MAX_LABEL))}</text>"
         f'<line x1="{left:.2f}" x2="{right:.2f}" y1="{y}" y2="{y}" stroke="currentColor" '
         f'stroke-width="2"/><circle cx="{x:.2f}" cy="{y}" r="4"/>'
         f'<text x="{most + 8}" y="{y + 4}">{text(number)}</text>'

@@ -20,7 +20,7 @@ from netkf.runs.tables import format_number
 
 MAX_EVENTS = 200_000
 """Events of a run up to which a page replays it for its readings, some seconds."""
-SURE = 0.99
+CONFIDENCE = 0.99
 """Probability that the interval of every node holds its mean, where P is exact."""
 LEVEL = 1.96
 
@@ -28,7 +28,7 @@ LEVEL = 1.96
 class NodeMeans(NamedTuple):
     """NIS over degrees of freedom of M nodes with readings: their ids (-1: readings that one filter
     uses together), ``means`` (M,), and the ends of the intervals that hold all of them with
-    probability SURE where P is exact.
+    probability CONFIDENCE where P is exact.
     """
 
     nodes: np.ndarray
@@ -60,7 +60,7 @@ def node_means(found: Innovations) -> NodeMeans:
         for values in (found.rows, found.nis)
     )
     # Bonferroni: nodes share the noise of the plant, so their sums are dependent.
-    low, high = chi_square_means(rows, 1.0 - (1.0 - SURE) / max(1, len(nodes)))
+    low, high = chi_square_means(rows, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
     return NodeMeans(nodes, sums / rows, low, high)
 
 
@@ -94,10 +94,12 @@ def innovation_claim(found: Innovations) -> str:
 def _judged(mean: float, low: float, high: float) -> str:
     inside = f"{format_number(low)} .. {format_number(high)}"
     if mean > high:
-        return f"P is too sure: {SURE:.0%} of such means would lie in {inside}"
+        return f"P is too sure: {CONFIDENCE:.0%} of such means would lie in {inside}"
     if mean < low:
-        return f"P is more careful than needed: {SURE:.0%} of such means would lie in {inside}"
-    return f"as exact covariances allow ({SURE:.0%}: {inside})"
+        return (
+            f"P is more careful than needed: {CONFIDENCE:.0%} of such means would lie in {inside}"
+        )
+    return f"as exact covariances allow ({CONFIDENCE:.0%}: {inside})"
 
 
 def innovation_columns(

@@ -21,11 +21,11 @@ from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
 from netkf.studies.why_text import relative_change, sentences
 
-SAME = 1e-4
+EQUAL_NUMBERS = 1e-4
 """Relative difference of numbers that look the same with four digits."""
 MAX_EVENTS = 60_000
 """Events until the worst instant up to which a page replays a run, a second or two."""
-REPLAYED_EVENTS, LEAST, MOST = 300_000, 5, 60
+REPLAYED_EVENTS, MIN_REPLAYS, MAX_REPLAYS = 300_000, 5, 60
 """Events of all replays of a page together, and the replays of a search at least and at most."""
 
 
@@ -42,7 +42,7 @@ def explain_worst(source: Opened) -> Explanation | str | None:
     events = int(np.searchsorted(run.log["t"], worst.time, side="right"))
     if events > MAX_EVENTS:
         return f"{events:,} events until then are many to replay; {_command(source, worst)} does it"
-    replays = max(LEAST, min(MOST, REPLAYED_EVENTS // max(1, events)))
+    replays = max(MIN_REPLAYS, min(MAX_REPLAYS, REPLAYED_EVENTS // max(1, events)))
     try:
         return why(run, worst.node, worst.time, replays=replays)
     except NetkfError as error:
@@ -56,8 +56,8 @@ def _command(source: Opened, worst: Worst) -> str:
 def mending_claim(found: Explanation) -> str:
     """Return a sentence that says what it would have taken."""
     was, best = found.what_ifs[0], found.what_ifs[-1]
-    same = math.isclose(was.trace, best.trace, rel_tol=SAME) or math.isnan(was.trace)
-    if same and not abs(best.error - was.error) > SAME * was.error:
+    same = math.isclose(was.trace, best.trace, rel_tol=EQUAL_NUMBERS) or math.isnan(was.trace)
+    if same and not abs(best.error - was.error) > EQUAL_NUMBERS * was.error:
         return "Messages would not have mended it: a replay in which none is missing is no better"
     error = _change("error", was.error, best.error)
     if same:
@@ -105,7 +105,7 @@ def price_claim(source: Opened, found: Explanation, central: CentralSample) -> s
         "With all readings at once: the centralised filter, on the same truth and readings, had "
         f"{' and '.join(had)} then"
     )
-    if not central.trace < best.trace * (1.0 - SAME):
+    if not central.trace < best.trace * (1.0 - EQUAL_NUMBERS):
         return f"{said}, no less than this node with no message missing"
     what = "how rarely nodes exchange, and of how they combine what they hear"
     clock = source.scenario.network.activation

@@ -62,7 +62,7 @@ POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; img-src data:; "
     "base-uri 'none'; form-action 'none'"
 )
-LEAST_BUDGET = 500
+MIN_BUDGET = 500
 MARK = b'<meta name="generator" content="netkf '
 """What every page has among its first HEAD bytes, and other files have not."""
 HEAD = 4096
@@ -134,7 +134,7 @@ def make_page(
     budget = Budget(*(part // len(entries) for part in BUDGET))
     while True:
         page = _assemble(entries, comparison, command, budget)
-        if len(page.encode("utf-8")) <= MAX_BYTES or budget.messages < LEAST_BUDGET:
+        if len(page.encode("utf-8")) <= MAX_BYTES or budget.messages < MIN_BUDGET:
             return page
         budget = budget.halved()
 
@@ -168,11 +168,11 @@ def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
 def _command(
     directories: Sequence[str | Path], replica: int | None, trust: bool, out: Path | None
 ) -> str:
-    words = ["netkf", "report", *map(str, directories)]
-    words += ["--replica", str(replica)] if replica is not None else []
-    words += ["--trust"] if trust else []
-    words += ["--out", str(out)] if out is not None else []
-    return shlex.join(words)
+    command = ["netkf", "report", *map(str, directories)]
+    command += ["--replica", str(replica)] if replica is not None else []
+    command += ["--trust"] if trust else []
+    command += ["--out", str(out)] if out is not None else []
+    return shlex.join(command)
 
 
 def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Comparison | str | None:

@@ -69,8 +69,8 @@ def _lock_or_refuse(opened: int, directory: Path) -> None:
 
 
 def _print_note(directory: Path, error: OSError) -> None:
-    words = f"note: {directory} cannot be locked ({error.strerror}): one command at a time on it"
-    print(words, file=sys.stderr)
+    note = f"note: {directory} cannot be locked ({error.strerror}): one command at a time on it"
+    print(note, file=sys.stderr)
 
 
 if sys.platform == "win32":

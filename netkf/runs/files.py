@@ -209,13 +209,13 @@ def check_sources(scenario: Scenario) -> None:
     """
     unnamed = unnamed_class(scenario, in_script=False)
     if unnamed is not None:
-        words = f"cannot name the class {unnamed} of this script, notebook or function"
+        rule = f"cannot name the class {unnamed} of this script, notebook or function"
         remedy = "put it into a module (a .py file beside the scenario) and import it from there"
-        raise ScenarioError("scenario.toml", words, None, remedy)
+        raise ScenarioError("scenario.toml", rule, None, remedy)
     for source in source_files(scenario):
         if source.name in OWN_FILES:
-            words = "is a name that run directories use themselves"
-            raise ScenarioError("path", words, source.name, "rename the file")
+            rule = "is a name that run directories use themselves"
+            raise ScenarioError("path", rule, source.name, "rename the file")
 
 
 def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None) -> None:

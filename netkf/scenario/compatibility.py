@@ -61,8 +61,8 @@ def _wrong_at(at: str, clocks: tuple[str, ...], name: str) -> None:
     kinds += ['kind = "readings"'] if "readings" in clocks else []
     listed = " or ".join(kinds)
     key = "kind" if at == "readings" else "at"
-    words = f"must be one that the {name} filter runs under: {listed}"
-    raise ScenarioError(f"network.activation.{key}", words, at, "write that, or change the filter")
+    rule = f"must be one that the {name} filter runs under: {listed}"
+    raise ScenarioError(f"network.activation.{key}", rule, at, "write that, or change the filter")
 
 
 def check_readings(scenario: DerivedScenario) -> None:

@@ -73,9 +73,9 @@ def _import_path(entries: list[str]) -> Iterator[None]:
 
 
 def _failure(kind: str, error: BaseException) -> ScenarioError:
-    words = f"could not be imported ({type(error).__name__}: {quote(str(error))})"
+    rule = f"could not be imported ({type(error).__name__}: {quote(str(error))})"
     remedy = "put the module beside the scenario file or on the Python path"
-    return ScenarioError("kind", words, kind, remedy)
+    return ScenarioError("kind", rule, kind, remedy)
 
 
 def is_loaded(module_name: str, class_name: str, folder: Path) -> bool:
@@ -159,9 +159,9 @@ class _Places:
     def _specs(self, module_name: str) -> list[ModuleSpec] | None:
         """Return the specifications of a module and its packages; None if one is not allowed."""
         specs: list[ModuleSpec] = []
-        path, words = self.path, module_name.split(".")
-        for k in range(len(words)):
-            name = ".".join(words[: k + 1])
+        path, names = self.path, module_name.split(".")
+        for k in range(len(names)):
+            name = ".".join(names[: k + 1])
             spec = (None if specs else self._mapped(name)) or _spec(name, path)
             if spec is None:
                 return None
@@ -291,16 +291,16 @@ class _Source:
 
     def _resolved(self, node: ast.expr, own: str) -> Iterator[tuple[str, str]]:
         """Yield what an expression ``Name`` or ``package.module.Name`` refers to."""
-        words: list[str] = []
+        names: list[str] = []
         while isinstance(node, ast.Attribute):
-            words.insert(0, node.attr)
+            names.insert(0, node.attr)
             node = node.value
         first = _name(node)
-        if not words and first not in ("", own):
+        if not names and first not in ("", own):
             yield self._module, first
-        elif words and first:
+        elif names and first:
             for module in self._modules(first):
-                yield ".".join([module, *words[:-1]]), words[-1]
+                yield ".".join([module, *names[:-1]]), names[-1]
 
     def _modules(self, name: str) -> Iterator[str]:
         """Yield the modules that a name may refer to."""

@@ -59,16 +59,16 @@ def _parsed(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8") from None
     except OSError as error:
-        words = f"cannot be read ({error.strerror})"
-        raise ScenarioError("", words, None, "check the path") from None
+        rule = f"cannot be read ({error.strerror})"
+        raise ScenarioError("", rule, None, "check the path") from None
     except RecursionError:
-        words = "is not valid TOML: nested too deep"
-        raise ScenarioError("", words, None, "mend the brackets") from None
+        rule = "is not valid TOML: nested too deep"
+        raise ScenarioError("", rule, None, "mend the brackets") from None
     except ScenarioError:
         raise
     except ValueError as error:  # TOMLDecodeError among them
-        words = f"is not valid TOML: {' '.join(str(error).split())[:120]}"
-        raise ScenarioError("", words, None, "mend that line") from None
+        rule = f"is not valid TOML: {' '.join(str(error).split())[:120]}"
+        raise ScenarioError("", rule, None, "mend that line") from None
 
 
 def _text(path: Path) -> str:
@@ -78,8 +78,8 @@ def _text(path: Path) -> str:
         while len(content) <= MAX_BYTES and (part := file.read(1 << 20)):
             content += part
     if len(content) > MAX_BYTES:
-        words = f"must have at most {MAX_BYTES >> 20} MiB"
-        raise ScenarioError("", words, None, "put long lists into CSV files")
+        rule = f"must have at most {MAX_BYTES >> 20} MiB"
+        raise ScenarioError("", rule, None, "put long lists into CSV files")
     return content.decode("utf-8-sig")
 
 
@@ -92,8 +92,8 @@ def parse_toml(text: str) -> dict[str, Any]:
     lines = text.splitlines()
     for number, line in enumerate(lines, 1):
         if line.count(".") > MAX_DOTS and _MANY_PARTS.search(line):
-            words = f"line {number} has a key of more than {MAX_DOTS} parts"
-            raise ScenarioError("", words, None, "mend that line")
+            rule = f"line {number} has a key of more than {MAX_DOTS} parts"
+            raise ScenarioError("", rule, None, "mend that line")
     arrays: dict[str, Any] = {}
     if len(text) > LONG_TEXT and '"""' not in text and "'''" not in text:
         mark = secrets.token_hex(16)

@@ -45,8 +45,8 @@ def _under(key: str, check: Callable[[], None]) -> None:
 def _readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> None:
     for node in sensor.listed:
         if node not in scenario.topology.index:
-            words = f"{sensor.path.name} names a node that the graph does not have"
-            raise ScenarioError(f"{key}.path", words, node, "mend the row or the graph")
+            rule = f"{sensor.path.name} names a node that the graph does not have"
+            raise ScenarioError(f"{key}.path", rule, node, "mend the row or the graph")
     if scenario.slotted:
         _under(key, lambda: sensor.demand(scenario.slot_plant.period))
 

@@ -143,9 +143,9 @@ def find(family: str, kind: object, origin: Origin) -> type[Component] | None:
         return names[kind]
     if isinstance(kind, str) and ":" in kind:
         return _custom(family, kind, origin)
-    words = other_time(family, kind)
-    if words is not None:
-        raise ScenarioError("kind", words, kind, "change the plant or choose another kind")
+    reason = other_time(family, kind)
+    if reason is not None:
+        raise ScenarioError("kind", reason, kind, "change the plant or choose another kind")
     listed = ", ".join(f'"{name}"' for name in names)
     raise ScenarioError(
         "kind",

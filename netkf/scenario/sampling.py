@@ -142,9 +142,9 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
     if isinstance(clock, RecordedSampling):
         for node in clock.listed:
             if node not in scenario.topology.index:
-                words = f"{clock.path.name} names a node that the graph does not have"
+                rule = f"{clock.path.name} names a node that the graph does not have"
                 remedy = "mend the row or the graph"
-                raise ScenarioError(f"{key}.sampling.path", words, node, remedy)
+                raise ScenarioError(f"{key}.sampling.path", rule, node, remedy)
     if getattr(clock, "rates", ()):
         raise ScenarioError(
             f"{key}.sampling.rates",
@@ -155,8 +155,8 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
     if getattr(clock, "rate", 0.0) is None and getattr(clock, "rates", None) is not None:
         raise ScenarioError(f"{key}.sampling.rate", "is missing", None, "add rate = ...")
     if getattr(clock, "at", "links") != "links":
-        words = "belongs to network.activation"
-        raise ScenarioError(f"{key}.sampling.at", words, getattr(clock, "at", None), "remove it")
+        rule = "belongs to network.activation"
+        raise ScenarioError(f"{key}.sampling.at", rule, getattr(clock, "at", None), "remove it")
     for node in sensor.nodes:
         count = clock.mean_rate((node, 0)) * scenario.horizon
         if count > MAX_SAMPLES:

@@ -126,8 +126,8 @@ def _table(keys: Sequence[KeyOf], first: Mapping[str, Schema] = MappingProxyType
 def _property(key: KeyOf) -> Schema:
     """Return the schema of the value of a key, with its description and its default."""
     known = key.rule and key.rule != "a table"
-    words = [key.description, f"Must be {key.rule}." if known else ""]
-    found = {**key.schema, "description": " ".join(filter(None, words))}
+    sentences = [key.description, f"Must be {key.rule}." if known else ""]
+    found = {**key.schema, "description": " ".join(filter(None, sentences))}
     if not found["description"]:
         del found["description"]
     if isinstance(key.default, (bool, int, float, str)):

@@ -12,8 +12,8 @@ def demand_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why
         want is None or have == want for have, want in zip(value.shape, shape, strict=True)
     )
     if not fits:
-        words = " x ".join("any" if want is None else str(want) for want in shape)
+        wanted = " x ".join("any" if want is None else str(want) for want in shape)
         got = " x ".join(map(str, value.shape))
         raise ScenarioError(
-            key, f"must be {words}, not {got}, because {why}", value, "mend the shape"
+            key, f"must be {wanted}, not {got}, because {why}", value, "mend the shape"
         )

@@ -187,12 +187,12 @@ def _made(cls: type[Any], values: dict[str, Any]) -> Any:
         raise
     except Exception as error:
         # A class of the user's failed, this one or one that the scenario asked.
-        words = f"{cls.__name__} could not be made ({describe_error(error)})"
+        rule = f"{cls.__name__} could not be made ({describe_error(error)})"
         if is_ours(cls):
-            words = blame(tuple(values.values()), error) or ""
-        if not words:
+            rule = blame(tuple(values.values()), error) or ""
+        if not rule:
             raise
-        raise ScenarioError("", words, None, "mend the class or its settings") from error
+        raise ScenarioError("", rule, None, "mend the class or its settings") from error
 
 
 def _plant(value: Any, origin: Origin) -> Any:

@@ -7,8 +7,8 @@ from typing import Any
 from netkf.core.errors import ScenarioError
 from netkf.scenario.reading import parse_toml
 
-LONGEST_WORD = 1000
-LONGEST_SETTING = 100_000
+MAX_WORD = 1000
+MAX_SETTING = 100_000
 """Characters of a setting; Linux passes no argument of more than 131,071."""
 
 
@@ -29,10 +29,10 @@ def typed_value(option: str, key: str, text: str) -> Any:
     try:
         return _toml(text)
     except (ValueError, RecursionError):
-        if text[0] in "[{\"'" or not text.isprintable() or len(text) > LONGEST_WORD:
-            words = f"value of {key} is not valid TOML"
+        if text[0] in "[{\"'" or not text.isprintable() or len(text) > MAX_WORD:
+            rule = f"value of {key} is not valid TOML"
             remedy = "mend it; quote the argument for your shell"
-            raise ScenarioError(option, words, text, remedy) from None
+            raise ScenarioError(option, rule, text, remedy) from None
         return text
 
 
@@ -47,8 +47,8 @@ def typed_values(option: str, key: str, text: str) -> list[Any]:
 
 
 def _require_short(option: str, text: str) -> None:
-    if len(text) > LONGEST_SETTING:
-        rule = f"must have at most {LONGEST_SETTING:,} characters"
+    if len(text) > MAX_SETTING:
+        rule = f"must have at most {MAX_SETTING:,} characters"
         raise ScenarioError(option, rule, len(text), "write long values into the file")
 
 

@@ -253,12 +253,12 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     a directory that is not that of a finished run.
     """
     found = _read_all(directories)
-    sure = number(above=0.0, below=1.0)("--confidence", confidence)
+    confidence = number(above=0.0, below=1.0)("--confidence", confidence)
     first = found[0]
     wanted = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
     if all(other.nodes == first.nodes for other in found):
         wanted += [("rms_error", node) for node in first.nodes]
-    level = (1.0 - sure) / (len(wanted) * max(1, len(found) - 1))
+    level = (1.0 - confidence) / (len(wanted) * max(1, len(found) - 1))
     rows = [
         ComparedRow(q, node, tuple(_entry(first, other, q, node, level) for other in found))
         for q, node in wanted
@@ -270,7 +270,7 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         tuple(str(other.directory) for other in found),
         tuple(str(other.manifest.get("name", "")) for other in found),
         tuple(other.runs for other in found),
-        sure,
+        confidence,
         tuple(rows),
         tuple(tuple(other.summary.get("notes", ())) for other in found),
     )
@@ -310,9 +310,9 @@ def _paired(
         return None
     mean, error = mean_over_runs(gaps)
     ends = _interval(mean, error, len(gaps) - 1, level)
-    words = "paired" if quantity != "rms_error" else "paired, mean squares"
+    method = "paired" if quantity != "rms_error" else "paired, mean squares"
     return entry._replace(
-        difference=mean, low=ends[0], high=ends[1], real=_excludes_zero(*ends), method=words
+        difference=mean, low=ends[0], high=ends[1], real=_excludes_zero(*ends), method=method
     )
 
 

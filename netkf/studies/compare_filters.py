@@ -156,7 +156,7 @@ def compare_filters(
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "compare_filters takes a netkf.Scenario", scenario, LOAD)
-    sure = number(above=0.0, below=1.0)("confidence", confidence)
+    confidence = number(above=0.0, below=1.0)("confidence", confidence)
     count = integer(low=1)("runs", runs)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     candidates = _candidates(scenario, filters, engine)
@@ -171,7 +171,7 @@ def compare_filters(
             if progress is not None:
                 progress(k + 1, len(candidates))
     first = next(iter(values))
-    level = (1.0 - sure) / (len(QUANTITIES) * max(1, len(values) - 1))
+    level = (1.0 - confidence) / (len(QUANTITIES) * max(1, len(values) - 1))
     rows = []
     for label, made, reason in candidates:
         if made is None:
@@ -180,7 +180,7 @@ def compare_filters(
         base = values[first] if label != first else None
         row = _row(label, values[label], base, traffic[label], scenario.plant.n, level)
         rows.append(dataclasses.replace(row, predicts=made.slotted and made.hosted.predicts))
-    return FilterComparison(scenario.name, count, root, sure, tuple(rows))
+    return FilterComparison(scenario.name, count, root, confidence, tuple(rows))
 
 
 def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:

@@ -294,7 +294,7 @@ def consistency(
         rule = "states or readings are recorded, so the law of the errors is unknown"
         raise ScenarioError("plant", rule, None, "simulate the plant and all readings")
     count = integer(low=MIN_RUNS)("runs", runs)
-    sure = number(above=0.0, below=1.0)("confidence", confidence)
+    confidence = number(above=0.0, below=1.0)("confidence", confidence)
     task = partial(run_consistency, engine=choose_engine(engine, scenario))
     found = replicate(
         task,
@@ -305,7 +305,7 @@ def consistency(
         executor=executor,
         scheduler=scheduler,
     )
-    return judge_consistency(scenario, found, sure)
+    return judge_consistency(scenario, found, confidence)
 
 
 def _without_horizon(scenario: Scenario) -> Scenario:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from netkf.studies.information import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
-NEAR = 0.05
+GOOD_ENOUGH = 0.05
 """By default a set is good enough if it brings the trace of P as close as that, relatively, to the
 one of the run in which every message came.
 """
@@ -41,7 +41,7 @@ class InformationSource:
     route           the nodes on the way of that, this one first
     with_more       its newest reading that could have come with at most 1, 2, .. more messages
     without_losses  its newest reading that could have come if every message had
-    missing         the fewest messages that had to come for a newer reading, of up to MOST
+    missing         the fewest messages that had to come for a newer reading, of up to MAX_MISSING
     """
 
     node: int

@@ -10,7 +10,7 @@ from netkf.figures.style import BLUE, MUTED, finish_figure, look, new_figure, wr
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare_filters import ComparedFilter, CompletedComparison
 
-LONGEST_LABEL = 34
+MAX_LABEL = 34
 PANELS = (
     ("rms_error", "RMS error"),
     ("worst_instant", "worst instant"),
@@ -29,7 +29,7 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         for axes, (name, label) in zip(panels, PANELS, strict=False):
             _draw_quantity(axes, rows, name, label)
         _draw_traffic(panels[-1], rows)
-        labels = [shorten(row.filter, LONGEST_LABEL) for row in rows]
+        labels = [shorten(row.filter, MAX_LABEL) for row in rows]
         panels[0].set_yticks(range(len(rows)), labels, parse_math=False)
         panels[0].invert_yaxis()
         runs = f"{completed.comparison.runs:,} runs on the same draws; bars: two standard errors."
@@ -44,7 +44,7 @@ def _claim(rows: list[ComparedFilter]) -> str:
         return "No filter has a finite error"
     best = min(known, key=lambda row: row.quantities["rms_error"].value)
     error = best.quantities["rms_error"].value
-    return f"{shorten(best.filter, LONGEST_LABEL)} has the smallest RMS error, {error:.3g}"
+    return f"{shorten(best.filter, MAX_LABEL)} has the smallest RMS error, {error:.3g}"
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:

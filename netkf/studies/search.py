@@ -29,7 +29,7 @@ REACHED, MISSED, UNDECIDED, NOT_SHOWN = "reached", "missed", "undecided", "not s
 """What was found of a value; ``not shown``: a bound is above the limit, which proves nothing."""
 FIRST_BATCH, FIRST_EXPECTED = 32, 8
 """Runs before the first look at a value, and those of expected squared errors."""
-CLOSE = 1.25
+END_RATIO = 1.25
 """Ratio of values below which the search ends once one of them is undecided."""
 MAX_PROBES = {"theory": 40, "simulation": 16, "both": 16}
 DIGITS = {"theory": 4, "simulation": 2, "both": 2}
@@ -244,7 +244,7 @@ class Search:
             reached = self._try(middle).target == REACHED
             value, misses = (middle, misses) if reached else (value, middle)
             # Noise hides the limit near a value that stayed undecided.
-            if self._is_undecided(misses) and max(value, misses) <= CLOSE * min(value, misses):
+            if self._is_undecided(misses) and max(value, misses) <= END_RATIO * min(value, misses):
                 break
         return value, misses
 

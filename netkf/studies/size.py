@@ -80,7 +80,10 @@ def size(
         raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)
     if by is not None:
         choice("theory", "simulation")("--by", by)
-    wanted, sure = parse_target(target), number(above=0.0, below=1.0)("--confidence", confidence)
+    wanted, confidence = (
+        parse_target(target),
+        number(above=0.0, below=1.0)("--confidence", confidence),
+    )
     integer(low=FIRST_BATCH)("--runs", runs)
     if wanted.of_errors and not scenario.plant.truth_known:
         rule = "is about errors, and there is no ground truth"
@@ -96,12 +99,12 @@ def size(
     task, simulated, first = _choose_task(problem, low, used)
     quantity = _describe_quantity(problem, low, simulated)
     # Bonferroni over all values and all interim looks at each of them.
-    level = (1.0 - sure) / (MAX_PROBES["simulation"] * _count_looks(runs, first))
+    level = (1.0 - confidence) / (MAX_PROBES["simulation"] * _count_looks(runs, first))
     with shared_pool(runs, PoolOptions(workers, executor, scheduler)) as pool:
         plan = SimulationPlan(task, runs, level, pool, progress, first)
         method = decide_by_both if chosen == "both" else decide_by_simulation
         decide = partial(method, problem, plan)
-        return Search(problem, decide).run(low, high, sure, quantity)
+        return Search(problem, decide).run(low, high, confidence, quantity)
 
 
 def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> str:

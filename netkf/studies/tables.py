@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 COLUMNS = ("worst_rms", "mean_rms", "mean_trace", "bound", "central")
 MAX_ROWS = 40
-LONGEST = 30
+MAX_LENGTH = 30
 
 
 def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
@@ -39,7 +39,7 @@ def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
 
 def _short(value: Any) -> str:
     text = f"{value:g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
 
 
 def _with_error(value: float | None, error: float | None) -> str:
@@ -76,8 +76,8 @@ def answer(found: Sizing) -> str:
     span = f"{min(values):g} .. {max(values):g}"
     if found.value is None:
         undecided = any(probe.target in ("undecided", "not shown") for probe in found.probes)
-        words = "was shown to reach" if undecided else "reaches"
-        return f"no value of {found.key} in {span} {words} {found.target}"
+        verb = "was shown to reach" if undecided else "reaches"
+        return f"no value of {found.key} in {span} {verb} {found.target}"
     which = "largest" if found.grows else "smallest"
     if found.misses is None:
         return f"{found.key} = {found.value:g}: all of {span} reaches {found.target}"
@@ -88,10 +88,10 @@ def answer(found: Sizing) -> str:
             f"{found.target}; at {found.misses:g} the bound is above the limit, the quantity may "
             "not be"
         )
-    words = "misses it" if miss.target == "missed" else "was not shown to"
+    verb = "misses it" if miss.target == "missed" else "was not shown to"
     return (
         f"{found.key} = {found.value:g} is the {which} that reaches {found.target}; "
-        f"{found.misses:g} {words}"
+        f"{found.misses:g} {verb}"
     )
 
 

@@ -16,7 +16,7 @@ from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.scenario.scenario import Scenario
-from netkf.studies.explanation import NEAR, Explanation, InformationSource, Missing, WhatIf
+from netkf.studies.explanation import GOOD_ENOUGH, Explanation, InformationSource, Missing, WhatIf
 from netkf.studies.information import (
     OUTCOMES,
     USED,
@@ -44,7 +44,7 @@ from netkf.trace.run import Run
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST = 3
+MAX_MISSING = 3
 MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 100, 1000, 5_000_000
 """By default as many replays look for a set as have so many events together, within the limits."""
 
@@ -80,7 +80,7 @@ def why(
     scenario: Scenario | None = None,
     replica: int | None = None,
     below: float | None = None,
-    most: int = MOST,
+    most: int = MAX_MISSING,
     replays: int | None = None,
     trust: bool = False,
 ) -> Why:
@@ -99,7 +99,7 @@ def why(
     """
     run, known = _given(run, scenario, replica, trust)
     at = _instant(run, known, node, at)
-    most = integer(low=1, high=MOST)("most", most)
+    most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
     replayer = Replayer(known, run.seed, run.replica, node, at)
     _same_events(rows_until(known, run.log, at), replayer.log)
@@ -112,7 +112,7 @@ def why(
     sources = evidence.sources()
     found = None
     if math.isfinite(before.trace):
-        target = (1.0 + NEAR) * replayer.outcome(None).trace if limit is None else limit
+        target = (1.0 + GOOD_ENOUGH) * replayer.outcome(None).trace if limit is None else limit
         wanted = _default_replays(len(replayer.log)) if replays is None else replays
         count = integer(low=1)("replays", wanted)
         found = smallest_set(replayer, evidence.candidates(), target, most, count)

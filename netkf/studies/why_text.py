@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.printable import shorten
 from netkf.runs.files import finite
 from netkf.runs.tables import format_number, shorten_rows, table
-from netkf.studies.explanation import NEAR, Explanation, InformationSource, WhatIf
+from netkf.studies.explanation import GOOD_ENOUGH, Explanation, InformationSource, WhatIf
 from netkf.studies.information import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
@@ -115,14 +115,14 @@ def sentences(found: Explanation) -> list[str]:
 
 def _state(found: Explanation) -> Iterator[str]:
     where = f"{shorten(found.scenario, 60)}, seed {found.seed}, replica {found.replica}"
-    words = f"Node {found.node} at {found.at:g} s ({where})"
+    sentence = f"Node {found.node} at {found.at:g} s ({where})"
     if math.isfinite(found.trace):
         rms = math.sqrt(max(found.trace, 0.0))
-        words += f": trace P is {found.trace:.4g}, which claims an RMS error of {rms:.3g}"
+        sentence += f": trace P is {found.trace:.4g}, which claims an RMS error of {rms:.3g}"
     else:
-        words += ": the filter gives no covariance"
+        sentence += ": the filter gives no covariance"
     error = f"; its error is {found.error:.3g}" if math.isfinite(found.error) else ""
-    yield f"{words}{error}."
+    yield f"{sentence}{error}."
 
 
 def _heard(found: Explanation) -> Iterator[str]:
@@ -157,11 +157,11 @@ def _readings(found: Explanation) -> Iterator[str]:
     never = [str(s.node) for s in sensors if math.isnan(s.reading)]
     if known:
         oldest = known[:MAX_LISTED]
-        words = [
+        parts = [
             f"{found.at - s.reading:.4g} s old from node {s.node} ({_route(s)})" for s in oldest
         ]
         which = "The oldest of its" if len(known) > MAX_LISTED else "Its"
-        yield f"{which} newest readings are {_and(words)}."
+        yield f"{which} newest readings are {_and(parts)}."
     if never:
         yield f"No reading of node {_and(never[:MAX_LISTED])} can have reached it."
     kept_away = [s for s in known + [s for s in sensors if math.isnan(s.reading)] if s.missing]
@@ -210,20 +210,20 @@ def _smallest(found: Explanation) -> Iterator[str]:
 
 def _limit(found: Explanation, smallest: SmallestSet) -> str:
     """The trace that was wanted, and where it comes from unless it was asked for."""
-    usual = (1.0 + NEAR) * found.what_ifs[-1].trace
-    where = f", {1.0 + NEAR:g} times that with no message missing"
+    usual = (1.0 + GOOD_ENOUGH) * found.what_ifs[-1].trace
+    where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
     own = math.isclose(smallest.limit, usual, rel_tol=1e-9)
     return f"{smallest.limit:.4g}{where if own else ''}"
 
 
 def _tried(smallest: SmallestSet) -> str:
-    words = f"{smallest.candidates} messages could have mattered"
+    sentence = f"{smallest.candidates} messages could have mattered"
     if smallest.considered < smallest.candidates:
         if not smallest.considered:
-            return f"{words}; all of them together change next to nothing"
+            return f"{sentence}; all of them together change next to nothing"
         since = f"{smallest.considered} of them sent from {smallest.since:.6g} s on"
-        words += f", {since}; all before would have changed next to nothing"
-    return f"{words}; {smallest.replays} replays"
+        sentence += f", {since}; all before would have changed next to nothing"
+    return f"{sentence}; {smallest.replays} replays"
 
 
 def _sources(found: Explanation) -> str:

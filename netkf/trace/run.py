@@ -243,8 +243,8 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
     """
     for given in (a, b):
         if not isinstance(given, Run) and not hasattr(given, "iloc"):
-            words = f"first_difference takes runs or their event tables, got {quote(given)}"
-            raise TypeError(words)
+            message = f"first_difference takes runs or their event tables, got {quote(given)}"
+            raise TypeError(message)
     one, other = (t.events if isinstance(t, Run) else t for t in (a, b))
     names = [name for name in EVENT_COLUMNS if name not in ("run", "seq")]
     shorter = min(len(one), len(other))

@@ -311,7 +311,7 @@ def test_a_page_of_fifty_nodes_and_100_000_events_is_small_and_complete(tmp_path
 def test_larger_pages_are_thinned_until_they_fit(ring, monkeypatch):
     whole = len(make_page([ring]))
     monkeypatch.setattr(pages, "MAX_BYTES", whole - 5_000)
-    monkeypatch.setattr(pages, "LEAST_BUDGET", 10)
+    monkeypatch.setattr(pages, "MIN_BUDGET", 10)
     text = make_page([ring])
     assert len(text.encode()) <= whole - 5_000
     assert "Left out: of" in text

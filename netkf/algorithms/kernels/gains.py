@@ -23,7 +23,7 @@ from netkf.linalg.legendre import MOMENTS, backward_coefficients
 from netkf.linalg.series import polynomial, with_reach
 from netkf.linalg.small import add_matmul, matvec
 
-LONGEST_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
+MAX_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
 
 
 class GainTable(NamedTuple):
@@ -48,8 +48,8 @@ def gain_table(
     M, scale = hamiltonian(A, Q, HR @ H)
     # The 1-norm of M times g bounds every term of the power series.
     size = float(np.abs(M).sum(axis=0).max()) * longest
-    # The tolerance admits an interval that was computed from LONGEST_INTERVAL itself.
-    if size > LONGEST_INTERVAL * (1.0 + 1e-9):
+    # The tolerance admits an interval that was computed from MAX_INTERVAL itself.
+    if size > MAX_INTERVAL * (1.0 + 1e-9):
         raise ValueError(f"an interval of {longest:g} s is too long for the gains of this sensor")
     terms = _terms(size)
     # k(s) looks back from the end b, hence exp(-M (b - s)).
@@ -83,7 +83,7 @@ def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     M, _ = hamiltonian(A, Q, G)
     norm = float(np.abs(M).sum(axis=0).max())
     # No dynamics and no information: every interval is short enough.
-    return LONGEST_INTERVAL / norm if norm > 0.0 else math.inf
+    return MAX_INTERVAL / norm if norm > 0.0 else math.inf
 
 
 def _terms(size: float) -> int:

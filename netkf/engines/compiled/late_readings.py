@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.algorithms.intermittent import SAME
+from netkf.algorithms.intermittent import TIME_TOLERANCE
 from netkf.algorithms.kernels.root_flow import move_root
 from netkf.algorithms.kernels.root_update import sample_root
 from netkf.engines.compiled.state import Simulation
@@ -178,7 +178,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
     # Go back: entries after the reading's time are reversed into the list ``again``. Times that
     # differ by rounding count as equal.
     again, k = -1, history.newest[h]
-    while past[k].time > time + SAME * now and past[k].before != -1:
+    while past[k].time > time + TIME_TOLERANCE * now and past[k].before != -1:
         before = past[k].before
         past[k].before = again
         again, k = k, before

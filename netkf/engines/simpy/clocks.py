@@ -20,7 +20,7 @@ from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
 TICK, TRANSMIT = CODES["tick"], CODES["transmit"]
-FIRST_BLOCK, LONGEST_BLOCK = 8, 1024
+FIRST_BLOCK, MAX_BLOCK = 8, 1024
 
 Process = Generator[simpy.Event, Any, None]
 Activation = Callable[[float], None]
@@ -87,7 +87,7 @@ def _ticking(
         recorder.flush_if_full()
         index += len(times)
         # Few numbers at first: a slow clock uses few, and a fast one soon draws long blocks.
-        count = min(2 * count, LONGEST_BLOCK)
+        count = min(2 * count, MAX_BLOCK)
 
 
 Places = list[tuple[tuple[int, ...], Activation]]

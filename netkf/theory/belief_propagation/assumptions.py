@@ -19,5 +19,5 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 def weight_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the row about loops of the graph."""
     tree = is_forest(scenario)
-    words = "every reading arrives on one way" if tree else "readings return and count again"
-    return [(TREE, SOURCE, tree, words)]
+    evidence = "every reading arrives on one way" if tree else "readings return and count again"
+    return [(TREE, SOURCE, tree, evidence)]

@@ -156,7 +156,7 @@ def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait
     )
 
 
-def messages_are_sure(scenario: Scenario) -> bool:
+def all_messages_arrive(scenario: Scenario) -> bool:
     """Return True if every message of a scenario in slots arrives in its exchange."""
     channel = scenario.network.channel
     delay = channel.delay.fixed

@@ -5,14 +5,14 @@ from __future__ import annotations
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import model_and_start_rows
-from netkf.theory.common.random_links import messages_are_sure
+from netkf.theory.common.random_links import all_messages_arrive
 
 SOURCE = "Battistelli et al. 2018"
-SURE = "no message is lost"
+NO_LOSS = "no message is lost"
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the messages and the first covariances."""
-    sure = messages_are_sure(scenario)
-    words = "neighbours have what was sent" if sure else "a sender does not notice a loss"
-    return model_and_start_rows(scenario, SOURCE, (SURE, SOURCE, sure, words))
+    sure = all_messages_arrive(scenario)
+    evidence = "neighbours have what was sent" if sure else "a sender does not notice a loss"
+    return model_and_start_rows(scenario, SOURCE, (NO_LOSS, SOURCE, sure, evidence))

@@ -16,7 +16,7 @@ from netkf.theory.intermittent.riccati import couple_from_the_past
 from netkf.theory.numerics.matrices import as_whole
 
 MAX_SAMPLES_AT_ONCE = 2000
-FAR = 1e3  # standard deviations of the upper start, in units of those of the plant
+FAR_START_DEVIATIONS = 1e3  # standard deviations of the upper start, in units of those of the plant
 
 
 class SwitchedSamples(NamedTuple):
@@ -52,14 +52,14 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
     # Abar is symmetric, so the reversed chain has the same transition probabilities.
     rows = np.cumsum(matching, axis=1)
     size = float(np.sqrt(np.trace(Q) + 1.0))
-    starts = np.stack([np.zeros((n, n)), FAR * size * np.eye(n)])
+    starts = np.stack([np.zeros((n, n)), FAR_START_DEVIATIONS * size * np.eye(n)])
     kind = np.uint8 if N < 256 else np.int64
     P, last = np.empty((samples, n, n)), np.empty(samples, dtype=np.int64)
     for first in range(0, samples, MAX_SAMPLES_AT_ONCE):
         part = slice(first, min(first + MAX_SAMPLES_AT_ONCE, samples))
         P[part], last[part] = couple_from_the_past(
             lambda following, T: _draw_before(rows, following, T, random),
-            lambda roots, words: move_roots(roots, words, F, root_Q, modes),
+            lambda roots, drawn: move_roots(roots, drawn, F, root_Q, modes),
             starts,
             np.zeros((part.stop - first, 0), dtype=kind),
         )

@@ -39,8 +39,8 @@ def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
     )
     if not whole:
         most = float(silent.max())
-        words = "its own, in slots in which it hears nothing"
-        return most <= 1.0 + TOLERANCE, f"a node counts a reading up to {most:.4g} times: {words}"
+        which = "its own, in slots in which it hears nothing"
+        return most <= 1.0 + TOLERANCE, f"a node counts a reading up to {most:.4g} times: {which}"
     _, counts = effective_weights(scenario, [weights] * steps)
     most = float(np.max(counts))
     return most <= 1.0 + TOLERANCE, f"a node counts a reading up to {most:.4g} times"

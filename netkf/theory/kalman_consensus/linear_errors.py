@@ -15,7 +15,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.jumps import SlotJumps
-from netkf.theory.common.random_links import messages_are_sure, ways_of
+from netkf.theory.common.random_links import all_messages_arrive, ways_of
 from netkf.theory.intermittent.riccati import steady_covariance
 
 
@@ -56,7 +56,7 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
 
 def _require_sure_links(scenario: Scenario) -> None:
     """Raise TheoryError unless every message arrives in its slot."""
-    if not messages_are_sure(scenario):
+    if not all_messages_arrive(scenario):
         raise TheoryError(
             "gains follow the readings that arrive; exact steady mean squares of kcf are known "
             "with share_readings = false, or where nothing is lost"

@@ -14,5 +14,5 @@ HEARD = "every node hears every other, without losses"
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the network and the first covariances."""
     heard = everyone_hears(scenario)
-    words = "silence is a decision" if heard else "who misses a message takes it for silence"
-    return model_and_start_rows(scenario, SOURCE, (HEARD, SOURCE, heard, words))
+    evidence = "silence is a decision" if heard else "who misses a message takes it for silence"
+    return model_and_start_rows(scenario, SOURCE, (HEARD, SOURCE, heard, evidence))

@@ -18,7 +18,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import HostObservations
-from netkf.theory.common.random_links import messages_are_sure
+from netkf.theory.common.random_links import all_messages_arrive
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.theory.numerics.updates import Observation
 from netkf.trace.run import Run
@@ -31,7 +31,7 @@ Decisions = set[tuple[int, int]]
 def everyone_hears(scenario: Scenario) -> bool:
     """Return True if every node hears every other, without losses."""
     N = len(scenario.nodes)
-    return len(scenario.topology.directions) == N * (N - 1) and messages_are_sure(scenario)
+    return len(scenario.topology.directions) == N * (N - 1) and all_messages_arrive(scenario)
 
 
 def decisions(scenario: Scenario, run: Run) -> Decisions:

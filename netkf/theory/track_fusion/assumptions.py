@@ -5,7 +5,7 @@ from __future__ import annotations
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import model_and_start_rows
-from netkf.theory.common.random_links import messages_are_sure
+from netkf.theory.common.random_links import all_messages_arrive
 
 SOURCES = {
     "best intersection": "Julier and Uhlmann 1997",
@@ -20,6 +20,6 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     rows = model_and_start_rows(scenario, source)
     if scenario.hosted.combination != "tracks":
         return rows
-    sure = messages_are_sure(scenario)
-    words = "every message arrives in its slot" if sure else "P depends on who is heard"
-    return [*rows, ("no message is lost", source, sure, words)]
+    sure = all_messages_arrive(scenario)
+    evidence = "every message arrives in its slot" if sure else "P depends on who is heard"
+    return [*rows, ("no message is lost", source, sure, evidence)]
