@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     read_all,
     rebase,
     show,
@@ -26,7 +26,7 @@ from netkf.linalg.compiling import kernel
 @kernel
 def local_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,  # noqa: ARG001 - nobody talks
     samples: SlotSamples,
@@ -36,7 +36,7 @@ def local_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
                 read_all(nodes, readings, room, b, s)
             show(nodes, plan, samples, room, b, s)
             rebase(nodes, readings, room, b, s)

@@ -29,7 +29,7 @@ MAX_STEPS = 10_000
 SLOT, ALL = "slot", "all"
 
 
-class Evidence(NamedTuple):
+class ReadingEvidence(NamedTuple):
     """All that some readings say of the state: ``y = H x + v``, cov(v) = I, with y (p,), H (p, n)
     and p at most n; its information is ``H' H``.
     """
@@ -38,10 +38,10 @@ class Evidence(NamedTuple):
     H: FloatArray
 
 
-class Told(NamedTuple):
+class HeardEvidence(NamedTuple):
     """What a neighbour said last: its ``evidence``, and when it was ``sent``, seconds."""
 
-    evidence: Evidence
+    evidence: ReadingEvidence
     sent: float
 
 
@@ -54,10 +54,10 @@ class BeliefState(NamedTuple):
     xhat: FloatArray
     root: FloatArray
     model: Any
-    prior: Evidence
-    own: Evidence
+    prior: ReadingEvidence
+    own: ReadingEvidence
     senders: tuple[int, ...]
-    told: tuple[Told, ...]
+    told: tuple[HeardEvidence, ...]
     node: int
 
     @property
@@ -71,9 +71,9 @@ class Beliefs(NamedTuple):
     a receiver leaves out what it has told itself.
     """
 
-    own: Evidence
+    own: ReadingEvidence
     senders: tuple[int, ...]
-    heard: tuple[Evidence, ...]
+    heard: tuple[ReadingEvidence, ...]
 
 
 @built_in("belief-propagation")
@@ -132,7 +132,7 @@ class BeliefPropagation(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BeliefState:
         """Nothing was read or heard."""
-        root, nothing = first_root(cov), Evidence(np.zeros(0), np.zeros((0, len(mean))))
+        root, nothing = first_root(cov), ReadingEvidence(np.zeros(0), np.zeros((0, len(mean))))
         prior = evidence_of(mean, root)
         return BeliefState(mean, root, model, prior, nothing, (), (), node.node)
 
@@ -141,16 +141,21 @@ class BeliefPropagation(Filter):
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         state = state._replace(xhat=xhat, root=root)
         if isinstance(state.model, SlotModel) and self.memory == SLOT:
-            prior, nothing = evidence_of(xhat, root), Evidence(state.own.y[:0], state.own.H[:0])
+            prior, nothing = (
+                evidence_of(xhat, root),
+                ReadingEvidence(state.own.y[:0], state.own.H[:0]),
+            )
             return state._replace(prior=prior, own=nothing, senders=(), told=())
         back = backward(state.model, gap)
-        return with_all(state, lambda evidence: moved(evidence, back))
+        return with_all(state, lambda evidence: move_evidence(evidence, back))
 
     def update(self, state: BeliefState, reading: Reading) -> BeliefState:
         """Add a reading to the own ones."""
         if not len(reading.y):
             return state
-        own = merged([state.own, Evidence(*whiten_reading(reading.y, reading.H, reading.R))])
+        own = merge_evidence(
+            [state.own, ReadingEvidence(*whiten_reading(reading.y, reading.H, reading.R))]
+        )
         return believing(state._replace(own=own))
 
     def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:
@@ -170,20 +175,20 @@ class BeliefPropagation(Filter):
                 continue
             evidence = evidence_for(state.node, message.payload)
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
-                evidence = moved(evidence, backward(state.model, message.age))
-            known[message.sender] = Told(evidence, sent)
+                evidence = move_evidence(evidence, backward(state.model, message.age))
+            known[message.sender] = HeardEvidence(evidence, sent)
         senders = tuple(sorted(known))
         return believing(state._replace(senders=senders, told=tuple(known[j] for j in senders)))
 
     def shift(self, state: BeliefState, offset: FloatArray) -> BeliefState:
         """Affine: readings move with the state."""
         state = state._replace(xhat=state.xhat + offset)
-        return with_all(state, lambda evidence: shifted(evidence, offset))
+        return with_all(state, lambda evidence: shift_evidence(evidence, offset))
 
     def shift_payload(self, payload: Beliefs, offset: FloatArray) -> Beliefs:
         """Move all evidence."""
-        heard = tuple(shifted(one, offset) for one in payload.heard)
-        return payload._replace(own=shifted(payload.own, offset), heard=heard)
+        heard = tuple(shift_evidence(one, offset) for one in payload.heard)
+        return payload._replace(own=shift_evidence(payload.own, offset), heard=heard)
 
 
 def is_forest(scenario: Any) -> bool:
@@ -193,37 +198,39 @@ def is_forest(scenario: Any) -> bool:
     return len(pairs) == len(topology.nodes) - len(topology.components)
 
 
-def merged(parts: Sequence[Evidence]) -> Evidence:
+def merge_evidence(parts: Sequence[ReadingEvidence]) -> ReadingEvidence:
     """Return the evidence of independent readings together, with at most n rows."""
     rows = np.concatenate([np.column_stack([one.H, one.y]) for one in parts])
     n = rows.shape[1] - 1
     if len(rows) > n:
         # |y - H x|^2 changes by a constant: the residual row says nothing about x.
         rows = np.asarray(np.linalg.qr(rows, mode="r"))[:n]
-    return Evidence(np.ascontiguousarray(rows[:, n]), np.ascontiguousarray(rows[:, :n]))
+    return ReadingEvidence(np.ascontiguousarray(rows[:, n]), np.ascontiguousarray(rows[:, :n]))
 
 
-def evidence_for(node: int, payload: Beliefs) -> Evidence:
+def evidence_for(node: int, payload: Beliefs) -> ReadingEvidence:
     """Return what a payload says to a node: all but what that node told."""
     others = zip(payload.senders, payload.heard, strict=True)
-    return merged([payload.own, *(one for sender, one in others if sender != node)])
+    return merge_evidence([payload.own, *(one for sender, one in others if sender != node)])
 
 
-def evidence_of(xhat: FloatArray, root: FloatArray) -> Evidence:
+def evidence_of(xhat: FloatArray, root: FloatArray) -> ReadingEvidence:
     """Return an estimate (n,) with the root (n, n) of its covariance as evidence."""
     inverse = np.asarray(np.linalg.inv(root))
-    return Evidence(inverse @ xhat, inverse)
+    return ReadingEvidence(inverse @ xhat, inverse)
 
 
 def believing(state: BeliefState) -> BeliefState:
     """Return the state with the belief that follows from its prior and all evidence."""
     # Not an update of the prior, which on an unstable plant is so far off that digits are lost.
-    y, H = merged([state.prior, state.own, *(one.evidence for one in state.told)])
+    y, H = merge_evidence([state.prior, state.own, *(one.evidence for one in state.told)])
     root = np.asarray(np.linalg.inv(H))
     return state._replace(xhat=root @ y, root=lower_root(root))
 
 
-def with_all(state: BeliefState, change: Callable[[Evidence], Evidence]) -> BeliefState:
+def with_all(
+    state: BeliefState, change: Callable[[ReadingEvidence], ReadingEvidence]
+) -> BeliefState:
     """Return the state with all its evidence changed."""
     told = tuple(one._replace(evidence=change(one.evidence)) for one in state.told)
     return state._replace(prior=change(state.prior), own=change(state.own), told=told)
@@ -238,11 +245,11 @@ def backward(model: Any, gap: float) -> FloatArray:
     return inverse
 
 
-def moved(evidence: Evidence, back: FloatArray) -> Evidence:
+def move_evidence(evidence: ReadingEvidence, back: FloatArray) -> ReadingEvidence:
     """Return evidence about a later state, from which ``back`` (n, n) leads to the earlier one."""
     return evidence._replace(H=evidence.H @ back)
 
 
-def shifted(evidence: Evidence, offset: FloatArray) -> Evidence:
+def shift_evidence(evidence: ReadingEvidence, offset: FloatArray) -> ReadingEvidence:
     """Return evidence about the state plus ``offset``."""
     return evidence._replace(y=evidence.y + evidence.H @ offset)

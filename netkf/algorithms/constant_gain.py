@@ -20,13 +20,13 @@ from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeI
 from netkf.algorithms.kernels.neighbours import combine_convex_roots, copy_pairs
 from netkf.algorithms.kernels.root_update import combine_roots, lower_root
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     predict_root,
     rebase,
     show,
@@ -84,7 +84,7 @@ class ConstantGainArrays(NamedTuple):
 @kernel
 def constant_gain_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -95,7 +95,7 @@ def constant_gain_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
                 for h in range(len(nodes.rows)):
                     if nodes.rows[h] > 0:
                         correct_by_gain(nodes, readings, room, arrays, b, s, h)
@@ -109,7 +109,7 @@ def constant_gain_slots(
 @kernel
 def correct_by_gain(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     room: SlotRoom,
     arrays: ConstantGainArrays,
     b: int,

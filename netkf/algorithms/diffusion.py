@@ -18,13 +18,13 @@ from netkf.algorithms.kernels.intersection import (
 )
 from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     read_all,
     rebase,
     show,
@@ -91,7 +91,7 @@ def weights_of_one(own: float, heard: float, keep_own: bool) -> tuple[float, flo
 @kernel
 def diffusion_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -106,7 +106,7 @@ def diffusion_slots(
             rebase(nodes, readings, room, b, s)
             if plan.sensed[s]:
                 read_all(nodes, readings, room, b, s)
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
             if plan.exchanged[s]:
                 # Everyone combines what was sent: estimates and inverse roots, once for each sender
                 # however many hear it.
@@ -115,11 +115,11 @@ def diffusion_slots(
                         store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
                     invert_lanes(room.lanes, room.root, nodes.root, b, h)
                 for h in range(len(nodes.rows)):
-                    combine(nodes, plan, links, room, weights, b, s, h)
+                    combine_senders(nodes, plan, links, room, weights, b, s, h)
 
 
 @kernel
-def combine(
+def combine_senders(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,

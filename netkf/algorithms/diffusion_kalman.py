@@ -13,13 +13,13 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.neighbours import add_to_estimate, fuse_readings, move_towards
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     rebase,
     show,
 )
@@ -54,7 +54,7 @@ class DiffusionKalmanState(NamedTuple):
 @kernel
 def diffusion_kalman_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -64,7 +64,7 @@ def diffusion_kalman_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
                 for h in range(len(nodes.rows)):
                     fuse_readings(nodes, readings, plan, links, room, True, b, s, h)
                 # All differences before any estimate moves: the combination is simultaneous.
@@ -153,7 +153,7 @@ class DiffusionKalman(Filter):
         if not messages:
             return state
         if exchange.phase == ESTIMATES:
-            return state._replace(xhat=combined(state.xhat, messages))
+            return state._replace(xhat=combine_estimates(state.xhat, messages))
         xhat, root = state.xhat, state.root
         for message in messages:
             one = message.payload
@@ -167,7 +167,7 @@ class DiffusionKalman(Filter):
         return payload if isinstance(payload, Reading) else payload + offset
 
 
-def combined(psi: FloatArray, messages: Sequence[Message]) -> FloatArray:
+def combine_estimates(psi: FloatArray, messages: Sequence[Message]) -> FloatArray:
     """Return ``sum_l c_l psi_l`` (n,) with the weights of the messages and the rest for psi."""
     # One receiver and its senders, as a star whose links are all up.
     count, n = len(messages), len(psi)

@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     read_all,
     rebase,
     show,
@@ -27,7 +27,7 @@ from netkf.linalg.lanes import any_lane, load, load_flags, select, store
 @kernel
 def gossip_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -43,7 +43,7 @@ def gossip_slots(
                 swap_pairs(nodes, plan, links, room, b, s)
             if plan.sensed[s]:
                 read_all(nodes, readings, room, b, s)
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
 
 
 @kernel

@@ -28,13 +28,13 @@ from netkf.algorithms.kernels.information import begin_part, mix_parts, read_off
 from netkf.algorithms.kernels.intersection import invert_lanes
 from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     rebase,
     show,
     slot_room,
@@ -108,7 +108,7 @@ class ConsensusArrays(NamedTuple):
 @kernel
 def consensus_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -119,7 +119,7 @@ def consensus_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
                 begin_all(nodes, readings, room, arrays, b, s)
                 for step in range(arrays.steps):
                     for h in range(len(nodes.rows)):
@@ -139,7 +139,7 @@ def consensus_slots(
 @kernel
 def begin_all(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     room: SlotRoom,
     arrays: ConsensusArrays,
     b: int,
@@ -159,7 +159,7 @@ def begin_all(
 
 @kernel
 def begin_one(
-    nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, arrays: ConsensusArrays
+    nodes: SlotNodes, readings: ReadingBlock, room: SlotRoom, arrays: ConsensusArrays
 ) -> None:
     """``begin_all`` of one filter with one lane."""
     begin_all(nodes, readings, room, arrays, 0, 0)
@@ -250,7 +250,7 @@ class InformationConsensus(Filter):
         if exchange.slot < 0:
             return self._intersect(state, messages)
         assert state.parts is not None
-        parts = mixed_parts(state.xhat, state.parts, messages)
+        parts = mix_node_parts(state.xhat, state.parts, messages)
         if exchange.step < self.steps - 1:
             return state._replace(parts=parts)
         xhat, root = estimate_of(state, parts)
@@ -347,7 +347,7 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
         state.model.root_Q,
         np.array([len(y)]),
     )
-    readings = SlotReadings(
+    readings = ReadingBlock(
         np.ascontiguousarray(y).reshape(1, 1, 1, -1, 1),
         np.ascontiguousarray(H).reshape(1, 1, 1, -1, n, 1),
         np.zeros((1, 1, n, 1)),
@@ -359,7 +359,7 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
     return parts[0, :, 0, :, :, 0]
 
 
-def mixed_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
+def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
     """Return the roots (K, n, n + 1) of a node's pairs after a consensus step."""
     # One receiver and its senders, as a star whose links are all up.
     count, (K, n, _) = len(messages), parts.shape

@@ -10,13 +10,13 @@ from typing import Any, ClassVar, NamedTuple
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.neighbours import fuse_readings
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     rebase,
     show,
 )
@@ -69,7 +69,7 @@ class IntermittentState(NamedTuple):
 @kernel
 def intermittent_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -85,7 +85,7 @@ def intermittent_slots(
                 for h in range(len(nodes.rows)):
                     # One after the other: with independent noise that equals one update.
                     fuse_readings(nodes, readings, plan, links, room, True, b, s, h)
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
 
 
 @built_in("intermittent")

@@ -18,13 +18,13 @@ from netkf.algorithms.kernels.neighbours import (
     scale_by_covariance,
 )
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     rebase,
     show,
 )
@@ -71,7 +71,7 @@ class KcfArrays(NamedTuple):
 @kernel
 def kcf_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -82,7 +82,7 @@ def kcf_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
                 # Consensus is on predictions and their covariances: before any reading is used.
                 for h in range(len(nodes.rows)):
                     move_towards(

@@ -14,7 +14,7 @@ from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.riccati import RiccatiTable, riccati_table
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
-from netkf.algorithms.kernels.slots import predicted_root
+from netkf.algorithms.kernels.slots import predict_root_alone
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 
@@ -163,7 +163,7 @@ class SlotModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Return estimate and root after one slot for each period of the gap."""
         for _ in range(round(gap / self.period)):
-            xhat, root = self.F @ xhat, predicted_root(root, self.F, self.root_Q)
+            xhat, root = self.F @ xhat, predict_root_alone(root, self.F, self.root_Q)
         return xhat, root
 
     def extrapolate(

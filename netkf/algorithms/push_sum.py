@@ -28,13 +28,13 @@ from netkf.algorithms.kernels.mass import (
 )
 from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     predict_mean,
     rebase,
     show,
@@ -164,7 +164,7 @@ class StopRoom(NamedTuple):
 @kernel
 def push_sum_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -177,7 +177,7 @@ def push_sum_slots(
             # Step 3: with asymptotic gains the covariance is the limit, and only the mean is
             # predicted.
             if plan.sensed[s] and not arrays.asymptotic:
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
             # Step 2 before the correction, so that the gain uses what the mass of this slot says.
             if plan.exchanged[s] and not arrays.asymptotic:
                 exchange_mass(arrays, plan, links, samples, room, b, s)
@@ -369,7 +369,7 @@ def stops(arrays: PushSumArrays, b: int, h: int, q: int, whole: bool) -> bool:
 @kernel(inlined=True)
 def correct(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     room: SlotRoom,
     arrays: PushSumArrays,
     b: int,
@@ -553,7 +553,7 @@ class PushSum(Filter):
     def predict(self, state: Any, gap: float) -> Any:
         """Estimate, covariance and, in running sums, all information."""
         if isinstance(state, RunningSums):
-            return running_sums.predict(state, gap)
+            return running_sums.predict_sums(state, gap)
         return super().predict(state, gap)
 
     def steps(self, phase: int) -> int:
@@ -581,21 +581,25 @@ class PushSum(Filter):
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
         """Steps 2.2 and 2.3, or step 5.2."""
         if isinstance(state, RunningSums):
-            return running_sums.hear(state, messages)
+            return running_sums.absorb_totals(state, messages)
         received = [message.payload for message in messages]
         # P step 5.2.
         if exchange.phase == AVERAGE:
-            return state._replace(xhat=averaged(state.xhat, received, self.delta or math.inf))
+            return state._replace(
+                xhat=average_estimates(state.xhat, received, self.delta or math.inf)
+            )
         if self.asymptotic or (self.stop == "paper" and state.stopped):
             return state
         if state.sums is not None:
-            return self._learned(_heard_totals(state, state.sums, messages), state.mass, False)
+            return self._learn_network(
+                _heard_totals(state, state.sums, messages), state.mass, False
+            )
         # P steps 2.2, (3)-(5), and 2.3, (6) with the stop rule.
-        mass = mixed(state.mass, received, state.degree)
+        mass = conserve_mass(state.mass, received, state.degree)
         whole = len(received) == state.degree
-        return self._learned(state._replace(mass=mass), state.mass, whole)
+        return self._learn_network(state._replace(mass=mass), state.mass, whole)
 
-    def _learned(self, state: PushSumState, before: FloatArray, whole: bool) -> PushSumState:
+    def _learn_network(self, state: PushSumState, before: FloatArray, whole: bool) -> PushSumState:
         """P (6) and the stop rule; ``whole``: all links of the node were up."""
         # Frozen by the safe rule: the mass was mixed, but is not read any more.
         if state.stopped:
@@ -619,13 +623,13 @@ class PushSum(Filter):
     def update(self, state: Any, reading: Reading) -> Any:
         """Steps 3 and 4 after the prediction, P (7) and (8)."""
         if isinstance(state, RunningSums):
-            return running_sums.add_reading(state, reading)
+            return running_sums.update_sums(state, reading)
         root = state.network.root
         # Without asymptotic gains P (7) with the node's G; with them P_inf.
         if root is None:
-            root = corrected_root(state.root, state.network.information)
+            root = correct_one_root(state.root, state.network.information)
         y, H, R = reading[:3]
-        xhat = corrected(state.xhat, root, state.network.number, y, H, R)
+        xhat = correct_estimate(state.xhat, root, state.network.number, y, H, R)
         return state._replace(xhat=xhat, root=root)
 
     def stopped(self, state: Any) -> bool:
@@ -735,7 +739,7 @@ def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Messag
     return state._replace(mass=mass, sums=sums._replace(heard=heard))
 
 
-def corrected(
+def correct_estimate(
     predicted: FloatArray,
     root: FloatArray,
     number: float,
@@ -768,7 +772,7 @@ def share(mass: FloatArray, degree: int) -> FloatArray:
     return part
 
 
-def mixed(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
+def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
     """P (3)-(5) as they conserve mass: the shares ``received`` and the node's own, which it keeps
     once for itself and once for each link of its ``degree`` that failed.
     """
@@ -787,7 +791,7 @@ def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
     return NetworkInformation(information[:, :, 0], float(number[0, 0]))
 
 
-def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
+def correct_one_root(root: FloatArray, information: FloatArray) -> FloatArray:
     """Root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root of P,
     possibly singular, and the information G (n, n).
     """
@@ -797,7 +801,7 @@ def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
     return np.asarray(result.reshape(n, n))
 
 
-def averaged(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
+def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
     """P (9): z plus 1 / delta of the differences to the estimates that arrived."""
     # One receiver and its senders, as a star whose links are all up.
     x, count = np.stack([z, *received])[None, :, :, None], len(received)
@@ -836,5 +840,5 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
                 if np.abs(G).max() * np.abs(P).max() > MAX_SPREAD:
                     return None
                 # P is the predicted covariance: use the reading to get that of P (12).
-                return corrected_root(lower_root(square_root(P)), information)
+                return correct_one_root(lower_root(square_root(P)), information)
     return None

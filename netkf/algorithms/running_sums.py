@@ -82,20 +82,20 @@ def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Runn
     )
 
 
-def predict(state: RunningSums, gap: float) -> RunningSums:
+def predict_sums(state: RunningSums, gap: float) -> RunningSums:
     """Return the state ``gap`` seconds later."""
     xhat, root = state.model.predict(state.xhat, state.root, gap)
     back = state.model.backward(gap)
     heard = {sender: predict_offer(offer, back) for sender, offer in state.heard.items()}
-    return state._replace(xhat=xhat, root=root, sent=_moved(state.sent, back), heard=heard)
+    return state._replace(xhat=xhat, root=root, sent=_move_total(state.sent, back), heard=heard)
 
 
 def predict_offer(offer: Offer, back: Backward) -> Offer:
     """Return an offer that refers to a later state."""
-    return offer._replace(total=_moved(offer.total, back))
+    return offer._replace(total=_move_total(offer.total, back))
 
 
-def _moved(total: FloatArray, back: Backward) -> FloatArray:
+def _move_total(total: FloatArray, back: Backward) -> FloatArray:
     inverse, fading = back
     n, out = len(inverse), total.copy()
     U = total[1 : 1 + n * n].reshape(n, n)
@@ -124,7 +124,7 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
     )
 
 
-def hear(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
+def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
     """Gain what each total grew by since it was heard last; an older one brings nothing."""
     gained, heard = np.zeros_like(state.sent), dict(state.heard)
     for message in messages:
@@ -149,7 +149,7 @@ def hear(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
     return state._replace(xhat=xhat, root=root, weight=weight, heard=heard)
 
 
-def add_reading(state: RunningSums, reading: Reading) -> RunningSums:
+def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
     """``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms of P^-1."""
     if not len(reading.y):
         return state
@@ -170,16 +170,16 @@ def weights(state: RunningSums) -> dict[str, list[float]]:
 def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
     """The estimate, and ``u`` by ``U offset`` wherever there is one."""
     heard = {sender: shift_offer(offer, offset) for sender, offer in state.heard.items()}
-    sent = _shifted(state.sent, offset)
+    sent = _shift_total(state.sent, offset)
     return state._replace(xhat=state.xhat + offset, sent=sent, heard=heard)
 
 
 def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
     """``u`` by ``U offset``."""
-    return offer._replace(total=_shifted(offer.total, offset))
+    return offer._replace(total=_shift_total(offer.total, offset))
 
 
-def _shifted(total: FloatArray, offset: FloatArray) -> FloatArray:
+def _shift_total(total: FloatArray, offset: FloatArray) -> FloatArray:
     n, out = len(offset), total.copy()
     out[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset
     return out

@@ -18,16 +18,16 @@ import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading, State
 from netkf.algorithms.kernels.neighbours import copy_pairs
-from netkf.algorithms.kernels.pair_fusion import fuse_pair, fused_pair
+from netkf.algorithms.kernels.pair_fusion import fuse_pair, fuse_tracks
 from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
     SlotSamples,
-    predict,
+    predict_all,
     read_all,
     rebase,
     show,
@@ -62,7 +62,7 @@ class FusionArrays(NamedTuple):
 @kernel
 def fusion_slots(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
@@ -73,7 +73,7 @@ def fusion_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict(nodes, room, b)
+                predict_all(nodes, room, b)
                 read_all(nodes, readings, room, b, s)
             if plan.exchanged[s]:
                 # What was sent: all estimates from before the exchange.
@@ -103,9 +103,9 @@ def fuse_heard(
         # The weight of a link is not used: whoever is heard counts by its covariance.
         sender = links.sender[m]
         if not heard:
-            take(arrays.x, arrays.root, room.xhat, room.root, h, q)
+            copy_track(arrays.x, arrays.root, room.xhat, room.root, h, q)
             heard = True
-        take(arrays.other_x, arrays.other, room.xhat, room.root, sender, q)
+        copy_track(arrays.other_x, arrays.other, room.xhat, room.root, sender, q)
         fuse_pair(
             arrays.x, arrays.root, arrays.other_x, arrays.other, arrays.inverse, arrays.trace,
             arrays.pair,
@@ -118,7 +118,7 @@ def fuse_heard(
 
 
 @kernel(inlined=True)
-def take(
+def copy_track(
     x: FloatArray, root: FloatArray, means: FloatArray, roots: FloatArray, h: int, q: int
 ) -> None:
     """Copy the estimate of filter h in lane q to x (n,) and ``root`` (n, n)."""
@@ -161,7 +161,7 @@ class PairFusion(Filter):
         for message in messages:
             heard = message.payload
             other = state.model.extrapolate(heard.xhat, heard.root, message.age)
-            pair = fused_pair(pair, other, self.inverse, self.minimise == TRACE)
+            pair = fuse_tracks(pair, other, self.inverse, self.minimise == TRACE)
         return state._replace(xhat=pair[0], root=pair[1])
 
     shift = Filter.shift  # affine: the gains of both estimates sum to I, and only P decides them
@@ -267,7 +267,7 @@ class BarShalomCampo(Filter):
     def predict(self, state: TrackState, gap: float) -> TrackState:
         """Predict the tracks."""
         xhat, root = state.model.predict(state.xhat, state.root, gap)
-        joint = predicted_joint(state.joint, state.model)
+        joint = predict_joint(state.joint, state.model)
         return state._replace(
             xhat=xhat, root=root, fused=xhat, fused_root=root, joint=joint, slot=state.slot + 1
         )
@@ -275,7 +275,7 @@ class BarShalomCampo(Filter):
     def update(self, state: TrackState, reading: Reading) -> TrackState:
         """Update the own track by the reading, and the covariances of all."""
         tracked: TrackState = super().update(state, reading)
-        joint = updated_joint(state.joint, state.sensors, len(state.xhat))
+        joint = update_joint(state.joint, state.sensors, len(state.xhat))
         return tracked._replace(joint=joint, fused=tracked.xhat, fused_root=tracked.root)
 
     def emit(self, state: TrackState, exchange: Exchange) -> tuple[TrackState, Track]:
@@ -305,7 +305,7 @@ class BarShalomCampo(Filter):
         return state._replace(xhat=state.xhat + offset, fused=state.fused + offset)
 
 
-def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
+def predict_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
     """Return the covariance (m n, m n) of the errors of m tracks one slot later: all of them have
     the same process noise.
     """
@@ -315,7 +315,7 @@ def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
     return np.asarray((moved + model.Q[None, :, None, :]).reshape(m * n, m * n))
 
 
-def updated_joint(
+def update_joint(
     joint: FloatArray, sensors: Sequence[tuple[FloatArray, FloatArray]], n: int
 ) -> FloatArray:
     """Return the covariance (m n, m n) of the errors of m tracks after each has used a reading of
@@ -344,7 +344,7 @@ def with_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
     # Nothing of the joint covariance depends on data: it is made up for from the start on.
     joint = np.tile(state.start, (len(senders), len(senders)))
     for _ in range(state.slot):
-        joint = updated_joint(predicted_joint(joint, state.model), sensors, len(state.xhat))
+        joint = update_joint(predict_joint(joint, state.model), sensors, len(state.xhat))
     return state._replace(senders=senders, sensors=sensors, joint=joint)
 
 

@@ -51,7 +51,7 @@ from netkf.theory.common.errors import diagonal_blocks, error_law
 from netkf.theory.common.replay import ErrorLaw
 from netkf.theory.common.stacked_errors import integration_steps
 from netkf.trace.nees import errors
-from netkf.trace.run import BLUR, Run, blurred
+from netkf.trace.run import BLUR, Run, blurred_samples
 
 MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 250_000
 """Replicas whose exact covariances are computed, fewer (but at least 20) where there are many slots
@@ -77,7 +77,7 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     """
     at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     _, nees = errors(run.error, run.P)
-    e = np.where(blurred(run, run.P)[..., None], np.nan, run.error)
+    e = np.where(blurred_samples(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
     P, e, nees = run.P[at][:, sampled], e[at][:, sampled], nees[at][:, sampled]
     if run.replica < most_replayed(scenario) and few_errors(scenario).holds:
@@ -136,7 +136,7 @@ def _replayed_summary(
     quadratic = _pool_nees(centred, run.P[:, :hosts], law)
     if hosts < nodes:  # all share one pooled filter
         mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
-    lost = blurred(run, Sigma)[at][:, sampled]
+    lost = blurred_samples(run, Sigma)[at][:, sampled]
     if lost.any():
         quadratic = np.full_like(quadratic, np.nan)
     e = np.where(lost[..., None], np.nan, e)

@@ -27,7 +27,7 @@ def read_columns(
     length, or an entry that is not a finite number.
     """
     numbers = array("d")
-    with _opened(source) as (header, rows):
+    with _open_table(source) as (header, rows):
         _demand(source, header, required)
         names = [name for name in (*required, *optional) if name in header]
         places = [header.index(name) for name in names]
@@ -39,7 +39,7 @@ def read_columns(
 
 def read_header(source: SourceFile) -> list[str]:
     """Return the names of the columns; raises ScenarioError if the file is not a table."""
-    with _opened(source) as (header, _):
+    with _open_table(source) as (header, _):
         return header
 
 
@@ -50,7 +50,7 @@ def read_rows(
 
     Raises ScenarioError if the file is not a table or lacks a required column.
     """
-    with _opened(source) as (header, rows):
+    with _open_table(source) as (header, rows):
         _demand(source, header, required)
         return header, list(rows)
 
@@ -63,7 +63,7 @@ def _demand(source: SourceFile, header: list[str], required: tuple[str, ...]) ->
 
 
 @contextmanager
-def _opened(
+def _open_table(
     source: SourceFile,
 ) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str]]]]]:
     """Give the names of the columns, and an iterator of (line, entries) of rows that are not

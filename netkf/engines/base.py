@@ -15,7 +15,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from netkf.engines.soundness import sound
+from netkf.engines.soundness import sound_mask
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -105,9 +105,9 @@ def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
 def broken(
     scenario: Scenario, xhat: FloatArray, P: FloatArray, without: np.ndarray | None = None
 ) -> list[int]:
-    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is not ``sound``; those
+    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is not sound; those
     ``without`` (N,) a covariance have none to be looked at. They end a run as diverged.
     """
     # False broadcasts: every node then has a covariance to be looked at.
-    intact = sound(xhat, P, False if without is None else without)
+    intact = sound_mask(xhat, P, False if without is None else without)
     return [scenario.nodes[k] for k in np.flatnonzero(~intact)]

@@ -31,7 +31,7 @@ INDEFINITE = 1e-9
 """The tolerated negative eigenvalue, as a share of the largest; rounding errors are far smaller."""
 
 
-def sound(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = False) -> BoolArray:
+def sound_mask(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = False) -> BoolArray:
     """Return a mask (...) of sound pairs of estimates (..., n) and covariances (..., n, n).
 
     Both must be finite, and the covariance positive semidefinite; a filter ``without`` covariance

@@ -59,7 +59,7 @@ def work(job: Job) -> Any:
     """Do a block; raises EngineError that names a plugged-in class that fails."""
     scenario = job.scenario
     if isinstance(scenario, PackedScenario):
-        scenario = unpacked(scenario)
+        scenario = unpack_scenario(scenario)
     try:
         return job.task(scenario, job.seed, job.replicas)
     except Exception as error:
@@ -110,13 +110,13 @@ KEPT = 4
 _scenarios: dict[str, Scenario] = {}
 
 
-def unpacked(travelling: PackedScenario) -> Scenario:
+def unpack_scenario(travelling: PackedScenario) -> Scenario:
     """The scenario that travelled, with its caches kept from one block to the next."""
     scenario = _scenarios.get(travelling.digest)
     if scenario is None:
         while len(_scenarios) >= KEPT:
             _scenarios.pop(next(iter(_scenarios)), None)
-        scenario = _scenarios.setdefault(travelling.digest, _unpickled(travelling))
+        scenario = _scenarios.setdefault(travelling.digest, _unpickle(travelling))
     return scenario
 
 
@@ -130,7 +130,7 @@ def _check_versions(wanted: tuple[tuple[str, str], ...]) -> None:
         raise EngineError(f"{message}; install the same there, or use --workers")
 
 
-def _unpickled(travelling: PackedScenario) -> Scenario:
+def _unpickle(travelling: PackedScenario) -> Scenario:
     if travelling.versions:
         _check_versions(travelling.versions)
     for name, folder in travelling.modules:

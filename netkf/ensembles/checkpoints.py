@@ -70,7 +70,7 @@ class BlockCheckpoints:
     def begun_with(self) -> int | None:
         """Return the number of runs in a block, as the first block says that can be read."""
         for file in self._files():
-            with contextlib.suppress(DamagedError), _opened(file) as arrays:
+            with contextlib.suppress(DamagedError), _open_block(file) as arrays:
                 size = _read_texts(arrays)["identity"]["block"]
                 if is_block_size(size):
                     return int(size)
@@ -102,7 +102,7 @@ class BlockCheckpoints:
         for file in self._files():
             with contextlib.suppress(DamagedError):
                 self._check(file, wanted)
-                with _opened(file) as arrays:
+                with _open_block(file) as arrays:
                     found.append(_statistics(arrays))
         return found
 
@@ -121,7 +121,7 @@ class BlockCheckpoints:
 
     def load(self, number: int) -> RunStatistics:
         """Return a block without its traces; raises EngineError if it was damaged meanwhile."""
-        with self._expected(number), _opened(self._file(number)) as arrays:
+        with self._expect_block(number), _open_block(self._file(number)) as arrays:
             return _statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
@@ -130,7 +130,7 @@ class BlockCheckpoints:
         """
         for number in sorted(self._numbers):
             file = self._file(number)
-            with self._expected(number), _opened(file, verified=False) as arrays:
+            with self._expect_block(number), _open_block(file, verified=False) as arrays:
                 for k in range(_read_texts(arrays)["traces"]):
                     yield self._trace(arrays, k)
 
@@ -147,7 +147,7 @@ class BlockCheckpoints:
 
     def _check(self, file: Path, identity: dict[str, Any]) -> None:
         """Raise DamagedError unless a file is whole, has this identity and fits the scenario."""
-        with _opened(file, verified=False) as arrays:
+        with _open_block(file, verified=False) as arrays:
             found = _read_texts(arrays).get("identity")
             for key, value in identity.items():
                 if not isinstance(found, dict) or found.get(key) != value:
@@ -182,7 +182,7 @@ class BlockCheckpoints:
         return Trace(int(trace.replica), *trace[1:])
 
     @contextlib.contextmanager
-    def _expected(self, number: int) -> Iterator[None]:
+    def _expect_block(self, number: int) -> Iterator[None]:
         """Raise EngineError for a block that was there a moment ago and cannot be used now; it is
         removed.
         """
@@ -239,7 +239,7 @@ def _digest(file: BinaryIO, length: int) -> bytes:
 
 
 @contextlib.contextmanager
-def _opened(file: Path, verified: bool = True) -> Iterator[Any]:
+def _open_block(file: Path, verified: bool = True) -> Iterator[Any]:
     """Yield the arrays of a file; raises DamagedError for whatever is wrong with them. The digest
     is compared unless it was ``verified`` before.
     """

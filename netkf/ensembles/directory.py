@@ -194,14 +194,14 @@ class _Keeper:
             progress=progress,
             block=self.plan.block,
             known={number: partial(self.blocks.load, number) for number in self._known},
-            received=self.received,
+            received=self.save_block,
         )
         return whole
 
     def _runs(self, number: int) -> int:
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
-    def received(self, number: int, found: RunStatistics) -> RunStatistics:
+    def save_block(self, number: int, found: RunStatistics) -> RunStatistics:
         """Save a block; its traces stay on disk."""
         self.blocks.save(number, found, self.plan)
         self._done += self._runs(number)

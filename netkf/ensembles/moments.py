@@ -44,12 +44,12 @@ def moments_of(values: FloatArray, size: FloatArray) -> Moments:
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
     """Moments of both samples together."""
-    size, mean, M2 = (_stacked(*pair) for pair in zip(a, b, strict=True))
+    size, mean, M2 = (_stack_pair(*pair) for pair in zip(a, b, strict=True))
     merge_two(size, mean, M2)
     return Moments(size[0], mean[0], M2[0])
 
 
-def _stacked(a: FloatArray, b: FloatArray) -> FloatArray:
+def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
     """``np.stack([a, b])``, which takes a multiple of the time for small arrays."""
     both = np.empty((2, *a.shape))
     both[0], both[1] = a, b

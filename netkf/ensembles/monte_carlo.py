@@ -144,8 +144,8 @@ def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str
     samples, shape = found.samples, (len(scenario.times), len(scenario.nodes), -1)
     means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
     n = scenario.plant.n
-    mean_P, mean_error, mean_nees = _unpacked(means.reshape(shape), n)
-    se_P, se_error, se_nees = _unpacked(samples.standard_error().reshape(shape), n)
+    mean_P, mean_error, mean_nees = _unpack_samples(means.reshape(shape), n)
+    se_P, se_error, se_nees = _unpack_samples(samples.standard_error().reshape(shape), n)
     for errors in (mean_error, mean_nees, se_error, se_nees):
         errors[scenario.times >= found.rounding_from] = np.nan
     totals = found.messages.mean[0] * found.messages.size
@@ -184,7 +184,7 @@ def _upper_indices(n: int) -> tuple[np.ndarray, np.ndarray]:
     return i, j
 
 
-def _unpacked(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(T, N, 2 u + 1) as two stacks of symmetric matrices (T, N, n, n) and (T, N)."""
     i, j = _upper_indices(n)
     matrices = np.empty((2, *values.shape[:2], n, n))

@@ -80,14 +80,14 @@ class Here(Pool):
             future.set_result(work(job))
         except Exception as error:
             future.set_exception(error)
-        self._measured(job, time.perf_counter() - began - (seconds_spent() - compiled))
+        self._note_duration(job, time.perf_counter() - began - (seconds_spent() - compiled))
         return future
 
     def next_size(self, left: int, runs: int) -> int:
         """Twice as many as before while blocks are quick."""
         return self._size
 
-    def _measured(self, job: Job, seconds: float) -> None:
+    def _note_duration(self, job: Job, seconds: float) -> None:
         """Take note of how long a block took, without what was compiled meanwhile."""
         # Blocks may be larger than was asked for: of several that take as long as one.
         if seconds < QUICK_SECONDS and len(job.replicas) >= self._size:
@@ -126,8 +126,8 @@ class Adaptive(Here):
             return super().next_size(left, runs)
         return block_size(left, self.width)
 
-    def _measured(self, job: Job, seconds: float) -> None:
-        super()._measured(job, seconds)
+    def _note_duration(self, job: Job, seconds: float) -> None:
+        super()._note_duration(job, seconds)
         self._spent += seconds
         if self._begun or seconds > 1.0:  # the first block fills caches
             self._seconds += seconds

@@ -200,7 +200,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
         rounding_from=np.full(runs, np.inf),
         regular=np.ones(runs, dtype=np.bool_),
     )
-    given = _given(batch)
+    given = _batch_arrays(batch)
     room = _rooms.of(filters, n, most)
     reduce_runs(MANY, given, bounds, sums, room)
     if not sums.regular.all():
@@ -212,7 +212,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     return Reduced(samples, sums.averages, sums.rounding_from)
 
 
-def _given(batch: RunBatch) -> Batch:
+def _batch_arrays(batch: RunBatch) -> Batch:
     """The arrays of a batch."""
     runs = len(batch)
     x, P, error = (np.ascontiguousarray(part) for part in (batch.x, batch.P, batch.error))

@@ -26,7 +26,7 @@ def replicate(
     """``task(scenario, seed, replica)`` for the replicas ``first`` .. ``first + runs - 1``, in
     their order; ``options`` are those of ``replicate_blocks``.
     """
-    whole = partial(each_replica, partial(_listed, task), operator.add)
+    whole = partial(each_replica, partial(_as_list, task), operator.add)
     found: list[Any] = replicate_blocks(whole, operator.add, scenario, runs, seed, **options)
     return found
 
@@ -81,7 +81,7 @@ def replicate_blocks(
     ended = False
     try:
         job = Job(scenario, task, seed, first, 0, runs, block or 0)
-        whole = _gathered(
+        whole = _gather(
             pool, job, together, merge, known or {}, received or _as_it_came, progress or _quiet
         )
         ended = True
@@ -90,7 +90,7 @@ def replicate_blocks(
     return whole
 
 
-def _listed(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
+def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
     """The result of one replica, for addition to join."""
     return [task(scenario, seed, replica)]
 
@@ -103,7 +103,7 @@ def _quiet(done: int, wanted: int) -> None:
     """No progress."""
 
 
-def _gathered(
+def _gather(
     pool: Pool,
     job: Job,
     together: int | None,
@@ -123,7 +123,7 @@ def _gathered(
 
     for number in sorted(known):
         take(job._replace(start=number * job.size), known[number]())
-    for block, result in _completed(pool, _blocks(pool, job, together, known)):
+    for block, result in _complete_blocks(pool, _blocks(pool, job, together, known)):
         take(block, received(block.start // block.size, result))
     return tree.result()
 
@@ -150,7 +150,7 @@ def _blocks(
         start += size
 
 
-def _completed(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
+def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
     """Yield blocks and their results as they complete.
 
     Raises EngineError if workers die again and again, or are lost.

@@ -24,7 +24,7 @@ from netkf.runs.provenance import machine, versions
 from netkf.scenario.plugins import module_files
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
-from netkf.scenario.writing import resolved, to_toml
+from netkf.scenario.writing import resolve_defaults, to_toml
 
 MANIFEST = {
     "name": TEXT,
@@ -102,7 +102,7 @@ def _difference(found: Any, wanted: Any) -> Any:
     return found
 
 
-def clear_unfinished(
+def clear_unfinished_runs(
     directory: Path,
     scenario: Scenario,
     replica: int = 0,
@@ -175,7 +175,7 @@ def _has_own_files(directory: Path, scenario: Scenario) -> bool:
 
 def _check_scenario(directory: Path, scenario: Scenario) -> None:
     """Raise ScenarioError if scenario.toml of a directory is not that of its run."""
-    kept, text = directory / "scenario.toml", to_toml(resolved(scenario))
+    kept, text = directory / "scenario.toml", to_toml(resolve_defaults(scenario))
     if not kept.exists():
         return
     with contextlib.suppress(OSError, ValueError):

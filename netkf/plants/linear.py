@@ -151,11 +151,11 @@ class LinearPath:
             parts.append(x[1:])
             self._last, start = x[-1], end
             if (first + end) % frame == 0:
-                self._origins[first + end] = self._moved_origin(first + end) + x[-1]
+                self._origins[first + end] = self._move_origin(first + end) + x[-1]
                 self._last = np.zeros(len(x[-1]))
         return np.concatenate(parts)
 
-    def _moved_origin(self, slot: int) -> FloatArray:
+    def _move_origin(self, slot: int) -> FloatArray:
         """(n,) absolute position in a slot of the origin of the frame that holds its state before
         any rebase.
         """
@@ -175,7 +175,7 @@ class LinearPath:
     def absolute(self, slot: int) -> FloatArray:
         """(n,) x, at a slot not before the last one asked for."""
         x = self._before(slot)
-        return x if self.frame_slots is None else self._moved_origin(slot) + x
+        return x if self.frame_slots is None else self._move_origin(slot) + x
 
     state = absolute
 

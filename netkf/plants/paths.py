@@ -29,7 +29,7 @@ from netkf.rng.normals import Normals
 BLOCK = 64  # steps drawn at once, or a multiple of it
 
 
-class Step(NamedTuple):
+class PathStep(NamedTuple):
     """One stretch of the path: times, states at its ends, (2, n) moments and the cubic's (4, n)
     Legendre coefficients of what noise added.
     """
@@ -379,13 +379,13 @@ class DiffusionPath:
         self._frame, self._origin = 0, np.zeros(self.laws.n)  # of the present frame, at its start
         self._block: Block | None = None
         self._first = self._piece = 0  # of the present step, and the one last asked for
-        self._step, self._step_end = Step(0.0, 0.0, *[np.empty(0)] * 4), 0.0
+        self._step, self._step_end = PathStep(0.0, 0.0, *[np.empty(0)] * 4), 0.0
 
     def grid(self, k: int) -> float:
         """Time of the k-th point of the sensing grid."""
         return grid_time(self.period, k)
 
-    def _at(self, time: float) -> Step:
+    def _at(self, time: float) -> PathStep:
         """The piece that ``time`` is in; it may lie before the last one asked for, in its step."""
         # Blocks are drawn when they are asked for: the path is never longer than it has to be.
         while self._block is None or time > self._block.ends[-1]:
@@ -396,7 +396,7 @@ class DiffusionPath:
             k += 1
         if k != self._piece:
             self._piece = k
-            self._step = Step(*(part[k] for part in block[:6]))
+            self._step = PathStep(*(part[k] for part in block[:6]))
             self._step_end = float(block.ends[block.step[k]])
             self._first = int(np.searchsorted(block.step, block.step[k]))
         return self._step
@@ -411,7 +411,7 @@ class DiffusionPath:
         """
         step = self._at(end)
         if start >= step.start:
-            return seen(self.laws, step, start, end)
+            return state_moments(self.laws, step, start, end)
         return self._over_pieces(start, end)
 
     def _over_pieces(self, start: float, end: float) -> FloatArray:
@@ -420,9 +420,9 @@ class DiffusionPath:
         assert block is not None
         total = np.zeros((2, self.laws.n))
         while True:
-            step = Step(*(part[k] for part in block[:6]))
+            step = PathStep(*(part[k] for part in block[:6]))
             first, last = max(start, step.start), min(end, step.end)
-            part = seen(self.laws, step, first, last)
+            part = state_moments(self.laws, step, first, last)
             # P_1 of the whole interval on this part of it.
             middle = ((first - start) - (end - last)) / gap
             # Moment by moment: P_0 adds up, P_1 is shifted by the middle and scaled by the share.
@@ -464,11 +464,11 @@ class DiffusionPath:
         start = 0.0 if k == 0 else float(self.frame_times[k - 1])
         with np.errstate(over="ignore", invalid="ignore"):
             # The new origin: the old one moved to this time, plus the local state.
-            self._origin = self._moved_origin(time - start) + step.x_end
+            self._origin = self._move_origin(time - start) + step.x_end
         self._frame = k + 1
         return step.x_end
 
-    def _moved_origin(self, gap: float) -> FloatArray:
+    def _move_origin(self, gap: float) -> FloatArray:
         """(n,) the origin of the present frame so many seconds after its start."""
         # An origin at 0 stays there.
         if self._moves is None or not self._origin.any():
@@ -481,12 +481,12 @@ class DiffusionPath:
         if not self._frame:
             return x
         with np.errstate(over="ignore", invalid="ignore"):
-            return x + self._moved_origin(time - float(self.frame_times[self._frame - 1]))
+            return x + self._move_origin(time - float(self.frame_times[self._frame - 1]))
 
     state = absolute
 
 
-def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
+def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> FloatArray:
     """(2, n) moments of x over ``[start, end]`` inside a step."""
     n = len(step.x_start)
     # The moments of a whole piece were drawn from their exact law: no cubic is needed.
@@ -497,7 +497,7 @@ def seen(laws: GridLaws, step: Step, start: float, end: float) -> FloatArray:
     out, course = np.empty((2, n)), np.empty((len(table), table.shape[2]))
     path, scratch = (step.x_start[None], step.cubic[None]), np.zeros(4 * course.shape[1])
     fill_course(course, table, length, *path, 0, scratch)
-    fill_seen(np.zeros(n), out, course, since, gap, length, scratch)
+    fill_state_moments(np.zeros(n), out, course, since, gap, length, scratch)
     return out
 
 
@@ -536,7 +536,7 @@ def fill_course(
 
 
 @kernel(fused=True)
-def fill_seen(
+def fill_state_moments(
     size: Size,
     out: FloatArray,
     course: FloatArray,

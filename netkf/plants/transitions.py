@@ -147,10 +147,10 @@ def frame_period(A: FloatArray) -> float | None:
     spectral abscissa a of ``A`` (n, n); None for a plant that is not unstable.
     """
     abscissa = float(np.linalg.eigvals(A).real.max())
-    return _rounded(GROWTH / abscissa) if abscissa > 0.0 else None
+    return _round(GROWTH / abscissa) if abscissa > 0.0 else None
 
 
-def _rounded(seconds: float) -> float:
+def _round(seconds: float) -> float:
     # Frames are to begin at the same times whatever the last bits of an eigenvalue.
     return float(f"{seconds:.9g}")
 
@@ -160,4 +160,4 @@ def frame_slots(F: FloatArray) -> int | None:
     radius of ``F`` (n, n); None for a plant that is not unstable.
     """
     radius = float(np.abs(np.linalg.eigvals(F)).max())
-    return max(1, int(_rounded(GROWTH / math.log(radius)))) if radius > 1.0 else None
+    return max(1, int(_round(GROWTH / math.log(radius)))) if radius > 1.0 else None

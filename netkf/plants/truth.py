@@ -113,7 +113,7 @@ class SampledTruth:
         before, normals = _drawn(moves, start, random, times, rebased)
         self.offsets = before[rebased]
         after = np.where(rebased[:, None], 0.0, before)
-        between = _bridged(moves, times, after, normals, probing, inside)
+        between = _bridge(moves, times, after, normals, probing, inside)
         order = np.argsort(np.concatenate([times, inside]), kind="stable")
         self._times = np.concatenate([times, inside])[order]
         self._local = np.concatenate([after, between])[order]
@@ -173,7 +173,7 @@ def _drawn(
     return states, np.concatenate(drawn)
 
 
-def _bridged(
+def _bridge(
     moves: Transitions,
     times: FloatArray,
     states: FloatArray,

@@ -166,16 +166,16 @@ def _why(source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSamp
     into = messages[messages["receiver"] == worst.node]
     found = []
     if sample.start is not None:
-        found.append(_started(sample.overall, worst, sample.start))
+        found.append(_startup_claim(sample.overall, worst, sample.start))
     if len(into):
         cut = float(source.cuts(np.array([worst.time]))[0])
         found.append(_heard(into, worst, cut) + _unusual(source, run, into, worst))
     if worst.by_error:
-        found += _judged(source, run, worst)
+        found += _judge_error(source, run, worst)
     return found
 
 
-def _started(worst: Worst, later: Worst, start: StartUp) -> str:
+def _startup_claim(worst: Worst, later: Worst, start: StartUp) -> str:
     """Return that the worst sample was in the start-up, and which one is explained instead."""
     said = (
         f"The filters had just started at {_time(worst.time)}: trace P was "
@@ -191,7 +191,7 @@ def _started(worst: Worst, later: Worst, start: StartUp) -> str:
     )
 
 
-def _judged(source: Opened, run: StoredRun, worst: Worst) -> list[str]:
+def _judge_error(source: Opened, run: StoredRun, worst: Worst) -> list[str]:
     """Return if P allows the error of a sample that was chosen because it is large."""
     k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
     nees, n = float(run.nees[at, k]), run.x.shape[1]

@@ -42,7 +42,7 @@ class Budget(NamedTuple):
     messages: int
     values: int
 
-    def halved(self) -> Budget:
+    def halve(self) -> Budget:
         """Return half of it."""
         return Budget(self.messages // 2, self.values // 2)
 

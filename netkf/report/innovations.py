@@ -79,7 +79,7 @@ def innovation_claim(found: Innovations) -> str:
     said += "1 where P is exact) is "
     if len(nodes) == 1:
         where = f"at node {nodes[0]}" if nodes[0] >= 0 else "of the filter of all readings"
-        return f"{said}{format_number(means[0])} {where}, {_judged(means[0], low[0], high[0])}"
+        return f"{said}{format_number(means[0])} {where}, {_judge_means(means[0], low[0], high[0])}"
     least, most = int(np.argmin(means)), int(np.argmax(means))
     said += f"{format_number(means[least])} (node {nodes[least]}) to "
     said += f"{format_number(means[most])} (node {nodes[most]})"
@@ -91,7 +91,7 @@ def innovation_claim(found: Innovations) -> str:
     return f"{said}: P is {' and '.join(parts)}"
 
 
-def _judged(mean: float, low: float, high: float) -> str:
+def _judge_means(mean: float, low: float, high: float) -> str:
     inside = f"{format_number(low)} .. {format_number(high)}"
     if mean > high:
         return f"P is too sure: {CONFIDENCE:.0%} of such means would lie in {inside}"

@@ -136,7 +136,7 @@ def make_page(
         page = _assemble(entries, comparison, command, budget)
         if len(page.encode("utf-8")) <= MAX_BYTES or budget.messages < MIN_BUDGET:
             return page
-        budget = budget.halved()
+        budget = budget.halve()
 
 
 def _entry(directory: Path, replica: int | None, trust: bool) -> _Entry:

@@ -57,7 +57,7 @@ def high_word_by_halves(a: Any, b: Any) -> Any:
 
 
 @kernel
-def scrambled(high: Any, low: Any) -> Any:
+def scramble(high: Any, low: Any) -> Any:
     """The word that a state of two words gives."""
     made = high ^ (high >> S32)
     made *= CHEAP
@@ -81,7 +81,7 @@ def next_word(states: np.ndarray, k: int) -> Any:
     high, low = states[k, 0], states[k, 1]
     upper = high_word(low, CHEAP)
     states[k, 0], states[k, 1] = following(high, low, upper, states[k, 2], states[k, 3])
-    return scrambled(high, low)
+    return scramble(high, low)
 
 
 @kernel
@@ -98,7 +98,7 @@ def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArr
     # One instruction for several lanes: all do the same to words of their own.
     for q in range(len(lanes)):
         high, low = states[b, k, 0, q], states[b, k, 1, q]
-        units[b, k, q] = float(scrambled(high, low) >> S11) * TO_UNIT
+        units[b, k, q] = float(scramble(high, low) >> S11) * TO_UNIT
         upper = high_word_by_halves(low, CHEAP)
         states[b, k, 0, q], states[b, k, 1, q] = following(
             high, low, upper, states[b, k, 2, q], states[b, k, 3, q]
@@ -112,11 +112,11 @@ def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
     states[b, k, 0, q], states[b, k, 1, q] = following(
         high, low, high_word(low, CHEAP), states[b, k, 2, q], states[b, k, 3, q]
     )
-    return float(scrambled(high, low) >> S11) * TO_UNIT
+    return float(scramble(high, low) >> S11) * TO_UNIT
 
 
 @kernel(inlined=True)
-def next_state(high: Any, low: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
+def next_stream_state(high: Any, low: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
     """``following`` of a stream that has registers to itself: its increment is ``more``."""
     return following(high, low, high_word(low, CHEAP), more_high, more_low)
 
@@ -128,11 +128,11 @@ def exponential_of(
     """``next_exponential`` of stream ``k``, whose state is in registers; return the state after it
     too. Numbers of one stream wait for each other's state, and memory makes them wait longer.
     """
-    word = scrambled(high, low) >> S3
+    word = scramble(high, low) >> S3
     layer = int(word & LAYER)
     word >>= S8
     if word < ziggurat.inside[layer]:
-        high, low = next_state(high, low, states[k, 2], states[k, 3])
+        high, low = next_stream_state(high, low, states[k, 2], states[k, 3])
         return float(word) * ziggurat.width[layer], high, low
     states[k, 0], states[k, 1] = high, low
     x = next_exponential(states, k, ziggurat)

@@ -17,7 +17,17 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.rng.draws import HALF, LAYER, ONE, S8, S32, next_state, next_unit, next_word, scrambled
+from netkf.rng.draws import (
+    HALF,
+    LAYER,
+    ONE,
+    S8,
+    S32,
+    next_stream_state,
+    next_unit,
+    next_word,
+    scramble,
+)
 
 _U = np.uint64
 MANTISSA, S1, S9 = _U(0x000FFFFFFFFFFFFF), _U(1), _U(9)
@@ -49,12 +59,12 @@ def normal_of(
     """``next_normal`` of stream ``k``, whose state is in registers; return the state after it too,
     see ``exponential_of``.
     """
-    word = scrambled(high, low)
+    word = scramble(high, low)
     layer = int(word & LAYER)
     size = (word >> S9) & MANTISSA
     if size < ziggurat.inside[layer]:
         x: float = float(size) * ziggurat.width[layer]
-        high, low = next_state(high, low, states[k, 2], states[k, 3])
+        high, low = next_stream_state(high, low, states[k, 2], states[k, 3])
         return -x if (word >> S8) & ONE == ONE else x, high, low
     states[k, 0], states[k, 1] = high, low
     x = next_normal(states, k, ziggurat)

@@ -56,10 +56,10 @@ class Streams:
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
-        """``generator`` of each of them, in order; see ``seeded``."""
+        """``generator`` of each of them, in order; see ``with_seeds``."""
         return ReplicaStreams(self.seed, self.replica, 1).generators(purpose, entities)
 
-    def seeded(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
+    def with_seeds(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
         """The same streams, with the seeds of these purposes and entities made all at once: numpy
         takes some 30 microseconds for one. Entities have as many numbers each.
         """

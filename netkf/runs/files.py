@@ -19,7 +19,7 @@ from netkf.core.errors import ScenarioError, WriteError
 from netkf.scenario.plugins import module_files, unnamed_class
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
-from netkf.scenario.writing import resolved, to_toml
+from netkf.scenario.writing import resolve_defaults, to_toml
 
 
 @contextlib.contextmanager
@@ -228,7 +228,7 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
     for module in module_files(scenario).values():
         if module is not None:
             _copy(module, directory / module.name)
-    table = resolved(scenario)
+    table = resolve_defaults(scenario)
     table["seed"] = scenario.seed if seed is None else seed
     write_text(directory / "scenario.toml", to_toml(table))
 
@@ -245,7 +245,7 @@ def _copy(source: Path, target: Path) -> None:
 
 def scenario_digest(scenario: Scenario) -> str:
     """Return the SHA-256 of a resolved scenario and of the files and modules that it names."""
-    digest = hashlib.sha256(to_toml(resolved(scenario)).encode())
+    digest = hashlib.sha256(to_toml(resolve_defaults(scenario)).encode())
     files = {source.name: source.full for source in source_files(scenario)}
     files |= {f"{name}.py": file for name, file in module_files(scenario).items() if file}
     for name, file in sorted(files.items()):

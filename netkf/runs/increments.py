@@ -18,7 +18,7 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.theory.numerics.prediction import LinearSDE
 
 
-class Interval(NamedTuple):
+class WhitenedInnovation(NamedTuple):
     """An interval of increments: its ``end`` (seconds), the ``node`` (-1 for a filter of all
     sensors), and the innovation (p,) times the inverse root of its covariance.
     """
@@ -59,7 +59,7 @@ class Expectations:
         return np.asarray(np.linalg.solve(np.linalg.cholesky(S), y - H @ J @ xhat))
 
 
-def noting_increments(algorithm: Filter, intervals: list[Interval]) -> Filter:
+def noting_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
     """Return the filter that does what it did, and notes the innovations of increments on the way.
 
     Its states are those of the filter with the node and the time that they belong to.
@@ -91,7 +91,7 @@ def noting_increments(algorithm: Filter, intervals: list[Interval]) -> Filter:
             if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():
                 y = reading.moments[: len(reading.moments) // 2]
                 found = expectations(state.inner.model).innovation(xhat, P, y, reading.gap)
-                intervals.append(Interval(state.time, state.node, found))
+                intervals.append(WhitenedInnovation(state.time, state.node, found))
             return state._replace(inner=base.update(self, state.inner, reading))
 
         def emit(self, state: Noted, exchange: Any) -> tuple[Noted, Any]:

@@ -15,7 +15,7 @@ from scipy.special import gammaincinv
 from netkf.algorithms.filter import Filter, Reading
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.increments import Interval, noting_increments
+from netkf.runs.increments import WhitenedInnovation, noting_increments
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
@@ -59,7 +59,7 @@ def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
         raise NetkfError(f"a run of more than {most:,} events is not replayed")
     algorithm: Filter = scenario.filter.algorithm
     noted: list[tuple[Reading, FloatArray, FloatArray | None]] = []
-    intervals: list[Interval] = []
+    intervals: list[WhitenedInnovation] = []
     if not scenario.slotted and scenario.increment_sensors:
         algorithm = noting_increments(algorithm, intervals)
     filtering = dataclasses.replace(scenario.filter, algorithm=_noting(algorithm, noted))
@@ -97,9 +97,9 @@ def _noting(algorithm: Filter, noted: list[Any]) -> Filter:
     return made  # type: ignore[no-any-return]
 
 
-def _collect(run: Run, noted: list[Any], intervals: list[Interval]) -> Innovations:
+def _collect(run: Run, noted: list[Any], intervals: list[WhitenedInnovation]) -> Innovations:
     """Return the innovations of what was noted, in the order of time."""
-    nodes, kept = _matched(run, [one for one in noted if len(one[0].y)])
+    nodes, kept = _match_nodes(run, [one for one in noted if len(one[0].y)])
     whitened = [_whiten(*one) for one in kept] + [one.whitened for one in intervals]
     nis = np.array([float(v @ v) for v in whitened])
     if not np.isfinite(nis).any():
@@ -114,7 +114,7 @@ def _collect(run: Run, noted: list[Any], intervals: list[Interval]) -> Innovatio
     return Innovations(times[order], nodes[order], rows[order], nis[order], ordered, len(intervals))
 
 
-def _matched(run: Run, noted: list[Any]) -> tuple[np.ndarray, list[Any]]:
+def _match_nodes(run: Run, noted: list[Any]) -> tuple[np.ndarray, list[Any]]:
     """Return the nodes of what was noted, -1 where a pooled filter reads for several at once."""
     senses = run.log[run.log["kind"] == CODES["sense"]][["t", "node"]]
     # A node with several sensors uses them together, and may have an event for each.

@@ -18,7 +18,7 @@ from netkf.theory.hybrid.coupled import reason_without_bound
 from netkf.theory.hybrid.steady import has_steady_state
 from netkf.trace.nees import errors
 from netkf.trace.recorder import Sink
-from netkf.trace.run import carried, rounding_from
+from netkf.trace.run import carried_size, rounding_from
 from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95
@@ -75,7 +75,7 @@ class SummarySink(Sink):
         self.first += list(np.array(xhat[:, :, 0]))
         self.trace += list(np.trace(P, axis1=2, axis2=3))
         if self.rounding_from is None:
-            first = rounding_from(t, carried(x, error, self.exact_errors), P, error)
+            first = rounding_from(t, carried_size(x, error, self.exact_errors), P, error)
             self.rounding_from = first if first < np.inf else None
 
     @property

@@ -180,7 +180,7 @@ class DerivedScenario(ScenarioModel):
         same = np.array_equal(self.belief[0], self.truth.A)
         return same and frame_period(self.truth.A) is not None
 
-    def moved_back(self, offset: FloatArray, age: float) -> FloatArray:
+    def move_back(self, offset: FloatArray, age: float) -> FloatArray:
         """Return the state (n,) that the plant without noise moves to ``offset`` in ``age`` s."""
         if self.slotted:
             return offset

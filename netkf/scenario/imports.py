@@ -162,7 +162,7 @@ class _Places:
         path, names = self.path, module_name.split(".")
         for k in range(len(names)):
             name = ".".join(names[: k + 1])
-            spec = (None if specs else self._mapped(name)) or _spec(name, path)
+            spec = (None if specs else self._map_editable(name)) or _spec(name, path)
             if spec is None:
                 return None
             path = [
@@ -174,7 +174,7 @@ class _Places:
             specs.append(spec)
         return specs
 
-    def _mapped(self, name: str) -> ModuleSpec | None:
+    def _map_editable(self, name: str) -> ModuleSpec | None:
         """Return what the import hook of an editable install maps a name to."""
         for finder in sys.meta_path:
             hook = finder if isinstance(finder, type) else type(finder)
@@ -273,13 +273,13 @@ class _Source:
         for node in _statements(self._body):
             if isinstance(node, ast.ClassDef) and node.name == name:
                 for base in node.bases:
-                    yield from self._resolved(base, name)
+                    yield from self._resolve(base, name)
             elif isinstance(node, ast.ImportFrom):
-                yield from self._imported(node, name)
+                yield from self._imported_names(node, name)
             elif isinstance(node, ast.Assign) and name in map(_name, node.targets):
-                yield from self._resolved(node.value, name)
+                yield from self._resolve(node.value, name)
 
-    def _imported(self, node: ast.ImportFrom, name: str) -> Iterator[tuple[str, str]]:
+    def _imported_names(self, node: ast.ImportFrom, name: str) -> Iterator[tuple[str, str]]:
         for alias in node.names:
             if alias.name == "*" or (alias.asname or alias.name) == name:
                 yield self._absolute(node), name if alias.name == "*" else alias.name
@@ -289,7 +289,7 @@ class _Source:
         kept = above[: len(above) - node.level + 1] if node.level else []
         return ".".join([*kept, *([node.module] if node.module else [])])
 
-    def _resolved(self, node: ast.expr, own: str) -> Iterator[tuple[str, str]]:
+    def _resolve(self, node: ast.expr, own: str) -> Iterator[tuple[str, str]]:
         """Yield what an expression ``Name`` or ``package.module.Name`` refers to."""
         names: list[str] = []
         while isinstance(node, ast.Attribute):

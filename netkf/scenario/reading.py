@@ -43,7 +43,7 @@ def load(
         rule, remedy = "must be a table", 'give values by key: {"horizon": 10.0}'
         raise ScenarioError("changes", rule, given, remedy)
     try:
-        return from_table(with_changes(_parsed(path), changes or {}), path.parent, trust)
+        return from_table(with_changes(_parse_file(path), changes or {}), path.parent, trust)
     except ScenarioError as error:
         raise explain_left_over(error, changes or {}).in_file(str(path)) from None
 
@@ -53,7 +53,7 @@ def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Sc
     return build_scenario(Scenario, table, Origin(folder, trust))
 
 
-def _parsed(path: Path) -> dict[str, Any]:
+def _parse_file(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(_text(path))
     except UnicodeDecodeError:
@@ -97,14 +97,14 @@ def parse_toml(text: str) -> dict[str, Any]:
     arrays: dict[str, Any] = {}
     if len(text) > LONG_TEXT and '"""' not in text and "'''" not in text:
         mark = secrets.token_hex(16)
-        text = "\n".join(_shortened(line, arrays, mark) for line in lines)
+        text = "\n".join(_shorten_array(line, arrays, mark) for line in lines)
     found: dict[str, Any] = _whole(tomllib.loads(text), arrays)
     if _depth(found) > MAX_DEPTH:
         raise ScenarioError("", "is nested too deep", None, "see the keys of a scenario file")
     return found
 
 
-def _shortened(line: str, arrays: dict[str, Any], mark: str) -> str:
+def _shorten_array(line: str, arrays: dict[str, Any], mark: str) -> str:
     """Return a line ``key = [numbers]`` with a key of ``arrays`` for its value; others unchanged.
 
     The json module reads such arrays fifty times faster than tomllib.

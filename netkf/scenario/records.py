@@ -30,7 +30,7 @@ def check_records(scenario: DerivedScenario) -> None:
             )
     plant = scenario.plant
     if isinstance(plant, RecordedPlant):
-        _under("plant", lambda: plant.demand(sorted(_wanted(scenario))))
+        _under("plant", lambda: plant.demand(sorted(_state_slots(scenario))))
     if scenario.slotted and scenario.filter.algorithm.talks:
         _exchanges(scenario)
 
@@ -93,7 +93,7 @@ def used_states(scenario: DerivedScenario) -> tuple[str, int, int] | None:
         return plant.path.name, len(plant.table[0]), _used_rows(scenario, plant)
     if not isinstance(plant, RecordedPlant):
         return None
-    return plant.path.name, len(plant.table), len(_wanted(scenario) & plant.table.keys())
+    return plant.path.name, len(plant.table), len(_state_slots(scenario) & plant.table.keys())
 
 
 def _used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
@@ -108,7 +108,7 @@ def _used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
     )
 
 
-def _wanted(scenario: DerivedScenario) -> set[int]:
+def _state_slots(scenario: DerivedScenario) -> set[int]:
     """Return the slots in which a run needs the state."""
     drawn = any(sensor.is_random for sensor in scenario.sensors)
     return {*scenario.slots, *(sensed_slots(scenario) if drawn else ())}

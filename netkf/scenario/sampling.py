@@ -26,7 +26,7 @@ MAX_SAMPLES = 1e9
 def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:
     """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
     found = {}
-    for node, place in _placed(scenario):
+    for node, place in _iterate_placed(scenario):
         sensor, generator = scenario.sensors[place.entry], _generator(streams, node, place)
         try:
             times = sensor.sample_times(node, place.ordinal, generator, scenario.horizon)
@@ -44,7 +44,7 @@ def sample_path(
     return sensor.samples(node, _generator(streams, node, place), scenario.horizon)
 
 
-def _placed(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
+def _iterate_placed(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
     for node, places in scenario.sampled_sensors.items():
         for place in places:
             yield node, place
@@ -89,7 +89,7 @@ def demand_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArr
         return
     try:
         plant.demand(scenario.times, "the probe")
-        for node, place in _placed(scenario):
+        for node, place in _iterate_placed(scenario):
             if scenario.sensors[place.entry].is_random:
                 plant.demand(times[node, place.ordinal], f"a sample of node {node}")
     except ScenarioError as error:

@@ -12,7 +12,7 @@ from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
-from netkf.scenario.tables import changed
+from netkf.scenario.tables import change_keys
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,7 +66,7 @@ class Scenario(DerivedScenario):
         table, so that ``mean`` and ``cov`` of the filter are the plant's again.
         Raises ScenarioError for a key that does not exist or a value that breaks a rule.
         """
-        return changed(self, changes)
+        return change_keys(self, changes)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:

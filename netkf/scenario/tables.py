@@ -31,7 +31,7 @@ WAITING = object()
 S = TypeVar("S", bound=DerivedScenario)
 
 
-def changed(scenario: S, changes: Mapping[str, Any]) -> S:
+def change_keys(scenario: S, changes: Mapping[str, Any]) -> S:
     """Return the scenario with some keys changed; see Scenario.replace."""
     folder = getattr(scenario, "_folder", None)
     if folder is None:  # built in Python
@@ -173,14 +173,14 @@ def _part(
             if rule is not None and not _waits(value):
                 rule(name, value)
         return WAITING
-    return _made(cls, values)
+    return _make(cls, values)
 
 
 def _waits(value: Any) -> bool:
     return value is WAITING or (isinstance(value, tuple) and any(map(_waits, value)))
 
 
-def _made(cls: type[Any], values: dict[str, Any]) -> Any:
+def _make(cls: type[Any], values: dict[str, Any]) -> Any:
     try:
         return cls(**values)
     except ScenarioError:

@@ -23,7 +23,7 @@ def as_table(scenario: DerivedScenario) -> dict[str, Any]:
     return _scenario(scenario, scenario.plant, scenario.network, scenario.filter, defaults=False)
 
 
-def resolved(scenario: DerivedScenario) -> dict[str, Any]:
+def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
     """Return the tables of a scenario file with all defaults; it gives the same runs."""
     network = scenario.network
     if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
@@ -36,10 +36,10 @@ def resolved(scenario: DerivedScenario) -> dict[str, Any]:
         cov=plant.start_cov if filtering.cov is None else filtering.cov,
     )
     # No second scenario is made of the parts: it would build and check the whole network again.
-    return _scenario(scenario, _filled(scenario), network, filtering, defaults=True)
+    return _scenario(scenario, _fill_start(scenario), network, filtering, defaults=True)
 
 
-def _filled(scenario: DerivedScenario) -> Plant:
+def _fill_start(scenario: DerivedScenario) -> Plant:
     plant = scenario.plant if scenario.slotted else scenario.truth
     return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
 

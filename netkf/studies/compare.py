@@ -292,12 +292,12 @@ def _entry(
     entry = Entry(value, se)
     if other is first or value is None:
         return entry
-    return _paired(first, other, quantity, node, level, entry) or _welch(
+    return _pair_runs(first, other, quantity, node, level, entry) or _welch(
         first.value(quantity, node), entry, (first.runs, other.runs), level
     )
 
 
-def _paired(
+def _pair_runs(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
     """Return the entry with a paired difference, None if the runs do not have the same truth."""

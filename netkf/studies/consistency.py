@@ -32,7 +32,7 @@ from netkf.runs.summary import NO_COVARIANCE
 from netkf.scenario.scenario import Scenario
 from netkf.theory import error_covariance
 from netkf.trace.nees import errors
-from netkf.trace.run import Run, blurred
+from netkf.trace.run import Run, blurred_samples
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,8 +75,8 @@ def run_consistency(
     _, nees = errors(run.error, run.P)
     after = np.flatnonzero(run.times > 0.0)
     sigma = _exact_covariance(scenario, run)
-    lost = blurred(run, run.P)
-    lost |= False if sigma is None else blurred(run, sigma)
+    lost = blurred_samples(run, run.P)
+    lost |= False if sigma is None else blurred_samples(run, sigma)
     nis, expected_nis = _mean_nis(scenario, run, sigma, lost)
     times = run.times[lost.any(axis=1) & (run.times > 0.0)]
     return RunConsistency(

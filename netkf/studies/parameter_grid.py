@@ -14,7 +14,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.values import split_setting, typed_values
-from netkf.scenario.writing import part_as_table, resolved, toml_text
+from netkf.scenario.writing import part_as_table, resolve_defaults, toml_text
 
 MAX_POINTS = 10_000
 _RANGE = re.compile(r"^([^:,\[{\"']+):([^:,]+):(\d+)$")
@@ -122,7 +122,7 @@ def is_integer_key(scenario: Scenario, key: str) -> bool:
 
     Raises ScenarioError at --vary if it is neither.
     """
-    value: Any = resolved(scenario)
+    value: Any = resolve_defaults(scenario)
     for name in key.replace("[", ".").replace("]", "").split("."):
         try:
             value = value[int(name)] if isinstance(value, (list, tuple)) else value[name]

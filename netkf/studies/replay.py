@@ -167,8 +167,7 @@ class Replayer:
         self._node, self.at, self.count = scenario.nodes.index(node), at, 0
         self._deliveries = Deliveries()
         self._short, self._whole = (
-            _delivering(_shortened(scenario, at, whole), self._deliveries)
-            for whole in (False, True)
+            _delivering(_shorten(scenario, at, whole), self._deliveries) for whole in (False, True)
         )
         self._known: dict[tuple[Chosen | None, bool], Outcome] = {}
 
@@ -237,7 +236,7 @@ def _delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
     return _with(scenario, network=dataclasses.replace(network, channel=channel))
 
 
-def _shortened(scenario: Scenario, at: float, whole: bool) -> Scenario:
+def _shorten(scenario: Scenario, at: float, whole: bool) -> Scenario:
     """Return the scenario with the state at ``at`` seconds as its last sample; unless ``whole`` it
     ends there.
 

@@ -67,7 +67,7 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     columns |= {name: read_flags(path, name).tolist() for name in FLAGS}
     columns |= {name: read_texts(path, name).astype(str).tolist() for name in WORDS}
     rows = [
-        _compared({name: values[k] for name, values in columns.items()})
+        _read_filter({name: values[k] for name, values in columns.items()})
         for k in range(len(numbers))
     ]
     if [row.filter for row in rows] != manifest["filters"] or not any(row.ran for row in rows):
@@ -84,7 +84,7 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     )
 
 
-def _compared(row: dict[str, Any]) -> ComparedFilter:
+def _read_filter(row: dict[str, Any]) -> ComparedFilter:
     """Return a filter of a comparison from its row in the table."""
     quantities = {
         key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in QUANTITIES

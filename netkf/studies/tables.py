@@ -178,7 +178,7 @@ def comparison_text(found: Comparison) -> str:
     rows = [
         [
             row.quantity if row.node < 0 else f"{row.quantity} of node {row.node}",
-            *map(_marked, row.entries),
+            *map(_mark, row.entries),
         ]
         for row in found.rows
     ]
@@ -208,5 +208,5 @@ def comparison_text(found: Comparison) -> str:
     return "\n".join(lines)
 
 
-def _marked(entry: Entry) -> str:
+def _mark(entry: Entry) -> str:
     return _with_error(entry.value, entry.se) + (" *" if entry.real else "  ")

@@ -97,7 +97,7 @@ def why(
 
     Raises ScenarioError for a node, time or run that is not there, and for a run without events.
     """
-    run, known = _given(run, scenario, replica, trust)
+    run, known = _check_run(run, scenario, replica, trust)
     at = _instant(run, known, node, at)
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
@@ -130,13 +130,13 @@ def why(
     )
 
 
-def _given(
+def _check_run(
     run: Run | str | Path, scenario: Scenario | None, replica: int | None, trust: bool
 ) -> tuple[Run, Scenario]:
     """Return a run with all its events, and its scenario; raises ScenarioError."""
     where = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
-        run = _opened(run, replica, trust)
+        run = _read_run(run, replica, trust)
     if replica is not None and replica != run.replica:
         rule = f"is another one than that of the run, {run.replica}"
         raise ScenarioError("replica", rule, replica, "leave it out")
@@ -151,7 +151,7 @@ def _given(
     return run, known
 
 
-def _opened(directory: str | Path, replica: int | None, trust: bool) -> Run:
+def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
     """Return a run that is read back from its directory; raises ScenarioError."""
     found = open_directory(directory, trust=trust)
     if isinstance(found, Run):

@@ -99,12 +99,12 @@ class Run(Shown):
     @cached_property
     def rounding(self) -> FloatArray:
         """The size (T,) of the rounding error in ``error``."""
-        return rounding(carried(self.x, self.error, self.exact_errors))
+        return rounding(carried_size(self.x, self.error, self.exact_errors))
 
     @cached_property
     def rounding_from(self) -> float:
         """The first sample time at which rounding blurs ``error``, inf if none does."""
-        size = carried(self.x, self.error, self.exact_errors)
+        size = carried_size(self.x, self.error, self.exact_errors)
         return rounding_from(self.times, size, self.P, self.error)
 
     def plot(self, figure: str = "error") -> Any:
@@ -173,7 +173,7 @@ def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray
     return float(times[np.argmax(lost)]) if lost.any() else np.inf
 
 
-def carried(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
+def carried_size(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
     """(T, n) the size of what a run computes with: states x (T, n), or with exact errors no more
     than the largest of the errors e (T, N, n), which a node may have passed on to others.
     """
@@ -185,7 +185,7 @@ def rounding(x: FloatArray) -> FloatArray:
     return np.asarray(ROUNDING * np.abs(x).max(axis=1))
 
 
-def blurred(run: Run, matrices: FloatArray) -> np.ndarray:
+def blurred_samples(run: Run, matrices: FloatArray) -> np.ndarray:
     """(T, N) samples whose errors rounding blurs in some direction, where their covariances are
     these (T, N, n, n): directions that are certain do not count, nor do matrices of nan.
     """

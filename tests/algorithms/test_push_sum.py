@@ -15,9 +15,9 @@ from netkf.algorithms.push_sum import (
     MASS,
     PushSum,
     asymptotic_root,
-    averaged,
-    corrected_root,
-    mixed,
+    average_estimates,
+    conserve_mass,
+    correct_one_root,
     share,
 )
 
@@ -42,7 +42,7 @@ def one_round(masses, edges, up):
         if here:
             received[i].append(shares[j])
             received[j].append(shares[i])
-    return [mixed(*args) for args in zip(masses, received, degrees, strict=True)]
+    return [conserve_mass(*args) for args in zip(masses, received, degrees, strict=True)]
 
 
 def drift(rounds, replicas, delivery, seed):
@@ -109,7 +109,7 @@ def test_the_correction_is_the_formula_of_the_paper(n):
     for rank in range(n + 1):
         A, B = random.standard_normal((n, n)), random.standard_normal((n, rank))
         M, G = A @ A.T, B @ B.T
-        root = corrected_root(np.linalg.cholesky(M), G)
+        root = correct_one_root(np.linalg.cholesky(M), G)
         expected = M @ np.linalg.inv(np.eye(n) + G @ M)
         np.testing.assert_allclose(root @ root.T, expected, rtol=1e-10, atol=1e-12)
 
@@ -117,7 +117,7 @@ def test_the_correction_is_the_formula_of_the_paper(n):
 def test_the_correction_survives_a_covariance_that_grew_for_long():
     """A node without mass lets P grow; when information comes, what is seen is known again."""
     P, G = np.diag([1e20, 1e18]), np.diag([4.0, 0.0])
-    root = corrected_root(np.sqrt(P), G)
+    root = correct_one_root(np.sqrt(P), G)
     np.testing.assert_allclose(root @ root.T, np.diag([0.25, 1e18]), rtol=1e-12)
 
 
@@ -149,7 +149,7 @@ def test_averaging_keeps_the_mean_and_follows_the_laplacian():
     for i, j in EDGES:
         L += np.outer(np.eye(5)[i] - np.eye(5)[j], np.eye(5)[i] - np.eye(5)[j])
     peers = [[j for e in EDGES for j in e if i in e and j != i] for i in range(5)]
-    after = [averaged(z[i], [z[j] for j in peers[i]], 4.5) for i in range(5)]
+    after = [average_estimates(z[i], [z[j] for j in peers[i]], 4.5) for i in range(5)]
     np.testing.assert_allclose(after, z - L @ z / 4.5, atol=1e-14)
 
 
@@ -202,7 +202,9 @@ def within(D, bound):
 
 
 def settled(information, number, former, former_number, tolerance):
-    return stopping.settled(information[None], number, former[None], 0, former_number, tolerance)
+    return stopping.has_settled(
+        information[None], number, former[None], 0, former_number, tolerance
+    )
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from netkf.algorithms.kernels import slots
-from netkf.algorithms.push_sum import corrected
+from netkf.algorithms.push_sum import correct_estimate
 from netkf.linalg.lanes import LANES, aligned
 
 CASES = [(seed, n) for seed in range(3) for n in (1, 2, 4, 7)]
@@ -35,7 +35,7 @@ def filters(random, n, p):
     y = lanes_last(random.standard_normal((LANES, 1, 2, p)))
     H = lanes_last(random.standard_normal((LANES, 1, 2, p, n)))
     local = lanes_last(random.standard_normal((LANES, 1, n)))
-    return nodes, slots.SlotReadings(y, H, local, np.array([True]))
+    return nodes, slots.ReadingBlock(y, H, local, np.array([True]))
 
 
 def estimates(nodes, h, q):
@@ -49,7 +49,7 @@ def test_prediction(seed, n):
     random = np.random.default_rng(seed)
     nodes, _ = filters(random, n, 1)
     before = [estimates(nodes, 1, q) for q in range(LANES)]
-    slots.predict(nodes, slots.slot_room(2, n), 0)
+    slots.predict_all(nodes, slots.slot_room(2, n), 0)
     for q, (x, P) in enumerate(before):
         found, cov = estimates(nodes, 1, q)
         expected = nodes.F @ P @ nodes.F.T + nodes.root_Q @ nodes.root_Q.T
@@ -64,16 +64,16 @@ def test_a_lane_is_the_same_in_any_company(n):
     random = np.random.default_rng(n)
     nodes, _ = filters(random, n, 1)
     roots = nodes.root[0, 0].copy()
-    slots.predict(nodes, slots.slot_room(2, n), 0)
+    slots.predict_all(nodes, slots.slot_room(2, n), 0)
     for q in range(LANES):
-        alone = slots.predicted_root(roots[:, :, q], nodes.F, nodes.root_Q)
+        alone = slots.predict_root_alone(roots[:, :, q], nodes.F, nodes.root_Q)
         np.testing.assert_array_equal(np.tril(alone), np.tril(nodes.root[0, 0, :, :, q]))
 
 
 def test_prediction_of_what_is_known_and_moves_by_itself():
     """Rows of zeros and signs that change."""
     F, zero = np.diag([-2.0, 1.0, 0.0]), np.zeros((3, 3))
-    root = slots.predicted_root(np.diag([1.0, 0.0, 3.0]), F, zero)
+    root = slots.predict_root_alone(np.diag([1.0, 0.0, 3.0]), F, zero)
     np.testing.assert_allclose(root, np.diag([2.0, 0.0, 0.0]), atol=0.0)
 
 
@@ -108,9 +108,9 @@ def test_the_gain_of_push_sum(seed, n):
     x, root = random.standard_normal(n), triangular(random, n)[0]
     y, H, R = random.standard_normal(2), random.standard_normal((2, n)), _covariance(random, 2)
     expected = x + 3.5 * root @ root.T @ H.T @ np.linalg.inv(R) @ (y - H @ x)
-    found = corrected(x, root, 3.5, y, H, R)
+    found = correct_estimate(x, root, 3.5, y, H, R)
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
-    assert (corrected(x, root, 3.5, y[:0], H[:0], R[:0, :0]) == x).all()
+    assert (correct_estimate(x, root, 3.5, y[:0], H[:0], R[:0, :0]) == x).all()
 
 
 @pytest.mark.parametrize("framed", [False, True])

@@ -9,7 +9,7 @@ import scipy.optimize
 
 import netkf
 from netkf import theory
-from netkf.algorithms.kernels.pair_fusion import fused_pair
+from netkf.algorithms.kernels.pair_fusion import fuse_tracks
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.theory.common.errors import error_law
 from tests.algorithms.test_literature import (
@@ -121,14 +121,16 @@ def test_known_correlations_beat_inverse_intersection_which_beats_intersection(s
     x, y = random.standard_normal((2, n))
     roots = [np.linalg.cholesky(P) for P in (A, B)]
     S_ci, S_ici = (
-        fused_pair((x, roots[0]), (y, roots[1]), inverse, True)[1] for inverse in (False, True)
+        fuse_tracks((x, roots[0]), (y, roots[1]), inverse, True)[1] for inverse in (False, True)
     )
     G = (A - cross) @ np.linalg.inv(A + B - cross - cross.T)
     known = A - G @ (A - cross).T
     assert np.trace(known) < np.trace(S_ici @ S_ici.T) < np.trace(S_ci @ S_ci.T)
     # And the claim of inverse intersection holds for such tracks.
     joint = np.block([[A, cross], [cross.T, B]])
-    w_x = np.stack([fused_pair((e, roots[0]), (0 * e, roots[1]), True, True)[0] for e in np.eye(n)])
+    w_x = np.stack(
+        [fuse_tracks((e, roots[0]), (0 * e, roots[1]), True, True)[0] for e in np.eye(n)]
+    )
     K = w_x.T
     error = np.hstack([K, np.eye(n) - K])
     gap = S_ici @ S_ici.T - error @ joint @ error.T
@@ -140,7 +142,7 @@ def test_weights_at_equal_covariances_are_one_half():
     S = np.linalg.cholesky(np.array([[2.0, 0.3], [0.3, 1.0]]))
     x, y = np.array([1.0, 2.0]), np.array([3.0, -1.0])
     for inverse in (False, True):
-        mean, root = fused_pair((x, S), (y, S * (1.0 + 1e-15)), inverse, True)
+        mean, root = fuse_tracks((x, S), (y, S * (1.0 + 1e-15)), inverse, True)
         np.testing.assert_allclose(mean, (x + y) / 2.0, rtol=1e-12)
         np.testing.assert_allclose(root, S, rtol=1e-12)
 

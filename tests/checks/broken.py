@@ -9,7 +9,7 @@ from netkf.algorithms.filter import Estimate
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.push_sum import AVERAGE, PushSum, averaged
+from netkf.algorithms.push_sum import AVERAGE, PushSum, average_estimates
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
 
@@ -225,7 +225,7 @@ class Overshoots(PushSum):
         if exchange.phase != AVERAGE:
             return super().absorb(state, messages, exchange)
         received = [message.payload for message in messages]
-        return state._replace(xhat=averaged(state.xhat, received, 0.6 * self.delta))
+        return state._replace(xhat=average_estimates(state.xhat, received, 0.6 * self.delta))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from netkf.algorithms.flow import FlowFilter
 from netkf.ensembles.directory import runs_to_directory
 from netkf.runs.run import run_to_directory
 from netkf.studies.compare import compare
-from netkf.trace.run import blurred
+from netkf.trace.run import blurred_samples
 from tests.conftest import SCENARIOS
 
 UNSTABLE = {
@@ -53,12 +53,12 @@ def growing(build):
 def test_samples_after_digits_are_lost_are_found(growing):
     run = subtracted(netkf.simulate(growing))
     assert 20.0 < run.rounding_from < 40.0
-    lost = blurred(run, run.P)
+    lost = blurred_samples(run, run.P)
     assert not lost[run.times < run.rounding_from].any()
     assert lost[-1].all()
     exact = dataclasses.replace(run, exact_errors=True)
     assert exact.rounding_from == np.inf
-    assert not blurred(exact, exact.P).any()
+    assert not blurred_samples(exact, exact.P).any()
 
 
 class NoFrames(FlowFilter):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from netkf.engines.soundness import sound, stack_estimates
+from netkf.engines.soundness import sound_mask, stack_estimates
 
 
 def rotated(values, seed=0):
@@ -24,18 +24,18 @@ def test_eigenvalues_decide_about_covariances():
         ([1e-200, 1e-200, -1e-205], False),
     ]
     P = np.array([rotated(values, k) for k, (values, _) in enumerate(eigenvalues)])
-    found = sound(np.zeros((len(P), 3)), P)
+    found = sound_mask(np.zeros((len(P), 3)), P)
     assert found.tolist() == [expected for _, expected in eigenvalues]
     for one, (_, expected) in zip(P, eigenvalues, strict=True):  # also without the others
-        assert sound(np.zeros(3), one) == expected
+        assert sound_mask(np.zeros(3), one) == expected
 
 
 def test_what_is_not_finite_is_not_sound_unless_it_was_not_given():
     xhat, P = np.zeros((4, 2)), np.array([np.eye(2)] * 4)
     xhat[1, 0], P[2, 0, 0], P[3] = np.inf, np.nan, np.nan
-    assert sound(xhat, P).tolist() == [True, False, False, False]
+    assert sound_mask(xhat, P).tolist() == [True, False, False, False]
     without = np.array([False, True, False, True])
-    assert sound(xhat, P, without).tolist() == [True, False, False, True]
+    assert sound_mask(xhat, P, without).tolist() == [True, False, False, True]
 
 
 def test_estimates_without_a_covariance_are_stacked():

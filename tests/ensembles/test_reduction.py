@@ -5,7 +5,7 @@ import pytest
 
 from netkf.ensembles.reduction import reduce_batch
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
-from netkf.trace.run import carried, rounding_from
+from netkf.trace.run import carried_size, rounding_from
 from netkf.trace.schema import KINDS
 
 TIMES = np.arange(7) * 0.5
@@ -37,7 +37,7 @@ def plain(given, r):
     with np.errstate(all="ignore"):
         blurred = rounding_from(
             TIMES[:stop],
-            carried(given.x[r, :stop], e[:stop], given.exact_errors),
+            carried_size(given.x[r, :stop], e[:stop], given.exact_errors),
             P[:stop],
             e[:stop],
         )

@@ -161,8 +161,8 @@ def test_moments_of_a_part_are_those_of_response_and_cubic(n, since, gap):
     random = np.random.default_rng(n)
     A = random.standard_normal((n, n)) / np.sqrt(n)
     x, cubic = random.standard_normal(n), random.standard_normal((4, n))
-    step = paths.Step(0.0, 0.2, x, np.zeros(n), np.zeros((2, n)), cubic)
-    got = paths.seen(GridLaws(A, np.eye(n), 0.2), step, since, since + gap)
+    step = paths.PathStep(0.0, 0.2, x, np.zeros(n), np.zeros((2, n)), cubic)
+    got = paths.state_moments(GridLaws(A, np.eye(n), 0.2), step, since, since + gap)
     # Gauss' rule is exact for polynomials of this degree, and the rest of exp(A s) is rounding.
     nodes, weights = np.polynomial.legendre.leggauss(12)
     times = since + 0.5 * gap * (1.0 + nodes)

@@ -12,7 +12,7 @@ ENTITIES = [(0, 1), (1, 0), (7, 123456), (2**32 - 1, 5)]
 @pytest.mark.parametrize("entities", [ENTITIES, [(3,), (2**31,)], [(2**40, 1)], []])
 def test_seeded_streams_are_the_same_streams(seed, replica, entities):
     plain = Streams(seed, replica)
-    seeded = plain.seeded(("loss", "clock"), entities)
+    seeded = plain.with_seeds(("loss", "clock"), entities)
     for one, entity in zip(plain.generators("sky", entities), entities, strict=True):
         assert one.bit_generator.state == plain.generator("sky", *entity).bit_generator.state
     for purpose in ("loss", "clock", "delay"):

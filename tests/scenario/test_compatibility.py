@@ -5,7 +5,7 @@ import pytest
 import netkf
 from netkf import parts
 from netkf.scenario.usage import record_usage, usage_notes
-from netkf.scenario.writing import resolved
+from netkf.scenario.writing import resolve_defaults
 
 SAMPLES = {"kind": "periodic", "period": 0.5}
 SENSOR = {"nodes": [0], "H": [[1.0]], "R": [[0.5]]}
@@ -227,10 +227,10 @@ def test_effective_rates_of_every_activation(build):
 def test_continuous_sampling_is_written_as_absent(build):
     scenario = build(sensors=[{**SENSOR, "sampling": "continuous"}])
     assert scenario == build()
-    assert "sampling" not in resolved(scenario)["sensors"][0]
-    again = resolved(build(sensors=SAMPLED))["sensors"][0]["sampling"]
+    assert "sampling" not in resolve_defaults(scenario)["sensors"][0]
+    again = resolve_defaults(build(sensors=SAMPLED))["sensors"][0]["sampling"]
     assert again == {"kind": "periodic", "period": 0.5, "phase": 0.0, "jitter": 0.0}
-    assert resolved(build(network=network(CLOCKS["readings"]), sensors=SAMPLED))["network"][
+    assert resolve_defaults(build(network=network(CLOCKS["readings"]), sensors=SAMPLED))["network"][
         "activation"
     ] == {"kind": "readings"}
 

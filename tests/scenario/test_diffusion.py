@@ -6,7 +6,7 @@ import pytest
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table, load
-from netkf.scenario.writing import resolved, to_toml
+from netkf.scenario.writing import resolve_defaults, to_toml
 from netkf.theory.diffusion.assumptions import sparse_weights
 from tests.conftest import SCENARIOS
 
@@ -143,7 +143,7 @@ def test_regressors_and_diffusion_belong_to_slots(build):
 )
 def test_recorded_regressors_are_checked(regression, tmp_path, header, rows, words):
     (tmp_path / "seen.csv").write_text("\n".join([header, *rows]) + "\n")
-    table = resolved(regression)
+    table = resolve_defaults(regression)
     table["sensors"] = [{"kind": "recorded", "path": "seen.csv", "R": [[0.1]]}]
     with pytest.raises(netkf.ScenarioError) as caught:
         from_table(table, tmp_path)
@@ -152,7 +152,7 @@ def test_recorded_regressors_are_checked(regression, tmp_path, header, rows, wor
 
 def test_written_out_it_gives_the_same_run(regression, tmp_path):
     file = tmp_path / "again.toml"
-    file.write_text(to_toml(resolved(regression)))
+    file.write_text(to_toml(resolve_defaults(regression)))
     again = load(file)
     assert netkf.simulate(again).fingerprint == netkf.simulate(regression).fingerprint
     np.testing.assert_array_equal(netkf.simulate(again).xhat, netkf.simulate(regression).xhat)

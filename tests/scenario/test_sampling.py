@@ -9,7 +9,7 @@ from netkf.plants.truth import RecordedTruth, SampledTruth
 from netkf.rng.streams import Streams
 from netkf.scenario import sampling
 from netkf.scenario.reading import from_table
-from netkf.scenario.writing import as_table, resolved
+from netkf.scenario.writing import as_table, resolve_defaults
 
 POISSON = {"kind": "poisson", "rate": 3.0}
 SAMPLED = {"nodes": [0, 1], "H": [[1.0, 0.0]], "R": [[0.5]], "sampling": POISSON}
@@ -59,7 +59,7 @@ def make(tmp_path):
 def test_what_is_written_reads_as_the_same_scenario(clock, make, tmp_path):
     (tmp_path / "s.csv").write_text("t,node\n0.5,0\n0.7,1\n")
     scenario = make([{**SAMPLED, "sampling": clock}])
-    for table in (as_table(scenario), resolved(scenario)):
+    for table in (as_table(scenario), resolve_defaults(scenario)):
         again = from_table(table, tmp_path)
         assert again.sensors == scenario.sensors
         times = [s.sample_times(Streams(1)) for s in (scenario, again)]

@@ -10,18 +10,18 @@ import pytest
 import netkf
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.scenario.reading import from_table, load
-from netkf.scenario.writing import as_table, resolved, to_toml
+from netkf.scenario.writing import as_table, resolve_defaults, to_toml
 from tests.conftest import scenario_files
 
 
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
 def test_written_scenarios_read_back_the_same(file):
     scenario = netkf.load(file)
-    for table in (as_table(scenario), resolved(scenario)):
+    for table in (as_table(scenario), resolve_defaults(scenario)):
         again = from_table(tomllib.loads(to_toml(table)), file.parent)
-        assert resolved(again) == resolved(scenario)
+        assert resolve_defaults(again) == resolve_defaults(scenario)
     if not scenario.slotted and scenario.increment_sensors:
-        assert resolved(scenario)["plant"]["sensing_period"] > 0.0
+        assert resolve_defaults(scenario)["plant"]["sensing_period"] > 0.0
 
 
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
@@ -31,7 +31,7 @@ def test_resolved_scenarios_give_the_same_run(file, tmp_path):
         {"horizon": 10.0, "probe": 1.0} if scenario.slotted else {"horizon": 1.0, "probe": 0.5}
     )
     scenario = scenario.replace(changes)
-    again = from_table(tomllib.loads(to_toml(resolved(scenario))), file.parent)
+    again = from_table(tomllib.loads(to_toml(resolve_defaults(scenario))), file.parent)
     one, other = netkf.simulate(scenario), netkf.simulate(again)
     assert one.fingerprint == other.fingerprint
     np.testing.assert_array_equal(one.xhat, other.xhat)
@@ -43,7 +43,7 @@ def test_random_graphs_are_resolved_with_their_seed(build):
         "activation": {"kind": "poisson", "rate": 1.0},
     }
     scenario = build(network=network, seed=5, filter={"kind": "hybrid", "epsilon": 0.1})
-    assert resolved(scenario)["network"]["graph"]["seed"] == 5
+    assert resolve_defaults(scenario)["network"]["graph"]["seed"] == 5
     assert scenario.replace({"seed": 6}).topology.links != scenario.topology.links
 
 
@@ -124,7 +124,7 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
     run = netkf.simulate(scenario)
     ticks = run.events[run.events.kind == "tick"]
     assert sorted(set(ticks.t)) == [0.3, 0.6, 1.2, 2.4, 4.8, 9.6, 19.2]
-    assert resolved(scenario)["filter"]["kind"] == "fusion:Timid"
+    assert resolve_defaults(scenario)["filter"]["kind"] == "fusion:Timid"
     plain = scenario.replace({"filter.kind": "hybrid", "filter.epsilon": 0.2})
     np.testing.assert_array_equal(netkf.simulate(plain, engine=SimpyEngine()).P, run.P)
     exact = netkf.theory.error_covariance(scenario, run)  # other weights are understood

@@ -12,7 +12,7 @@ from netkf.checks.storage import save_verdict
 from netkf.ensembles.directory import runs_to_directory
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.run import run_to_directory
-from netkf.scenario.writing import resolved, to_toml
+from netkf.scenario.writing import resolve_defaults, to_toml
 from netkf.studies.compare_filters import compare_filters, write_comparison
 from netkf.studies.sweep import sweep_to_directory
 from netkf.studies.tables import filters_text
@@ -67,7 +67,7 @@ def test_a_run_comes_back_as_it_was(name, changes, tmp_path):
     assert (found.status, found.engine) == (run.status, run.engine)
     assert (found.fingerprint, found.truth_known) == (run.fingerprint, run.truth_known)
     assert found.sums == run.sums
-    assert to_toml(resolved(found.scenario)) == to_toml(resolved(scenario))
+    assert to_toml(resolve_defaults(found.scenario)) == to_toml(resolve_defaults(scenario))
     bound = found.bound
     assert (bound is None) == (name != "poisson_ring")
     if bound is not None:

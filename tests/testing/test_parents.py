@@ -55,10 +55,10 @@ class Unfair(parts.DiffusionFilter):
         return own + 0.1 * sum(given), [0.9 * weight for weight in given]
 
 
-@keep(ADJUSTED, "Forgetful._learned: must have the numbers of PushSum", gamma=3, delta=4.0)
+@keep(ADJUSTED, "Forgetful._learn_network: must have the numbers of PushSum", gamma=3, delta=4.0)
 class Forgetful(parts.PushSum):
-    def _learned(self, state, before, whole):
-        new = super()._learned(state, before, whole)
+    def _learn_network(self, state, before, whole):
+        new = super()._learn_network(state, before, whole)
         return new._replace(mass=before) if hasattr(new, "mass") else new
 
 

@@ -10,7 +10,7 @@ import netkf
 from netkf import theory
 from netkf.cli.main import main
 from netkf.runs.promises import compute_promises, promises_text
-from netkf.scenario.writing import resolved, to_toml
+from netkf.scenario.writing import resolve_defaults, to_toml
 from tests.theory.push_sum_systems import RHO_T1, planar, scenario
 
 
@@ -107,7 +107,7 @@ def test_the_central_covariance_of_slots_is_that_after_the_reading():
 
 def test_netkf_theory_shows_both_kinds_of_gamma(tmp_path, capsys):
     path = tmp_path / "planar.toml"
-    path.write_text(to_toml(resolved(planar(2, 0.7, delta=1.01 * RHO_T1))))
+    path.write_text(to_toml(resolve_defaults(planar(2, 0.7, delta=1.01 * RHO_T1))))
     assert main(["theory", str(path), "--json"]) == 0
     whole = json.loads(capsys.readouterr().out)
     found = whole["push_sum"]

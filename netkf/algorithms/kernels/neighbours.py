@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotRoom,
-    reflect_row,
     use_reading,
+    write_root_column,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -102,7 +102,7 @@ def add_to_estimate(lanes: Lanes, x: FloatArray, b: int, h: int, moved: FloatArr
 @kernel
 def fuse_readings(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
     room: SlotRoom,
@@ -174,4 +174,4 @@ def combine_convex_roots(
             gap = load(lanes, room.xhat, sender, i) - load(lanes, room.xhat, h, i)
             store(lanes, nodes.xhat, b, h, i, load(lanes, nodes.xhat, b, h, i) + weight * gap)
         for i in range(n):
-            reflect_row(lanes, nodes.root, b, h, i, room.moved, room.noise)
+            write_root_column(lanes, nodes.root, b, h, i, room.moved, room.noise)

@@ -195,7 +195,7 @@ def other_share(p: float, w: float, b: float, inverse: bool) -> float:
     return p * (1.0 - w) / b
 
 
-def fused_pair(
+def fuse_tracks(
     first: tuple[FloatArray, FloatArray],
     second: tuple[FloatArray, FloatArray],
     inverse: bool,

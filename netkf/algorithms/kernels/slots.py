@@ -1,7 +1,7 @@
 """Filters in slots, compiled: what the kernels of all of them share.
 
 A filter's kernel (``Filter.slot_kernel``) carries H filters through S slots of R runs in one call.
-It is given :class:`SlotNodes` (the state), :class:`SlotReadings` and :class:`SlotPlan` (what was
+It is given :class:`SlotNodes` (the state), :class:`ReadingBlock` and :class:`SlotPlan` (what was
 drawn for these slots), :class:`SlotLinks` (who hears whom), :class:`SlotSamples` (what it fills in)
 and :class:`SlotRoom` (scratch), and works in place.
 
@@ -52,7 +52,7 @@ class SlotNodes(NamedTuple):
     rows: np.ndarray
 
 
-class SlotReadings(NamedTuple):
+class ReadingBlock(NamedTuple):
     """Whitened readings y (B, S, H, p, L) and H (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is
     fixed; the truth ``local`` (B, S, n, L) in the coordinates of the estimates, whose origin moves
     there in slots that are ``rebased`` (S,).
@@ -204,7 +204,7 @@ def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, places: np.nd
 
 
 @kernel
-def rebase(nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, b: int, s: int) -> None:
+def rebase(nodes: SlotNodes, readings: ReadingBlock, room: SlotRoom, b: int, s: int) -> None:
     """Count estimates from the state of slot ``s``, where a frame of coordinates begins."""
     # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
@@ -216,7 +216,7 @@ def rebase(nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, b: int, s: 
 
 
 @kernel
-def read_all(nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, b: int, s: int) -> None:
+def read_all(nodes: SlotNodes, readings: ReadingBlock, room: SlotRoom, b: int, s: int) -> None:
     """Update all filters of a block with their own readings of slot ``s``."""
     for h in range(len(nodes.rows)):
         use_reading(nodes, readings, room, b, s, h, h, True)
@@ -225,7 +225,7 @@ def read_all(nodes: SlotNodes, readings: SlotReadings, room: SlotRoom, b: int, s
 @kernel(inlined=True)
 def use_reading(
     nodes: SlotNodes,
-    readings: SlotReadings,
+    readings: ReadingBlock,
     room: SlotRoom,
     b: int,
     s: int,
@@ -289,7 +289,7 @@ def rotate_lanes(
 
 
 @kernel
-def predict(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
+def predict_all(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
     """Move all filters of a block to the next slot: ``F xhat`` and ``F P F' + Q``."""
     for h in range(len(nodes.rows)):
         predict_mean(nodes, room, b, h)
@@ -337,11 +337,11 @@ def predict_root(
             store(lanes, noise, i, j, root_Q[i, j])
     # Reflect [F S, root_Q] from the right, row by row, which leaves a lower triangular root.
     for i in range(n):
-        reflect_row(lanes, root, b, h, i, moved, noise)
+        write_root_column(lanes, root, b, h, i, moved, noise)
 
 
 @kernel(inlined=True)
-def reflect_row(
+def write_root_column(
     lanes: Lanes, root: FloatArray, b: int, h: int, i: int, moved: FloatArray, noise: FloatArray
 ) -> None:
     """Write column ``i`` of the triangular root of ``[moved, noise]``: the reflection that empties
@@ -390,7 +390,7 @@ def predict_one(
     predict_root(ONE, root, 0, 0, F, root_Q, moved, noise)
 
 
-def predicted_root(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
+def predict_root_alone(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
     """The lower triangular root (n, n) of ``F S S' F' + Q``, of lower triangular roots."""
     n = len(F)
     moved = np.array(root).reshape(1, 1, n, n, 1)

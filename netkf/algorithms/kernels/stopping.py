@@ -43,7 +43,7 @@ def has_stopped(
         return seen and moved_within(mass, k, before, tolerance, work)
     # SAFE trusts a step only if all links were up: an outage also makes the estimate stand still.
     if rule == SAFE and whole and mass[k, 0] > 0.0:
-        return settled(information, number[0], former, k, former_number[k], tolerance)
+        return has_settled(information, number[0], former, k, former_number[k], tolerance)
     return False
 
 
@@ -92,7 +92,7 @@ def has_positive_pivots(work: FloatArray) -> bool:
 
 
 @kernel
-def settled(
+def has_settled(
     information: FloatArray,
     number: float,
     former: FloatArray,

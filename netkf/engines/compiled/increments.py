@@ -11,7 +11,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
 from netkf.linalg.small import copy_matrix
-from netkf.plants.paths import fill_course, fill_seen
+from netkf.plants.paths import fill_course, fill_state_moments
 from netkf.plants.sensors import divide, fill_reading
 from netkf.rng.numbers import NormalZiggurat, normal_of
 
@@ -87,7 +87,7 @@ def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, e
         return
     course = path.course[run - state.first_run, know_course(state, run, piece)]
     seen, values = scratch.state_moments, scratch.values
-    fill_seen(state.size, seen, course, now - start, end - now, stop - start, values)
+    fill_state_moments(state.size, seen, course, now - start, end - now, stop - start, values)
 
 
 @kernel(inlined=True)

@@ -35,7 +35,7 @@ def move_origin(
         return
     for m in state.heap[: state.flying]:
         # An estimate under way is of the time it was sent: the offset is moved back to then.
-        state.pool_x[m] += scenario.moved_back(offset, now - state.pool["sent"][m])
+        state.pool_x[m] += scenario.move_back(offset, now - state.pool["sent"][m])
 
 
 def _move_totals(
@@ -44,9 +44,9 @@ def _move_totals(
     """Move every ``u`` by ``U offset``, in coordinates of the time that it refers to."""
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
-            _shift(values[k], scenario.moved_back(offset, now - time))
+            _shift(values[k], scenario.move_back(offset, now - time))
     for m in state.heap[: state.flying]:
-        _shift(totals.offered[m], scenario.moved_back(offset, now - state.pool["sent"][m]))
+        _shift(totals.offered[m], scenario.move_back(offset, now - state.pool["sent"][m]))
 
 
 def _shift(total: FloatArray, offset: FloatArray) -> None:

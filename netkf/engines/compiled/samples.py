@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from netkf.engines.base import Progress
-from netkf.engines.soundness import sound
+from netkf.engines.soundness import sound_mask
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -34,7 +34,7 @@ def recorded(
     # The loop may stop for other reasons than samples.
     if not len(times):
         return True
-    intact = sound(xhat, P).all(axis=1)
+    intact = sound_mask(xhat, P).all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.
     if scenario.filter.algorithm.pooled:
         nodes = len(scenario.nodes)
@@ -48,7 +48,7 @@ def recorded(
         return True
     # Events up to the sample come first, and then which nodes have diverged.
     pass_rows_on(last)
-    lost = ~sound(xhat[last], P[last])
+    lost = ~sound_mask(xhat[last], P[last])
     for node in (scenario.nodes[k] for k in np.flatnonzero(lost)):
         recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
     return False

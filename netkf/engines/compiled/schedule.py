@@ -197,7 +197,7 @@ class Outcomes:
             self._fates = [
                 ChannelSampler(channel, partial(_stream, made, source))
                 for made in (
-                    one.seeded(stream_purposes(channel), senders.sources)
+                    one.with_seeds(stream_purposes(channel), senders.sources)
                     for one in streams.per_replica
                 )
                 for source in senders.sources

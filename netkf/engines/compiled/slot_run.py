@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
     SlotNodes,
     SlotPlan,
-    SlotReadings,
     SlotSamples,
     slot_room,
 )
@@ -310,7 +310,7 @@ class SlotRuns:
         room = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, room, local, absolute)
 
-    def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> SlotReadings:
+    def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> ReadingBlock:
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.hosts, setup.p
         y: FloatArray = unset((*shape, LANES))
@@ -329,7 +329,7 @@ class SlotRuns:
         noise, room = self._noise, np.zeros((setup.p, LANES))
         draw_readings(MANY, setup.sensors, noise, normal_ziggurat(), x, driven, room, y, H)
         if not self._recorded or not times.sensed.any():
-            return SlotReadings(y, H, local, rebased)
+            return ReadingBlock(y, H, local, rebased)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
         for s, path in self._recorded:
             some = slice(s.row, s.row + len(s.root))
@@ -338,7 +338,7 @@ class SlotRuns:
             white = solve_lower(s.root, values.T).T, solve_lower(s.root, matrices)
             y[:, times.sensed, s.host, some] = white[0][..., None]
             H[:, times.sensed, s.host, some] = white[1][..., None]
-        return SlotReadings(y, H, local, rebased)
+        return ReadingBlock(y, H, local, rebased)
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
         """The EVENT rows of a block of one run and how many of them come before each sample."""

@@ -126,7 +126,7 @@ def _directions(
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
         i, j = link
-        way = transmitter.directed(link, entity, nodes[j], transmitter.sampler(link))
+        way = transmitter.directed_link(link, entity, nodes[j], transmitter.sampler(link))
 
         def activate(now: float) -> None:
             recorder.append((now, TICK, i, j, -1, -1, NAN))
@@ -151,7 +151,7 @@ def broadcasts(
     """
     ways: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
     for k, (i, j) in enumerate(scenario.topology.directions):
-        ways[i].append(transmitter.directed((i, j), k, nodes[j], transmitter.sampler((i, j))))
+        ways[i].append(transmitter.directed_link((i, j), k, nodes[j], transmitter.sampler((i, j))))
 
     def activation(node: int) -> Activation:
         hearers, sent = tuple(way.link[1] for way in ways[node]), 0

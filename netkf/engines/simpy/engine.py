@@ -18,9 +18,9 @@ from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import (
     FIRST_RANK,
     Reader,
-    Schedule,
     SlotClock,
     SlotNode,
+    SlotSchedule,
 )
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import Transmitter
@@ -139,7 +139,7 @@ class _Simulation:
         """Return the processes of a scenario in slots."""
         scenario, streams, recorder = self._scenario, self._streams, self._recorder
         truth = scenario.slot_truth(streams)
-        schedule, period = Schedule(scenario), scenario.slot_plant.period
+        schedule, period = SlotSchedule(scenario), scenario.slot_plant.period
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
             own = _identity(scenario, node, entity)
@@ -160,7 +160,7 @@ class _Simulation:
         return [self._sampling_slots(truth, schedule, nodes, sums), *processes]
 
     def _sampling_slots(
-        self, truth: Any, schedule: Schedule, nodes: dict[int, SlotNode], sums: _Sums
+        self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
         """Record the states of slots: predictions at their start, filtered states at their end."""
         predicts, recorder, slot = self._scenario.hosted.predicts, self._recorder, 0

@@ -152,7 +152,7 @@ class ClockedNode(Node):
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
-        pairs = [linearised(self.algorithm, self.state, y, H) for _, y, H, _ in samples]
+        pairs = [linearise(self.algorithm, self.state, y, H) for _, y, H, _ in samples]
         y, H = (np.concatenate(part) for part in zip(*pairs, strict=True))
         R = block_diagonal([sample[3] for sample in samples])
         self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
@@ -188,7 +188,7 @@ class ClockedNode(Node):
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))
 
 
-def linearised(
+def linearise(
     algorithm: Filter, state: Any, y: FloatArray, H: Any
 ) -> tuple[FloatArray, FloatArray]:
     """Return a reading y (p,) and its H (p, n); one of a nonlinear sensor, which comes with a

@@ -15,7 +15,7 @@ import simpy
 
 from netkf.algorithms.filter import Exchange, Reading
 from netkf.engines.base import Rank
-from netkf.engines.simpy.nodes import Envelope, Node, distinct, linearised
+from netkf.engines.simpy.nodes import Envelope, Node, distinct, linearise
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.linalg.arrays import FloatArray
@@ -50,7 +50,7 @@ class Stage(NamedTuple):
     number: int = -1
 
 
-class Schedule:
+class SlotSchedule:
     """Computes the stages of every slot from the schedule of the filter."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -131,7 +131,7 @@ class SlotNode(Node):
     def __init__(
         self,
         recorder: Recorder,
-        schedule: Schedule,
+        schedule: SlotSchedule,
         period: float,
         streams: Streams,
         *rest: Any,
@@ -173,7 +173,7 @@ class SlotNode(Node):
     def _update(self, time: float) -> None:
         """Use the readings of this slot; without sensors they have no rows."""
         model = self.model
-        samples = [linearised(self.algorithm, self.state, y, H) for y, H in self._samples]
+        samples = [linearise(self.algorithm, self.state, y, H) for y, H in self._samples]
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
         H = np.concatenate([model.H[:0], *(H for _, H in samples)])
@@ -236,7 +236,7 @@ class Reader:
     """The sensors of one node: a process that reads the truth once a slot."""
 
     def __init__(
-        self, recorder: Recorder, schedule: Schedule, node: int, entity: int, carrier: SlotNode
+        self, recorder: Recorder, schedule: SlotSchedule, node: int, entity: int, carrier: SlotNode
     ) -> None:
         self._recorder, self._schedule = recorder, schedule
         self._node, self._entity, self._carrier = node, entity, carrier
@@ -264,7 +264,7 @@ class SlotClock:
         scenario: Scenario,
         streams: Streams,
         recorder: Recorder,
-        schedule: Schedule,
+        schedule: SlotSchedule,
         transmitter: Transmitter,
         nodes: dict[int, SlotNode],
     ) -> None:

@@ -73,7 +73,7 @@ class Transmitter:
         # The sampler makes its streams when it needs them, by purpose.
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
 
-    def directed(
+    def directed_link(
         self, link: Link, entity: int, receiver: Receiver, sampler: ChannelSampler
     ) -> DirectedLink:
         """Return one direction of a link."""
@@ -132,7 +132,7 @@ class Transmitter:
         now = self._timeline.now
         for key, envelope in self._flying.items():
             # A payload is of the time it was sent: the offset is moved back to then.
-            earlier = self._scenario.moved_back(offset, now - envelope.sent)
+            earlier = self._scenario.move_back(offset, now - envelope.sent)
             payload = algorithm.shift_payload(envelope.payload, earlier)
             self._flying[key] = envelope._replace(payload=payload)
 
@@ -158,10 +158,10 @@ class LinkExchange:
         self._outcomes: list[ChannelDraw] = []
         forth = transmitter.sampler((i, j))
         # Entities 2 k and 2 k + 1: the order in which simultaneous messages arrive.
-        self._ways = [transmitter.directed((i, j), 2 * entity, receivers[j], forth)]
+        self._ways = [transmitter.directed_link((i, j), 2 * entity, receivers[j], forth)]
         if not scenario.topology.directed:
             back = forth if self._shared else transmitter.sampler((j, i))
-            self._ways.append(transmitter.directed((j, i), 2 * entity + 1, receivers[i], back))
+            self._ways.append(transmitter.directed_link((j, i), 2 * entity + 1, receivers[i], back))
 
     def exchange(
         self,

@@ -21,7 +21,7 @@ def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> F
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P).T)
 
 
-def slot_jumps(scenario: Scenario) -> SlotJumps:
+def silent_jumps(scenario: Scenario) -> SlotJumps:
     """Return the errors of each node by itself, or those of one filter that every node shows."""
     F, Q = scenario.slot_belief
     if scenario.hosted.pooled:

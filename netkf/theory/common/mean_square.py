@@ -16,7 +16,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.alone import slot_jumps as silent_jumps
+from netkf.theory.common.alone import silent_jumps
 from netkf.theory.common.errors import diagonal_blocks
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse, SlotJumps
 from netkf.theory.common.papers import paper_function
@@ -38,7 +38,7 @@ def mean_square_radius(scenario: Scenario) -> float:
     1 that it is on; inf where errors already grow between jumps, or in their mean. Raises
     TheoryError where the scenario's filter has no constant gains or its network no such law.
     """
-    return _solved(scenario)[0]
+    return _solve(scenario)[0]
 
 
 def steady_error_covariance(scenario: Scenario) -> FloatArray:
@@ -53,7 +53,7 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
     of all nodes together. Raises TheoryError with the reason where there is no such mean, or it is
     not known.
     """
-    radius, covariance = _solved(scenario)
+    radius, covariance = _solve(scenario)
     if covariance is None:
         raise TheoryError(
             f"no steady mean square: its radius is {radius:.6g}, not below 1, and errors grow in "
@@ -63,7 +63,7 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
 
 @lru_cache(maxsize=8)
-def _solved(scenario: Scenario) -> tuple[float, FloatArray | None]:
+def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
     """Return the radius, and the covariances (N, n, n) if it is below 1."""
     solve = _solver(scenario)
     if solve is not None:

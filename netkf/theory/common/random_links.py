@@ -89,7 +89,7 @@ class Ways(NamedTuple):
         receiver, sender = self.receiver[among], self.sender[among]
         _add_blocks(found, receiver, sender, parts)
         _add_blocks(found, receiver, receiver, -parts)
-        return _joined(found)
+        return _join_blocks(found)
 
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
@@ -107,7 +107,7 @@ class Ways(NamedTuple):
         terms = factor[:, :, None, None] * (self.weight[first] @ gap @ turned)
         found = np.zeros_like(blocks)
         _add_blocks(found, i, k, terms)
-        return _joined(found)
+        return _join_blocks(found)
 
     def joint(self, first: IntArray, second: IntArray) -> FloatArray:
         """Return the probability (S, P) that messages on both of two ways arrive in one activation,
@@ -125,7 +125,7 @@ def _add_blocks(blocks: FloatArray, rows: IntArray, columns: IntArray, terms: Fl
     np.add.at(blocks, place, terms)
 
 
-def _joined(blocks: FloatArray) -> FloatArray:
+def _join_blocks(blocks: FloatArray) -> FloatArray:
     """Return matrices (S, N n, N n) of blocks (S, N, N, n, n)."""
     S, N, _, n, _ = blocks.shape
     return np.asarray(np.swapaxes(blocks, 2, 3).reshape(S, N * n, N * n))
@@ -208,14 +208,14 @@ def _deliveries(
 
 def _source(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
     """Return the link whose draw decides on a direction: both share it if they are symmetric."""
-    return min(link, link[::-1]) if _shared(scenario) else link
+    return min(link, link[::-1]) if _fail_together(scenario) else link
 
 
 def _sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return list(dict.fromkeys(_source(scenario, link) for link in links))
 
 
-def _shared(scenario: Scenario) -> bool:
+def _fail_together(scenario: Scenario) -> bool:
     """Return True if both directions of a link are activated, and lost, together."""
     at = getattr(scenario.network.activation, "at", "links")
     return scenario.network.channel.symmetric and at == "links"

@@ -43,7 +43,7 @@ def slot_ways(scenario: Scenario) -> Ways | None:
     return ways_of(scenario, weights, scenario.phase_length) if weights else None
 
 
-class Flow(NamedTuple):
+class ErrorFlow(NamedTuple):
     """Errors between ticks: ``drift`` (N, n, n) of each node's, ``noise`` (N n, N n) a second."""
 
     drift: FloatArray
@@ -93,7 +93,7 @@ def _own(k: int, n: int) -> slice:
     return slice(k * n, (k + 1) * n)
 
 
-def _flow(scenario: Scenario) -> Flow:
+def _flow(scenario: Scenario) -> ErrorFlow:
     """Return the errors between events; increments are used all the time."""
     gains, truth = _gains(scenario), scenario.truth
     N, n = len(gains), len(truth.A)
@@ -103,7 +103,7 @@ def _flow(scenario: Scenario) -> Flow:
         if len(H):
             drift[k] -= L @ H
             noise[_own(k, n), _own(k, n)] += L @ R @ L.T
-    return Flow(drift, noise)
+    return ErrorFlow(drift, noise)
 
 
 def _samples(scenario: Scenario) -> list[SampledNode]:
@@ -119,7 +119,7 @@ def _samples(scenario: Scenario) -> list[SampledNode]:
 
 
 def _from_tick_to_tick(
-    clock: Periodic, flow: Flow, samples: list[SampledNode], ways: Ways, delay: float
+    clock: Periodic, flow: ErrorFlow, samples: list[SampledNode], ways: Ways, delay: float
 ) -> SlotJumps:
     """Return the system from one exchange of clocks that all tick together to the next.
 
@@ -139,7 +139,9 @@ def _from_tick_to_tick(
         closed[one.node] -= one.lost
         added[_own(one.node, n), _own(one.node, n)] += one.noise
     # To the tick, its samples, and to the arrival of what was sent at it.
-    (before, noise), (after, rest) = (_moved(flow, gap) for gap in (clock.period - delay, delay))
+    (before, noise), (after, rest) = (
+        _move_errors(flow, gap) for gap in (clock.period - delay, delay)
+    )
     C = block_diagonal(list(closed))
     noise = after @ (C @ noise @ C.T + added) @ after.T + rest
     whole = after @ C @ before
@@ -164,7 +166,7 @@ def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
             raise TheoryError("sensors do not sample at the ticks of the network's periodic clock")
 
 
-def _moved(flow: Flow, gap: float) -> tuple[FloatArray, FloatArray]:
+def _move_errors(flow: ErrorFlow, gap: float) -> tuple[FloatArray, FloatArray]:
     """Return the transition (N n, N n) of errors over a gap, and the covariance that it adds."""
     drift = block_diagonal(list(flow.drift))
     M = len(drift)

@@ -146,7 +146,7 @@ class _PiecewiseSolution:
                 self._append(end, output)
             else:
                 self._iterate(begin, end, slope)
-            if self._jumps.happen_at(end):
+            if self._jumps.jumps_at(end):
                 self._first = self._jumped[end] = self._jumps.apply(end, self._first)
 
     def _piece_end(self, begin: float, last: float) -> float:
@@ -241,7 +241,7 @@ class _PiecewiseSolution:
                 method="Radau",
                 jac=self._jacobian,
                 max_step=max_step,
-                events=_grown(growth * float(self._sizes().max())),
+                events=_growth_event(growth * float(self._sizes().max())),
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
@@ -287,7 +287,7 @@ class _PiecewiseSolution:
         return linear.matrix(arriving=self._packed.equations.delay == 0.0)
 
 
-def _grown(limit: float) -> Callable[[float, FloatArray], float]:
+def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
     """Return an event of the solver that ends it where an entry exceeds ``limit``."""
 
     def below(_: float, y: FloatArray) -> float:
@@ -314,7 +314,7 @@ class _SampleJumps:
         place = bisect.bisect_right(self._times, begin)
         return min(end, self._times[place]) if place < len(self._times) else end
 
-    def happen_at(self, time: float) -> bool:
+    def jumps_at(self, time: float) -> bool:
         """Return True if the solution jumps at ``time``."""
         return time in self._samples or time in self._arrivals
 

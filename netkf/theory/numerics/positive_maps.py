@@ -41,7 +41,7 @@ def spectral_radius(T: PositiveMap, shape: Shape) -> float:
         if _least_factor(T, X) <= value * (1.0 + PROOF_TOLERANCE):
             return value
         if _numbers(shape) > MAX_DENSE_FALLBACK:
-            return _confirmed(T, X, value)
+            return _confirm(T, X, value)
     return float(np.abs(np.linalg.eigvals(_dense(T, shape))).max())
 
 
@@ -59,9 +59,9 @@ def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
         rest = Q + T(X) - X
         if _is_small(rest, X, tolerance):
             return symmetric(X)
-        X = X + (_eliminated(T, rest) if few else _by_gmres(T, rest))
+        X = X + (_solve_by_elimination(T, rest) if few else _by_gmres(T, rest))
     if not few and _numbers(Q.shape) <= MAX_DENSE_FALLBACK:
-        return _eliminated(T, Q)
+        return _solve_by_elimination(T, Q)
     raise TheoryError(f"the mean squares were solved to {np.abs(rest).max():.1e} only")
 
 
@@ -70,7 +70,7 @@ def _numbers(shape: Shape) -> int:
     return shape[0] * shape[-1] * (shape[-1] + 1) // 2
 
 
-def _confirmed(T: PositiveMap, X: FloatArray, value: float) -> float:
+def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
     """Return the radius ``value`` if a different search, for the largest modulus from another
     start, agrees; raises TheoryError if not.
     """
@@ -149,7 +149,7 @@ def _dense(T: PositiveMap, shape: Shape) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def _eliminated(T: PositiveMap, right: FloatArray) -> FloatArray:
+def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
     """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination."""
     s, i, j = at = _triangles(right.shape)
     X = np.zeros_like(right)

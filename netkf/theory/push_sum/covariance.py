@@ -23,7 +23,7 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
     return _covariance(estimation_steps(scenario), push_sum_radius(scenario))
 
 
-def steady_error_covariance(steps: EstimationSteps) -> FloatArray:
+def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
     """Return the covariance (N, n, n) of ``push_sum_error_covariance`` for given steps 4 and 5."""
     return _covariance(steps, radius(steps))
 

@@ -13,7 +13,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.matrices import as_whole
-from netkf.theory.push_sum.covariance import steady_error_covariance
+from netkf.theory.push_sum.covariance import covariance_of_steps
 from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
 from netkf.theory.push_sum.limits import consensus_gain_bound
 
@@ -81,7 +81,7 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
     found = np.full((len(gammas), N, n, n), np.nan)
     for k, gamma in enumerate(gammas):
         try:
-            found[k] = steady_error_covariance(_with_gamma(steps, gamma))
+            found[k] = covariance_of_steps(_with_gamma(steps, gamma))
         except TheoryError:
             continue
     return found

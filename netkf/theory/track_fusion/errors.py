@@ -12,8 +12,8 @@ from netkf.algorithms.track_fusion import (
     BarShalomCampo,
     PairFusion,
     best_combination,
-    predicted_joint,
-    updated_joint,
+    predict_joint,
+    update_joint,
 )
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
@@ -81,8 +81,8 @@ class TrackRule(ErrorRule):
 
     def sense(self, time: float, observations: HostObservations) -> None:
         """Update the tracks; a node that hears nothing shows its own."""
-        joint = predicted_joint(self._joint, self._models[0])
-        self._joint = updated_joint(joint, self._sensors, self.errors.n)
+        joint = predict_joint(self._joint, self._models[0])
+        self._joint = update_joint(joint, self._sensors, self.errors.n)
         columns = self.errors.reading_noises(observations)
         for host, observation in observations.items():
             self.errors.update(_track(host), observation, columns[host])

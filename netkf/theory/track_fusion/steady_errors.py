@@ -40,7 +40,7 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
     joint, radius = steady_tracks(scenario)
     N, n = len(scenario.nodes), scenario.plant.n
     blocks = joint.reshape(N, n, N, n)
-    return radius, np.stack([_shown(scenario, blocks, i) for i in range(N)])
+    return radius, np.stack([_mean_shown_covariance(scenario, blocks, i) for i in range(N)])
 
 
 def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
@@ -63,11 +63,11 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
     return joint.reshape(len(closed) * n, -1), radius**2
 
 
-def _shown(scenario: Scenario, blocks: FloatArray, i: int) -> FloatArray:
+def _mean_shown_covariance(scenario: Scenario, blocks: FloatArray, i: int) -> FloatArray:
     """Return the mean covariance (n, n) of what node i shows; ``blocks`` (N, n, N, n)."""
-    chances = _chances(scenario, scenario.nodes[i])
-    sure = [j for j, p in chances.items() if p == 1.0]
-    unsure = [j for j, p in chances.items() if 0.0 < p < 1.0]
+    probabilities = _hearing_probabilities(scenario, scenario.nodes[i])
+    sure = [j for j, p in probabilities.items() if p == 1.0]
+    unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
     if len(unsure) > MAX_NEIGHBOURS:
         raise TheoryError(
             f"node {scenario.nodes[i]} hears {len(unsure)} nodes with losses; at most "
@@ -75,14 +75,16 @@ def _shown(scenario: Scenario, blocks: FloatArray, i: int) -> FloatArray:
         )
     total = np.zeros_like(blocks[i, :, i])
     for up in itertools.product((True, False), repeat=len(unsure)):
-        fates = list(zip(unsure, up, strict=True))
-        chance = math.prod(chances[j] if one else 1.0 - chances[j] for j, one in fates)
-        order = [i, *sure, *(j for j, one in fates if one)]
-        total += chance * _fused(blocks[order][:, :, order])
+        outcomes = list(zip(unsure, up, strict=True))
+        probability = math.prod(
+            probabilities[j] if one else 1.0 - probabilities[j] for j, one in outcomes
+        )
+        order = [i, *sure, *(j for j, one in outcomes if one)]
+        total += probability * _fuse(blocks[order][:, :, order])
     return total
 
 
-def _chances(scenario: Scenario, node: int) -> dict[int, float]:
+def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
     """Return the probability with which a node hears each other, by their indices."""
     topology, channel = scenario.topology, scenario.network.channel
     delay = channel.delay.fixed
@@ -98,7 +100,7 @@ def _chances(scenario: Scenario, node: int) -> dict[int, float]:
     }
 
 
-def _fused(blocks: FloatArray) -> FloatArray:
+def _fuse(blocks: FloatArray) -> FloatArray:
     """Return the covariance (n, n) of the best combination of tracks, the first one the own."""
     own = blocks[0, :, 0]
     if len(blocks) == 1:
