@@ -110,7 +110,7 @@ SlotLocal, SlotCentral = Local, Central
 
 
 def kinds() -> dict[str, dict[str, type]]:
-    """The classes by family and kind, as scenario files name them."""
+    """Return the classes by family and kind, as scenario files name them."""
     return {family: dict(names) for family, names in KINDS.items()}
 
 

@@ -181,7 +181,7 @@ class BeliefPropagation(Filter):
         return believing(state._replace(senders=senders, told=tuple(known[j] for j in senders)))
 
     def shift(self, state: BeliefState, offset: FloatArray) -> BeliefState:
-        """Affine: readings move with the state."""
+        """Return the state shifted by ``offset``: readings move with it."""
         state = state._replace(xhat=state.xhat + offset)
         return with_all(state, lambda evidence: shift_evidence(evidence, offset))
 

@@ -266,7 +266,7 @@ class ConsensusInnovations(Filter):
         require_common_start(scenario, "from which gains are computed", "hcmci")
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """A message is an estimate of the pseudo-state."""
+        """Return the numbers of a message, an estimate of the pseudo-state."""
         return n
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PseudoState:
@@ -321,7 +321,7 @@ class ConsensusInnovations(Filter):
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
 
     def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
-        """Affine: gains multiply differences."""
+        """Return the state shifted by ``offset``: gains multiply differences."""
         observed = state.observed
         if observed is not None:
             n = len(offset)

@@ -180,7 +180,7 @@ class ConstantGain(Filter):
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> ConstantGainState:
-        """The node takes its gain."""
+        """Return the first state of a node, which has its gain."""
         gain = self.gain_of(node.place)
         increments = not isinstance(model, SlotModel) and len(model.H)
         loop = ClosedLoop(model.A, model.Q, model.H, model.R, gain) if increments else None

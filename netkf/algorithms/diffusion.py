@@ -83,7 +83,7 @@ def applied_weights(lanes: Lanes, own: float, heard: Any, keep_own: bool) -> tup
 
 @kernel
 def weights_of_one(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
-    """``applied_weights`` of one filter with one lane."""
+    """Return ``applied_weights`` of one filter with one lane."""
     found: tuple[float, float] = applied_weights(ONE, own, heard, keep_own)
     return found
 
@@ -188,7 +188,7 @@ class DiffusionFilter(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[DiffusionWeights]:
-        """The weights of the nodes."""
+        """Return the weights of the nodes."""
         own = np.array([info.own_weight for info in infos], dtype=np.float64)
         return (DiffusionWeights(own, self.on_loss == "keep-own"),)
 
@@ -203,7 +203,7 @@ class DiffusionFilter(Filter):
         return None if isinstance(self.weights, str) else self.weights
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> DiffusionState:
-        """The node knows its own weight."""
+        """Return the first state of a node, which knows its own weight."""
         return DiffusionState(mean, first_root(cov), model, node.own_weight)
 
     def absorb(
@@ -221,8 +221,8 @@ class DiffusionFilter(Filter):
     shift = Filter.shift  # affine: the weights sum to one
 
     def share(self, own: float, arrived: list[float]) -> tuple[float, list[float]]:
-        """The own weight and those of the messages that arrived, which sum to 1, from the nominal
-        ones.
+        """Return the own weight and those of the messages that arrived, which sum to 1, from the
+        nominal ones.
         """
         # fsum: the sum must not depend on the order of messages.
         kept, divisor = weights_of_one(own, math.fsum(arrived), self.on_loss == "keep-own")

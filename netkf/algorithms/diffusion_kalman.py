@@ -80,7 +80,7 @@ def diffusion_kalman_slots(
 
 @kernel
 def move_one(x: FloatArray, links: SlotLinks, up: Any, moved: FloatArray) -> None:
-    """``move_towards`` of one node, the first of x (1, H, n, 1), with one lane."""
+    """Apply ``move_towards`` to one node, the first of x (1, H, n, 1), with one lane."""
     move_towards(ONE, x, 0, 0, links, up, 0, 0, True, moved)
 
 
@@ -124,7 +124,7 @@ class DiffusionKalman(Filter):
         return has_sensor or phase == ESTIMATES
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """A message is y, H and R, or psi."""
+        """Return the numbers of a message: y, H and R, or psi."""
         return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
 
     def init(
@@ -163,7 +163,9 @@ class DiffusionKalman(Filter):
     shift = Filter.shift  # affine: the weights sum to one
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Estimates move; a reading stays in the coordinates of its own time."""
+        """Return the payload shifted: estimates move, readings keep the coordinates of
+        their time.
+        """
         return payload if isinstance(payload, Reading) else payload + offset
 
 

@@ -334,8 +334,8 @@ class Filter(Component):
         return n + n * (n + 1) // 2
 
     def slot_stopping(self) -> tuple[int, bool]:
-        """The exchange in which nodes may stop for good (-1: none), and whether they are silent in
-        it from then on; for compiled filters.
+        """Return the exchange in which nodes may stop for good (-1: none), and whether they are
+        silent in it from then on; for compiled filters.
         """
         return -1, False
 

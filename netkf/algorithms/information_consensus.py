@@ -161,13 +161,15 @@ def begin_all(
 def begin_one(
     nodes: SlotNodes, readings: ReadingBlock, room: SlotRoom, arrays: ConsensusArrays
 ) -> None:
-    """``begin_all`` of one filter with one lane."""
+    """Apply ``begin_all`` to one filter with one lane."""
     begin_all(nodes, readings, room, arrays, 0, 0)
 
 
 @kernel
 def mix_one(parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any) -> None:
-    """A step of one node, the first of ``parts`` (2, K, H, n, n + 1, 1), with one lane."""
+    """Do a consensus step of one node, the first of ``parts`` (2, K, H, n, n + 1, 1), with one
+    lane.
+    """
     mix_parts(ONE, parts, 0, 0, links, up, (0, 0, 0), centre, work[0], work[1])
 
 
@@ -181,7 +183,7 @@ def read_one(
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
-    """``read_off`` of one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
+    """Apply ``read_off`` to one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
     invert_lanes(ONE, inverse, root, 0, 0)
     read_off(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
 

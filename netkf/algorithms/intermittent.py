@@ -118,7 +118,7 @@ class Intermittent(Filter):
         return has_sensor
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """A message is y, H and R."""
+        """Return the numbers of a message: y, H and R."""
         return rows * (1 + n) + rows * (rows + 1) // 2
 
     def init(
@@ -176,7 +176,7 @@ class Intermittent(Filter):
         return age <= self.max_age
 
     def shift(self, state: IntermittentState, offset: FloatArray) -> IntermittentState:
-        """Affine; the past is in the coordinates of its own time."""
+        """Return the state shifted by ``offset``; the past keeps the coordinates of its time."""
         xhat = state.xhat + offset
         # A late reading that goes back over this time must shift again on its way forward.
         if state.lag > 0.0:
@@ -185,7 +185,7 @@ class Intermittent(Filter):
         return state._replace(xhat=xhat)
 
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """A reading stays in the coordinates of its own time."""
+        """Return the payload as it is: a reading keeps the coordinates of its time."""
         return payload
 
 
@@ -235,7 +235,9 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
 
 
 def _recent(past: Past, since: float) -> Past:
-    """The past without what no late reading can reach: all after ``since``, and one before it."""
+    """Return the past without what no late reading can reach: all after ``since``, and one before
+    it.
+    """
     kept: list[Past] = []
     event: Past | None = past
     while event is not None:

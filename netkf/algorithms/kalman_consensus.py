@@ -108,7 +108,7 @@ def term_of_one(
     moved: FloatArray,
     work: FloatArray,
 ) -> None:
-    """The consensus term of one node, the first of x (1, H, n, 1), with one lane."""
+    """Write the consensus term of one node, the first of x (1, H, n, 1), with one lane."""
     move_towards(ONE, x, 0, 0, links, up, 0, 0, False, moved)
     scale_by_covariance(ONE, root, 0, 0, epsilon, moved, work)
 
@@ -147,7 +147,7 @@ class Kcf(Filter):
         return (KcfArrays(self.epsilon, self.share_readings),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """A message is (u, U, xbar), or xbar alone."""
+        """Return the numbers of a message: (u, U, xbar), or xbar alone."""
         return 2 * n + n * (n + 1) // 2 if rows and self.share_readings else n
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> KcfState:
@@ -189,7 +189,7 @@ class Kcf(Filter):
         return state._replace(xhat=xhat + term, root=root)
 
     def shift(self, state: KcfState, offset: FloatArray) -> KcfState:
-        """Affine: the consensus term is made of differences."""
+        """Return the state shifted by ``offset``: the consensus term is made of differences."""
         return state._replace(xhat=state.xhat + offset, prior=state.prior + offset)
 
 

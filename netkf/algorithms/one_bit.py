@@ -65,7 +65,7 @@ class OneBit(Filter):
     one_way: ClassVar[bool] = True
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:
-        """A message is a bit for each row."""
+        """Return the numbers of a message: a bit for each row."""
         return rows / 64.0
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> OneBitState:

@@ -225,7 +225,7 @@ def exchange_mass(
     b: int,
     s: int,
 ) -> None:
-    """One exchange of mass, P steps 2.1 to 2.3."""
+    """Exchange mass once, P steps 2.1 to 2.3."""
     H, slot = len(arrays.degree), plan.first + s
     # All shares before any mass changes: everyone sends what it had at the start of the exchange.
     for h in range(H):
@@ -328,7 +328,9 @@ def learn(
     received: Any,
     slot: int,
 ) -> None:
-    """P (6) for the mass of node ``h``, which ``received`` so many shares; note where it stops."""
+    """Apply P (6) to the mass of node ``h``, which ``received`` so many shares; note where it
+    stops.
+    """
     lanes, found = room.lanes, arrays.found
     learn_network(lanes, arrays.mass, b, h, arrays.alone, found, arrays.found_number)
     # The stop rule compares with the former G and N, so they are replaced only afterwards.
@@ -400,19 +402,19 @@ def correct(
 def add_gain_to_one(
     x: FloatArray, root: FloatArray, number: float, y: FloatArray, H: FloatArray, room: FloatArray
 ) -> None:
-    """``add_gain`` of one filter with one lane: x (1, 1, n, 1), y (1, 1, 1, p, 1)."""
+    """Apply ``add_gain`` to one filter with one lane: x (1, 1, n, 1), y (1, 1, 1, p, 1)."""
     add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], room[0], room[1])
 
 
 @kernel
 def split_one(mass: FloatArray, degree: int, share: FloatArray) -> None:
-    """``split_mass`` of one node with one lane, mass (1, 1, m, 1)."""
+    """Apply ``split_mass`` to one node with one lane, mass (1, 1, m, 1)."""
     split_mass(ONE, mass, 0, 0, degree, share)
 
 
 @kernel
 def keep_one(mass: FloatArray, share: FloatArray, times: int) -> None:
-    """``keep_share`` of one node with one lane, mass (1, 1, m, 1)."""
+    """Apply ``keep_share`` to one node with one lane, mass (1, 1, m, 1)."""
     keep_share(ONE, mass, 0, 0, share, times, False)
 
 
@@ -420,7 +422,7 @@ def keep_one(mass: FloatArray, share: FloatArray, times: int) -> None:
 def learn_one(
     mass: FloatArray, alone: FloatArray, information: FloatArray, number: FloatArray
 ) -> None:
-    """``learn_network`` of one node with one lane, mass (1, 1, m, 1)."""
+    """Apply ``learn_network`` to one node with one lane, mass (1, 1, m, 1)."""
     learn_network(ONE, mass, 0, 0, alone, information, number)
 
 
@@ -428,7 +430,7 @@ def learn_one(
 def correct_one(
     root: FloatArray, information: FloatArray, rest: FloatArray, room: SlotRoom
 ) -> None:
-    """``correct_root`` of one filter with one lane, root (1, 1, n, n, 1)."""
+    """Apply ``correct_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
     correct_root(root, 0, 0, information, rest, room)
 
 
@@ -478,7 +480,9 @@ class PushSum(Filter):
         return phase == AVERAGE or not self.asymptotic
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """A message is w, n~ and C~, or z; under clocks a weight, information and its vector."""
+        """Return the numbers of a message: w, n~ and C~, or z; under clocks a weight, information
+        and its vector.
+        """
         if phase == AVERAGE:
             return n
         return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
@@ -557,7 +561,7 @@ class PushSum(Filter):
         return super().predict(state, gap)
 
     def steps(self, phase: int) -> int:
-        """One for the mass, ``gamma`` for the estimates."""
+        """Return the steps of an exchange: 1 for the mass, ``gamma`` for the estimates."""
         return self.gamma or 1 if phase == AVERAGE else 1
 
     def redraws_links(self, phase: int, step: int) -> bool:
@@ -600,7 +604,7 @@ class PushSum(Filter):
         return self._learn_network(state._replace(mass=mass), state.mass, whole)
 
     def _learn_network(self, state: PushSumState, before: FloatArray, whole: bool) -> PushSumState:
-        """P (6) and the stop rule; ``whole``: all links of the node were up."""
+        """Apply P (6) and the stop rule; ``whole``: all links of the node were up."""
         # Frozen by the safe rule: the mass was mixed, but is not read any more.
         if state.stopped:
             return state
@@ -637,7 +641,7 @@ class PushSum(Filter):
         return not isinstance(state, RunningSums) and bool(state.stopped)
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """The sum of the weights is 1, that of the numbers N."""
+        """Return weight and number of a node; their sums over all nodes are 1 and N."""
         if isinstance(state, RunningSums):
             return running_sums.weights(state)
         if state.sums is None:
@@ -652,13 +656,13 @@ class PushSum(Filter):
         }
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Affine: averaging weights sum to one."""
+        """Return the state shifted by ``offset``: averaging weights sum to one."""
         if isinstance(state, RunningSums):
             return running_sums.shift(state, offset)
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Estimates move, mass does not."""
+        """Return the payload shifted by ``offset``: estimates move, mass does not."""
         if isinstance(payload, Offer):
             return running_sums.shift_offer(payload, offset)
         # A mass is longer than an estimate: 2 + n^2 > n entries.
@@ -714,7 +718,9 @@ class PushSum(Filter):
             )
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """One line each: delta is below rho(L); settings of slots are not used under clocks."""
+        """Return one line each: delta is below rho(L); settings of slots are not used
+        under clocks.
+        """
         if not scenario.slotted:
             fields = dataclasses.fields(self)
             given = [f"filter.{f.name}" for f in fields if getattr(self, f.name) != f.default]
@@ -747,8 +753,8 @@ def correct_estimate(
     H: FloatArray,
     R: FloatArray,
 ) -> FloatArray:
-    """P (8): the prediction (n,) and ``number`` times the gain of the reading, which may have no
-    rows.
+    """Return P (8): the prediction (n,) and ``number`` times the gain of the reading, which may
+    have no rows.
     """
     n, x = len(predicted), np.array(predicted, dtype=np.float64)
     if len(y):
@@ -773,7 +779,7 @@ def share(mass: FloatArray, degree: int) -> FloatArray:
 
 
 def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
-    """P (3)-(5) as they conserve mass: the shares ``received`` and the node's own, which it keeps
+    """Return the mass by P (3)-(5): the shares ``received`` and the node's own, which it keeps
     once for itself and once for each link of its ``degree`` that failed.
     """
     total = np.array(sum(received, np.zeros(mass.shape)))
@@ -784,7 +790,9 @@ def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int)
 
 
 def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
-    """P (6): C~ / w and n~ / w, or what the node knows of itself while its weight is exactly 0."""
+    """Return C~ / w and n~ / w, P (6), or what the node knows of itself while its weight is exactly
+    0.
+    """
     alone = model.information
     information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
     learn_one(mass.reshape(1, 1, -1, 1), alone[None], information, number)
@@ -792,7 +800,7 @@ def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
 
 
 def correct_one_root(root: FloatArray, information: FloatArray) -> FloatArray:
-    """Root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root of P,
+    """Return root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root of P,
     possibly singular, and the information G (n, n).
     """
     n = len(root)
@@ -802,7 +810,7 @@ def correct_one_root(root: FloatArray, information: FloatArray) -> FloatArray:
 
 
 def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
-    """P (9): z plus 1 / delta of the differences to the estimates that arrived."""
+    """Return z plus 1 / delta of the differences to the estimates that arrived, P (9)."""
     # One receiver and its senders, as a star whose links are all up.
     x, count = np.stack([z, *received])[None, :, :, None], len(received)
     places = np.arange(count)
@@ -813,7 +821,7 @@ def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: floa
 
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
-    """Root of P_inf (n, n), P (12): the steady covariance of a filter that has all the
+    """Return root of P_inf (n, n), P (12): the steady covariance of a filter that has all the
     information (n, n) in each slot, after its reading; None if there is none.
 
     By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and

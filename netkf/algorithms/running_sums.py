@@ -150,7 +150,9 @@ def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSum
 
 
 def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
-    """``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms of P^-1."""
+    """Use a reading: ``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms
+    of P^-1.
+    """
     if not len(reading.y):
         return state
     R = reading.R * (state.weight / state.nodes)
@@ -159,8 +161,8 @@ def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
 
 
 def weights(state: RunningSums) -> dict[str, list[float]]:
-    """The terms of the node's weight, with what it sent and what it heard: over all nodes they
-    come to what nodes hold and what is under way, N.
+    """Return the terms of the node's weight, with what it sent and what it heard: over all nodes
+    they come to what nodes hold and what is under way, N.
     """
     heard = [-float(offer.total[0]) for offer in state.heard.values()]
     sent = [float(state.sent[0])] * state.receivers
@@ -168,14 +170,14 @@ def weights(state: RunningSums) -> dict[str, list[float]]:
 
 
 def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
-    """The estimate, and ``u`` by ``U offset`` wherever there is one."""
+    """Shift the estimate by ``offset``, and every ``u`` by ``U offset``."""
     heard = {sender: shift_offer(offer, offset) for sender, offer in state.heard.items()}
     sent = _shift_total(state.sent, offset)
     return state._replace(xhat=state.xhat + offset, sent=sent, heard=heard)
 
 
 def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
-    """``u`` by ``U offset``."""
+    """Shift the vector ``u`` of an offer by ``U offset``."""
     return offer._replace(total=_shift_total(offer.total, offset))
 
 

@@ -89,11 +89,11 @@ class SlotFilter(Component):
     pooled: ClassVar[bool] = False
 
     def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> Any:
-        """The state at slot 0."""
+        """Return the state at slot 0."""
         return SlotState(mean, square_root(cov), model)
 
     def place(self, state: Any, role: Role) -> Any:
-        """The state at slot 0 of a node that knows its role; asked for after ``init``."""
+        """Return the state at slot 0 of a node that knows its role; asked for after ``init``."""
         return state
 
     def steps(self, phase: int) -> int:
@@ -108,14 +108,16 @@ class SlotFilter(Component):
 
     @abstractmethod
     def sense(self, state: Any, reading: Reading) -> Any:
-        """The state once the node's reading of this slot is known; p is 0 without sensors."""
+        """Return the state once the node's reading of this slot is known; p is 0 without
+        sensors.
+        """
 
     def emit(self, state: Any, phase: int) -> Any:
         """Return the payload of each step of exchange number ``phase``; None sends nothing."""
         return None
 
     def absorb(self, state: Any, phase: int, messages: Messages) -> Any:
-        """The state when the inbox of that step closes; called for every node, with all
+        """Return the state when the inbox of that step closes; called for every node, with all
         ``(weight, payload, age)`` that arrived in time in the order of their senders.
         """
         return state
@@ -125,13 +127,16 @@ class SlotFilter(Component):
         return False
 
     def conserved(self, state: Any) -> dict[str, float]:
-        """Quantities by name whose sums over all nodes no exchange changes as long as messages are
-        lost in both directions or in none; a run reports how far the sums have drifted.
+        """Return quantities by name whose sums over all nodes no exchange changes as long as
+        messages are lost in both directions or in none; a run reports how far the sums have
+        drifted.
         """
         return {}
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """The weight a node of ``degree`` links gives to a message of a ``peer_degree`` one."""
+        """Return the weight a node of ``degree`` links gives to a message of a
+        ``peer_degree`` one.
+        """
         return 1.0 / (1.0 + max(degree, peer_degree))
 
     @property
@@ -142,19 +147,19 @@ class SlotFilter(Component):
         return None
 
     def largest_degree(self) -> float:
-        """The largest number of links a node may have."""
+        """Return the largest number of links a node may have."""
         return np.inf
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:
-        """``xhat`` (n,) and ``P`` (n, n)."""
+        """Return ``xhat`` (n,) and ``P`` (n, n)."""
         return state.xhat, state.root @ state.root.T
 
 
 def update_and_predict(
     xhat: FloatArray, root: FloatArray, model: SlotModel, reading: Reading
 ) -> tuple[FloatArray, FloatArray]:
-    """The next prediction (n,) and the root (n, n) of its covariance, from a prediction, any root
-    of its covariance, and a reading, which may have no rows.
+    """Return the next prediction (n,) and the root (n, n) of its covariance, from a prediction, any
+    root of its covariance, and a reading, which may have no rows.
     """
     root = lower_root(root)
     if len(reading.y):

@@ -41,7 +41,7 @@ class Clock(Component):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Times of up to ``count`` ticks from number ``index`` on; tick ``index - 1`` was at
+        """Return times of up to ``count`` ticks from number ``index`` on; tick ``index - 1`` was at
         ``now`` (0.0 before the first). Empty when the clock has stopped for good.
 
         ``count`` must not show in the values: two blocks are the same ticks as one.

@@ -73,7 +73,7 @@ class Engine(ABC):
         """Simulate up to the horizon and return the status, "complete" or "diverged"."""
 
     def together(self, scenario: Scenario) -> int:
-        """The number of runs, a power of two, that are best handed out together at least."""
+        """Return the number of runs, a power of two, that are best handed out together at least."""
         return 1
 
     def run_many(
@@ -105,7 +105,7 @@ def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
 def broken(
     scenario: Scenario, xhat: FloatArray, P: FloatArray, without: np.ndarray | None = None
 ) -> list[int]:
-    """The nodes whose estimate or covariance, (N, n) and (N, n, n), is not sound; those
+    """Return the nodes whose estimate or covariance, (N, n) and (N, n, n), is not sound; those
     ``without`` (N,) a covariance have none to be looked at. They end a run as diverged.
     """
     # False broadcasts: every node then has a covariance to be looked at.

@@ -78,7 +78,7 @@ def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replic
 
 
 def pack_scenario(scenario: Scenario) -> PackedScenario:
-    """A scenario for other processes; raises EngineError where it cannot be pickled."""
+    """Return a scenario for other processes; raises EngineError where it cannot be pickled."""
     unnamed = unnamed_class(scenario)
     if unnamed is not None:
         message = f"workers cannot import the class {unnamed} of a notebook, a prompt or a function"
@@ -94,7 +94,7 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
 
 
 def _modules(scenario: Scenario) -> set[tuple[str, str]]:
-    """The module of each plugged-in class, with the folder that it can be imported from."""
+    """Return the module of each plugged-in class, with the folder that it can be imported from."""
     found = set()
     for part in plugged_in(scenario):
         name = type(part).__module__
@@ -111,7 +111,7 @@ _scenarios: dict[str, Scenario] = {}
 
 
 def unpack_scenario(travelling: PackedScenario) -> Scenario:
-    """The scenario that travelled, with its caches kept from one block to the next."""
+    """Return the scenario that travelled, with its caches kept from one block to the next."""
     scenario = _scenarios.get(travelling.digest)
     if scenario is None:
         while len(_scenarios) >= KEPT:

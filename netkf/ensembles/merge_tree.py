@@ -33,7 +33,9 @@ class MergeTree:
         self._waiting[level, k] = value
 
     def result(self) -> Any:
-        """The result of all; those at the end that have no neighbour join from right to left."""
+        """Return the result of all; those at the end that have no neighbour join from right to
+        left.
+        """
         values = [value for _, value in sorted(self._waiting.items(), key=_first)]
         whole = values.pop()
         while values:

@@ -50,7 +50,7 @@ def merge_moments(a: Moments, b: Moments) -> Moments:
 
 
 def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``np.stack([a, b])``, which takes a multiple of the time for small arrays."""
+    """Return ``np.stack([a, b])``, which takes a multiple of the time for small arrays."""
     both = np.empty((2, *a.shape))
     both[0], both[1] = a, b
     return both

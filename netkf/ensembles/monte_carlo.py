@@ -79,7 +79,7 @@ class Ensemble(Shown):
         return plot_by_name(self, figure)
 
     def _shown_table(self) -> pd.DataFrame:
-        """Averages over the samples after time 0, a row per node and one for all."""
+        """Return averages over the samples after time 0, a row per node and one for all."""
         import pandas as pd
 
         mean, error = self.average, self.se_average
@@ -140,7 +140,7 @@ def monte_carlo(
 
 
 def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str) -> Ensemble:
-    """The ensemble that the statistics of all runs describe."""
+    """Return the ensemble that the statistics of all runs describe."""
     samples, shape = found.samples, (len(scenario.times), len(scenario.nodes), -1)
     means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
     n = scenario.plant.n
@@ -185,7 +185,7 @@ def _upper_indices(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(T, N, 2 u + 1) as two stacks of symmetric matrices (T, N, n, n) and (T, N)."""
+    """Return (T, N, 2 u + 1) as two stacks of symmetric matrices (T, N, n, n) and (T, N)."""
     i, j = _upper_indices(n)
     matrices = np.empty((2, *values.shape[:2], n, n))
     for matrix, upper in zip(matrices, np.split(values[..., :-1], 2, axis=-1), strict=True):

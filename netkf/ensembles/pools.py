@@ -53,7 +53,9 @@ class Pool(ABC):
         """Hand out a block."""
 
     def next_size(self, left: int, runs: int) -> int:
-        """Runs of the next block, a power of two, where so many of all ``runs`` are left."""
+        """Return the number of runs of the next block, a power of two, with ``left`` of ``runs``
+        left.
+        """
         return block_size(runs, self.width)
 
     def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
@@ -73,7 +75,7 @@ class Here(Pool):
         self._size = 1
 
     def submit(self, job: Job) -> Future[Any]:
-        """Done before it returns."""
+        """Do the block before returning."""
         future: Future[Any] = Future()
         began, compiled = time.perf_counter(), seconds_spent()
         try:
@@ -84,7 +86,7 @@ class Here(Pool):
         return future
 
     def next_size(self, left: int, runs: int) -> int:
-        """Twice as many as before while blocks are quick."""
+        """Return twice as many runs as before while blocks are quick."""
         return self._size
 
     def _note_duration(self, job: Job, seconds: float) -> None:
@@ -285,7 +287,7 @@ def cores() -> int:
 
 
 def block_size(runs: int, width: int) -> int:
-    """A power of two that leaves every worker several blocks, so that all end together."""
+    """Return a power of two that leaves every worker several blocks, so that all end together."""
     size = 1
     while size < MAX_BLOCK and 2 * size * width * ROUNDS <= runs:
         size *= 2
@@ -301,8 +303,8 @@ def make_pool(
     scheduler: str | None = None,
     open_ended: bool = False,
 ) -> Pool:
-    """The pool that was asked for; by default this process, and as many processes of our own as
-    there are cores once they are worth it. ``open_ended``: more jobs follow.
+    """Return the pool that was asked for; by default this process, and as many processes of our own
+    as there are cores once they are worth it. ``open_ended``: more jobs follow.
 
     Raises ScenarioError where two were asked for, or where one is of the wrong kind.
     """

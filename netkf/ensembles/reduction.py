@@ -129,7 +129,7 @@ class Room(Struct):
 
 
 def reduction_room(filters: int, n: int, largest: int) -> Room:
-    """Scratch for so many filters of n states, in pieces of at most so many runs."""
+    """Return scratch for so many filters of n states, in pieces of at most so many runs."""
     columns = filters * (n * (n + 1) + 1)
     times = max(1, TOGETHER // columns)
     # L entries are moved at a time, which goes beyond the last column.
@@ -174,7 +174,7 @@ class _Rooms(threading.local):
         self._sizes, self._room = (0, 0, 0), reduction_room(1, 1, 1)
 
     def of(self, filters: int, n: int, largest: int) -> Room:
-        """Scratch as ``reduction_room`` makes it, with anything in it."""
+        """Return scratch as ``reduction_room`` makes it, with anything in it."""
         if filters * n * n > MAX_SCRATCH_ENTRIES:
             return reduction_room(filters, n, largest)
         if self._sizes[:2] != (filters, n) or self._sizes[2] < largest:
@@ -186,8 +186,8 @@ _rooms = _Rooms()
 
 
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
-    """Values of all runs of a batch, samples by ``pieces``, which are neighbours and hold all runs;
-    the last sample of a run that diverged is left out.
+    """Return values of all runs of a batch, samples by ``pieces``, which are neighbours and hold
+    all runs; the last sample of a run that diverged is left out.
     """
     runs, count, filters, n = batch.error.shape
     bounds = np.array([0, *(piece.stop for piece in pieces)])
@@ -213,7 +213,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
 
 
 def _batch_arrays(batch: RunBatch) -> Batch:
-    """The arrays of a batch."""
+    """Return the arrays of a batch."""
     runs = len(batch)
     x, P, error = (np.ascontiguousarray(part) for part in (batch.x, batch.P, batch.error))
     return Batch(
@@ -235,7 +235,7 @@ def _batch_arrays(batch: RunBatch) -> Batch:
 
 
 def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
-    """NEES (R, T, F) of the kept samples of the runs that are not ``regular`` (R,)."""
+    """Return NEES (R, T, F) of the kept samples of the runs that are not ``regular`` (R,)."""
     nees = np.empty(batch.error.shape[:3])
     for r in np.flatnonzero(~regular):
         kept = batch.kept[r]
@@ -297,7 +297,7 @@ def add_node(lanes: Lanes, room: Room, active: int, count: int, node: int, whole
 
 @kernel
 def merge_whole(lanes: Lanes, room: Room, count: int, node: int) -> None:
-    """``merge_row`` of L rows where all sizes are equal, L columns at a time."""
+    """Merge L rows as ``merge_row`` does, where all sizes are equal, L columns at a time."""
     rows, work, mean_of, M2_of = room.rows, room.work, room.mean, room.M2
     for s in range(count):
         room.node_size[node, s] = 1.0 * len(lanes)
@@ -539,8 +539,8 @@ def find_blur(
 
 @kernel
 def is_blurred(b: Batch, r: int, t: int) -> bool:
-    """The rule of ``trace.run.rounding_from`` for sample ``t`` of run ``r``: x (n,), P (F, n, n),
-    error (F, n).
+    """Return True if rounding blurs, by the rule of ``trace.run.rounding_from``, sample ``t`` of
+    run ``r``: x (n,), P (F, n, n), error (F, n).
     """
     filters, n = b.error.shape[2:]
     largest, least, square = 0.0, np.inf, 0.0

@@ -23,8 +23,8 @@ Progress = Callable[[int, int], None]
 def replicate(
     task: Task, scenario: Scenario, runs: int, seed: int | None = None, **options: Any
 ) -> list[Any]:
-    """``task(scenario, seed, replica)`` for the replicas ``first`` .. ``first + runs - 1``, in
-    their order; ``options`` are those of ``replicate_blocks``.
+    """Return ``task(scenario, seed, replica)`` for the replicas ``first`` .. ``first + runs - 1``,
+    in their order; ``options`` are those of ``replicate_blocks``.
     """
     whole = partial(each_replica, partial(_as_list, task), operator.add)
     found: list[Any] = replicate_blocks(whole, operator.add, scenario, runs, seed, **options)
@@ -49,9 +49,9 @@ def replicate_blocks(
     known: Mapping[int, Callable[[], Any]] | None = None,
     received: Callable[[int, Any], Any] | None = None,
 ) -> Any:
-    """``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first + runs -
-    1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into one of
-    the same kind.
+    """Return ``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first +
+    runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
+    one of the same kind.
 
     Results are merged in the binary tree over replicas, inside blocks by the task itself: the whole
     is equal to the last bit for every number of workers, size of block and order of completion.
@@ -91,7 +91,7 @@ def replicate_blocks(
 
 
 def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
-    """The result of one replica, for addition to join."""
+    """Return the result of one replica, for addition to join."""
     return [task(scenario, seed, replica)]
 
 
@@ -100,7 +100,7 @@ def _as_it_came(number: int, result: Any) -> Any:  # noqa: ARG001
 
 
 def _quiet(done: int, wanted: int) -> None:
-    """No progress."""
+    """Report no progress."""
 
 
 def _gather(

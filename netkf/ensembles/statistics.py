@@ -145,7 +145,7 @@ class RunValues(NamedTuple):
 
 
 def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues:
-    """Values of the runs of a batch, for every node where the filter is pooled.
+    """Return values of the runs of a batch, for every node where the filter is pooled.
 
     ``first`` is the number of the first run in the tree over all runs, whose pieces these are.
     """
@@ -170,7 +170,7 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
 
 
 def _mean_of_nodes(averages: FloatArray) -> FloatArray:
-    """(R, 1, 3) means over the nodes of (R, N, 3), node after node in every run."""
+    """Return means (R, 1, 3) over the nodes of (R, N, 3), node after node in every run."""
     # accumulate() adds in this order, and sum() does not.
     total = np.add.accumulate(averages, axis=1)[:, -1:]
     return np.asarray(total / averages.shape[1])
@@ -207,7 +207,7 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
 
 
 def count_messages(counts: np.ndarray, slotted: bool) -> FloatArray:
-    """(R, 5) as MESSAGES, from the events by kind (R, len(KINDS))."""
+    """Return (R, 5) as MESSAGES, from the events by kind (R, len(KINDS))."""
     of = dict(zip(KINDS, counts.T.astype(np.float64), strict=True))
     sent, delivered, lost = of["send"], of["deliver"], of["lost"] + of["late"]
     # Without broadcasts every message is a transmission of its own.

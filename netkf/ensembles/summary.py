@@ -16,8 +16,8 @@ from netkf.scenario.usage import record_usage
 def summarise_ensemble(
     scenario: Scenario, found: RunStatistics, promised: PromisedTraces
 ) -> dict[str, Any]:
-    """The keys of one run's summary. ``rms_error`` is the root of the mean square error of all
-    runs; a key that ends in ``_se`` is a standard error.
+    """Return the keys of one run's summary. ``rms_error`` is the root of the mean square error of
+    all runs; a key that ends in ``_se`` is a standard error.
     """
     mean = found.averages.mean.reshape(-1, 3)
     error = found.averages.standard_error().reshape(-1, 3)
@@ -69,7 +69,7 @@ def _chi_square(scenario: Scenario, found: RunStatistics) -> dict[str, float]:
 
 
 def _bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
-    """Averages of the bound over the samples after time 0, of the nodes and of all."""
+    """Return averages of the bound over the samples after time 0, of the nodes and of all."""
     if promised.bound is None:
         return [None] * (len(scenario.nodes) + 1)
     after: FloatArray = promised.bound[scenario.times > 0.0]

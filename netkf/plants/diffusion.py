@@ -69,10 +69,10 @@ class Diffusion(Plant):
         horizon: float = 0.0,
         frames: bool = False,
     ) -> DiffusionPath:
-        """A path of its own that can be asked for its state on the sensing grid and at the times
-        ``sampled`` and ``shown`` (increasing). ``sampling`` is used only for times sampled off the
-        grid, ``probing`` only for those shown off both. With ``frames``, states are local, see
-        ``truth``, in frames that begin before the ``horizon``.
+        """Return a path of its own that can be asked for its state on the sensing grid and at the
+        times ``sampled`` and ``shown`` (increasing). ``sampling`` is used only for times sampled
+        off the grid, ``probing`` only for those shown off both. With ``frames``, states are local,
+        see ``truth``, in frames that begin before the ``horizon``.
         """
         own, shows = GeneratorNormals([random]), GeneratorNormals([probing])
         samples = GeneratorNormals([] if sampling is None else [sampling])
@@ -88,7 +88,9 @@ class Diffusion(Plant):
         sampled: FloatArray = NO_TIMES,
         frames: bool = False,
     ) -> DiffusionPaths:
-        """The paths of several runs together, which are sampled and shown at the same times."""
+        """Return the paths of several runs together, which are sampled and shown at the
+        same times.
+        """
         start = self.starts(normals)
         cuts = [] if sampling is None or not len(sampled) else [Cuts(sampled, sampling)]
         steps = self.frame_steps if frames else None
@@ -114,7 +116,7 @@ class Diffusion(Plant):
         horizon: float,
         frames: bool = False,
     ) -> SampledTruth:
-        """A path that needs no sensing grid: it can be asked for its state at ``samples``,
+        """Return a path that needs no sensing grid: it can be asked for its state at ``samples``,
         ``probes`` and frame times, up to the ``horizon``.
         """
         marks = multiples(frame_period(self.A), horizon)
@@ -126,7 +128,7 @@ class Diffusion(Plant):
 def default_sensing_period(
     plant: Diffusion, informations: list[FloatArray], longest: float
 ) -> float:
-    """The sensing period for which the errors' covariance is within 1e-3 of the exact one.
+    """Return the sensing period for which the errors' covariance is within 1e-3 of the exact one.
 
     ``informations`` are the matrices H' R^-1 H of the nodes that sense, ``longest`` what their
     filters can use at once (algorithms/kernels/gains). The period is a fraction

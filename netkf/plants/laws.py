@@ -53,7 +53,7 @@ class GridLaws:
         self._grids: dict[tuple[int, int], FloatArray] = {}
 
     def grid(self, first: int, count: int) -> FloatArray:
-        """(count,) points of the sensing grid from number ``first`` on."""
+        """Return points (count,) of the sensing grid from number ``first`` on."""
         known = self._grids.get((first, count))
         if known is None:
             known = np.array([grid_time(self.period, first + k) for k in range(count)])
@@ -62,12 +62,16 @@ class GridLaws:
         return known
 
     def responses(self, gap: float) -> FloatArray:
-        """(3, n, n): what a state adds to the state ``gap`` later and to the two moments."""
+        """Return the matrices (3, n, n) of what a state adds to the state ``gap`` later and to the
+        two moments.
+        """
         values = [polynomial(series, gap) for series in (self.to_end, self.to_moments)]
         return np.concatenate(values).reshape(3, self.n, self.n)
 
     def _noise(self, gap: float) -> FloatArray:
-        """(3 n, 20 m): responses of the end and the moments to noise at the quadrature nodes."""
+        """Return the responses (3 n, 20 m) of the end and the moments to noise at the quadrature
+        nodes.
+        """
         out = np.empty((3 * self.n, len(_NODES) * self.B.shape[1]))
         self._fill_impulses(out, 0, gap, _NODES * gap, _WEIGHTS * gap)
         return out
@@ -142,7 +146,7 @@ def fill_impulses(
 
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
-    """Power series in the gap of ``exp(A g)`` (terms, n n + 1) and of its two moments
+    """Return power series in the gap of ``exp(A g)`` (terms, n n + 1) and of its two moments
     (terms, 2 n n + 1), with their reach, see linalg/series.
     """
     n, size = len(A), float(np.abs(A).sum(axis=0).max()) * longest
@@ -167,9 +171,9 @@ def course_width(n: int) -> int:
 
 
 def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
-    """(D, n + 4, W): what ``paths.fill_course`` multiplies with the state at the start of a piece
-    of at most so many seconds, by powers of its length, and with the four Legendre coefficients of
-    its cubic. Columns are those of the course.
+    """Return the table (D, n + 4, W) of what ``paths.fill_course`` multiplies with the state at the
+    start of a piece of at most so many seconds, by powers of its length, and with the four Legendre
+    coefficients of its cubic. Columns are those of the course.
     """
     # Terms beyond are below rounding, see linalg/series.
     needed = int(np.searchsorted(to_end[:-1, -1], longest)) + 1
@@ -188,8 +192,8 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
 
 
 def _factor(noise: FloatArray) -> FloatArray:
-    """The lower triangular S with ``S S' = noise noise'`` and no entry below zero on its diagonal,
-    whose column is zero where a row of ``noise`` depends on those before it.
+    """Return the lower triangular S with ``S S' = noise noise'`` and no entry below zero on its
+    diagonal, whose column is zero where a row of ``noise`` depends on those before it.
     """
     # Gram and Schmidt, twice, which is enough (Kahan and Parlett). Householder's reflections would
     # give a dependent row a direction of its own, made of rounding, and later rows a share in it.

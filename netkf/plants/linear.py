@@ -52,7 +52,7 @@ class LinearPlant(Plant):
         return self.slot_time(slot) >= horizon - 1e-9 * self.period
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
-        """The truth of one run; ``frames``: in frames, where the plant is unstable."""
+        """Return the truth of one run; ``frames``: in frames, where the plant is unstable."""
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
         return LinearPath(self._steps, self.noise_root, start, random, slots)
@@ -78,17 +78,17 @@ class Truth(Protocol):
         """Slots between two frames, the first of which begins at slot 0; None without frames."""
 
     def local(self, slot: int) -> FloatArray:
-        """(n,) x in the present frame."""
+        """Return x (n,) in the present frame."""
 
     def absolute(self, slot: int) -> FloatArray:
-        """(n,) x."""
+        """Return x (n,)."""
 
     def state(self, slot: int) -> FloatArray:
         """Return x (n,), as ``absolute`` does."""
 
     def rebase(self, slot: int) -> FloatArray:
-        """(n,) by which estimates are to be lowered at a slot that begins a frame: its local state.
-        Called once for each of them, when that slot's state has been sampled.
+        """Return the shift (n,) to subtract from estimates at a slot that begins a frame: its local
+        state. Called once for each of them, when that slot's state has been sampled.
         """
 
 
@@ -99,7 +99,7 @@ class Readings(Protocol):
         """H (p, n) of a slot not before the last one asked for."""
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """(p,) of that slot, in which the state is x."""
+        """Return the reading (p,) of that slot, in which the state is x."""
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (S, p) and matrices (S, p, n) of increasing slots; x is (S, n)."""
@@ -126,7 +126,7 @@ class LinearPath:
         self._origins = {0: np.zeros(len(start))}  # absolute, by the slot at which a frame begins
 
     def local(self, slot: int) -> FloatArray:
-        """(n,) x in the present frame, at a slot not before the last one asked for."""
+        """Return x (n,) in the present frame, at a slot not before the last one asked for."""
         x = self._before(slot)
         return np.zeros(len(x)) if slot == self._rebased > 0 else x
 
@@ -139,7 +139,7 @@ class LinearPath:
         return np.asarray(self._x[slot - self._first])
 
     def _following(self, noise: FloatArray) -> FloatArray:
-        """(BLOCK + 1, n) states before any rebase, of which the first is known."""
+        """Return states (BLOCK + 1, n) before any rebase, of which the first is known."""
         frame, first = self.frame_slots, self._first
         if frame is None:
             return np.asarray(self._steps.states(self._x[-1:], noise[None, None])[0])
@@ -156,8 +156,8 @@ class LinearPath:
         return np.concatenate(parts)
 
     def _move_origin(self, slot: int) -> FloatArray:
-        """(n,) absolute position in a slot of the origin of the frame that holds its state before
-        any rebase.
+        """Return the absolute position (n,) in a slot of the origin of the frame that holds its
+        state before any rebase.
         """
         assert self.frame_slots is not None
         begun = max(slot - 1, 0) // self.frame_slots * self.frame_slots
@@ -168,12 +168,12 @@ class LinearPath:
         return np.asarray(x)
 
     def rebase(self, slot: int) -> FloatArray:
-        """(n,) the local state of a slot that begins a frame, which is zero from now on."""
+        """Return the local state (n,) of a slot that begins a frame, which is zero from now on."""
         self._rebased = slot
         return self._before(slot)
 
     def absolute(self, slot: int) -> FloatArray:
-        """(n,) x, at a slot not before the last one asked for."""
+        """Return x (n,), at a slot not before the last one asked for."""
         x = self._before(slot)
         return x if self.frame_slots is None else self._move_origin(slot) + x
 
@@ -193,22 +193,26 @@ class SlotReadings:
         return self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """(p,) the reading of a slot not before the last one asked for; each has its own noise."""
+        """Return the reading (p,) of a slot not before the last one asked for; each has its own
+        noise.
+        """
         return apply(self.matrix(slot), x) + self.noise(slot)
 
     def noise(self, slot: int) -> FloatArray:
-        """(p,) the noise of the reading of a slot not before the last one asked for."""
+        """Return the noise (p,) of the reading of a slot not before the last one asked for."""
         while self._slot < slot:
             self._v = apply(self._root, self._noise.draw())
             self._slot += 1
         return self._v
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
-        """``matrix`` (S, p, n) of slots that ascend."""
+        """Return ``matrix`` (S, p, n) of slots that ascend."""
         return np.broadcast_to(self._H, (len(slots), *self._H.shape))
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``reading`` (S, p) and ``matrix`` (S, p, n) of slots that ascend, with states (S, n)."""
+        """Return ``reading`` (S, p) and ``matrix`` (S, p, n) of slots that ascend, with states
+        (S, n).
+        """
         H = self.matrices(slots)
         ahead = np.array(slots) - self._slot - 1
         # Slot by slot, so that no reading is rounded as the slots happen to be taken together.
@@ -226,14 +230,14 @@ class Blocks:
         self._drawn = np.empty((0, size))
 
     def draw(self) -> FloatArray:
-        """(size,) the next vector."""
+        """Return the next vector (size,)."""
         if self._used == len(self._drawn):
             self._drawn, self._used = self._random.standard_normal((BLOCK, self._size)), 0
         self._used += 1
         return np.asarray(self._drawn[self._used - 1])
 
     def draws(self, count: int) -> FloatArray:
-        """(count, size) the next vectors."""
+        """Return the next vectors (count, size)."""
         short = self._used + count - len(self._drawn)
         if short > 0:
             more = self._random.standard_normal((max(short, BLOCK), self._size))

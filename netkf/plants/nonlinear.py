@@ -102,7 +102,7 @@ class NonlinearSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """(K,) from the streams "sampling" and "sampling phase"."""
+        """Return the sample times (K,), drawn from the streams "sampling" and "sampling phase"."""
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 
@@ -127,7 +127,7 @@ class NonlinearReadings(SlotReadings):
         return Linearised(self._sensor, self._node)
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """(p,) the reading of a slot not before the last one asked for."""
+        """Return the reading (p,) of a slot not before the last one asked for."""
         noise = self.noise(slot)
         found: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64) + noise
         return found
@@ -140,7 +140,7 @@ class NonlinearSamples:
         self._readings = NonlinearReadings(sensor, node, random)
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, Any]:
-        """``y`` (p,) of sample k, and the function that linearises it."""
+        """Return ``y`` (p,) of sample k, and the function that linearises it."""
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:

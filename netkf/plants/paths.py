@@ -139,7 +139,9 @@ class DiffusionPaths:
         return block
 
     def _cut(self, block: Block, shown: FloatArray, source: Normals) -> Block:
-        """The block with pieces that also end at the times ``shown``, inside its own pieces."""
+        """Return the block with pieces that also end at the times ``shown``, inside its
+        own pieces.
+        """
         # The piece that each time is in.
         owners = np.searchsorted(block.end, shown)
         normals = source.draw((len(shown), 3 * self.laws.n))
@@ -382,11 +384,13 @@ class DiffusionPath:
         self._step, self._step_end = PathStep(0.0, 0.0, *[np.empty(0)] * 4), 0.0
 
     def grid(self, k: int) -> float:
-        """Time of the k-th point of the sensing grid."""
+        """Return the time (seconds) of the k-th point of the sensing grid."""
         return grid_time(self.period, k)
 
     def _at(self, time: float) -> PathStep:
-        """The piece that ``time`` is in; it may lie before the last one asked for, in its step."""
+        """Return the piece that ``time`` is in; it may lie before the last one asked for, in its
+        step.
+        """
         # Blocks are drawn when they are asked for: the path is never longer than it has to be.
         while self._block is None or time > self._block.ends[-1]:
             self._block, self._first, self._piece = self._paths.following().of(0), 0, -1
@@ -402,12 +406,12 @@ class DiffusionPath:
         return self._step
 
     def step_end(self) -> float:
-        """Time in seconds at which the sensing step that was last asked for ends."""
+        """Return the time (seconds) at which the sensing step that was last asked for ends."""
         return self._step_end
 
     def moments(self, start: float, end: float) -> FloatArray:
-        """(2, n) moments of x over ``[start, end]``, which lies inside one sensing step and not in
-        one before the last one asked for.
+        """Return moments (2, n) of x over ``[start, end]``, which lies inside one sensing step and
+        not in one before the last one asked for.
         """
         step = self._at(end)
         if start >= step.start:
@@ -415,7 +419,9 @@ class DiffusionPath:
         return self._over_pieces(start, end)
 
     def _over_pieces(self, start: float, end: float) -> FloatArray:
-        """``moments`` over several pieces of a step, which samples of other nodes may cut."""
+        """Return ``moments`` over several pieces of a step, which samples of other nodes
+        may cut.
+        """
         block, k, gap = self._block, self._piece, end - start
         assert block is not None
         total = np.zeros((2, self.laws.n))
@@ -441,8 +447,8 @@ class DiffusionPath:
         return np.asarray(times[times < horizon])
 
     def local(self, time: float) -> FloatArray:
-        """(n,) x in the present frame, on the sensing grid or at a time sampled or shown, not
-        before the last one asked for; 0 at a frame time.
+        """Return x (n,) in the present frame, on the sensing grid or at a time sampled or shown,
+        not before the last one asked for; 0 at a frame time.
         """
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor shown"
@@ -456,8 +462,8 @@ class DiffusionPath:
         return k < len(self.frame_times) and bool(self.frame_times[k] == time)
 
     def rebase(self, k: int) -> FloatArray:
-        """(n,) by which estimates are to be lowered at ``frame_times[k]``, k = 0, 1, ...: the local
-        state just before.
+        """Return the shift (n,) to subtract from estimates at ``frame_times[k]``, k = 0, 1, ...:
+        the local state just before.
         """
         time = float(self.frame_times[k])
         step = self._at(time)
@@ -469,14 +475,16 @@ class DiffusionPath:
         return step.x_end
 
     def _move_origin(self, gap: float) -> FloatArray:
-        """(n,) the origin of the present frame so many seconds after its start."""
+        """Return the origin (n,) of the present frame so many seconds after its start."""
         # An origin at 0 stays there.
         if self._moves is None or not self._origin.any():
             return self._origin
         return apply(self._moves.transitions(np.array([gap]))[0], self._origin)
 
     def absolute(self, time: float) -> FloatArray:
-        """(n,) x, as ``local``; ``rebase`` must have been called for all frame times so far."""
+        """Return x (n,), as ``local``; ``rebase`` must have been called for all frame
+        times so far.
+        """
         x = self.local(time)
         if not self._frame:
             return x
@@ -487,7 +495,7 @@ class DiffusionPath:
 
 
 def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> FloatArray:
-    """(2, n) moments of x over ``[start, end]`` inside a step."""
+    """Return moments (2, n) of x over ``[start, end]`` inside a step."""
     n = len(step.x_start)
     # The moments of a whole piece were drawn from their exact law: no cubic is needed.
     if start == step.start and end == step.end:

@@ -54,7 +54,7 @@ class Plant(Component):
         return noise_root(self.start_cov)
 
     def starts(self, normals: Normals) -> FloatArray:
-        """(B, n) x(0) of each run, drawn."""
+        """Return x(0) (B, n) of each run, drawn."""
         # Row by row, so that no state is rounded as its neighbours happen to be.
         drawn = product(normals.draw((1, self.n)), self.start_root.T)
         return np.asarray(self.start_mean + drawn[:, 0])

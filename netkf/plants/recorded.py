@@ -78,7 +78,7 @@ class RecordedPlant(LinearPlant):
         _demand(self.path, self.table, slots, self.period, "state")
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """The states of the table."""
+        """Return the states of the table."""
         return RecordedPath(self.table, np.full(self.n, math.nan))
 
 
@@ -139,7 +139,7 @@ class RecordedDiffusion(Diffusion):
 
 
 def _states(source: SourceFile, n: int) -> tuple[FloatArray, FloatArray]:
-    """Times (K,) and states (K, n) of a table ``t,x0,x1,...``, row by row."""
+    """Return times (K,) and states (K, n) of a table ``t,x0,x1,...``, row by row."""
     names = [f"x{k}" for k in range(n)]
     columns = read_columns(source, ("t", *names))
     return columns["t"], np.stack([columns[name] for name in names], axis=1)
@@ -154,13 +154,13 @@ class RecordedPath:
         self._states, self._otherwise = states, otherwise
 
     def state(self, slot: int) -> FloatArray:
-        """(n,) the state of any slot."""
+        """Return the state (n,) of any slot."""
         return self._states.get(slot, self._otherwise)
 
     local = absolute = state
 
     def rebase(self, slot: int) -> FloatArray:
-        """There are no frames."""
+        """Raise IndexError: there are no frames."""
         raise IndexError(slot)
 
 
@@ -262,7 +262,7 @@ class RecordedSensor(Sensor):
                 raise ScenarioError("path", rule, entries[place], "leave it empty or mend H")
 
     def table(self, node: int, period: float) -> Table:
-        """The readings (p,) of a node, with their regressors where there are any, by slot of
+        """Return the readings (p,) of a node, with their regressors where there are any, by slot of
         ``period`` seconds; raises ScenarioError for times that are no slots and for slots that are
         there twice.
         """
@@ -280,17 +280,17 @@ class RecordedSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """(K,) the times of the table."""
+        """Return the times (K,) of the table."""
         times = self.rows(node)[0]
         return times[: int(np.searchsorted(times, horizon))]
 
     def recorded_times(self, node: int) -> FloatArray:
-        """(K,) the times of all rows of a node, in the order of the table."""
+        """Return the times (K,) of all rows of a node, in the order of the table."""
         return np.array([t for t, _ in self._rows[node]])
 
     def rows(self, node: int) -> tuple[FloatArray, FloatArray]:
-        """Times (K,), increasing, and readings (K, p) of a node, each with its regressor where
-        there are any; raises ScenarioError for times below 0 or that are there twice.
+        """Return times (K,), increasing, and readings (K, p) of a node, each with its regressor
+        where there are any; raises ScenarioError for times below 0 or that are there twice.
         """
         given = sorted(self._rows[node], key=lambda row: row[0])
         times = np.array([t for t, _ in given])
@@ -334,7 +334,7 @@ class RecordedReadings:
         return phi[None] if phi.size else self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """(p,) the reading of a slot; nan without a row."""
+        """Return the reading (p,) of a slot; nan without a row."""
         row = self._table.get(slot)
         return np.full(len(self._H), math.nan) if row is None else row[: len(self._H)]
 
@@ -358,7 +358,7 @@ def _component(name: str, letter: str = "y") -> int:
 def by_slot(
     source: SourceFile, rows: Iterable[tuple[float, FloatArray]], period: float, whose: str
 ) -> Table:
-    """Rows (t, values) by the slot that begins at t."""
+    """Return rows (t, values) by the slot that begins at t."""
     table: Table = {}
     for t, values in rows:
         slot = round(t / period)

@@ -15,8 +15,8 @@ class Recursion:
         self.F, self._powers = F, F[None]
 
     def states(self, start: FloatArray, noise: FloatArray) -> FloatArray:
-        """(B, blocks L + 1, n) the states of B paths from ``start`` (B, n) on, each step of which
-        adds its noise (B, blocks, L, n).
+        """Return the states (B, blocks L + 1, n) of B paths from ``start`` (B, n) on, each step of
+        which adds its noise (B, blocks, L, n).
 
         Block by block, so that no path is rounded as its neighbours happen to be.
         """
@@ -26,7 +26,7 @@ class Recursion:
             return (_in_sums if summed else _one_by_one)(start, noise, to_later)
 
     def _to_later(self, count: int) -> FloatArray:
-        """(count, n, n): F, its square and so on."""
+        """Return ``F^1 .. F^count`` (count, n, n)."""
         found = self._powers
         while len(found) < count:
             found = np.concatenate([found, product(found, found[-1])])

@@ -76,7 +76,7 @@ class RegressorReadings(SlotReadings):
         self._C, self._s = sensor.C, LinearPath(sensor.steps, sensor.drive, sensor.start, driving)
 
     def matrix(self, slot: int) -> FloatArray:
-        """``phi_k'`` (1, n) of a slot not before the last one asked for."""
+        """Return ``phi_k'`` (1, n) of a slot not before the last one asked for."""
         return apply(self._C, self._s.state(slot))[None]
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:

@@ -21,8 +21,8 @@ class Samples(Protocol):
     """The samples of one sensor on one node in one run, k = 0, 1, ... in order of time."""
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``y`` (p,) and ``H`` (p, n) of sample k, not before the last one asked for, at which the
-        state is x (n,).
+        """Return ``y`` (p,) and ``H`` (p, n) of sample k, not before the last one asked for, at
+        which the state is x (n,).
         """
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -38,7 +38,7 @@ class DrawnSamples:
         self._readings = SlotReadings(H, R, random)
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``y`` (p,) and ``H`` (p, n) of sample k."""
+        """Return ``y`` (p,) and ``H`` (p, n) of sample k."""
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -53,7 +53,7 @@ class RecordedSamples:
         self._H, self._rows = H, rows
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``y`` (p,) and ``H`` (p, n) of sample k, whatever x."""
+        """Return ``y`` (p,) and ``H`` (p, n) of sample k, whatever x."""
         p = len(self._H)
         phi = self._rows[k, p:]
         return self._rows[k, :p], phi[None] if phi.size else self._H
@@ -95,7 +95,7 @@ class RecordedSampling(Clock):
         return tuple(self._times)
 
     def recorded_times(self, node: int) -> FloatArray:
-        """(K,) the instants at which a node samples, increasing."""
+        """Return the instants (K,) at which a node samples, increasing."""
         return self._times.get(node, np.empty(0))
 
     def ticks(
@@ -107,7 +107,7 @@ class RecordedSampling(Clock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """The recorded times of the node ``entity[0]``."""
+        """Return the recorded times of the node ``entity[0]``."""
         return self._times.get(entity[0], np.empty(0))[index : index + count]
 
 

@@ -64,7 +64,7 @@ class Sensor(Component):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> Readings:
-        """The readings of one of the nodes in one run, in slots of ``period`` seconds;
+        """Return the readings of one of the nodes in one run, in slots of ``period`` seconds;
         ``generator`` makes the streams of that sensor by purpose.
         """
 
@@ -75,7 +75,7 @@ class Sensor(Component):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """(K,) the times in continuous time at which one of the nodes samples, below the
+        """Return the times (K,) in continuous time at which one of the nodes samples, below the
         ``horizon``; sensors in slots and of increments have none.
         """
         # None by default: only sensors with a clock sample.
@@ -84,7 +84,7 @@ class Sensor(Component):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
-        """The samples of one of the nodes at these times in one run."""
+        """Return the samples of one of the nodes at these times in one run."""
         raise NotImplementedError
 
 
@@ -120,7 +120,7 @@ class LinearSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """(K,) from the streams "sampling" and "sampling phase"."""
+        """Return the sample times (K,), drawn from the streams "sampling" and "sampling phase"."""
         # Only sensors with a clock are asked.
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
@@ -132,7 +132,7 @@ class LinearSensor(Sensor):
         return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
-        """The readings of one of the nodes in one run in continuous time."""
+        """Return the readings of one of the nodes in one run in continuous time."""
         return SensorPath(self.H, self.R, random, cutting)
 
     def slot_path(
@@ -165,8 +165,8 @@ class SensorPath:
     def moments(
         self, truth: DiffusionPath, seen: FloatArray, start: float, end: float
     ) -> FloatArray:
-        """(2, p) moments of dy over ``[start, end]`` inside the truth's present step, where x has
-        the moments ``seen``; ``start`` is where the last call ended.
+        """Return moments (2, p) of dy over ``[start, end]`` inside the truth's present step, where
+        x has the moments ``seen``; ``start`` is where the last call ended.
         """
         last = truth.step_end()
         # A new step: what was left of the one before has been read to its end.
@@ -200,7 +200,7 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 
 
 def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
-    """(2, p) moments of dy from those of x (2, n) and of unit white noise (2, p)."""
+    """Return moments (2, p) of dy from those of x (2, n) and of unit white noise (2, p)."""
     out = np.empty(2 * len(H))
     fill_reading(ONE, H[0], out, 0, len(H), seen, H[None], noise, root[None], 0)
     return out.reshape(2, len(H))

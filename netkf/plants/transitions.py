@@ -42,7 +42,7 @@ class Transitions:
         self._known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``Phi`` and ``L``, both (K, n, n), of K gaps in seconds, none below 0."""
+        """Return ``Phi`` and ``L``, both (K, n, n), of K gaps in seconds, none below 0."""
         distinct, place = np.unique(gaps, return_inverse=True)
         key = distinct.tobytes()
         if key not in self._known:
@@ -64,7 +64,7 @@ class Transitions:
         return Phi, L
 
     def transitions(self, gaps: FloatArray) -> FloatArray:
-        """``Phi = e^{A g}`` (K, n, n) alone."""
+        """Return ``Phi = e^{A g}`` (K, n, n) alone."""
         distinct, place = np.unique(gaps, return_inverse=True)
         doublings = self._doublings(distinct)
         Phi = self._unit_transition(np.ldexp(distinct, -doublings))
@@ -75,8 +75,9 @@ class Transitions:
         return np.asarray(Phi[place])
 
     def bridges(self, before: FloatArray, after: FloatArray) -> FloatArray:
-        """(K, n, 2 n) rows D with ``z = D [z1; z2]``: how the noise of a whole gap is made of that
-        of its two parts of ``before`` and ``after`` seconds (K,). Rows are orthonormal or zero.
+        """Return rows D (K, n, 2 n) with ``z = D [z1; z2]``: how the noise of a whole gap is made
+        of that of its two parts of ``before`` and ``after`` seconds (K,). Rows are orthonormal or
+        zero.
         """
         pairs, place = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
         L1, (Phi2, L2) = self.laws(pairs[0])[1], self.laws(pairs[1])
@@ -84,7 +85,7 @@ class Transitions:
         return np.asarray(directions[place.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
-        """(K,) how often each gap is halved before the power series is used."""
+        """Return how often (K,) each gap is halved before the power series is used."""
         sizes = np.maximum(gaps * (self._norm / UNIT_SIZE), 1.0)
         return np.ceil(np.log2(sizes)).astype(np.int64)
 
@@ -94,7 +95,7 @@ class Transitions:
         return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
-        """(K, n, 10 m): a factor of the noise, ``e^{A s} B sqrt(weight)`` at the nodes s."""
+        """Return a factor (K, n, 10 m) of the noise, ``e^{A s} B sqrt(weight)`` at the nodes s."""
         terms, n, m = self._response.shape
         powers = _powers(gaps[:, None] * _NODES, terms)
         response = product(powers, self._response.reshape(terms, n * m))

@@ -34,14 +34,14 @@ class ContinuousTruth(Protocol):
         """(F,) increasing, inside the run; empty unless frames are used."""
 
     def local(self, time: float) -> FloatArray:
-        """(n,) x in the present frame."""
+        """Return x (n,) in the present frame."""
 
     def absolute(self, time: float) -> FloatArray:
-        """(n,) x."""
+        """Return x (n,)."""
 
     def rebase(self, k: int) -> FloatArray:
-        """(n,) by which estimates are to be lowered at ``frame_times[k]``: the local state just
-        before.
+        """Return the shift (n,) to subtract from estimates at ``frame_times[k]``: the local state
+        just before.
         """
 
 
@@ -54,7 +54,8 @@ def multiples(period: float | None, horizon: float) -> FloatArray:
 
 
 def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
-    """(F + 1, n) absolute position of the origin of each frame at its start, 0 for the first.
+    """Return the absolute position (F + 1, n) of the origin of each frame at its start, 0 for the
+    first.
 
     ``Phi`` (F, n, n) moves over the frame that each rebase ends, ``offsets`` (F, n) are its
     results.
@@ -69,7 +70,9 @@ def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
 def absolute_states(
     moves: Transitions, frame_times: FloatArray, offsets: FloatArray, t: FloatArray, x: FloatArray
 ) -> FloatArray:
-    """(K, n) absolute states at times ``t`` (K,), from local ones ``x`` (K, n) after any rebase."""
+    """Return absolute states (K, n) at times ``t`` (K,), from local ones ``x`` (K, n) after any
+    rebase.
+    """
     starts = np.concatenate([[0.0], frame_times])
     at = origins(moves.transitions(np.diff(starts)), offsets)
     frame = np.searchsorted(frame_times, t, side="right")
@@ -130,19 +133,19 @@ class SampledTruth:
         return k
 
     def local(self, time: float) -> FloatArray:
-        """(n,) x in the present frame."""
+        """Return x (n,) in the present frame."""
         return np.asarray(self._local[self._index_of(time)])
 
     def absolute(self, time: float) -> FloatArray:
-        """(n,) x."""
+        """Return x (n,)."""
         return np.asarray(self._absolute[self._index_of(time)])
 
     def rebase(self, k: int) -> FloatArray:
-        """(n,) the local state just before ``frame_times[k]``."""
+        """Return the local state (n,) just before ``frame_times[k]``."""
         return np.asarray(self.offsets[k])
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(K, n) local and absolute states at times in any order."""
+        """Return local and absolute states (K, n) at times in any order."""
         places = np.searchsorted(self._times, times)
         return self._local[places], self._absolute[places]
 
@@ -154,8 +157,8 @@ def _drawn(
     times: FloatArray,
     rebased: np.ndarray,
 ) -> tuple[FloatArray, FloatArray]:
-    """(K, n) states at ``times`` (K,) just before any rebase, which makes them 0, and the normals
-    (K - 1, n) of the gaps.
+    """Return states (K, n) at ``times`` (K,) just before any rebase, which makes them 0, and the
+    normals (K - 1, n) of the gaps.
     """
     gaps = np.diff(times)
     states = np.empty((len(times), moves.n))
@@ -181,8 +184,8 @@ def _bridge(
     probing: np.random.Generator,
     probes: FloatArray,
 ) -> FloatArray:
-    """(P, n) states at ``probes`` (P,), in the frame of the time before, given those at ``times``;
-    beyond the last of them the path goes on freely.
+    """Return states (P, n) at ``probes`` (P,), in the frame of the time before, given those at
+    ``times``; beyond the last of them the path goes on freely.
     """
     n = moves.n
     found, rest = np.empty((len(probes), n)), np.empty(0)
@@ -224,24 +227,24 @@ class RecordedTruth:
         self._missing = np.full(n, math.nan)
 
     def local(self, time: float) -> FloatArray:
-        """(n,) x, or nan."""
+        """Return x (n,), or nan."""
         k = nearest_row(self._times, time)
         return self._missing if k is None else np.asarray(self._states[k])
 
     absolute = local
 
     def rebase(self, k: int) -> FloatArray:
-        """There are no frames."""
+        """Raise IndexError: there are no frames."""
         raise IndexError(k)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(K, n) states at times in any order, twice."""
+        """Return states (K, n) at times in any order, twice."""
         x = np.array([self.local(time) for time in times.tolist()]).reshape(-1, len(self._missing))
         return x, x
 
 
 def nearest_row(times: FloatArray, time: float) -> int | None:
-    """The row whose time (increasing) is ``time`` to 1e-9 s."""
+    """Return the row whose time (increasing) is ``time`` to 1e-9 s."""
     k = int(np.searchsorted(times, time - TOLERANCE))
     return k if k < len(times) and times[k] <= time + TOLERANCE else None
 

@@ -49,7 +49,7 @@ def ziggurat() -> Ziggurat:
 
 @kernel
 def high_word_by_halves(a: Any, b: Any) -> Any:
-    """``high_word`` as registers of several words compute it side by side."""
+    """Return ``high_word(a, b)`` from products of halves, which compilers can vectorise."""
     a1, a0, b1, b0 = a >> S32, a & HALF, b >> S32, b & HALF
     low, cross = a0 * b0, a1 * b0
     middle = (low >> S32) + (cross & HALF) + a0 * b1
@@ -58,7 +58,7 @@ def high_word_by_halves(a: Any, b: Any) -> Any:
 
 @kernel
 def scramble(high: Any, low: Any) -> Any:
-    """The word that a state of two words gives."""
+    """Return the output word of a state (high, low): the DXSM permutation."""
     made = high ^ (high >> S32)
     made *= CHEAP
     made ^= made >> S48
@@ -67,7 +67,7 @@ def scramble(high: Any, low: Any) -> Any:
 
 @kernel
 def following(high: Any, low: Any, upper: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
-    """The next state, of the state and the increment of a stream; ``upper`` is
+    """Return the state of a stream after (high, low), given its increment; ``upper`` is
     ``high_word(low, CHEAP)``.
     """
     step = low * CHEAP + more_low
@@ -77,7 +77,9 @@ def following(high: Any, low: Any, upper: Any, more_high: Any, more_low: Any) ->
 
 @kernel
 def next_word(states: np.ndarray, k: int) -> Any:
-    """The next word of stream ``k`` of states (K, 4): state and increment, high words first."""
+    """Return the next word of stream ``k`` of states (K, 4): state and increment, high
+    words first.
+    """
     high, low = states[k, 0], states[k, 1]
     upper = high_word(low, CHEAP)
     states[k, 0], states[k, 1] = following(high, low, upper, states[k, 2], states[k, 3])
@@ -86,7 +88,7 @@ def next_word(states: np.ndarray, k: int) -> Any:
 
 @kernel
 def next_unit(states: np.ndarray, k: int) -> float:
-    """The next number of stream ``k``, uniform on [0, 1)."""
+    """Return the next number of stream ``k``, uniform on [0, 1)."""
     return float(next_word(states, k) >> S11) * TO_UNIT
 
 
@@ -107,7 +109,7 @@ def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArr
 
 @kernel
 def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
-    """The next uniform number of stream ``k`` of the run of lane ``q`` of block ``b``."""
+    """Return the next uniform number of stream ``k`` of the run of lane ``q`` of block ``b``."""
     high, low = states[b, k, 0, q], states[b, k, 1, q]
     states[b, k, 0, q], states[b, k, 1, q] = following(
         high, low, high_word(low, CHEAP), states[b, k, 2, q], states[b, k, 3, q]
@@ -117,7 +119,7 @@ def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
 
 @kernel(inlined=True)
 def next_stream_state(high: Any, low: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
-    """``following`` of a stream that has registers to itself: its increment is ``more``."""
+    """Return the state of a stream after (high, low); its increment is ``more``."""
     return following(high, low, high_word(low, CHEAP), more_high, more_low)
 
 
@@ -125,8 +127,9 @@ def next_stream_state(high: Any, low: Any, more_high: Any, more_low: Any) -> tup
 def exponential_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: Ziggurat
 ) -> tuple[float, Any, Any]:
-    """``next_exponential`` of stream ``k``, whose state is in registers; return the state after it
-    too. Numbers of one stream wait for each other's state, and memory makes them wait longer.
+    """Return ``next_exponential`` of stream ``k``, whose state is in registers; return the state
+    after it too. Numbers of one stream wait for each other's state, and memory makes them wait
+    longer.
     """
     word = scramble(high, low) >> S3
     layer = int(word & LAYER)
@@ -141,7 +144,7 @@ def exponential_of(
 
 @kernel
 def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
-    """The next number of stream ``k`` from the exponential law of mean 1."""
+    """Return the next number of stream ``k`` from the exponential law of mean 1."""
     while True:
         word = next_word(states, k) >> S3
         layer = int(word & LAYER)
@@ -210,7 +213,9 @@ class StreamBatch:
         seed_states(words, self.states)
 
     def in_lanes(self, runs: int) -> np.ndarray:
-        """The states (B, K, 4, L) of the K streams of each of so many runs, by blocks of lanes."""
+        """Return the states (B, K, 4, L) of the K streams of each of so many runs, by blocks of
+        lanes.
+        """
         count = len(self.states) // runs
         by_lane = np.zeros((blocks_of(runs) * LANES, count, 4), dtype=np.uint64)
         by_lane[:runs] = self.states.reshape(runs, count, 4)
@@ -219,7 +224,7 @@ class StreamBatch:
         return made
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """``Generator.random(count)`` of each of the entities in these places, one after the
+        """Return ``Generator.random(count)`` of each of the entities in these places, one after the
         other.
         """
         out = np.empty(int(counts.sum()))
@@ -227,7 +232,7 @@ class StreamBatch:
         return out
 
     def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """The same for ``Generator.standard_exponential``."""
+        """Return ``Generator.standard_exponential(count)`` of each entity, as ``units``."""
         out = np.empty(int(counts.sum()))
         fill_exponentials(self.states, which, counts, ziggurat(), out)
         return out

@@ -17,7 +17,7 @@ class Normals(Protocol):
     """K streams of standard normal numbers."""
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """(K, *shape) the next numbers of each stream."""
+        """Return the next numbers (K, *shape) of each stream."""
 
 
 class GeneratorNormals:
@@ -27,7 +27,7 @@ class GeneratorNormals:
         self._randoms = randoms
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """(K, *shape) the next numbers of each generator."""
+        """Return the next numbers (K, *shape) of each generator."""
         return np.stack([random.standard_normal(shape) for random in self._randoms])
 
 
@@ -39,7 +39,7 @@ class StreamNormals:
         seed_states(words, self.states)
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """(K, *shape) the next numbers of each stream."""
+        """Return the next numbers (K, *shape) of each stream."""
         out = np.empty((len(self.states), *shape))
         fill_normals_of_all(self.states, normal_ziggurat(), out.reshape(len(out), -1))
         return out

@@ -47,7 +47,7 @@ class NormalZiggurat(NamedTuple):
 
 @cache
 def normal_ziggurat() -> NormalZiggurat:
-    """The layers that numpy uses."""
+    """Return the layers that numpy uses."""
     with np.load(Path(__file__).with_name("ziggurat_normal.npz")) as kept:
         return NormalZiggurat(kept["fi"], kept["wi"], kept["ki"])
 
@@ -56,8 +56,8 @@ def normal_ziggurat() -> NormalZiggurat:
 def normal_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: NormalZiggurat
 ) -> tuple[float, Any, Any]:
-    """``next_normal`` of stream ``k``, whose state is in registers; return the state after it too,
-    see ``exponential_of``.
+    """Return ``next_normal`` of stream ``k``, whose state is in registers; return the state after
+    it too, see ``exponential_of``.
     """
     word = scramble(high, low)
     layer = int(word & LAYER)
@@ -73,7 +73,7 @@ def normal_of(
 
 @kernel
 def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
-    """The next standard normal number of stream ``k`` of states (K, >= 4)."""
+    """Return the next standard normal number of stream ``k`` of states (K, >= 4)."""
     while True:
         word = next_word(states, k)
         layer = int(word & LAYER)
@@ -94,7 +94,7 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
 
 @kernel
 def _tail(states: np.ndarray, k: int, negative: bool) -> float:
-    """A number beyond the lowest layer (Marsaglia 1964)."""
+    """Return a number beyond the lowest layer (Marsaglia 1964)."""
     while True:
         x = -INVERSE_TAIL_START * math.log1p(-next_unit(states, k))
         y = -math.log1p(-next_unit(states, k))
@@ -104,8 +104,8 @@ def _tail(states: np.ndarray, k: int, negative: bool) -> float:
 
 @kernel
 def next_half(states: np.ndarray, k: int) -> Any:
-    """The next 32 bits of stream ``k`` of states (K, 6): the lower half of a word, then the upper
-    half.
+    """Return the next 32 bits of stream ``k`` of states (K, 6): the lower half of a word, then the
+    upper half.
     """
     if states[k, HAS_HALF] == ONE:
         states[k, HAS_HALF] = _U(0)
@@ -117,7 +117,9 @@ def next_half(states: np.ndarray, k: int) -> Any:
 
 @kernel
 def next_integer(states: np.ndarray, k: int, count: int) -> Any:
-    """The next integer of stream ``k`` of states (K, 6), uniform from 0 to ``count`` - 1 < 2^32."""
+    """Return the next integer of stream ``k`` of states (K, 6), uniform from 0 to ``count`` - 1 <
+    2^32.
+    """
     if count <= 1:
         return np.int64(0)
     excluded = _U(count)

@@ -30,8 +30,8 @@ class Streams:
     replica: int = 0
 
     def generator(self, purpose: str, *entity: int) -> np.random.Generator:
-        """The generator of ``purpose`` for ``entity`` (node ids, a link's two ends,
-        ...: integers that are not negative).
+        """Return the generator of ``purpose`` for ``entity`` (node ids, a link's two ends, ...:
+        integers that are not negative).
         """
         return np.random.Generator(np.random.PCG64DXSM(self._sequence(purpose, *entity)))
 
@@ -50,13 +50,13 @@ class Streams:
         return (self,)
 
     def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """(K, 4) words of 64 bits that seed the generators of K entities."""
+        """Return words (K, 4) of 64 bits that seed the generators of K entities."""
         return ReplicaStreams(self.seed, self.replica, 1).seed_words(purpose, entities)
 
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
-        """``generator`` of each of them, in order; see ``with_seeds``."""
+        """Return ``generator`` of each of them, in order; see ``with_seeds``."""
         return ReplicaStreams(self.seed, self.replica, 1).generators(purpose, entities)
 
     def with_seeds(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
@@ -101,7 +101,9 @@ class ReplicaStreams:
         return tuple(Streams(self.seed, self.replica + k) for k in range(self.count))
 
     def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """(count K, 4) words of 64 bits that seed the generators of K entities, run by run."""
+        """Return words (count K, 4) of 64 bits that seed the generators of K entities,
+        run by run.
+        """
         if not entities:
             return np.empty((0, 4), dtype=np.uint64)
         last = self.replica + self.count - 1
@@ -120,7 +122,7 @@ class ReplicaStreams:
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
-        """The generators that these words seed."""
+        """Return the generators that these words seed."""
         made: list[Any] = [_Words(words) for words in self.seed_words(purpose, entities)]
         return [np.random.Generator(np.random.PCG64DXSM(words)) for words in made]
 
@@ -149,7 +151,7 @@ WORD, MASK = 1 << 32, (1 << 32) - 1
 
 @cache
 def _entropy(seed: int) -> np.ndarray:
-    """The words of a seed, lowest first, at least as many as the pool has."""
+    """Return the words of a seed, lowest first, at least as many as the pool has."""
     words = [seed & MASK]
     while seed := seed >> 32:
         words.append(seed & MASK)

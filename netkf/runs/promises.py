@@ -225,7 +225,9 @@ def _rate_line(found: dict[str, Any]) -> str:
 
 
 def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
-    """A row per node; of large networks the nodes with the smallest, middle and largest bounds."""
+    """Return a row per node; of large networks the nodes with the smallest, middle and largest
+    bounds.
+    """
     rows = [
         [str(node), *(format_number(c["trace"][k] if c["trace"] else None) for c in columns)]
         for k, node in enumerate(scenario.nodes)

@@ -187,9 +187,9 @@ class DerivedScenario(ScenarioModel):
         return np.asarray(scipy.linalg.expm(-age * self.truth.A) @ offset)
 
     def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
-        """``H`` (p, n) and ``R`` (p, p) of all sensors of a node together, over a diffusion of
-        those that give increments; p may be 0. With ``believed``, R is what the filter takes it to
-        be. Raises TheoryError where H differs from slot to slot.
+        """Return ``H`` (p, n) and ``R`` (p, p) of all sensors of a node together, over a diffusion
+        of those that give increments; p may be 0. With ``believed``, R is what the filter takes it
+        to be. Raises TheoryError where H differs from slot to slot.
         """
         placed = (self.placed if self.slotted else self.increment_sensors).get(node, ())
         for sensor in (self.sensors[place.entry] for place in placed):

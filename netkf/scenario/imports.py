@@ -85,7 +85,7 @@ def is_loaded(module_name: str, class_name: str, folder: Path) -> bool:
 
 
 def forget_other(module_name: str, folder: Path) -> None:
-    """A module beside the scenario wins over one of that name imported from elsewhere."""
+    """Forget a module imported from elsewhere whose name a module beside the scenario has."""
     if _is_other(sys.modules.get(module_name), module_name, folder):
         del sys.modules[module_name]
         importlib.invalidate_caches()

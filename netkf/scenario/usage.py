@@ -88,7 +88,7 @@ def _activation(scenario: DerivedScenario) -> Use | None:
 
 
 def _sensors(scenario: DerivedScenario) -> dict[str, Use]:
-    """Sampling times and readings; tables are told apart by their files."""
+    """Return the use of sampling times and readings; tables are told apart by their files."""
     nodes: dict[tuple[str, Any], set[int]] = {}
     parts: dict[tuple[str, Any], tuple[str, RecordedSampling | RecordedSensor]] = {}
     for k, sensor in enumerate(scenario.sensors):

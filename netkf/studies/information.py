@@ -134,7 +134,9 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
 
 
 def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
-    """(K,) bool: messages that count where a receiver takes one of those of an instant."""
+    """Return a mask (K,) of the messages that count where a receiver takes one of those of an
+    instant.
+    """
     order = np.lexsort((sent_row, sender, used))
     last = np.ones(len(used), dtype=bool)
     last[:-1] = used[order][1:] != used[order][:-1]
@@ -228,7 +230,9 @@ def find_flow(
 
 
 def _carry_readings(combination: str, messages: Messages) -> IntArray:
-    """(M,) bool: messages that carry the reading of their sender and nothing else."""
+    """Return a mask (M,) of the messages that carry the reading of their sender and
+    nothing else.
+    """
     if combination == "readings, then estimates":
         return np.asarray(messages.phase == 0)
     return np.full(len(messages), combination == "readings")

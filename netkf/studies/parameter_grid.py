@@ -58,7 +58,7 @@ def _finite(*texts: str) -> bool:
 
 
 def check_grid(grid: Any) -> dict[str, list[Any]]:
-    """The values of each key, at least one; raises ScenarioError at --vary."""
+    """Return the values of each key, at least one; raises ScenarioError at --vary."""
     if not isinstance(grid, Mapping) or not grid:
         raise ScenarioError("--vary", "needs a key with its values", grid or None, "KEY=V1,V2,...")
     found = {}

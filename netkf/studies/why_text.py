@@ -151,7 +151,7 @@ def _heard(found: Explanation) -> Iterator[str]:
 
 
 def _readings(found: Explanation) -> Iterator[str]:
-    """The newest readings, and what kept newer ones away."""
+    """Yield the newest readings, and what kept newer ones away."""
     sensors = [s for s in found.sources if s.sensor and s.node != found.node]
     known = sorted((s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading)
     never = [str(s.node) for s in sensors if math.isnan(s.reading)]
@@ -209,7 +209,7 @@ def _smallest(found: Explanation) -> Iterator[str]:
 
 
 def _limit(found: Explanation, smallest: SmallestSet) -> str:
-    """The trace that was wanted, and where it comes from unless it was asked for."""
+    """Return the trace that was wanted, and where it comes from unless it was asked for."""
     usual = (1.0 + GOOD_ENOUGH) * found.what_ifs[-1].trace
     where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
     own = math.isclose(smallest.limit, usual, rel_tol=1e-9)
@@ -227,7 +227,7 @@ def _tried(smallest: SmallestSet) -> str:
 
 
 def _sources(found: Explanation) -> str:
-    """The table of sources: sensors and neighbours first."""
+    """Return the table of sources: sensors and neighbours first."""
     chosen = [s for s in found.sources if s.sensor or s.neighbour or s.node == found.node]
     others = len(found.sources) - len(chosen)
     more = len(chosen[0].with_more) if chosen else 0

@@ -58,7 +58,7 @@ class RunBatch:
         return np.asarray(self.status == DIVERGED)
 
     def count(self, kind: str) -> np.ndarray:
-        """(R,) number of events of a kind in each run."""
+        """Return the number (R,) of events of a kind in each run."""
         return np.asarray(self.counts[:, CODES[kind]])
 
 
@@ -108,7 +108,7 @@ class BatchSink(Sink):
         self._sums.append(recorder.sums)
 
     def batch(self) -> RunBatch:
-        """The batch of all runs."""
+        """Return the batch of all runs."""
         return RunBatch(
             replicas=self._replicas,
             times=self._times,

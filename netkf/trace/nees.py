@@ -49,7 +49,9 @@ def fill_nees(
 
 
 def _regular(P: FloatArray) -> np.ndarray:
-    """(K,) bool: matrices (K, n, n) that are finite and of full rank up to rounding."""
+    """Return a mask (K,) of the matrices (K, n, n) that are finite and of full rank up to
+    rounding.
+    """
     found = np.asarray(np.isfinite(P).all(axis=(1, 2)))
     ranks = np.linalg.matrix_rank(P[found], hermitian=True)
     found[found] = np.asarray(ranks) == P.shape[-1]

@@ -61,13 +61,13 @@ class MemorySink(Sink):
         self.samples: list[tuple[FloatArray, ...]] = []
 
     def events(self, rows: np.ndarray) -> None:
-        """Append the block."""
+        """Append a block of rows."""
         self.blocks.append(rows)
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Append the block."""
+        """Append a block of rows."""
         self.samples.append((t, x, xhat, P, error))
 
 

@@ -115,7 +115,7 @@ class Run(Shown):
         return plot_by_name(self, figure)
 
     def _shown_table(self) -> pd.DataFrame:
-        """Averages over the samples after time 0, a row per node."""
+        """Return averages over the samples after time 0, a row per node."""
         import pandas as pd
 
         after = self.times > 0.0
@@ -159,9 +159,9 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
 
 
 def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray) -> float:
-    """The first of the times (T,) at which states x (T, n) are so large that rounding blurs errors
-    x - xhat of the size that P (T, N, n, n) says, or, where P is nan, of the root mean square of
-    the errors e (T, N, n) themselves; inf where there is none.
+    """Return the first of the times (T,) at which states x (T, n) are so large that rounding blurs
+    errors x - xhat of the size that P (T, N, n, n) says, or, where P is nan, of the root mean
+    square of the errors e (T, N, n) themselves; inf where there is none.
     """
     if not len(times):
         return np.inf
@@ -174,20 +174,22 @@ def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray
 
 
 def carried_size(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
-    """(T, n) the size of what a run computes with: states x (T, n), or with exact errors no more
-    than the largest of the errors e (T, N, n), which a node may have passed on to others.
+    """Return the size (T, n) of what a run computes with: states x (T, n), or with exact errors no
+    more than the largest of the errors e (T, N, n), which a node may have passed on to others.
     """
     return np.abs(e).max(axis=1) if exact else np.abs(x)
 
 
 def rounding(x: FloatArray) -> FloatArray:
-    """(T,) the size of the error that rounding adds to x - xhat where both are about x (T, n)."""
+    """Return the size (T,) of the error that rounding adds to x - xhat where both are about x
+    (T, n).
+    """
     return np.asarray(ROUNDING * np.abs(x).max(axis=1))
 
 
 def blurred_samples(run: Run, matrices: FloatArray) -> np.ndarray:
-    """(T, N) samples whose errors rounding blurs in some direction, where their covariances are
-    these (T, N, n, n): directions that are certain do not count, nor do matrices of nan.
+    """Return samples (T, N) whose errors rounding blurs in some direction, where their covariances
+    are these (T, N, n, n): directions that are certain do not count, nor do matrices of nan.
     """
     if not run.rounding.any():
         return np.zeros(matrices.shape[:2], dtype=bool)

@@ -32,7 +32,9 @@ class ReadingModes(NamedTuple):
 
 
 def reading_modes(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> ReadingModes:
-    """The modes of readings ``(H, R)``, each (p, n) and (p, p) with a p of its own, also 0."""
+    """Return the modes of readings ``(H, R)``, each (p, n) and (p, p) with a p of its
+    own, also 0.
+    """
     most = max((len(H) for H, _ in readings), default=0)
     rows = np.array([len(H) for H, _ in readings], dtype=np.int64)
     H_, root_R = np.zeros((len(readings), most, n)), np.zeros((len(readings), most, most))

@@ -99,7 +99,9 @@ def _terms(size: float) -> int:
 def gain_update(
     table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
-    """``xhat(b)`` (n,) from the open-loop prediction ``x``, ``P = P(b)`` and the moments (2p,)."""
+    """Return ``xhat(b)`` (n,) from the open-loop prediction ``x``, ``P = P(b)`` and the moments
+    (2p,).
+    """
     n, q = table.n, table.moments
     # One evaluation of the concatenated series [U, W, C].
     values = polynomial(table.series, gap)

@@ -55,8 +55,9 @@ def learn_network(
     information: FloatArray,
     number: FloatArray,
 ) -> None:
-    """P (6): write C~ / w and n~ / w of a node into ``information`` (n, n, L) and ``number``
-    (1, L), or what the node knows of itself, ``alone[h]``, while its weight is exactly 0.
+    """Divide masses by the weight, P (6): write C~ / w and n~ / w of a node into ``information``
+    (n, n, L) and ``number`` (1, L), or what the node knows of itself, ``alone[h]``, while its
+    weight is exactly 0.
     """
     # P (6): G = C~ / w and N = n~ / w.
     n, weight = information.shape[0], load(lanes, mass, b, h, 0)
@@ -152,9 +153,9 @@ def add_gain(
     seen: FloatArray,
     turned: FloatArray,
 ) -> None:
-    """P (8): add ``number`` times ``S S' H' (y - H x)`` to the estimate of a filter, for its
-    whitened reading ``y[b, s, h]`` of so many ``rows`` and its H; ``seen`` and ``turned`` (n, L)
-    are scratch.
+    """Correct an estimate, P (8): add ``number`` times ``S S' H' (y - H x)`` to the estimate of a
+    filter, for its whitened reading ``y[b, s, h]`` of so many ``rows`` and its H; ``seen`` and
+    ``turned`` (n, L) are scratch.
     """
     n = x.shape[2]
     # H that is fixed has one block and one slot.
@@ -194,7 +195,7 @@ def average(
     moved: FloatArray,
     factor: float,
 ) -> None:
-    """One averaging step of all nodes of a block, P (9): add ``factor`` = 1 / delta times the
+    """Do one averaging step of all nodes of a block, P (9): add ``factor`` = 1 / delta times the
     differences to the estimates that arrive to z (B, H, n, L); ``moved`` (H, n, L) is scratch.
     """
     H, n = len(links.first) - 1, z.shape[2]

@@ -47,7 +47,7 @@ class RiccatiTable(NamedTuple):
 
 
 def exponential_series(M: FloatArray, terms: int) -> FloatArray:
-    """(terms, n, n) with ``exp(M g) = sum_k g^k series[k]``."""
+    """Return the series (terms, n, n) with ``exp(M g) = sum_k g^k series[k]``."""
     series = np.empty((terms, *M.shape), dtype=M.dtype)
     series[0] = np.eye(len(M))
     for k in range(1, terms):
@@ -68,7 +68,7 @@ def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
 
 
 def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray, float]:
-    """The Hamiltonian of ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``."""
+    """Return the Hamiltonian of ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``."""
     size_A, size_Q, size_G = (float(np.abs(matrix).max()) for matrix in (A, Q, G))
     # A floor, so that a plant without dynamics does not divide by zero below.
     size_A = max(size_A, 1e-6)
@@ -106,7 +106,7 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
 
 
 def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
-    """(terms, ...) coefficients of matrices as rows (terms, size + 1)."""
+    """Return coefficients (terms, ...) of matrices as rows (terms, size + 1)."""
     rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
     return with_reach(rows, unit)
 
@@ -138,8 +138,8 @@ def _triples(
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """The inverse in the precision of ``matrix``, by Newton's iteration from double; nan where
-    there is none, as after so many units of an unstable plant that nothing is left of them.
+    """Return the inverse in the precision of ``matrix``, by Newton's iteration from double; nan
+    where there is none, as after so many units of an unstable plant that nothing is left of them.
     """
     if not np.isfinite(matrix).all():
         return np.full_like(matrix, np.nan)

@@ -109,8 +109,8 @@ class FlowScratch(Struct):
 
 
 def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
-    """Scratch arrays for all models of a table; where ``unrolled`` kernels are compiled for its n,
-    if it is small.
+    """Return scratch arrays for all models of a table; where ``unrolled`` kernels are compiled for
+    its n, if it is small.
     """
     n, q = table.levels.shape[-1], table.seen.shape[1]
     cls = FlowScratch.of_size(n) if unrolled else FlowScratch
@@ -194,7 +194,7 @@ def flow_table(
 def packed(
     E: FloatArray, F: FloatArray, grown: FloatArray, G: FloatArray, observed: bool
 ) -> FloatArray:
-    """The series (C, terms, width) of a FlowTable from those of exp(A g), F, Q_g and G_g."""
+    """Return the series (C, terms, width) of a FlowTable from those of exp(A g), F, Q_g and G_g."""
     rows, columns = np.tril_indices(E.shape[2])
     parts = [grown[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
     if observed:
@@ -206,7 +206,7 @@ def packed(
 
 
 def whitened(H: FloatArray, R: FloatArray) -> FloatArray:
-    """``R^-1/2 H`` as at most n rows (q, n)."""
+    """Return ``R^-1/2 H`` as at most n rows (q, n)."""
     p, n = H.shape
     if p == 0:
         return np.zeros((0, n))
@@ -287,7 +287,7 @@ def wide_zeros(*shape: int) -> Any:
 
 
 def wide_inverse(matrix: FloatArray) -> FloatArray:
-    """The inverse in extended precision, by Newton's iteration from double."""
+    """Return the inverse in extended precision, by Newton's iteration from double."""
     inverse = np.linalg.inv(matrix.astype(np.float64)).astype(WIDE)
     # X <- X (2 I - M X) doubles the correct digits: twice takes double precision to extended.
     for _ in range(2):
@@ -317,7 +317,7 @@ def information_blocks(
 
 
 def legendre_moment(k: int, j: int) -> float:
-    """``int_0^1 u^k P_j(2 u - 1) du`` = k!^2 / ((k - j)! (k + j + 1)!)."""
+    """Return ``int_0^1 u^k P_j(2 u - 1) du`` = k!^2 / ((k - j)! (k + j + 1)!)."""
     value = math.factorial(k) ** 2
     return value / (math.factorial(k - j) * math.factorial(k + j + 1))
 
@@ -331,7 +331,7 @@ def doubled(
     unit: float,
     levels: int,
 ) -> FloatArray:
-    """(levels, 4, n, n) exp(A g), F, Gamma and T over ``unit 2^level`` seconds.
+    """Return exp(A g) (levels, 4, n, n), F, Gamma and T over ``unit 2^level`` seconds.
 
     Doubling also doubles relative errors, so it works in extended precision, and on roots, so that
     what is not observed stays so.
@@ -407,7 +407,7 @@ def cholesky_root(Q: FloatArray) -> FloatArray:
 
 
 def substitute(lower: FloatArray, right: FloatArray) -> FloatArray:
-    """``lower^-1 right`` by forward substitution, in the precision of both."""
+    """Return ``lower^-1 right`` by forward substitution, in the precision of both."""
     out = np.zeros_like(right)
     for i in range(len(lower)):
         out[i] = (right[i] - lower[i, :i] @ out[:i]) / lower[i, i]
@@ -415,7 +415,7 @@ def substitute(lower: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
-    """One table for all models, in their order."""
+    """Return one table for all models, in their order."""
 
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
         # The padding is never read: ``sizes`` and the infinite last reach end every loop before it.
@@ -464,7 +464,7 @@ def move_root(
 
 @kernel
 def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
-    """``trace(P)`` at place ``k`` as ``is_narrow`` asks for it, 0 where it does not."""
+    """Return ``trace(P)`` at place ``k`` as ``is_narrow`` asks for it, 0 where it does not."""
     # Where nothing is observed G is 0, and any P is narrow.
     return 0.0 if table.sizes[m, 1] == 0 else float(root_size(ONE, size, root[k]))
 
@@ -487,7 +487,7 @@ def is_quick(table: FlowTable, m: int, gap: float, trace: float) -> bool:
 
 @kernel(inlined=True)
 def root_size(lanes: Lanes, size: Size, S: FloatArray) -> Any:
-    """``trace(P)`` of roots S (n, n, L)."""
+    """Return ``trace(P)`` of roots S (n, n, L)."""
     total = spread(lanes, 0.0)
     # |S|_F^2 = trace(S S').
     for i in range(len(size)):
@@ -532,7 +532,7 @@ def move_level(
     k: int,
     scratch: FlowScratch,
 ) -> None:
-    """``move_root`` over ``unit 2^level`` seconds."""
+    """Apply ``move_root`` over ``unit 2^level`` seconds."""
     n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
         # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
@@ -572,7 +572,7 @@ def move_wide(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """``move_root`` over less than a unit for any P, however wide."""
+    """Apply ``move_root`` over less than a unit for any P, however wide."""
     # First the information of the whole gap, then F and Q_g: P (I + G P)^-1, then F . F' + Q_g.
     use_readings(table, m, root, k, gap, scratch)
     n = len(scratch.size)
@@ -592,7 +592,9 @@ def move_narrow(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """``move_root`` over a gap inside a cell, where nothing is observed or P is not too wide."""
+    """Apply ``move_root`` over a gap inside a cell, where nothing is observed or P is not
+    too wide.
+    """
     fill_values(scratch.values, table, m, gap)
     move_by_series(table, m, root, x, k, True, scratch)
 
@@ -630,8 +632,8 @@ def move_by_series(
     reads: bool,
     scratch: FlowScratch,
 ) -> None:
-    """``move_root`` with what is in ``values``; the readings of the gap are used already where it
-    does not read.
+    """Apply ``move_root`` with what is in ``values``; the readings of the gap are used already
+    where it does not read.
     """
     size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
     S, mean = local_matrix(size, scratch.S), local_vector(size, scratch.mean)
@@ -666,7 +668,7 @@ def place_of_flow(n: int, observed: bool) -> int:
 def move_mean(
     lanes: Lanes, size: Size, x: FloatArray, values: FloatArray, moved: FloatArray
 ) -> None:
-    """``x = exp(A g) x`` (n, L); ``moved`` is scratch of the same shape."""
+    """Compute ``x = exp(A g) x`` (n, L) in place; ``moved`` is scratch of the same shape."""
     n, begin = len(size), len(size) * (len(size) + 1) // 2
     for i in range(n):
         total = spread(lanes, 0.0)
@@ -809,7 +811,9 @@ def transform(
 
 @kernel(inlined=True, fused=True)
 def information_rate(lanes: Lanes, size: Size, seen: FloatArray, S: FloatArray) -> Any:
-    """``trace(P G)`` in 1/s of roots S (n, n, L) and ``seen`` (q, n, L), which is R^-1/2 H."""
+    """Return ``trace(P G)`` in 1/s of roots S (n, n, L) and ``seen`` (q, n, L), which is
+    R^-1/2 H.
+    """
     # |R^-1/2 H S|_F^2 = trace(S' G S).
     n, rate = len(size), spread(lanes, 0.0)
     for r in range(len(seen)):
@@ -851,8 +855,8 @@ def use_moments(
     values: FloatArray,
     moments: FloatArray,
 ) -> None:
-    """``gain_root`` with S (n, n, L), x (n, L), moments (q, L) and what ``values`` of the gap the
-    series has: U and W (n, q), C (q, n); C is used up.
+    """Apply ``gain_root`` to S (n, n, L), x (n, L), moments (q, L) and what ``values`` of the gap
+    the series has: U and W (n, q), C (q, n); C is used up.
     """
     n, q = len(size), len(moments)
     # Innovations: the moments minus C x.
@@ -890,7 +894,7 @@ def use_moments(
 def move_alone(
     table: IntArray, scratch: IntArray, root: FloatArray, x: FloatArray, gap: float
 ) -> None:
-    """``move_root`` of one node by a table of one model, given the memory of the structs."""
+    """Apply ``move_root`` to one node by a table of one model, given the memory of the structs."""
     move_root(struct_at(table, FlowTable), 0, root, x, 0, gap, struct_at(scratch, FlowScratch))
 
 
@@ -901,7 +905,7 @@ class _Scratches(threading.local):
         self.known: dict[tuple[int, ...], FlowScratch] = {}
 
     def of(self, table: FlowTable) -> FlowScratch:
-        """Scratch arrays for a table."""
+        """Return scratch arrays for a table."""
         # Scratch holds no results, so tables of equal shapes may share it.
         sizes = table.series.shape[3], *table.seen.shape[1:]
         if sizes not in self.known:
@@ -915,7 +919,9 @@ _scratches = _Scratches()
 def flow_root(
     table: FlowTable, root: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Root (n, n) and x (n,) of one node ``gap`` >= 0 seconds later, by a table of one model."""
+    """Return the root (n, n) and x (n,) of one node ``gap`` >= 0 seconds later, by a table of one
+    model.
+    """
     n = len(x)
     roots, means = root.reshape(1, n, n).copy(), x.reshape(1, n).copy()
     if gap > 0.0:
@@ -926,7 +932,9 @@ def flow_root(
 def gain_update_root(
     table: GainTable, root: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
-    """``xhat(b)`` (n,) from the open-loop prediction ``x``, the root at b and the moments (2p,)."""
+    """Return ``xhat(b)`` (n,) from the open-loop prediction ``x``, the root at b and the moments
+    (2p,).
+    """
     if table.moments == 0:
         return x
     n = len(x)

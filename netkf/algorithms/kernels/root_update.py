@@ -60,8 +60,8 @@ class UpdateScratch(Struct):
 
 
 def update_scratch(n: int, p: int, unrolled: bool = False) -> UpdateScratch:
-    """Scratch arrays for states of n entries and samples of at most p rows; where ``unrolled``
-    kernels are compiled for that n, if it is small.
+    """Return scratch arrays for states of n entries and samples of at most p rows; where
+    ``unrolled`` kernels are compiled for that n, if it is small.
     """
     p = max(p, 1)
     shapes = {
@@ -81,7 +81,7 @@ class _Scratches(threading.local):
         self.known: dict[tuple[int, int], UpdateScratch] = {}
 
     def of(self, n: int, p: int) -> UpdateScratch:
-        """Scratch arrays for n states and samples of p rows."""
+        """Return scratch arrays for n states and samples of p rows."""
         if (n, p) not in self.known:
             self.known[n, p] = update_scratch(n, p)
         return self.known[n, p]
@@ -91,7 +91,9 @@ _scratches = _Scratches()
 
 
 def lower_root(root: FloatArray) -> FloatArray:
-    """The lower triangular S (n, n) with nonnegative diagonal and ``S S' = root root'`` (n, c)."""
+    """Return the lower triangular S (n, n) with nonnegative diagonal and ``S S' = root root'``
+    (n, c).
+    """
     n, columns = root.shape
     # QR of the transpose needs at least as many columns as rows.
     wide = np.concatenate([root, np.zeros((n, max(n - columns, 0)))], axis=1)
@@ -185,7 +187,9 @@ def sample_root(
 def rotate_rows(
     root: FloatArray, k: int, C: FloatArray, HS: FloatArray, gains: FloatArray, r: int, p: int
 ) -> None:
-    """``rotate_out`` for row ``r`` of p, which turns the rows of the observation below it too."""
+    """Apply ``rotate_out`` to row ``r`` of p, which turns the rows of the observation
+    below it too.
+    """
     n = root.shape[1]
     for i in range(n):
         gains[r, i] = 0.0
@@ -210,7 +214,7 @@ def rotate_rows(
 def update_with_sample(
     root: FloatArray, x: FloatArray, y: FloatArray, H: FloatArray, root_R: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Root (n, n), x (n,) and normalised innovation (p,) once the sample y (p,) is used."""
+    """Return root (n, n), x (n,) and normalised innovation (p,) once the sample y (p,) is used."""
     n = len(x)
     roots, means, innovation = root.reshape(1, n, n).copy(), x.reshape(1, n).copy(), y.copy()
     sample_root(roots, means, 0, innovation, H, root_R, _scratches.of(n, len(y)))
@@ -274,7 +278,7 @@ def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) ->
 def combine_roots(
     weights: FloatArray, means: FloatArray, roots: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """``sum w_j x_j`` (n,) and the root of ``sum w_j P_j`` (n, n), for weights (k,), means
+    """Return ``sum w_j x_j`` (n,) and the root of ``sum w_j P_j`` (n, n), for weights (k,), means
     (k, n) and roots (k, n, n).
     """
     x, root = means[:1].copy(), roots[:1].copy()

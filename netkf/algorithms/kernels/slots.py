@@ -136,7 +136,7 @@ class SlotRoom(NamedTuple):
 
 
 def slot_room(H: int, n: int, lanes: Lanes = MANY) -> SlotRoom:
-    """Scratch for H filters of n states."""
+    """Return scratch for H filters of n states."""
     L = len(lanes)
     shapes: list[tuple[int, ...]] = [*[(n, L)] * 3, *[(n, n, L)] * 2, *[(n, n + 1, L)] * 2]
     shapes += [(H, n, L), (H, n, n, L)]
@@ -147,7 +147,7 @@ def slot_room(H: int, n: int, lanes: Lanes = MANY) -> SlotRoom:
 
 
 def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A reading y (p,) and its H (p, n) times ``L^-1``, with ``L L' = R``."""
+    """Return a reading y (p,) and its H (p, n) times ``L^-1``, with ``L L' = R``."""
     # One solve for y and H together.
     made = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
     return np.ascontiguousarray(made[:, 0]), np.ascontiguousarray(made[:, 1:])
@@ -386,12 +386,12 @@ def write_root_column(
 def predict_one(
     root: FloatArray, F: FloatArray, root_Q: FloatArray, moved: FloatArray, noise: FloatArray
 ) -> None:
-    """``predict_root`` of one filter with one lane, root (1, 1, n, n, 1)."""
+    """Apply ``predict_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
     predict_root(ONE, root, 0, 0, F, root_Q, moved, noise)
 
 
 def predict_root_alone(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
-    """The lower triangular root (n, n) of ``F S S' F' + Q``, of lower triangular roots."""
+    """Return the lower triangular root (n, n) of ``F S S' F' + Q``, of lower triangular roots."""
     n = len(F)
     moved = np.array(root).reshape(1, 1, n, n, 1)
     predict_one(moved, F, root_Q, np.empty((n, n, 1)), np.empty((n, n, 1)))

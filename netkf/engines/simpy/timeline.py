@@ -27,7 +27,7 @@ class Timeline(simpy.Environment):
         self.process(process)
 
     def at(self, time: float, rank: Rank | int, entity: int) -> simpy.Event:
-        """An event that happens at ``time``, before those of higher (rank, entity).
+        """Return an event that happens at ``time``, before those of higher (rank, entity).
 
         ``Environment.timeout`` would add a delay to the present time, and ``now + (time - now)`` is
         not ``time`` in the last bit: recorded times would not come back, lattices would not meet.

@@ -211,7 +211,7 @@ class LinearisedRiccati(NamedTuple):
         return total
 
     def mean_map(self) -> FloatArray:
-        """(m, m): what becomes of the mean over the nodes of rows that are equal everywhere."""
+        """Return the map (m, m) of the mean over the nodes of rows that are equal everywhere."""
         total = self.blocks.mean(axis=0)
         for rates, _, maps in self.heard:
             share = np.asarray(rates.sum(axis=0)).reshape(-1) / len(self.blocks)
