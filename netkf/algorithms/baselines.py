@@ -12,8 +12,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     read_all,
     rebase,
@@ -30,16 +30,16 @@ def local_slots(
     plan: SlotPlan,
     links: SlotLinks,  # noqa: ARG001 - nobody talks
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
 ) -> None:
     """Carry filters that never talk through the slots of a plan: predict, then update."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict_all(nodes, room, b)
-                read_all(nodes, readings, room, b, s)
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+                predict_all(nodes, scratch, b)
+                read_all(nodes, readings, scratch, b, s)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
 
 
 @built_in("local")

@@ -24,8 +24,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     predict_root,
     rebase,
@@ -88,51 +88,53 @@ def constant_gain_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
     arrays: ConstantGainArrays,
 ) -> None:
     """Carry filters with constant gains through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict_all(nodes, room, b)
+                predict_all(nodes, scratch, b)
                 for h in range(len(nodes.rows)):
                     if nodes.rows[h] > 0:
-                        correct_by_gain(nodes, readings, room, arrays, b, s, h)
-                copy_pairs(nodes, room, b)
+                        correct_by_gain(nodes, readings, scratch, arrays, b, s, h)
+                copy_pairs(nodes, scratch, b)
                 for h in range(len(nodes.rows)):
-                    combine_convex_roots(nodes, plan, links, room, b, s, h)
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+                    combine_convex_roots(nodes, plan, links, scratch, b, s, h)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
 
 
 @kernel
 def correct_by_gain(
     nodes: SlotNodes,
     readings: ReadingBlock,
-    room: SlotRoom,
+    scratch: SlotScratch,
     arrays: ConstantGainArrays,
     b: int,
     s: int,
     h: int,
 ) -> None:
     """Use the reading of filter ``h`` of a block: ``xhat + L (y - H xhat)`` and P."""
-    lanes, n = room.lanes, nodes.xhat.shape[2]
+    lanes, n = scratch.lanes, nodes.xhat.shape[2]
     for i in range(n):
-        store(lanes, room.moved_mean, i, 0.0)
+        store(lanes, scratch.moved_mean, i, 0.0)
     for k in range(nodes.rows[h]):
         innovation = load(lanes, readings.y, b, s, h, k)
         for j in range(n):
             weight = load(lanes, readings.H, 0, 0, h, k, j)
             innovation -= weight * load(lanes, nodes.xhat, b, h, j)
         for i in range(n):
-            moved = load(lanes, room.moved_mean, i) + arrays.gain[h, i, k] * innovation
-            store(lanes, room.moved_mean, i, moved)
+            moved = load(lanes, scratch.moved_mean, i) + arrays.gain[h, i, k] * innovation
+            store(lanes, scratch.moved_mean, i, moved)
     for i in range(n):
-        total = load(lanes, nodes.xhat, b, h, i) + load(lanes, room.moved_mean, i)
+        total = load(lanes, nodes.xhat, b, h, i) + load(lanes, scratch.moved_mean, i)
         store(lanes, nodes.xhat, b, h, i, total)
     # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
-    predict_root(lanes, nodes.root, b, h, arrays.closed[h], arrays.noise[h], room.moved, room.noise)
+    predict_root(
+        lanes, nodes.root, b, h, arrays.closed[h], arrays.noise[h], scratch.moved, scratch.noise
+    )
 
 
 @built_in("constant-gain")

@@ -22,8 +22,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     read_all,
     rebase,
@@ -95,27 +95,33 @@ def diffusion_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
     weights: DiffusionWeights,
 ) -> None:
     """Carry diffusion filters through the slots of a plan, D (6)-(9)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
-                read_all(nodes, readings, room, b, s)
-                predict_all(nodes, room, b)
+                read_all(nodes, readings, scratch, b, s)
+                predict_all(nodes, scratch, b)
             if plan.exchanged[s]:
                 # Everyone combines what was sent: estimates and inverse roots, once for each sender
                 # however many hear it.
                 for h in range(len(nodes.rows)):
                     for i in range(nodes.xhat.shape[2]):
-                        store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
-                    invert_lanes(room.lanes, room.root, nodes.root, b, h)
+                        store(
+                            scratch.lanes,
+                            scratch.xhat,
+                            h,
+                            i,
+                            load(scratch.lanes, nodes.xhat, b, h, i),
+                        )
+                    invert_lanes(scratch.lanes, scratch.root, nodes.root, b, h)
                 for h in range(len(nodes.rows)):
-                    combine_senders(nodes, plan, links, room, weights, b, s, h)
+                    combine_senders(nodes, plan, links, scratch, weights, b, s, h)
 
 
 @kernel
@@ -123,14 +129,14 @@ def combine_senders(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,
-    room: SlotRoom,
+    scratch: SlotScratch,
     weights: DiffusionWeights,
     b: int,
     s: int,
     h: int,
 ) -> None:
     """Intersect what filter ``h`` of a block has with what it hears, D (8) and (9)."""
-    lanes, heard = room.lanes, spread(room.lanes, 0.0)
+    lanes, heard = scratch.lanes, spread(scratch.lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
         heard += select(arrived, links.weight[m], 0.0)
@@ -139,17 +145,25 @@ def combine_senders(
     if not any_lane(own != 1.0):
         return
     # The own term needs no merging: it is the first.
-    whiten(lanes, room.total, own, room.root, room.xhat, h, h)
+    whiten(lanes, scratch.total, own, scratch.root, scratch.xhat, h, h)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
         # A weight of 0 adds no information.
         if links.weight[m] > 0.0 and any_lane(arrived):
             weight = select(arrived, links.weight[m] / divisor, 0.0)
-            whiten(lanes, room.whitened, weight, room.root, room.xhat, links.sender[m], h)
-            merge_lanes(lanes, room.total, room.whitened)
+            whiten(lanes, scratch.whitened, weight, scratch.root, scratch.xhat, links.sender[m], h)
+            merge_lanes(lanes, scratch.total, scratch.whitened)
     # P = (sum w P^-1)^-1 and the mean, D (8) and (9).
     finish_lanes(
-        lanes, nodes.root, nodes.xhat, b, h, room.xhat, room.total, room.whitened, own == 1.0
+        lanes,
+        nodes.root,
+        nodes.xhat,
+        b,
+        h,
+        scratch.xhat,
+        scratch.total,
+        scratch.whitened,
+        own == 1.0,
     )
 
 

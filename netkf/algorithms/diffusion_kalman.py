@@ -17,8 +17,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     rebase,
     show,
@@ -58,24 +58,24 @@ def diffusion_kalman_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
 ) -> None:
     """Carry diffusion Kalman filters through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict_all(nodes, room, b)
+                predict_all(nodes, scratch, b)
                 for h in range(len(nodes.rows)):
-                    fuse_readings(nodes, readings, plan, links, room, True, b, s, h)
+                    fuse_readings(nodes, readings, plan, links, scratch, True, b, s, h)
                 # All differences before any estimate moves: the combination is simultaneous.
                 for h in range(len(nodes.rows)):
                     move_towards(
-                        room.lanes, nodes.xhat, b, h, links, plan.up, s, 1, True, room.xhat
+                        scratch.lanes, nodes.xhat, b, h, links, plan.up, s, 1, True, scratch.xhat
                     )
                 for h in range(len(nodes.rows)):
-                    add_to_estimate(room.lanes, nodes.xhat, b, h, room.xhat)
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+                    add_to_estimate(scratch.lanes, nodes.xhat, b, h, scratch.xhat)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
 
 
 @kernel

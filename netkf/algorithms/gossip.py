@@ -12,8 +12,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     read_all,
     rebase,
@@ -31,50 +31,52 @@ def gossip_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
 ) -> None:
     """Carry gossip filters through the slots of a plan, G (10)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
             if plan.exchanged[s]:
-                swap_pairs(nodes, plan, links, room, b, s)
+                swap_pairs(nodes, plan, links, scratch, b, s)
             if plan.sensed[s]:
-                read_all(nodes, readings, room, b, s)
-                predict_all(nodes, room, b)
+                read_all(nodes, readings, scratch, b, s)
+                predict_all(nodes, scratch, b)
 
 
 @kernel
 def swap_pairs(
-    nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, room: SlotRoom, b: int, s: int
+    nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, scratch: SlotScratch, b: int, s: int
 ) -> None:
     """Put what each node hears in place of its own pair, of several the last sender's."""
-    lanes, n = room.lanes, nodes.xhat.shape[2]
+    lanes, n = scratch.lanes, nodes.xhat.shape[2]
     # All payloads are from before the exchange.
     for h in range(len(nodes.rows)):
         for i in range(n):
-            store(lanes, room.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
+            store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
             for j in range(i + 1):
-                store(lanes, room.root, h, i, j, load(lanes, nodes.root, b, h, i, j))
+                store(lanes, scratch.root, h, i, j, load(lanes, nodes.root, b, h, i, j))
     for h in range(len(nodes.rows)):
         for m in range(links.first[h], links.first[h + 1]):
             heard = load_flags(lanes, plan.up, b, s, 0, links.way[m])
             # Most links are idle in a matching of a single run.
             if any_lane(heard):
-                take_pair(nodes, room, b, h, links.sender[m], heard)
+                take_pair(nodes, scratch, b, h, links.sender[m], heard)
 
 
 @kernel(inlined=True)
-def take_pair(nodes: SlotNodes, room: SlotRoom, b: int, h: int, sender: int, heard: Any) -> None:
+def take_pair(
+    nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, heard: Any
+) -> None:
     """Copy what ``sender`` sent to filter ``h`` in the lanes that ``heard`` it."""
-    lanes = room.lanes
+    lanes = scratch.lanes
     for i in range(nodes.xhat.shape[2]):
-        own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, room.xhat, sender, i)
+        own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, scratch.xhat, sender, i)
         store(lanes, nodes.xhat, b, h, i, select(heard, sent, own))
         for j in range(i + 1):
-            own, sent = load(lanes, nodes.root, b, h, i, j), load(lanes, room.root, sender, i, j)
+            own, sent = load(lanes, nodes.root, b, h, i, j), load(lanes, scratch.root, sender, i, j)
             store(lanes, nodes.root, b, h, i, j, select(heard, sent, own))
 
 

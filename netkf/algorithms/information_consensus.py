@@ -32,12 +32,12 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     rebase,
     show,
-    slot_room,
+    slot_scratch,
     whiten_reading,
 )
 from netkf.algorithms.models import SlotModel, first_root
@@ -112,35 +112,35 @@ def consensus_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
     arrays: ConsensusArrays,
 ) -> None:
     """Carry filters by consensus on information through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict_all(nodes, room, b)
-                begin_all(nodes, readings, room, arrays, b, s)
+                predict_all(nodes, scratch, b)
+                begin_all(nodes, readings, scratch, arrays, b, s)
                 for step in range(arrays.steps):
                     for h in range(len(nodes.rows)):
                         mix_parts(
-                            room.lanes, arrays.parts, step, h, links, plan.up, (b, s, step),
-                            room.xhat, room.total, room.whitened,
+                            scratch.lanes, arrays.parts, step, h, links, plan.up, (b, s, step),
+                            scratch.xhat, scratch.total, scratch.whitened,
                         )  # fmt: skip
                 for h in range(len(nodes.rows)):
                     read_off(
-                        room.lanes, nodes.root, nodes.xhat, b, h, arrays.parts, arrays.steps % 2,
-                        arrays.counts, room.root, room.xhat, room.total, room.whitened,
+                        scratch.lanes, nodes.root, nodes.xhat, b, h, arrays.parts, arrays.steps % 2,
+                        arrays.counts, scratch.root, scratch.xhat, scratch.total, scratch.whitened,
                     )  # fmt: skip
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
 
 
 @kernel
 def begin_all(
     nodes: SlotNodes,
     readings: ReadingBlock,
-    room: SlotRoom,
+    scratch: SlotScratch,
     arrays: ConsensusArrays,
     b: int,
     s: int,
@@ -148,21 +148,21 @@ def begin_all(
     """Begin the pairs of all filters of a block from their predictions and readings."""
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
-            store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
-        invert_lanes(room.lanes, room.root, nodes.root, b, h)
+            store(scratch.lanes, scratch.xhat, h, i, load(scratch.lanes, nodes.xhat, b, h, i))
+        invert_lanes(scratch.lanes, scratch.root, nodes.root, b, h)
         for k in range(len(arrays.shares)):
             begin_part(
-                room.lanes, arrays.parts, k, arrays.shares, room.root, readings.y, readings.H,
-                (b, s, h), nodes.rows[h], room.xhat, room.total, room.whitened,
+                scratch.lanes, arrays.parts, k, arrays.shares, scratch.root, readings.y, readings.H,
+                (b, s, h), nodes.rows[h], scratch.xhat, scratch.total, scratch.whitened,
             )  # fmt: skip
 
 
 @kernel
 def begin_one(
-    nodes: SlotNodes, readings: ReadingBlock, room: SlotRoom, arrays: ConsensusArrays
+    nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, arrays: ConsensusArrays
 ) -> None:
     """Apply ``begin_all`` to one filter with one lane."""
-    begin_all(nodes, readings, room, arrays, 0, 0)
+    begin_all(nodes, readings, scratch, arrays, 0, 0)
 
 
 @kernel
@@ -217,7 +217,7 @@ class InformationConsensus(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConsensusArrays]:
-        """Return steps, recipe and room for the pairs of all nodes."""
+        """Return steps, recipe and scratch for the pairs of all nodes."""
         made = self.recipe(infos[0].nodes)
         n, K = len(states[0].xhat), len(made.shares)
         parts: FloatArray = aligned((2, K, len(states), n, n + 1, LANES))
@@ -357,7 +357,7 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
     )
     shares, counts = state.recipe
     parts = np.zeros((2, len(shares), 1, n, n + 1, 1))
-    begin_one(nodes, readings, slot_room(1, n, ONE), ConsensusArrays(1, shares, counts, parts))
+    begin_one(nodes, readings, slot_scratch(1, n, ONE), ConsensusArrays(1, shares, counts, parts))
     return parts[0, :, 0, :, :, 0]
 
 

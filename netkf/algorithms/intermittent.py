@@ -14,8 +14,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     rebase,
     show,
@@ -73,19 +73,19 @@ def intermittent_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
 ) -> None:
     """Carry intermittent filters through the slots of a plan, R (15)-(18)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):
                     # One after the other: with independent noise that equals one update.
-                    fuse_readings(nodes, readings, plan, links, room, True, b, s, h)
-                predict_all(nodes, room, b)
+                    fuse_readings(nodes, readings, plan, links, scratch, True, b, s, h)
+                predict_all(nodes, scratch, b)
 
 
 @built_in("intermittent")

@@ -22,8 +22,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     rebase,
     show,
@@ -75,27 +75,27 @@ def kcf_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
     arrays: KcfArrays,
 ) -> None:
     """Carry Kalman-consensus filters through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict_all(nodes, room, b)
+                predict_all(nodes, scratch, b)
                 # Consensus is on predictions and their covariances: before any reading is used.
                 for h in range(len(nodes.rows)):
                     move_towards(
-                        room.lanes, nodes.xhat, b, h, links, plan.up, s, 0, False, room.xhat
+                        scratch.lanes, nodes.xhat, b, h, links, plan.up, s, 0, False, scratch.xhat
                     )
                     scale_by_covariance(
-                        room.lanes, nodes.root, b, h, arrays.epsilon, room.xhat, room.row
+                        scratch.lanes, nodes.root, b, h, arrays.epsilon, scratch.xhat, scratch.row
                     )
                 for h in range(len(nodes.rows)):
-                    fuse_readings(nodes, readings, plan, links, room, arrays.share, b, s, h)
-                    add_to_estimate(room.lanes, nodes.xhat, b, h, room.xhat)
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+                    fuse_readings(nodes, readings, plan, links, scratch, arrays.share, b, s, h)
+                    add_to_estimate(scratch.lanes, nodes.xhat, b, h, scratch.xhat)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
 
 
 @kernel

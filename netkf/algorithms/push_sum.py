@@ -32,13 +32,13 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     predict_mean,
     rebase,
     show,
-    slot_room,
+    slot_scratch,
     whiten_reading,
 )
 from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, has_stopped
@@ -168,7 +168,7 @@ def push_sum_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
     arrays: PushSumArrays,
 ) -> None:
     """Carry push-sum filters through the slots of a plan, P Fig. 1."""
@@ -177,42 +177,42 @@ def push_sum_slots(
             # Step 3: with asymptotic gains the covariance is the limit, and only the mean is
             # predicted.
             if plan.sensed[s] and not arrays.asymptotic:
-                predict_all(nodes, room, b)
+                predict_all(nodes, scratch, b)
             # Step 2 before the correction, so that the gain uses what the mass of this slot says.
             if plan.exchanged[s] and not arrays.asymptotic:
-                exchange_mass(arrays, plan, links, samples, room, b, s)
+                exchange_mass(arrays, plan, links, samples, scratch, b, s)
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):
-                    correct(nodes, readings, room, arrays, b, s, h)
+                    correct(nodes, readings, scratch, arrays, b, s, h)
             if plan.exchanged[s]:
                 for step in range(1, 1 + arrays.gamma):
                     # Row 0 of ``up`` is the exchange of mass; averaging has the rows after it.
                     average(
-                        room.lanes, nodes.xhat, b, links, plan.up, s, step, room.xhat,
+                        scratch.lanes, nodes.xhat, b, links, plan.up, s, step, scratch.xhat,
                         1.0 / arrays.delta,
                     )  # fmt: skip
             if plan.sample[s] >= 0:
-                keep_sums(arrays, links, samples, room, b)
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+                keep_sums(arrays, links, samples, scratch, b)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
 
 
 @kernel
 def keep_sums(
-    arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, room: SlotRoom, b: int
+    arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, scratch: SlotScratch, b: int
 ) -> None:
     """Write what the nodes hold of the sums over the network: the weight, to 1, and n~, to N; with
     running sums also what is on its way to them.
     """
     for h in range(len(arrays.degree)):
         for k in range(2):
-            value = load(room.lanes, arrays.mass, b, h, k)
+            value = load(scratch.lanes, arrays.mass, b, h, k)
             if arrays.running:
                 # Offered to each of the neighbours, less what was heard of theirs.
                 for m in range(links.first[h], links.first[h + 1]):
-                    offered = load(room.lanes, arrays.offered, b, links.sender[m], k)
-                    value += offered - load(room.lanes, arrays.heard, b, m, k)
-            store(room.lanes, samples.conserved, b, h, k, value)
+                    offered = load(scratch.lanes, arrays.offered, b, links.sender[m], k)
+                    value += offered - load(scratch.lanes, arrays.heard, b, m, k)
+            store(scratch.lanes, samples.conserved, b, h, k, value)
 
 
 @kernel
@@ -221,7 +221,7 @@ def exchange_mass(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
     b: int,
     s: int,
 ) -> None:
@@ -229,42 +229,55 @@ def exchange_mass(
     H, slot = len(arrays.degree), plan.first + s
     # All shares before any mass changes: everyone sends what it had at the start of the exchange.
     for h in range(H):
-        split_mass(room.lanes, arrays.mass, b, h, arrays.degree[h], arrays.share)
+        split_mass(scratch.lanes, arrays.mass, b, h, arrays.degree[h], arrays.share)
     if arrays.running:
-        add_to_totals(arrays, room, b)
+        add_to_totals(arrays, scratch, b)
     if arrays.rule == PAPER:  # nodes that have stopped send no mass
         # The same as a link that is down, so that receivers keep the mass conserved.
         for m in range(len(links.sender)):
-            for q in range(len(room.lanes)):
+            for q in range(len(scratch.lanes)):
                 if samples.stopped[b, links.sender[m], q] < slot:
                     plan.up[b, s, 0, links.way[m], q] = 0
     for h in range(H):
-        for q in range(len(room.lanes)):
+        for q in range(len(scratch.lanes)):
             arrays.silent[q] = samples.stopped[b, h, q] < slot
         if arrays.running:
-            hear_totals(arrays, plan, links, room, b, s, h)
+            hear_totals(arrays, plan, links, scratch, b, s, h)
             # Without a stop rule nobody asks how many shares came.
-            learn(arrays, samples, room, b, h, spread(room.lanes, 0.0), slot)
+            learn(arrays, samples, scratch, b, h, spread(scratch.lanes, 0.0), slot)
         else:
-            received = mix_mass(arrays, plan, links, room, b, s, h)
-            learn(arrays, samples, room, b, h, received, slot)
+            received = mix_mass(arrays, plan, links, scratch, b, s, h)
+            learn(arrays, samples, scratch, b, h, received, slot)
 
 
 @kernel
-def add_to_totals(arrays: PushSumArrays, room: SlotRoom, b: int) -> None:
+def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
     """Add the share of each node to the total that it has offered to each of its neighbours."""
     for h in range(len(arrays.degree)):
         for i in range(arrays.mass.shape[2]):
-            total = load(room.lanes, arrays.offered, b, h, i)
-            store(room.lanes, arrays.offered, b, h, i, total + load(room.lanes, arrays.share, h, i))
+            total = load(scratch.lanes, arrays.offered, b, h, i)
+            store(
+                scratch.lanes,
+                arrays.offered,
+                b,
+                h,
+                i,
+                total + load(scratch.lanes, arrays.share, h, i),
+            )
 
 
 @kernel
 def hear_totals(
-    arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, room: SlotRoom, b: int, s: int, h: int
+    arrays: PushSumArrays,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    b: int,
+    s: int,
+    h: int,
 ) -> None:
     """Make the mass of node ``h`` what has grown of the totals that arrive, and its own share."""
-    lanes, mass = room.lanes, arrays.mass
+    lanes, mass = scratch.lanes, arrays.mass
     for i in range(mass.shape[2]):
         store(lanes, mass, b, h, i, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
@@ -285,13 +298,13 @@ def mix_mass(
     arrays: PushSumArrays,
     plan: SlotPlan,
     links: SlotLinks,
-    room: SlotRoom,
+    scratch: SlotScratch,
     b: int,
     s: int,
     h: int,
 ) -> Any:
     """Take the mass that node ``h`` keeps and receives, P (3)-(5); return how many shares came."""
-    lanes, mass, received = room.lanes, arrays.mass, spread(room.lanes, 0.0)
+    lanes, mass, received = scratch.lanes, arrays.mass, spread(scratch.lanes, 0.0)
     # The mass before is kept for the stop rule.
     for i in range(mass.shape[2]):
         store(lanes, arrays.before, i, load(lanes, mass, b, h, i))
@@ -322,7 +335,7 @@ def mix_mass(
 def learn(
     arrays: PushSumArrays,
     samples: SlotSamples,
-    room: SlotRoom,
+    scratch: SlotScratch,
     b: int,
     h: int,
     received: Any,
@@ -331,13 +344,13 @@ def learn(
     """Apply P (6) to the mass of node ``h``, which ``received`` so many shares; note where it
     stops.
     """
-    lanes, found = room.lanes, arrays.found
+    lanes, found = scratch.lanes, arrays.found
     learn_network(lanes, arrays.mass, b, h, arrays.alone, found, arrays.found_number)
     # The stop rule compares with the former G and N, so they are replaced only afterwards.
     if arrays.rule != NEVER:
-        store(lanes, room.row, 0, received)
+        store(lanes, scratch.row, 0, received)
         for q in range(len(lanes)):
-            whole = room.row[0, q] == arrays.degree[h]
+            whole = scratch.row[0, q] == arrays.degree[h]
             if arrays.silent[q] == 0 and stops(arrays, b, h, q, whole):
                 samples.stopped[b, h, q] = slot
     # A node that stopped before learns no more.
@@ -372,38 +385,43 @@ def stops(arrays: PushSumArrays, b: int, h: int, q: int, whole: bool) -> bool:
 def correct(
     nodes: SlotNodes,
     readings: ReadingBlock,
-    room: SlotRoom,
+    scratch: SlotScratch,
     arrays: PushSumArrays,
     b: int,
     s: int,
     h: int,
 ) -> None:
     """Step 4 after the prediction, P (7) and (8); with asymptotic gains step 3 too."""
-    n, lanes = nodes.xhat.shape[2], room.lanes
+    n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:
         # Asymptotic gains: xhat <- F xhat, and P_inf for the root.
-        predict_mean(nodes, room, b, h)
+        predict_mean(nodes, scratch, b, h)
         for i in range(n):
             for j in range(i + 1):
                 store(lanes, nodes.root, b, h, i, j, arrays.limit[i, j])
     else:
         # P (7), from the prediction's root and what the node knows of the network.
-        correct_root(nodes.root, b, h, arrays.information, room.moved, room)
+        correct_root(nodes.root, b, h, arrays.information, scratch.moved, scratch)
     if nodes.rows[h] > 0:
         # P (8): N^(i) times the gain of the node's own reading.
         number = load(lanes, arrays.number, b, h)
         add_gain(
             lanes, nodes.xhat, nodes.root, b, h, number, readings.y, s, readings.H, nodes.rows[h],
-            room.row, room.gains,
+            scratch.row, scratch.gains,
         )  # fmt: skip
 
 
 @kernel
 def add_gain_to_one(
-    x: FloatArray, root: FloatArray, number: float, y: FloatArray, H: FloatArray, room: FloatArray
+    x: FloatArray,
+    root: FloatArray,
+    number: float,
+    y: FloatArray,
+    H: FloatArray,
+    scratch: FloatArray,
 ) -> None:
     """Apply ``add_gain`` to one filter with one lane: x (1, 1, n, 1), y (1, 1, 1, p, 1)."""
-    add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], room[0], room[1])
+    add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], scratch[0], scratch[1])
 
 
 @kernel
@@ -428,10 +446,10 @@ def learn_one(
 
 @kernel
 def correct_one(
-    root: FloatArray, information: FloatArray, rest: FloatArray, room: SlotRoom
+    root: FloatArray, information: FloatArray, rest: FloatArray, scratch: SlotScratch
 ) -> None:
     """Apply ``correct_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
-    correct_root(root, 0, 0, information, rest, room)
+    correct_root(root, 0, 0, information, rest, scratch)
 
 
 @built_in("push-sum")
@@ -805,7 +823,7 @@ def correct_one_root(root: FloatArray, information: FloatArray) -> FloatArray:
     """
     n = len(root)
     result, known = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
-    correct_one(result, known, np.empty((n, n, 1)), slot_room(1, n, ONE))
+    correct_one(result, known, np.empty((n, n, 1)), slot_scratch(1, n, ONE))
     return np.asarray(result.reshape(n, n))
 
 

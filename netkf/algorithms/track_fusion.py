@@ -25,8 +25,8 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
     SlotSamples,
+    SlotScratch,
     predict_all,
     read_all,
     rebase,
@@ -66,7 +66,7 @@ def fusion_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotRoom,
+    room: SlotScratch,
     arrays: FusionArrays,
 ) -> None:
     """Carry filters that fuse pairs of estimates through the slots of a plan."""
@@ -90,7 +90,7 @@ def fuse_heard(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,
-    room: SlotRoom,
+    room: SlotScratch,
     arrays: FusionArrays,
     place: tuple[int, int, int, int],
 ) -> None:

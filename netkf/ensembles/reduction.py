@@ -91,7 +91,7 @@ class Sums(Struct):
     regular: np.ndarray
 
 
-class Room(Struct):
+class Scratch(Struct):
     """Scratch for S times and C = F (2 u + 1) columns of L runs, with some memory behind.
 
     ``lines`` (L, S F n n) as they are in a batch; in lanes ``error`` (S F n, L), ``P``
@@ -128,7 +128,7 @@ class Room(Struct):
     times: int
 
 
-def reduction_room(filters: int, n: int, largest: int) -> Room:
+def reduction_scratch(filters: int, n: int, largest: int) -> Scratch:
     """Return scratch for so many filters of n states, in pieces of at most so many runs."""
     columns = filters * (n * (n + 1) + 1)
     times = max(1, TOGETHER // columns)
@@ -140,7 +140,7 @@ def reduction_room(filters: int, n: int, largest: int) -> Room:
     def in_lanes(numbers: int) -> FloatArray:
         return np.asarray(aligned((wide * numbers + LANES, LANES)))
 
-    return Room(
+    return Scratch(
         lines=np.empty((LANES, wide * filters * n * n + LANES)),
         error=in_lanes(filters * n),
         P=in_lanes(filters * n * n),
@@ -167,22 +167,25 @@ def reduction_room(filters: int, n: int, largest: int) -> Room:
     )
 
 
-class _Rooms(threading.local):
+class _ScratchCache(threading.local):
     """The scratch of each thread for the batch before, which the next one may use again."""
 
     def __init__(self) -> None:
-        self._sizes, self._room = (0, 0, 0), reduction_room(1, 1, 1)
+        self._sizes, self._scratch = (0, 0, 0), reduction_scratch(1, 1, 1)
 
-    def of(self, filters: int, n: int, largest: int) -> Room:
-        """Return scratch as ``reduction_room`` makes it, with anything in it."""
+    def of(self, filters: int, n: int, largest: int) -> Scratch:
+        """Return scratch as ``reduction_scratch`` makes it, with anything in it."""
         if filters * n * n > MAX_SCRATCH_ENTRIES:
-            return reduction_room(filters, n, largest)
+            return reduction_scratch(filters, n, largest)
         if self._sizes[:2] != (filters, n) or self._sizes[2] < largest:
-            self._sizes, self._room = (filters, n, largest), reduction_room(filters, n, largest)
-        return self._room
+            self._sizes, self._scratch = (
+                (filters, n, largest),
+                reduction_scratch(filters, n, largest),
+            )
+        return self._scratch
 
 
-_rooms = _Rooms()
+_scratch_cache = _ScratchCache()
 
 
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
@@ -201,13 +204,13 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
         regular=np.ones(runs, dtype=np.bool_),
     )
     given = _batch_arrays(batch)
-    room = _rooms.of(filters, n, most)
-    reduce_runs(MANY, given, bounds, sums, room)
+    scratch = _scratch_cache.of(filters, n, most)
+    reduce_runs(MANY, given, bounds, sums, scratch)
     if not sums.regular.all():
         # Some P is exactly singular: those that are singular up to rounding are left out as well.
         given.given, given.known = _nees_of_irregular(given, sums.regular), ~sums.regular
         sums.averages[:], sums.rounding_from[:] = 0.0, np.inf
-        reduce_runs(MANY, given, bounds, sums, room)
+        reduce_runs(MANY, given, bounds, sums, scratch)
     samples = [Moments(*found) for found in zip(sums.size, sums.mean, sums.M2, strict=True)]
     return Reduced(samples, sums.averages, sums.rounding_from)
 
@@ -244,28 +247,28 @@ def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
 
 
 @kernel
-def reduce_runs(lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, room: Room) -> None:
+def reduce_runs(lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: Scratch) -> None:
     """Find the sums of R runs, of which piece k holds ``bounds[k]`` to ``bounds[k + 1]``."""
     for k in range(len(bounds) - 1):
         # Some times in all runs of a piece: what is found is merged before the next.
-        for t in range(0, len(b.times), room.times):
-            count, depth = min(room.times, len(b.times) - t), 0
+        for t in range(0, len(b.times), scratch.times):
+            count, depth = min(scratch.times, len(b.times) - t), 0
             for first in range(bounds[k], bounds[k + 1], len(lanes)):
                 active = min(len(lanes), bounds[k + 1] - first)
-                whole = reduce_group(lanes, b, sums, room, first, active, t, count)
-                add_node(lanes, room, active, count, depth, whole)
+                whole = reduce_group(lanes, b, sums, scratch, first, active, t, count)
+                add_node(lanes, scratch, active, count, depth, whole)
                 depth += 1
                 # A binary counter: as many nodes are complete as the number ends in ones.
                 number = (first - bounds[k]) // len(lanes)
                 while number & 1 == 1:
-                    depth = join_nodes(room, depth, count)
+                    depth = join_nodes(scratch, depth, count)
                     number >>= 1
             # Those at the end that have no neighbour join from right to left.
             while depth > 1:
-                depth = join_nodes(room, depth, count)
-            mean, M2, mean_of, M2_of = room.mean, room.M2, sums.mean, sums.M2
+                depth = join_nodes(scratch, depth, count)
+            mean, M2, mean_of, M2_of = scratch.mean, scratch.M2, sums.mean, sums.M2
             for s in range(count):
-                sums.size[k, t + s] = room.node_size[0, s]
+                sums.size[k, t + s] = scratch.node_size[0, s]
                 for c in range(mean.shape[2]):
                     mean_of[k, t + s, c], M2_of[k, t + s, c] = mean[0, s, c], M2[0, s, c]
     for r in range(len(b.kept)):
@@ -273,34 +276,39 @@ def reduce_runs(lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, room: Ro
 
 
 @kernel
-def join_nodes(room: Room, depth: int, count: int) -> int:
+def join_nodes(scratch: Scratch, depth: int, count: int) -> int:
     """Merge the last two of the nodes that wait; return how many there are then."""
     for s in range(count):
-        merge_pair(room.node_size, room.mean, room.M2, depth - 2, depth - 1, s, s)
+        merge_pair(scratch.node_size, scratch.mean, scratch.M2, depth - 2, depth - 1, s, s)
     return depth - 1
 
 
 @kernel
-def add_node(lanes: Lanes, room: Room, active: int, count: int, node: int, whole: bool) -> None:
+def add_node(
+    lanes: Lanes, scratch: Scratch, active: int, count: int, node: int, whole: bool
+) -> None:
     """Merge the ``active`` rows of a group of runs in the tree over them, as a new node. They are
     ``whole`` if none lacks a sample.
     """
     if whole and active == len(lanes):
-        merge_whole(lanes, room, count, node)
+        merge_whole(lanes, scratch, count, node)
         return
     for s in range(count):
-        merge_row(room.size[:active], room.rows[:active], room.work[:active], s)
-        room.node_size[node, s] = room.size[0, s]
-        for c in range(room.mean.shape[2]):
-            room.mean[node, s, c], room.M2[node, s, c] = room.rows[0, s, c], room.work[0, 0, c]
+        merge_row(scratch.size[:active], scratch.rows[:active], scratch.work[:active], s)
+        scratch.node_size[node, s] = scratch.size[0, s]
+        for c in range(scratch.mean.shape[2]):
+            scratch.mean[node, s, c], scratch.M2[node, s, c] = (
+                scratch.rows[0, s, c],
+                scratch.work[0, 0, c],
+            )
 
 
 @kernel
-def merge_whole(lanes: Lanes, room: Room, count: int, node: int) -> None:
+def merge_whole(lanes: Lanes, scratch: Scratch, count: int, node: int) -> None:
     """Merge L rows as ``merge_row`` does, where all sizes are equal, L columns at a time."""
-    rows, work, mean_of, M2_of = room.rows, room.work, room.mean, room.M2
+    rows, work, mean_of, M2_of = scratch.rows, scratch.work, scratch.mean, scratch.M2
     for s in range(count):
-        room.node_size[node, s] = 1.0 * len(lanes)
+        scratch.node_size[node, s] = 1.0 * len(lanes)
     for c in range(0, count * rows.shape[2], len(lanes)):
         stride = 1
         while stride < len(lanes):
@@ -345,7 +353,7 @@ def reduce_group(
     lanes: Lanes,
     b: Batch,
     sums: Sums,
-    room: Room,
+    scratch: Scratch,
     first: int,
     active: int,
     t: int,
@@ -355,41 +363,45 @@ def reduce_group(
     on, and add them to the averages; return True if no run lacks one of them.
     """
     filters, n = b.error.shape[2:]
-    each, whole, kept, totals, averages = filters * n, True, b.kept, room.totals, sums.averages
-    take_lines(lanes, b.error_rows, first, active, t * each, count * each, room.lines, room.error)
-    take_lines(lanes, b.P_rows, first, active, t * each * n, count * each * n, room.lines, room.P)
+    each, whole, kept, totals, averages = filters * n, True, b.kept, scratch.totals, sums.averages
+    take_lines(
+        lanes, b.error_rows, first, active, t * each, count * each, scratch.lines, scratch.error
+    )
+    take_lines(
+        lanes, b.P_rows, first, active, t * each * n, count * each * n, scratch.lines, scratch.P
+    )
     if not b.exact:
-        take_lines(lanes, b.x_rows, first, active, t * n, count * n, room.lines, room.x)
+        take_lines(lanes, b.x_rows, first, active, t * n, count * n, scratch.lines, scratch.x)
     for q in range(active):
         whole = whole and t + count <= kept[first + q]
         for f in range(filters):
             for a in range(3):
                 totals[f, a, q] = averages[first + q, f, a]
     for s in range(count):
-        find_blur(lanes, b, sums, room, first, active, t + s, s)
-        choose_counted(b, sums, room, first, active, t + s)
+        find_blur(lanes, b, sums, scratch, first, active, t + s, s)
+        choose_counted(b, sums, scratch, first, active, t + s)
         for f in range(filters):
-            reduce_sample(lanes, b, sums, room, first, active, t + s, s, f)
-    for c in range(0, count * room.rows.shape[2], len(lanes)):
-        scatter(lanes, room.columns, c, room.rows, room.places, len(lanes))
+            reduce_sample(lanes, b, sums, scratch, first, active, t + s, s, f)
+    for c in range(0, count * scratch.rows.shape[2], len(lanes)):
+        scatter(lanes, scratch.columns, c, scratch.rows, scratch.places, len(lanes))
     for q in range(active):
         for f in range(filters):
             for a in range(3):
                 averages[first + q, f, a] = totals[f, a, q]
     if not whole or active < len(lanes):
-        mark_missing(b, room, first, active, t, count)
+        mark_missing(b, scratch, first, active, t, count)
     return whole
 
 
 @kernel
-def mark_missing(b: Batch, room: Room, first: int, active: int, t: int, count: int) -> None:
+def mark_missing(b: Batch, scratch: Scratch, first: int, active: int, t: int, count: int) -> None:
     """Give samples that a run has size 1, and those that it lacks size 0 and zeros."""
     for q in range(active):
         for s in range(count):
             exists = t + s < b.kept[first + q]
-            room.size[q, s] = 1.0 if exists else 0.0
-            for c in range(0 if exists else room.rows.shape[2]):
-                room.rows[q, s, c] = 0.0
+            scratch.size[q, s] = 1.0 if exists else 0.0
+            for c in range(0 if exists else scratch.rows.shape[2]):
+                scratch.rows[q, s, c] = 0.0
 
 
 @kernel(inlined=True)
@@ -397,7 +409,7 @@ def reduce_sample(
     lanes: Lanes,
     b: Batch,
     sums: Sums,
-    room: Room,
+    scratch: Scratch,
     first: int,
     active: int,
     t: int,
@@ -408,8 +420,14 @@ def reduce_sample(
     averages.
     """
     # Taken from the struct once, and not in each step of the loops.
-    errors_of, P, columns, factor, z = room.error, room.P, room.columns, room.factor, room.z
-    n, filters = len(z), len(room.totals)
+    errors_of, P, columns, factor, z = (
+        scratch.error,
+        scratch.P,
+        scratch.columns,
+        scratch.factor,
+        scratch.z,
+    )
+    n, filters = len(z), len(scratch.totals)
     half, place, place_P = n * (n + 1) // 2, (s * filters + f) * n, (s * filters + f) * n * n
     column = (s * filters + f) * (2 * half + 1)
     last, square, trace = column + 2 * half, spread(lanes, 0.0), spread(lanes, 0.0)
@@ -424,17 +442,17 @@ def reduce_sample(
             store(lanes, columns, column, entry)
             store(lanes, columns, half + column, e * load(lanes, errors_of, place + j))
             column += 1
-    if any_lane(nees_of_lanes(lanes, room)):
+    if any_lane(nees_of_lanes(lanes, scratch)):
         # Singular or broken: alone, with a choice of pivots.
         for q in range(active):
-            if room.broken[q] > 0.0 and t < b.kept[first + q]:
-                nees_alone(b, sums, room, first + q, t, f, q)
-    nees = load(lanes, room.nees, 0)
+            if scratch.broken[q] > 0.0 and t < b.kept[first + q]:
+                nees_alone(b, sums, scratch, first + q, t, f, q)
+    nees = load(lanes, scratch.nees, 0)
     store(lanes, columns, last, nees)
-    clear, traced = load(lanes, room.clear, 0) > 0.0, load(lanes, room.traced, 0) > 0.0
-    add_total(lanes, room.totals, f, 0, select(clear, square, 0.0))
-    add_total(lanes, room.totals, f, 1, select(traced, trace, 0.0))
-    add_total(lanes, room.totals, f, 2, select(clear, nees, 0.0))
+    clear, traced = load(lanes, scratch.clear, 0) > 0.0, load(lanes, scratch.traced, 0) > 0.0
+    add_total(lanes, scratch.totals, f, 0, select(clear, square, 0.0))
+    add_total(lanes, scratch.totals, f, 1, select(traced, trace, 0.0))
+    add_total(lanes, scratch.totals, f, 2, select(clear, nees, 0.0))
 
 
 @kernel(inlined=True)
@@ -444,21 +462,21 @@ def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> 
 
 
 @kernel
-def nees_alone(b: Batch, sums: Sums, room: Room, r: int, t: int, f: int, q: int) -> None:
+def nees_alone(b: Batch, sums: Sums, scratch: Scratch, r: int, t: int, f: int, q: int) -> None:
     """Write NEES of one sample into lane ``q``, and note where its P is singular."""
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
-    if not fill_nees(error, P, room.alone, room.one, room.solved):
+    if not fill_nees(error, P, scratch.alone, scratch.one, scratch.solved):
         sums.regular[r] = False
-    room.nees[q] = b.given[r, t, f] if b.known[r] else room.alone[0]
+    scratch.nees[q] = b.given[r, t, f] if b.known[r] else scratch.alone[0]
 
 
 @kernel
-def choose_counted(b: Batch, sums: Sums, room: Room, first: int, active: int, t: int) -> None:
+def choose_counted(b: Batch, sums: Sums, scratch: Scratch, first: int, active: int, t: int) -> None:
     """Note in which runs sample ``t`` counts in the averages, by the rule of
     ``runs.summary.averaged_samples``: in those of errors (``clear``), in that of P (``traced``).
     """
     kept, diverged, times, start = b.kept, b.diverged, b.times, b.start
-    blurred_from, clears, traces = sums.rounding_from, room.clear, room.traced
+    blurred_from, clears, traces = sums.rounding_from, scratch.clear, scratch.traced
     for q in range(active):
         r, from_here = first + q, blurred_from[first + q]
         begin = start if start < kept[r] else 0  # no sample after time 0: all there are
@@ -485,12 +503,12 @@ def divide_averages(b: Batch, sums: Sums, r: int) -> None:
 
 
 @kernel(inlined=True)
-def nees_of_lanes(lanes: Lanes, room: Room) -> Any:
+def nees_of_lanes(lanes: Lanes, scratch: Scratch) -> Any:
     """Write ``e' P^-1 e`` of L errors, and which P are not positive definite, or nan; return flags
     of the latter.
     """
     # P = L D L', and e' P^-1 e = z' D^-1 z with L z = e; P becomes L, and the error z.
-    rest, error = room.factor, room.z
+    rest, error = scratch.factor, scratch.z
     n, total, broken = len(error), spread(lanes, 0.0), spread(lanes, 0.0)
     for k in range(n):
         pivot, z = load(lanes, rest, k, k), load(lanes, error, k)
@@ -503,20 +521,20 @@ def nees_of_lanes(lanes: Lanes, room: Room) -> Any:
                 entry = load(lanes, rest, i, j) - factor * load(lanes, rest, j, k)
                 store(lanes, rest, i, j, entry)
             store(lanes, error, i, load(lanes, error, i) - factor * z)
-    store(lanes, room.nees, 0, total)
-    store(lanes, room.broken, 0, broken)
+    store(lanes, scratch.nees, 0, total)
+    store(lanes, scratch.broken, 0, broken)
     return broken > 0.0
 
 
 @kernel(inlined=True)
 def find_blur(
-    lanes: Lanes, b: Batch, sums: Sums, room: Room, first: int, active: int, t: int, s: int
+    lanes: Lanes, b: Batch, sums: Sums, scratch: Scratch, first: int, active: int, t: int, s: int
 ) -> None:
     """Note the time of sample ``t``, the ``s``-th of a group, in the runs where it is blurred."""
     # Squares tell without a root where it is surely not. A nan is no number here: what is blurred
     # is not decided by it either.
     filters, n = b.error.shape[2:]
-    errors_of, P = room.error, room.P
+    errors_of, P = scratch.error, scratch.P
     largest, least = spread(lanes, 0.0), spread(lanes, np.inf)
     for f in range(s * filters, (s + 1) * filters):
         for i in range(n):
@@ -526,7 +544,7 @@ def find_blur(
                 size = magnitude(load(lanes, errors_of, f * n + i))
                 largest = select(size > largest, size, largest)
     for place in range(0 if b.exact else s * n, 0 if b.exact else (s + 1) * n):
-        size = magnitude(load(lanes, room.x, place))
+        size = magnitude(load(lanes, scratch.x, place))
         largest = select(size > largest, size, largest)
     bound = ROUNDING * BLUR * largest
     clear = (least < np.inf) & (bound * bound < 0.5 * least)

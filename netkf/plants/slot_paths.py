@@ -56,19 +56,19 @@ def draw_starts(
     ziggurat: NormalZiggurat,
     mean: FloatArray,
     root: FloatArray,
-    room: FloatArray,
+    scratch: FloatArray,
     x: FloatArray,
 ) -> None:
     """Fill x (B, n, L) with ``mean + root z`` for the first normals z (q,) of each of the streams
-    ``states`` (R, >= 4); ``room`` (q, L) is scratch.
+    ``states`` (R, >= 4); ``scratch`` (q, L) is scratch.
     """
     for b in range(len(x)):
         first, count = b * len(lanes), root.shape[1]
-        draw_normals(lanes, states, first, 1, len(states) - first, ziggurat, room, count)
+        draw_normals(lanes, states, first, 1, len(states) - first, ziggurat, scratch, count)
         for i in range(len(mean)):
             total = spread(lanes, mean[i])
             for j in range(count):
-                total += root[i, j] * load(lanes, room, j)
+                total += root[i, j] * load(lanes, scratch, j)
             store(lanes, x, b, i, total)
 
 
@@ -129,20 +129,27 @@ def draw_paths(
     states: np.ndarray,
     ziggurat: NormalZiggurat,
     slot: int,
-    room: FloatArray,
+    scratch: FloatArray,
     local: FloatArray,
     absolute: FloatArray,
 ) -> None:
     """Fill ``local`` and, with frames, ``absolute`` (B, S, n, L) from ``slot`` on with the next
-    numbers of the streams ``states`` (R, >= 4); ``room`` (2, max(n, q), L) is scratch.
+    numbers of the streams ``states`` (R, >= 4); ``scratch`` (2, max(n, q), L) is scratch.
     """
     for b in range(local.shape[0]):
         first = b * len(lanes)
         for s in range(local.shape[1]):
             draw_normals(
-                lanes, states, first, 1, len(states) - first, ziggurat, room[0], path.root.shape[1]
+                lanes,
+                states,
+                first,
+                1,
+                len(states) - first,
+                ziggurat,
+                scratch[0],
+                path.root.shape[1],
             )
-            move_path(lanes, path, b, s, slot + s, room[0], local, absolute, room[1])
+            move_path(lanes, path, b, s, slot + s, scratch[0], local, absolute, scratch[1])
 
 
 class SlotSensors(NamedTuple):
@@ -170,13 +177,13 @@ def draw_readings(
     ziggurat: NormalZiggurat,
     x: FloatArray,
     regressors: FloatArray,
-    room: FloatArray,
+    scratch: FloatArray,
     y: FloatArray,
     H: FloatArray,
 ) -> None:
     """Fill the readings y (B, S, hosts, p, L), and H (B, S, hosts, p, n, L) where it is random,
     from the states x (B, S, n, L) and ``regressors`` (D, B, S, k, L), with the next numbers of the
-    streams ``states`` (R M, >= 4); ``room`` (p, L) is scratch.
+    streams ``states`` (R M, >= 4); ``scratch`` (p, L) is scratch.
     """
     count = len(sensors.host)
     for b in range(x.shape[0] if count > 0 else 0):
@@ -185,9 +192,11 @@ def draw_readings(
             for m in range(count):
                 # All normals of a sensor's reading before its rows, in the order that a single run
                 # takes them.
-                draw_normals(lanes, states, first + m, count, runs, ziggurat, room, sensors.rows[m])
+                draw_normals(
+                    lanes, states, first + m, count, runs, ziggurat, scratch, sensors.rows[m]
+                )
                 for i in range(sensors.rows[m]):
-                    read_row(lanes, sensors, b, s, m, i, x, regressors, room, y, H)
+                    read_row(lanes, sensors, b, s, m, i, x, regressors, scratch, y, H)
 
 
 @kernel(inlined=True)

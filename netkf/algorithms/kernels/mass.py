@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from netkf.algorithms.kernels.slots import SlotLinks, SlotRoom, rotate_lanes
+from netkf.algorithms.kernels.slots import SlotLinks, SlotScratch, rotate_lanes
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, any_lane, load, load_flags, root_of, select, spread, store
@@ -77,14 +77,19 @@ def learn_network(
 
 @kernel(inlined=True)
 def correct_root(
-    root: FloatArray, b: int, h: int, information: FloatArray, rest: FloatArray, room: SlotRoom
+    root: FloatArray,
+    b: int,
+    h: int,
+    information: FloatArray,
+    rest: FloatArray,
+    scratch: SlotScratch,
 ) -> None:
     """Make the root of a filter that of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the
     information G of its place in ``information`` (B, H, n, n, L); ``rest`` (n, n, L) is scratch.
     """
     # G = sum v v' by Cholesky with the largest pivot first, and each v' is a row that is observed
     # with noise of variance 1: nothing is inverted, and P may be singular.
-    lanes, n, v = room.lanes, root.shape[2], room.moved_mean
+    lanes, n, v = scratch.lanes, root.shape[2], scratch.moved_mean
     largest = spread(lanes, 0.0)
     # The whole diagonal gives the scale of G, against which a later pivot counts as rounding.
     for i in range(n):
@@ -106,10 +111,10 @@ def correct_root(
             total = spread(lanes, 0.0)
             for i in range(j, n):
                 total += load(lanes, v, i) * load(lanes, root, b, h, i, j)
-            store(lanes, room.row, j, total)
+            store(lanes, scratch.row, j, total)
         # P <- P - P v v' P / (1 + v' P v) on the root. The state is not corrected here: P (8) does
         # that.
-        rotate_lanes(lanes, root, b, h, room.row, room.gains)
+        rotate_lanes(lanes, root, b, h, scratch.row, scratch.gains)
         # Deflate, rest -= v v'.
         for i in range(n):
             for j in range(n):

@@ -13,7 +13,7 @@ from netkf.algorithms.kernels.slots import (
     SlotLinks,
     SlotNodes,
     SlotPlan,
-    SlotRoom,
+    SlotScratch,
     use_reading,
     write_root_column,
 )
@@ -105,7 +105,7 @@ def fuse_readings(
     readings: ReadingBlock,
     plan: SlotPlan,
     links: SlotLinks,
-    room: SlotRoom,
+    scratch: SlotScratch,
     share: bool,
     b: int,
     s: int,
@@ -114,24 +114,24 @@ def fuse_readings(
     """Update filter ``h`` of a block with its own reading and, where they ``share`` them, those
     that arrive in the first step of the slot.
     """
-    use_reading(nodes, readings, room, b, s, h, h, True)
+    use_reading(nodes, readings, scratch, b, s, h, h, True)
     if not share:
         return
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(room.lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.way[m])
         if any_lane(arrived):
-            use_reading(nodes, readings, room, b, s, h, links.sender[m], arrived)
+            use_reading(nodes, readings, scratch, b, s, h, links.sender[m], arrived)
 
 
 @kernel
-def copy_pairs(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
-    """Copy the pairs (xhat, root) of all filters of a block, which they send, to ``room``."""
+def copy_pairs(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
+    """Copy the pairs (xhat, root) of all filters of a block, which they send, to ``scratch``."""
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
-            store(room.lanes, room.xhat, h, i, load(room.lanes, nodes.xhat, b, h, i))
+            store(scratch.lanes, scratch.xhat, h, i, load(scratch.lanes, nodes.xhat, b, h, i))
             for j in range(i + 1):
-                entry = load(room.lanes, nodes.root, b, h, i, j)
-                store(room.lanes, room.root, h, i, j, entry)
+                entry = load(scratch.lanes, nodes.root, b, h, i, j)
+                store(scratch.lanes, scratch.root, h, i, j, entry)
 
 
 @kernel
@@ -139,16 +139,16 @@ def combine_convex_roots(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,
-    room: SlotRoom,
+    scratch: SlotScratch,
     b: int,
     s: int,
     h: int,
 ) -> None:
     """Reset filter ``h`` of a block to the convex combination of its pair (xhat, P) and those that
-    it hears, H (7) and (9), from the copies of all pairs in ``room``; the weight of what does not
-    arrive stays with its own.
+    it hears, H (7) and (9), from the copies of all pairs in ``scratch``; the weight of what does
+    not arrive stays with its own.
     """
-    lanes, n = room.lanes, nodes.xhat.shape[2]
+    lanes, n = scratch.lanes, nodes.xhat.shape[2]
     heard = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
@@ -157,7 +157,7 @@ def combine_convex_roots(
     size = root_of(select(own > 0.0, own, 0.0))
     for i in range(n):
         for j in range(i + 1):
-            store(lanes, nodes.root, b, h, i, j, size * load(lanes, room.root, h, i, j))
+            store(lanes, nodes.root, b, h, i, j, size * load(lanes, scratch.root, h, i, j))
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
         if not any_lane(arrived):
@@ -167,11 +167,11 @@ def combine_convex_roots(
         # [S, sqrt(w) S_j] is reflected into one triangle.
         for i in range(n):
             for j in range(n):
-                store(lanes, room.moved, i, j, 0.0)
+                store(lanes, scratch.moved, i, j, 0.0)
             for j in range(i + 1):
-                store(lanes, room.moved, i, j, load(lanes, nodes.root, b, h, i, j))
-                store(lanes, room.noise, i, j, size * load(lanes, room.root, sender, i, j))
-            gap = load(lanes, room.xhat, sender, i) - load(lanes, room.xhat, h, i)
+                store(lanes, scratch.moved, i, j, load(lanes, nodes.root, b, h, i, j))
+                store(lanes, scratch.noise, i, j, size * load(lanes, scratch.root, sender, i, j))
+            gap = load(lanes, scratch.xhat, sender, i) - load(lanes, scratch.xhat, h, i)
             store(lanes, nodes.xhat, b, h, i, load(lanes, nodes.xhat, b, h, i) + weight * gap)
         for i in range(n):
-            write_root_column(lanes, nodes.root, b, h, i, room.moved, room.noise)
+            write_root_column(lanes, nodes.root, b, h, i, scratch.moved, scratch.noise)

@@ -3,7 +3,7 @@
 A filter's kernel (``Filter.slot_kernel``) carries H filters through S slots of R runs in one call.
 It is given :class:`SlotNodes` (the state), :class:`ReadingBlock` and :class:`SlotPlan` (what was
 drawn for these slots), :class:`SlotLinks` (who hears whom), :class:`SlotSamples` (what it fills in)
-and :class:`SlotRoom` (scratch), and works in place.
+and :class:`SlotScratch` (scratch), and works in place.
 
 Runs are side by side in blocks of L lanes (``netkf.linalg.lanes``): what belongs to filter ``h`` of
 run ``b L + q`` is ``[b, ..., h, ..., q]``, and kernels compute all lanes of a filter at once. Where
@@ -111,7 +111,7 @@ class SlotSamples(NamedTuple):
     total: FloatArray
 
 
-class SlotRoom(NamedTuple):
+class SlotScratch(NamedTuple):
     """The ``lanes`` and scratch: ``row``, ``gains`` and ``moved_mean`` (n, L) of a reading and a
     mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened`` and ``total``
     (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n, n, L). Of a
@@ -135,7 +135,7 @@ class SlotRoom(NamedTuple):
     places: np.ndarray
 
 
-def slot_room(H: int, n: int, lanes: Lanes = MANY) -> SlotRoom:
+def slot_scratch(H: int, n: int, lanes: Lanes = MANY) -> SlotScratch:
     """Return scratch for H filters of n states."""
     L = len(lanes)
     shapes: list[tuple[int, ...]] = [*[(n, L)] * 3, *[(n, n, L)] * 2, *[(n, n + 1, L)] * 2]
@@ -143,7 +143,7 @@ def slot_room(H: int, n: int, lanes: Lanes = MANY) -> SlotRoom:
     # L entries are moved at a time, which goes beyond the last one.
     shapes += [(H * n + L, L), (H * n + L, L), (H * n * n + L, L)]
     scratch: list[Any] = [aligned(shape) for shape in shapes]
-    return SlotRoom._make([lanes, *scratch, np.zeros(L, dtype=np.int64)])
+    return SlotScratch._make([lanes, *scratch, np.zeros(L, dtype=np.int64)])
 
 
 def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -155,10 +155,10 @@ def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatAr
 
 @kernel
 def show(
-    nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, room: SlotRoom, b: int, s: int
+    nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, scratch: SlotScratch, b: int, s: int
 ) -> None:
     """Fill in the samples of a block in slot ``s``, where it is one."""
-    k, lanes = plan.sample[s], room.lanes
+    k, lanes = plan.sample[s], scratch.lanes
     if k < 0:
         return
     n, first = nodes.xhat.shape[2], b * len(lanes)
@@ -168,10 +168,10 @@ def show(
             x = load(lanes, nodes.xhat, b, h, i)
             # In the coordinates of the estimates: a difference of large states loses digits.
             local = load(lanes, samples.local, b, s, i)
-            store(lanes, room.shown_error, h * n + i, local - x)
+            store(lanes, scratch.shown_error, h * n + i, local - x)
             if samples.framed:
                 x += load(lanes, samples.absolute, b, s, i) - local
-            store(lanes, room.shown_xhat, h * n + i, x)
+            store(lanes, scratch.shown_xhat, h * n + i, x)
             sum_of_all += x
             # P = S S', lower triangle and its mirror image, because samples hold covariances.
             for j in range(i + 1):
@@ -180,19 +180,19 @@ def show(
                     total += load(lanes, nodes.root, b, h, i, m) * load(
                         lanes, nodes.root, b, h, j, m
                     )
-                store(lanes, room.shown_P, (h * n + i) * n + j, total)
-                store(lanes, room.shown_P, (h * n + j) * n + i, total)
+                store(lanes, scratch.shown_P, (h * n + i) * n + j, total)
+                store(lanes, scratch.shown_P, (h * n + j) * n + i, total)
                 sum_of_all += total
     store(lanes, samples.total, b, sum_of_all)
     for q in range(len(lanes)):
         # Idle lanes are not shown.
         shown = first + q < len(samples.x)
-        room.places[q] = first + q if shown else -1
+        scratch.places[q] = first + q if shown else -1
         for i in range(n if shown else 0):
             samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
-    hand_out(lanes, room.shown_xhat, samples.xhat[:, k], room.places)
-    hand_out(lanes, room.shown_error, samples.error[:, k], room.places)
-    hand_out(lanes, room.shown_P, samples.P[:, k], room.places)
+    hand_out(lanes, scratch.shown_xhat, samples.xhat[:, k], scratch.places)
+    hand_out(lanes, scratch.shown_error, samples.error[:, k], scratch.places)
+    hand_out(lanes, scratch.shown_P, samples.P[:, k], scratch.places)
 
 
 @kernel
@@ -204,29 +204,31 @@ def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, places: np.nd
 
 
 @kernel
-def rebase(nodes: SlotNodes, readings: ReadingBlock, room: SlotRoom, b: int, s: int) -> None:
+def rebase(nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: int, s: int) -> None:
     """Count estimates from the state of slot ``s``, where a frame of coordinates begins."""
     # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
         for h in range(len(nodes.rows)):
             for i in range(nodes.xhat.shape[2]):
-                x = load(room.lanes, nodes.xhat, b, h, i)
-                origin = load(room.lanes, readings.local, b, s, i)
-                store(room.lanes, nodes.xhat, b, h, i, x - origin)
+                x = load(scratch.lanes, nodes.xhat, b, h, i)
+                origin = load(scratch.lanes, readings.local, b, s, i)
+                store(scratch.lanes, nodes.xhat, b, h, i, x - origin)
 
 
 @kernel
-def read_all(nodes: SlotNodes, readings: ReadingBlock, room: SlotRoom, b: int, s: int) -> None:
+def read_all(
+    nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: int, s: int
+) -> None:
     """Update all filters of a block with their own readings of slot ``s``."""
     for h in range(len(nodes.rows)):
-        use_reading(nodes, readings, room, b, s, h, h, True)
+        use_reading(nodes, readings, scratch, b, s, h, h, True)
 
 
 @kernel(inlined=True)
 def use_reading(
     nodes: SlotNodes,
     readings: ReadingBlock,
-    room: SlotRoom,
+    scratch: SlotScratch,
     b: int,
     s: int,
     h: int,
@@ -236,7 +238,7 @@ def use_reading(
     """Update filter ``h`` of a block with the reading of filter ``sender`` in slot ``s``, in the
     lanes where it has ``arrived``.
     """
-    lanes, row, gains, n = room.lanes, room.row, room.gains, nodes.xhat.shape[2]
+    lanes, row, gains, n = scratch.lanes, scratch.row, scratch.gains, nodes.xhat.shape[2]
     # H that is fixed has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(nodes.rows[sender]):
@@ -289,25 +291,27 @@ def rotate_lanes(
 
 
 @kernel
-def predict_all(nodes: SlotNodes, room: SlotRoom, b: int) -> None:
+def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
     """Move all filters of a block to the next slot: ``F xhat`` and ``F P F' + Q``."""
     for h in range(len(nodes.rows)):
-        predict_mean(nodes, room, b, h)
-        predict_root(room.lanes, nodes.root, b, h, nodes.F, nodes.root_Q, room.moved, room.noise)
+        predict_mean(nodes, scratch, b, h)
+        predict_root(
+            scratch.lanes, nodes.root, b, h, nodes.F, nodes.root_Q, scratch.moved, scratch.noise
+        )
 
 
 @kernel(inlined=True)
-def predict_mean(nodes: SlotNodes, room: SlotRoom, b: int, h: int) -> None:
+def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
     """Move the estimate of a filter to the next slot, ``F xhat``."""
-    lanes, n = room.lanes, nodes.xhat.shape[2]
+    lanes, n = scratch.lanes, nodes.xhat.shape[2]
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(n):
             total += nodes.F[i, j] * load(lanes, nodes.xhat, b, h, j)
-        store(lanes, room.moved_mean, i, total)
+        store(lanes, scratch.moved_mean, i, total)
     # F xhat needs all of the old xhat, hence the copy.
     for i in range(n):
-        store(lanes, nodes.xhat, b, h, i, load(lanes, room.moved_mean, i))
+        store(lanes, nodes.xhat, b, h, i, load(lanes, scratch.moved_mean, i))
 
 
 @kernel(inlined=True)

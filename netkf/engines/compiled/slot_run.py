@@ -20,7 +20,7 @@ from netkf.algorithms.kernels.slots import (
     SlotNodes,
     SlotPlan,
     SlotSamples,
-    slot_room,
+    slot_scratch,
 )
 from netkf.engines.base import Progress
 from netkf.engines.compiled.samples import recorded
@@ -100,7 +100,7 @@ class SlotRuns:
             setup.root_Q,
             setup.rows,
         )
-        self._room = slot_room(setup.hosts, setup.n)
+        self._room = slot_scratch(setup.hosts, setup.n)
         self._extra = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
         # No slot reaches it: a node that never stops.
         self._stopped = np.full((blocks, setup.hosts, LANES), NEVER)
