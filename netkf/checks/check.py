@@ -46,6 +46,7 @@ from netkf.core.fields import integer, number
 from netkf.core.shown import Shown
 from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
+from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
 from netkf.runs.simulate import LOAD, choose_engine, simulate
 from netkf.scenario.registry import kind_name
@@ -313,9 +314,7 @@ def check(
             count - len(found),
             root,
             first=len(found),
-            workers=workers,
-            executor=executor,
-            scheduler=scheduler,
+            pool=PoolOptions(workers, executor, scheduler),
             progress=progress,
         )
         verdict = _look_again(chosen, verdict, found, root, sure, bool(until))

@@ -106,8 +106,11 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
-    from netkf.ensembles.directory import runs_to_directory
+    from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+    from netkf.ensembles.pools import PoolOptions
 
+    pool = PoolOptions(options.workers, None, options.scheduler)
+    how = EnsembleOptions(options.engine, options.trace or "first", options.resume, pool)
     draw = None
     if not options.no_plot:
         draw = partial(pictures.draw_picture, pictures.ENSEMBLE, scenario)
@@ -119,11 +122,7 @@ def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
             scenario,
             options.runs,
             options.out,
-            options.engine,
-            options.trace or "first",
-            workers=options.workers,
-            scheduler=options.scheduler,
-            resume=options.resume,
+            how,
             progress=line.counter("runs"),
             finish=draw,
             note=_print_note,

@@ -46,9 +46,10 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from netkf.ensembles.pools import PoolOptions
     from netkf.runs.directory_lock import only_writer
     from netkf.studies.parameter_grid import parse_grid
-    from netkf.studies.sweep import sweep_to_directory
+    from netkf.studies.sweep import plan_sweep, sweep_to_directory
 
     grid, scenario = parse_grid(options.vary), load_scenario(options)
     draw = partial(pictures.draw_picture, pictures.SWEEP, scenario.name)
@@ -56,13 +57,9 @@ def _run(options: argparse.Namespace) -> int:
     try:
         with only_writer(options.out), ProgressLine() as line:
             sweep_to_directory(
-                scenario,
-                grid,
-                options.runs,
+                plan_sweep(scenario, grid, options.runs, engine=options.engine),
                 options.out,
-                options.engine,
-                options.workers,
-                options.scheduler,
+                PoolOptions(options.workers, None, options.scheduler),
                 progress=line.counter("points"),
                 finish=None if options.no_plot else draw,
                 take=completed.append,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +12,8 @@ from typing import Any
 from netkf.core.fields import choice, integer
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
-from netkf.ensembles.pools import Pool, block_size, make_pool
-from netkf.ensembles.replicas import Progress, replicate_blocks
+from netkf.ensembles.pools import ANYWHERE, Pool, PoolOptions, block_size, make_pool
+from netkf.ensembles.replicas import NumberedBlocks, Progress, replicate_blocks
 from netkf.ensembles.resume import ensemble_to_resume
 from netkf.ensembles.statistics import RunStatistics, block_statistics, merge
 from netkf.ensembles.summary import summarise_ensemble
@@ -53,39 +52,51 @@ class FinishedEnsemble:
     seconds: float
 
 
+@dataclass(frozen=True)
+class EnsembleOptions:
+    """How the runs of a directory are simulated: by which ``engine`` and ``pool``, whether those of
+    all runs, of the first or of none leave a ``trace`` (of TRACES), and whether to ``resume`` what
+    was stopped.
+    """
+
+    engine: str = "auto"
+    trace: str = "first"
+    resume: bool = False
+    pool: PoolOptions = ANYWHERE
+
+
+DEFAULTS = EnsembleOptions()
+
+
 def runs_to_directory(
     scenario: Scenario,
     runs: int,
     out: Path | None = None,
-    engine: str = "auto",
-    trace: str = "first",
+    options: EnsembleOptions = DEFAULTS,
     *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    scheduler: str | None = None,
-    resume: bool = False,
     progress: Progress | None = None,
     finish: Callable[[FinishedEnsemble], None] | None = None,
     note: Callable[[str], None] | None = None,
 ) -> FinishedEnsemble | None:
     """Simulate replicas 0 .. runs - 1 and write scenario.toml, manifest.json, ensemble.parquet,
-    summary.json and, for all runs (``trace`` full), the first or none, events and states.
+    summary.json and the events and states of the runs that leave a trace; return None where all was
+    done before.
 
-    Blocks of runs are kept in the directory as they are done; with ``resume`` those that ``out``
-    has are not done again, and the files come out the same to the last bit; None where all was
-    done before. Blocks that are not of this run or damaged are done again, and ``note`` is called
-    with a line that says so. ``finish`` adds what else belongs to the directory, before the
-    manifest says that it is complete. Raises ScenarioError and EngineError before anything is
-    written, WriteError, InterruptedRunError (a KeyboardInterrupt) when interrupted, and EngineError
-    where a plugged-in class fails.
+    Blocks of runs are kept in the directory as they are done; on resuming those that ``out`` has
+    are not done again, and the files come out the same to the last bit. Blocks that are not of this
+    run or damaged are done again, and ``note`` is called with a line that says so. ``finish`` adds
+    what else belongs to the directory, before the manifest says that it is complete. Raises
+    ScenarioError and EngineError before anything is written, WriteError, InterruptedRunError (a
+    KeyboardInterrupt) when interrupted, and EngineError where a plugged-in class fails.
     """
     began = time.perf_counter()
-    runs, trace = integer(low=1)("runs", runs), choice(*TRACES)("trace", trace)
-    engine_used = choose_engine(engine, scenario, announce=False)
+    runs = integer(low=1)("runs", runs)
+    choice(*TRACES)("trace", options.trace)
+    engine_used = choose_engine(options.engine, scenario, announce=False)
     check_sources(scenario)
-    pool = make_pool(runs, workers, executor, scheduler)
+    pool = make_pool(runs, options.pool)
     try:
-        keeper = _begin(scenario, runs, out, resume, trace, engine_used.name, pool.width)
+        keeper = _begin(scenario, runs, out, options, engine_used.name, pool.width)
         if keeper is None:
             return None
         try:
@@ -113,17 +124,16 @@ def _begin(
     scenario: Scenario,
     runs: int,
     out: Path | None,
-    resume: bool,
-    trace: str,
+    options: EnsembleOptions,
     engine: str,
     width: int,
 ) -> _Keeper | None:
     """Return the keeper of a new directory or of one to go on in, None if all is done there."""
     size = block_size(runs, width)
-    size = min(size, MAX_TRACED_BLOCK) if trace == "full" else size
+    size = min(size, MAX_TRACED_BLOCK) if options.trace == "full" else size
     digest, seed = scenario_digest(scenario), scenario.seed
-    plan = RunIdentity(digest, seed, runs, trace, engine, installation(), size)
-    begun = ensemble_to_resume(out, scenario, plan) if resume else None
+    plan = RunIdentity(digest, seed, runs, options.trace, engine, installation(), size)
+    begun = ensemble_to_resume(out, scenario, plan) if options.resume else None
     directory = new_directory(out, scenario.name) if begun is None else begun.directory
     if begun is not None:
         if begun.finished:
@@ -185,16 +195,10 @@ class _Keeper:
         self, task: Callable[..., RunStatistics], pool: Pool, progress: Progress | None
     ) -> RunStatistics:
         """Return the statistics of all runs; those of kept blocks are read."""
+        known = {number: partial(self.blocks.load, number) for number in self._known}
+        blocks = NumberedBlocks(self.plan.block, known, self.save_block)
         whole: RunStatistics = replicate_blocks(
-            task,
-            merge,
-            self.scenario,
-            self.plan.runs,
-            pool=pool,
-            progress=progress,
-            block=self.plan.block,
-            known={number: partial(self.blocks.load, number) for number in self._known},
-            received=self.save_block,
+            task, merge, self.scenario, self.plan.runs, pool=pool, progress=progress, blocks=blocks
         )
         return whole
 

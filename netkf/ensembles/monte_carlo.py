@@ -12,6 +12,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer
 from netkf.core.shown import Shown
+from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate_blocks
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
 from netkf.linalg.arrays import FloatArray
@@ -130,9 +131,7 @@ def monte_carlo(
         scenario,
         count,
         seed,
-        workers=workers,
-        executor=executor,
-        scheduler=scheduler,
+        pool=PoolOptions(workers, executor, scheduler),
         progress=progress,
         together=chosen.together(scenario),
     )

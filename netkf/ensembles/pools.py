@@ -7,6 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from dataclasses import dataclass
 from typing import Any
 
 from netkf.core.errors import EngineError, ScenarioError
@@ -66,7 +67,7 @@ class Pool(ABC):
         """Give back what is ours; ``at_once`` without waiting for blocks that are being done."""
 
 
-class Here(Pool):
+class LocalPool(Pool):
     """The present process, one block at a time, with the scenario and the caches that it has."""
 
     ahead = 1
@@ -96,7 +97,7 @@ class Here(Pool):
             self._size = min(2 * job.size, MAX_BLOCK_HERE)
 
 
-class Adaptive(Here):
+class AdaptivePool(LocalPool):
     """The present process, until the rest of the work is worth processes of our own, which do it.
 
     In an ``open_ended`` pool, which serves one job after another, as much work is expected to come
@@ -106,7 +107,7 @@ class Adaptive(Here):
     def __init__(self, workers: int, open_ended: bool = False) -> None:
         super().__init__()
         self.width, self._open_ended = workers, open_ended
-        self._processes: Processes | None = None
+        self._processes: ProcessPool | None = None
         self._scenario: object = None
         self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
 
@@ -116,7 +117,7 @@ class Adaptive(Here):
             self._scenario, self._size = job.scenario, 1
             self._begun, self._seconds, self._runs = False, 0.0, 0
         if self._processes is None and self._worth_processes(job):
-            self._processes = Processes(self.width)
+            self._processes = ProcessPool(self.width)
             self.ahead = AHEAD
         if self._processes is not None:
             return self._processes.submit(job)
@@ -156,7 +157,7 @@ class Adaptive(Here):
             self._processes.close(at_once)
 
 
-class Elsewhere(Pool):
+class RemotePool(Pool):
     """A pool outside this process: scenarios are packed, each once."""
 
     def __init__(self) -> None:
@@ -178,7 +179,7 @@ class Elsewhere(Pool):
         """Hand out a block that can travel."""
 
 
-class Given(Elsewhere):
+class ExecutorPool(RemotePool):
     """An executor of the user's, which stays open."""
 
     def __init__(self, executor: Executor) -> None:
@@ -190,7 +191,7 @@ class Given(Elsewhere):
         return self._executor.submit(work, job)
 
 
-class Cluster(Elsewhere):
+class DaskPool(RemotePool):
     """The workers of a Dask scheduler, which does the blocks of lost workers again.
 
     Raises ScenarioError for an address where no scheduler answers.
@@ -260,7 +261,7 @@ def _unreachable(address: str, reason: str) -> ScenarioError:
     return ScenarioError("scheduler", f"cannot be reached ({reason})", address, remedy)
 
 
-class Processes(Elsewhere):
+class ProcessPool(RemotePool):
     """Worker processes of our own, each with one BLAS thread and without the user's script."""
 
     def __init__(self, workers: int) -> None:
@@ -296,18 +297,27 @@ def block_size(runs: int, width: int) -> int:
     return size
 
 
-def make_pool(
-    blocks: int,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    scheduler: str | None = None,
-    open_ended: bool = False,
-) -> Pool:
-    """Return the pool that was asked for; by default this process, and as many processes of our own
-    as there are cores once they are worth it. ``open_ended``: more jobs follow.
+@dataclass(frozen=True)
+class PoolOptions:
+    """Where replicas are simulated: on so many ``workers`` (processes; 1 is this one), by an
+    ``executor`` of concurrent.futures or by the Dask ``scheduler`` at an address, of which one may
+    be given; by default here, and on as many processes as there are cores once they are worth it.
+    """
+
+    workers: int | None = None
+    executor: Executor | None = None
+    scheduler: str | None = None
+
+
+ANYWHERE = PoolOptions()
+
+
+def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = False) -> Pool:
+    """Return the pool that was asked for, for so many blocks. ``open_ended``: more jobs follow.
 
     Raises ScenarioError where two were asked for, or where one is of the wrong kind.
     """
+    workers, executor, scheduler = options.workers, options.executor, options.scheduler
     asked = {"workers": workers, "executor": executor, "scheduler": scheduler}
     given = [name for name, value in asked.items() if value is not None]
     if len(given) > 1:
@@ -319,11 +329,11 @@ def make_pool(
             raise ScenarioError(
                 "executor", "must be a concurrent.futures.Executor", executor, remedy
             )
-        return Given(executor)
+        return ExecutorPool(executor)
     if scheduler is not None:
-        return Cluster(scheduler)
+        return DaskPool(scheduler)
     count = cores() if workers is None else integer(low=1)("workers", workers)
     count = min(count, blocks)
     if count == 1:
-        return Here()
-    return Adaptive(count, open_ended) if workers is None else Processes(count)
+        return LocalPool()
+    return AdaptivePool(count, open_ended) if workers is None else ProcessPool(count)

@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, Future
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.ensembles.blocks import BlockTask, Job, Task, each_replica
 from netkf.ensembles.merge_tree import Merge, MergeTree
-from netkf.ensembles.pools import Pool, make_pool
+from netkf.ensembles.pools import ANYWHERE, Pool, PoolOptions, make_pool
 from netkf.linalg.lanes import LANES
 from netkf.scenario.scenario import Scenario
 
 Progress = Callable[[int, int], None]
 """Called with the runs done and wanted."""
+
+
+class NumberedBlocks(NamedTuple):
+    """Blocks of ``size`` replicas, a power of two, numbered from 0. Those that are ``known`` are
+    not done again but called for; ``received(number, result)`` sees each of the others when it
+    comes and returns what to merge.
+    """
+
+    size: int
+    known: Mapping[int, Callable[[], Any]]
+    received: Callable[[int, Any], Any]
 
 
 def replicate(
@@ -38,16 +49,11 @@ def replicate_blocks(
     runs: int,
     seed: int | None = None,
     *,
-    workers: int | None = None,
-    executor: Executor | None = None,
-    scheduler: str | None = None,
-    pool: Pool | None = None,
+    pool: Pool | PoolOptions = ANYWHERE,
     progress: Progress | None = None,
     first: int = 0,
-    block: int | None = None,
     together: int | None = None,
-    known: Mapping[int, Callable[[], Any]] | None = None,
-    received: Callable[[int, Any], Any] | None = None,
+    blocks: NumberedBlocks | None = None,
 ) -> Any:
     """Return ``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first +
     runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
@@ -58,16 +64,12 @@ def replicate_blocks(
     ``task`` and ``merge`` are functions of a module, or partials of such, that workers can import;
     what they return must pickle.
 
-    By default the work is done in this process, and what would still take seconds by as many
-    processes as there are cores; else by so many ``workers`` (1 is this process), by any
-    ``executor`` of concurrent.futures, or by the Dask ``scheduler`` at an address; a ``pool`` of
-    make_pool stands for all of them, and is closed at the end. ``seed`` defaults to the scenario's.
+    The work is done by a ``pool`` of make_pool, or by one that the options describe; it is closed
+    at the end. ``seed`` defaults to the scenario's.
 
     ``together`` replicas, a power of two, are one block at least where blocks are done here; by
-    default several of a scenario in slots, where runs are side by side. ``block`` is the number of
-    replicas handed out together, a power of two; by default the pool chooses. With ``block``,
-    blocks are numbered from 0; those that are ``known`` are not done again but called for, and
-    ``received(number, result)`` sees each of the others when it comes and returns what to merge.
+    default several of a scenario in slots, where runs are side by side. The pool chooses how many
+    replicas are a block, unless ``blocks`` are numbered.
 
     Raises ScenarioError for arguments that are wrong, EngineError where workers die again and again
     or a plugged-in class fails, and what ``task`` raises.
@@ -76,14 +78,13 @@ def replicate_blocks(
         raise ScenarioError("", "must be a netkf.Scenario", scenario, "netkf.load(path) gives one")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     runs, first = integer(low=1)("runs", runs), integer(low=0)("first", first)
-    if pool is None:
-        pool = make_pool(-(-runs // (block or 1)), workers, executor, scheduler)
+    blocks = blocks or CHOSEN_BY_POOL
+    if isinstance(pool, PoolOptions):
+        pool = make_pool(-(-runs // (blocks.size or 1)), pool)
     ended = False
     try:
-        job = Job(scenario, task, seed, first, 0, runs, block or 0)
-        whole = _gather(
-            pool, job, together, merge, known or {}, received or _as_it_came, progress or _quiet
-        )
+        job = Job(scenario, task, seed, first, 0, runs, blocks.size)
+        whole = _gather(pool, job, together, merge, blocks, progress or _quiet)
         ended = True
     finally:
         pool.close(at_once=not ended)
@@ -99,6 +100,9 @@ def _as_it_came(number: int, result: Any) -> Any:  # noqa: ARG001
     return result
 
 
+CHOSEN_BY_POOL = NumberedBlocks(0, {}, _as_it_came)
+
+
 def _quiet(done: int, wanted: int) -> None:
     """Report no progress."""
 
@@ -108,12 +112,11 @@ def _gather(
     job: Job,
     together: int | None,
     merge: Merge,
-    known: Mapping[int, Callable[[], Any]],
-    received: Callable[[int, Any], Any],
+    blocks: NumberedBlocks,
     progress: Progress,
 ) -> Any:
     """Hand out the blocks that are not known, and merge all as they come."""
-    tree, done = MergeTree(merge), 0
+    tree, done, known = MergeTree(merge), 0, blocks.known
 
     def take(block: Job, result: Any) -> None:
         nonlocal done
@@ -124,7 +127,7 @@ def _gather(
     for number in sorted(known):
         take(job._replace(start=number * job.size), known[number]())
     for block, result in _complete_blocks(pool, _blocks(pool, job, together, known)):
-        take(block, received(block.start // block.size, result))
+        take(block, blocks.received(block.start // block.size, result))
     return tree.result()
 
 

@@ -16,7 +16,7 @@ from netkf.core.errors import EngineError, ScenarioError, nearest
 from netkf.core.fields import integer, number
 from netkf.core.printable import one_line, shorten
 from netkf.core.shown import Shown
-from netkf.ensembles.pools import Pool
+from netkf.ensembles.pools import Pool, PoolOptions
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failures
@@ -37,7 +37,7 @@ from netkf.studies.filter_values import (
     estimate_quantities,
     join_values,
 )
-from netkf.studies.pools import PoolOptions, shared_pool
+from netkf.studies.pools import shared_pool
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,6 +23,7 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
 from netkf.core.shown import Shown
 from netkf.engines.base import Engine
+from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.rng.streams import Streams
@@ -296,15 +297,8 @@ def consistency(
     count = integer(low=MIN_RUNS)("runs", runs)
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     task = partial(run_consistency, engine=choose_engine(engine, scenario))
-    found = replicate(
-        task,
-        _without_horizon(scenario),
-        count,
-        seed,
-        workers=workers,
-        executor=executor,
-        scheduler=scheduler,
-    )
+    pool = PoolOptions(workers, executor, scheduler)
+    found = replicate(task, _without_horizon(scenario), count, seed, pool=pool)
     return judge_consistency(scenario, found, confidence)
 
 

@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from netkf.ensembles.blocks import Job
-from netkf.ensembles.pools import Pool, make_pool
-
-
-@dataclass(frozen=True)
-class PoolOptions:
-    """Where to run replicas, with the arguments of ``netkf.monte_carlo``."""
-
-    workers: int | None = None
-    executor: Executor | None = None
-    scheduler: str | None = None
+from netkf.ensembles.pools import Pool, PoolOptions, make_pool
 
 
 class _OpenPool(Pool):
@@ -48,7 +38,7 @@ class _OpenPool(Pool):
 @contextmanager
 def shared_pool(runs: int, options: PoolOptions) -> Iterator[Pool]:
     """Yield a pool for several scenarios of ``runs`` runs each; it is closed at the end."""
-    pool = make_pool(runs, options.workers, options.executor, options.scheduler, open_ended=True)
+    pool = make_pool(runs, options, open_ended=True)
     done = False
     try:
         yield _OpenPool(pool)

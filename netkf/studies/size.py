@@ -11,6 +11,7 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import choice, integer, number
 from netkf.engines.base import Engine
 from netkf.ensembles.blocks import BlockTask, each_replica
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
@@ -20,7 +21,7 @@ from netkf.studies.metrics import (
     join_metrics,
 )
 from netkf.studies.parameter_grid import is_integer_key
-from netkf.studies.pools import PoolOptions, shared_pool
+from netkf.studies.pools import shared_pool
 from netkf.studies.search import (
     FIRST_BATCH,
     FIRST_EXPECTED,

@@ -15,6 +15,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer
+from netkf.ensembles.pools import ANYWHERE, PoolOptions
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.documents import write_sealed
 from netkf.runs.failures import InterruptedRunError, explain_failures
@@ -40,7 +41,7 @@ from netkf.studies.metrics import (
     worst_node,
 )
 from netkf.studies.parameter_grid import GridPoint, check_grid, expand_grid, table_value
-from netkf.studies.pools import PoolOptions, shared_pool
+from netkf.studies.pools import shared_pool
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,23 +76,31 @@ def sweep(
     """
     import pandas as pd
 
-    plan = _make_plan(scenario, vary, runs, seed, engine)
+    plan = plan_sweep(scenario, vary, runs, seed, engine)
     rows = _simulate_points(plan, PoolOptions(workers, executor, scheduler), progress)
     return pd.DataFrame(rows)
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """The points of a sweep, the runs at each of them and the engine."""
+class SweepPlan:
+    """The ``base`` of a sweep, the keys that ``vary`` with their values, the points that follow,
+    the runs at each of them and the engine.
+    """
 
+    base: Scenario
+    vary: Mapping[str, Sequence[Any]]
     points: list[GridPoint]
     runs: int
     engine: str
 
 
-def _make_plan(
-    scenario: Scenario, vary: Mapping[str, Sequence[Any]], runs: int, seed: int | None, engine: str
-) -> _Plan:
+def plan_sweep(
+    scenario: Scenario,
+    vary: Mapping[str, Sequence[Any]],
+    runs: int = 1,
+    seed: int | None = None,
+    engine: str = "auto",
+) -> SweepPlan:
     """Return a plan whose points can all be run; raises ScenarioError or EngineError."""
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "sweep takes a netkf.Scenario", scenario, LOAD)
@@ -100,10 +109,12 @@ def _make_plan(
     points = expand_grid(base, vary)
     for point in points:
         choose_engine(engine, point.scenario)
-    return _Plan(points, runs, engine)
+    return SweepPlan(base, vary, points, runs, engine)
 
 
-def _simulate_points(plan: _Plan, options: PoolOptions, progress: Progress | None) -> Iterator[Row]:
+def _simulate_points(
+    plan: SweepPlan, options: PoolOptions, progress: Progress | None
+) -> Iterator[Row]:
     """Yield the row of each point as it is done."""
     with shared_pool(plan.runs, options) as pool:
         for k, point in enumerate(plan.points):
@@ -161,13 +172,10 @@ class CompletedSweep:
 
 
 def sweep_to_directory(
-    scenario: Scenario,
-    vary: Mapping[str, Sequence[Any]],
-    runs: int = 1,
+    plan: SweepPlan,
     out: Path | None = None,
-    engine: str = "auto",
-    workers: int | None = None,
-    scheduler: str | None = None,
+    pool: PoolOptions = ANYWHERE,
+    *,
     progress: Progress | None = None,
     finish: Callable[[CompletedSweep], None] | None = None,
     take: Callable[[CompletedSweep], None] | None = None,
@@ -176,20 +184,20 @@ def sweep_to_directory(
 
     ``take`` is given a complete sweep before its files are written, which may fail; ``finish`` adds
     its files to the directory before the manifest says that the sweep is complete. A sweep that is
-    interrupted keeps the rows that it had. Raises ScenarioError before anything runs,
-    InterruptedRunError when interrupted.
+    interrupted keeps the rows that it had. Raises ScenarioError and WriteError before anything
+    runs, InterruptedRunError when interrupted.
     """
     import pandas as pd
 
-    plan, began = _make_plan(scenario, vary, runs, None, engine), time.perf_counter()
-    check_sources(scenario)
-    directory = new_directory(out, f"{scenario.name}-sweep")
-    write_scenario(directory, scenario)
+    began = time.perf_counter()
+    check_sources(plan.base)
+    directory = new_directory(out, f"{plan.base.name}-sweep")
+    write_scenario(directory, plan.base)
     rows: list[Row] = []
     status = "interrupted"
-    _write_manifest(directory, scenario, vary, plan, 0, status)
+    _write_manifest(directory, plan, 0, status)
     try:
-        for row in _simulate_points(plan, PoolOptions(workers, None, scheduler), progress):
+        for row in _simulate_points(plan, pool, progress):
             rows.append(row)  # noqa: PERF402 - an interrupted sweep keeps its rows
         status = "complete"
     except KeyboardInterrupt:
@@ -199,13 +207,13 @@ def sweep_to_directory(
         raise
     finally:
         seconds = time.perf_counter() - began
-        completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(vary), seconds)
+        completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(plan.vary), seconds)
         if status == "complete" and take is not None:
             take(completed)
         _write_rows(completed)
         if status == "complete" and finish is not None:
             finish(completed)
-        _write_manifest(directory, scenario, vary, plan, len(rows), status)
+        _write_manifest(directory, plan, len(rows), status)
     return completed
 
 
@@ -218,20 +226,13 @@ def _write_rows(completed: CompletedSweep) -> None:
         write_text(directory / "sweep.csv", table.to_csv(index=False))
 
 
-def _write_manifest(
-    directory: Path,
-    scenario: Scenario,
-    vary: Mapping[str, Sequence[Any]],
-    plan: _Plan,
-    done: int,
-    status: str,
-) -> None:
+def _write_manifest(directory: Path, plan: SweepPlan, done: int, status: str) -> None:
     """Write manifest.json of a sweep with ``done`` points."""
     manifest = {
-        "name": scenario.name,
+        "name": plan.base.name,
         "versions": versions(),
-        "seed": scenario.seed,
-        "vary": check_grid(vary),
+        "seed": plan.base.seed,
+        "vary": check_grid(plan.vary),
         "runs": {"wanted": plan.runs * len(plan.points), "done": plan.runs * done},
         "status": status,
     }

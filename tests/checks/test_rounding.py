@@ -8,7 +8,8 @@ import pytest
 
 import netkf
 from netkf.algorithms.flow import FlowFilter
-from netkf.ensembles.directory import runs_to_directory
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs.run import run_to_directory
 from netkf.studies.compare import compare
 from netkf.trace.run import blurred_samples
@@ -113,7 +114,9 @@ def test_averages_leave_out_what_rounding_blurs(plugged, tmp_path):
 
 def test_comparisons_leave_out_what_rounding_blurs(plugged, tmp_path):
     for name in ("one", "two"):
-        runs_to_directory(plugged, 3, tmp_path / name, trace="full", workers=1)
+        runs_to_directory(
+            plugged, 3, tmp_path / name, EnsembleOptions(trace="full", pool=PoolOptions(1))
+        )
     found = compare([tmp_path / "one", tmp_path / "two"])
     rms = next(row for row in found.rows if row.quantity == "rms_error")
     assert rms.entries[0].value < 3.0

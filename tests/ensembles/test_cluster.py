@@ -13,7 +13,7 @@ import pytest
 import netkf
 from netkf.core.errors import EngineError
 from netkf.ensembles import pools
-from netkf.ensembles.pools import Cluster
+from netkf.ensembles.pools import DaskPool
 from tests.ensembles.test_ensembles import assert_same_bits
 
 pytest.importorskip("distributed")
@@ -120,7 +120,7 @@ def test_what_is_no_scheduler_is_told_in_one_line(ring, monkeypatch, listen, tre
     address, began = listen(treat), time.monotonic()
     before = threading.active_count()
     with pytest.raises(netkf.ScenarioError, match="no Dask scheduler answers there"):
-        Cluster(address)
+        DaskPool(address)
     assert time.monotonic() - began < 8.0
     others = {"silent", "closes", "is_a_web_server", "sends_noise"}
     mine = [one for one in threading.enumerate() if not any(o in one.name for o in others)]
@@ -132,7 +132,7 @@ def test_what_is_no_scheduler_is_told_in_one_line(ring, monkeypatch, listen, tre
 )
 def test_what_is_no_address_is_refused_at_once(ring, address):
     with pytest.raises(netkf.ScenarioError, match="must be an address") as error:
-        Cluster(address)
+        DaskPool(address)
     assert str(error.value).isprintable()
 
 

@@ -1,5 +1,6 @@
 """Ensembles: the same bits wherever and however the runs are done, and the right moments."""
 
+import dataclasses
 import itertools
 import json
 import os
@@ -18,9 +19,10 @@ import netkf
 from netkf.cli.main import main
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.ensembles import pools
-from netkf.ensembles.directory import runs_to_directory
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.merge_tree import MergeTree, aligned_pieces
 from netkf.ensembles.moments import merge_moments, moments_of
+from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
 from tests.conftest import SAVING, SCENARIOS
 
@@ -162,7 +164,9 @@ def replica_number(scenario, seed, replica):
 
 
 def test_results_that_are_not_merged_come_in_order(short):
-    found = replicate(replica_number, short, 9, seed=4, executor=Backwards(), first=5)
+    found = replicate(
+        replica_number, short, 9, seed=4, pool=PoolOptions(executor=Backwards()), first=5
+    )
     assert found == [(5 + k, 4, short.name) for k in range(9)]
 
 
@@ -192,13 +196,13 @@ def dies(scenario, seed, replica):
 
 def test_a_worker_that_dies_is_replaced_and_its_runs_are_done_once(short, tmp_path):
     scenario = short.replace({"claim": str(tmp_path / "mark")})
-    assert replicate(dies_once, scenario, 8, workers=2) == list(range(8))
+    assert replicate(dies_once, scenario, 8, pool=PoolOptions(2)) == list(range(8))
     assert (tmp_path / "mark").exists()
 
 
 def test_workers_that_die_again_and_again_end_in_one_line(short):
     with pytest.raises(netkf.EngineError, match="workers ended again and again"):
-        replicate(dies, short, 2, workers=2)
+        replicate(dies, short, 2, pool=PoolOptions(2))
 
 
 SCRIPT = """
@@ -228,7 +232,7 @@ def test_workers_know_no_pictures_and_have_one_blas_thread(short, tmp_path, monk
     monkeypatch.syspath_prepend(tmp_path)
     import facts_of_workers
 
-    found = replicate(facts_of_workers.facts, short, 2, workers=2)
+    found = replicate(facts_of_workers.facts, short, 2, pool=PoolOptions(2))
     assert found == [(False, False, "1")] * 2
 
 
@@ -322,17 +326,18 @@ def test_a_stopped_ensemble_goes_on_where_it_was(short, tmp_path, trace, capsys)
         if done >= 7:
             raise KeyboardInterrupt
 
-    runs = {"runs": 18, "trace": trace, "workers": 1}
-    runs_to_directory(short, out=tmp_path / "whole", **runs)
+    options = EnsembleOptions(trace=trace, pool=PoolOptions(1))
+    again = dataclasses.replace(options, resume=True)
+    runs_to_directory(short, 18, tmp_path / "whole", options)
     with pytest.raises(KeyboardInterrupt, match="go on with --resume"):
-        runs_to_directory(short, out=tmp_path / "cut", **runs, progress=stop)
+        runs_to_directory(short, 18, tmp_path / "cut", options, progress=stop)
     manifest = json.loads((tmp_path / "cut" / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"
     assert 7 <= manifest["runs"]["done"] < 18
-    done = runs_to_directory(short, out=tmp_path / "cut", **runs, resume=True)
+    done = runs_to_directory(short, 18, tmp_path / "cut", again)
     assert done.simulated == 18 - manifest["runs"]["done"]
     assert files(tmp_path / "cut") == files(tmp_path / "whole")
-    assert runs_to_directory(short, out=tmp_path / "cut", **runs, resume=True) is None
+    assert runs_to_directory(short, 18, tmp_path / "cut", again) is None
 
 
 def test_what_cannot_be_resumed_is_refused(tmp_path, capsys):
@@ -376,7 +381,7 @@ class NoProcesses:
 
 
 def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
-    monkeypatch.setattr(pools, "Processes", NoProcesses)
+    monkeypatch.setattr(pools, "ProcessPool", NoProcesses)
     monkeypatch.setattr(pools, "cores", lambda: 2)
     monkeypatch.setattr(pools, "SAVING", SAVING)
     short = ring.replace({"horizon": 2.0})
@@ -396,7 +401,7 @@ def test_bits_do_not_depend_on_when_processes_start(short, monkeypatch, done):
     alone, blocks = netkf.monte_carlo(short, 300, workers=1), []
     monkeypatch.setattr(pools, "cores", lambda: 2)
     monkeypatch.setattr(
-        pools.Adaptive, "_worth_processes", lambda *_: blocks.append(0) or len(blocks) > done
+        pools.AdaptivePool, "_worth_processes", lambda *_: blocks.append(0) or len(blocks) > done
     )
     assert_same_bits(netkf.monte_carlo(short, 300), alone)
     assert len(blocks) == done + 1

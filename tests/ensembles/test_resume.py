@@ -1,6 +1,7 @@
 """What is kept of a stopped ensemble is proved before it is used."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -17,14 +18,15 @@ from netkf.cli.main import main
 from netkf.core.errors import EngineError, ScenarioError, WriteError
 from netkf.ensembles import checkpoints
 from netkf.ensembles.checkpoints import BlockCheckpoints
-from netkf.ensembles.directory import runs_to_directory
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs import provenance
 from netkf.runs.documents import write_sealed
 from netkf.runs.files import write_scenario
 from netkf.runs.parquet_files import TraceTables
 from tests.conftest import SCENARIOS
 
-RUNS = {"runs": 12, "trace": "first", "workers": 1}
+RUNS, OPTIONS = 12, EnsembleOptions(pool=PoolOptions(1))
 RING = str(SCENARIOS / "poisson_ring.toml")
 
 
@@ -45,10 +47,10 @@ def made(tmp_path_factory):
         if done >= 6:
             raise KeyboardInterrupt
 
-    runs_to_directory(short(), out=folder / "whole", **RUNS)
+    runs_to_directory(short(), RUNS, folder / "whole", OPTIONS)
     for name, seed in (("cut", 1), ("other", 2)):
         with pytest.raises(KeyboardInterrupt):
-            runs_to_directory(short(seed), out=folder / name, **RUNS, progress=stop)
+            runs_to_directory(short(seed), RUNS, folder / name, OPTIONS, progress=stop)
     return folder
 
 
@@ -61,7 +63,11 @@ def resume(folder, scenario=None):
     """Go on; return the notes and the number of runs that were simulated."""
     notes = []
     done = runs_to_directory(
-        scenario or short(), out=folder, **RUNS, resume=True, note=notes.append
+        scenario or short(),
+        RUNS,
+        folder,
+        dataclasses.replace(OPTIONS, resume=True),
+        note=notes.append,
     )
     return notes, None if done is None else done.simulated
 
@@ -375,7 +381,7 @@ def test_contents_reach_the_disk_before_names(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", record("fsync", os.fsync))
     monkeypatch.setattr(os, "replace", record("replace", os.replace))
-    runs_to_directory(short(), out=tmp_path / "out", **RUNS)
+    runs_to_directory(short(), RUNS, tmp_path / "out", OPTIONS)
     renamed = {path for name, path in calls if name == "replace"}
     kept = {str(file) for file in (tmp_path / "out").iterdir()}
     assert kept <= renamed

@@ -12,7 +12,7 @@ import pytest
 
 import netkf
 from netkf.ensembles.blocks import Job
-from netkf.ensembles.pools import Processes
+from netkf.ensembles.pools import PoolOptions, ProcessPool
 from netkf.ensembles.replicas import replicate
 from tests.conftest import SCENARIOS
 
@@ -31,7 +31,7 @@ def dies_while_it_writes(scenario, seed, replicas):
 
 def test_a_worker_killed_while_it_writes_is_replaced(ring, tmp_path):
     mark = tmp_path / "mark"
-    pool = Processes(1)
+    pool = ProcessPool(1)
     future = pool.submit(
         Job(ring.replace({"claim": str(mark)}), dies_while_it_writes, 1, 0, 0, 1, 1)
     )
@@ -51,7 +51,7 @@ def test_workers_are_killed_at_once(ring):
     began = time.monotonic()
     threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
-        replicate(sleeps, ring, 2, workers=2)
+        replicate(sleeps, ring, 2, pool=PoolOptions(2))
     assert time.monotonic() - began < 10.0
 
 
@@ -74,7 +74,7 @@ def fails(scenario, seed, replica):
 )
 def test_what_a_task_raises_comes_with_its_traceback(ring, claim, kind):
     with pytest.raises(kind) as failed:
-        replicate(fails, ring.replace({"claim": claim}), 2, workers=2)
+        replicate(fails, ring.replace({"claim": claim}), 2, pool=PoolOptions(2))
     assert "in fails" in str(failed.value.__cause__)
 
 

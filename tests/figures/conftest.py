@@ -3,8 +3,9 @@
 import pytest
 
 import netkf
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs.run import run_to_directory
-from netkf.studies.sweep import sweep_to_directory
+from netkf.studies.sweep import plan_sweep, sweep_to_directory
 from tests.conftest import SCENARIOS
 
 RING = SCENARIOS / "poisson_ring.toml"
@@ -94,5 +95,5 @@ def sweeps(tmp_path_factory):
         "parts": {"filter": [{"kind": "local"}, {"kind": "central"}]},
     }
     for name, grid in grids.items():
-        sweep_to_directory(scenario, grid, 2, folder / name, workers=1)
+        sweep_to_directory(plan_sweep(scenario, grid, 2), folder / name, PoolOptions(1))
     return {name: netkf.open(folder / name) for name in grids}

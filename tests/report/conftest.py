@@ -3,10 +3,11 @@
 import pytest
 
 import netkf
-from netkf.ensembles.directory import runs_to_directory
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs.documents import write_sealed
 from netkf.runs.run import run_to_directory
-from netkf.studies.sweep import sweep_to_directory
+from netkf.studies.sweep import plan_sweep, sweep_to_directory
 from tests.conftest import SCENARIOS
 
 EVIL = "</script><script>window.pwned=1</script><img src=x onerror='window.pwned=1'>&lt;b&gt;"
@@ -67,7 +68,7 @@ def ensembles(folder):
         changes = {"horizon": 6.0, "network.activation.rate": rate}
         scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
         target = folder / f"rate{rate:g}"
-        runs_to_directory(scenario, 12, target, trace="full", workers=1)
+        runs_to_directory(scenario, 12, target, EnsembleOptions(trace="full", pool=PoolOptions(1)))
         found.append(target)
     return found
 
@@ -76,7 +77,7 @@ def ensembles(folder):
 def sweep(folder):
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 2.0})
     vary = {"network.activation.rate": [1.0, 3.0]}
-    return sweep_to_directory(scenario, vary, 3, folder / "sweep").directory
+    return sweep_to_directory(plan_sweep(scenario, vary, 3), folder / "sweep").directory
 
 
 def write_verdict(directory, promise):

@@ -15,7 +15,8 @@ import scipy.stats
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
-from netkf.ensembles.directory import runs_to_directory
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.pools import PoolOptions
 from netkf.figures.style import SEQUENTIAL
 from netkf.report import page as pages
 from netkf.report.claims import findings
@@ -457,7 +458,13 @@ def test_an_interrupted_ensemble_shows_the_runs_that_were_kept(tmp_path):
 
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 1.0})
     with pytest.raises(KeyboardInterrupt):
-        runs_to_directory(scenario, 400, tmp_path / "many", workers=1, progress=interrupt)
+        runs_to_directory(
+            scenario,
+            400,
+            tmp_path / "many",
+            EnsembleOptions(pool=PoolOptions(1)),
+            progress=interrupt,
+        )
     found = netkf.open(tmp_path / "many")
     errors = np.sqrt(found.average[:-1, 0])
     shown = Page(make_page([tmp_path / "many"])).shown

@@ -103,7 +103,8 @@ def prepare(folder: Path) -> dict[str, tuple[Path, list[str]]]:
 
 def stop_in_the_middle(out: Path) -> None:
     """Leave an ensemble with half of its blocks."""
-    from netkf.ensembles.directory import runs_to_directory
+    from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+    from netkf.ensembles.pools import PoolOptions
     from netkf.scenario.reading import load
 
     def stop(done: int, wanted: int) -> None:
@@ -111,7 +112,9 @@ def stop_in_the_middle(out: Path) -> None:
             raise KeyboardInterrupt
 
     scenario = load(RING, {"horizon": 1.0})
-    runs_to_directory(scenario, 6, out, trace="full", workers=1, progress=stop)
+    runs_to_directory(
+        scenario, 6, out, EnsembleOptions(trace="full", pool=PoolOptions(1)), progress=stop
+    )
 
 
 def damage(folder: Path, draw: random.Random) -> str:

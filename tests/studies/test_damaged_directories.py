@@ -10,7 +10,8 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.ensembles.directory import runs_to_directory
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.studies.compare import DIAGONAL, compare
 from netkf.trace.schema import state_columns
@@ -23,7 +24,7 @@ HOSTILE = "x\x1b[31m\x9b\u202e\u2066\nnetkf: done\r\x00y"
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made") / "runs"
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 1.0})
-    runs_to_directory(scenario, 4, folder, trace="full", workers=1)
+    runs_to_directory(scenario, 4, folder, EnsembleOptions(trace="full", pool=PoolOptions(1)))
     return folder
 
 

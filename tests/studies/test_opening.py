@@ -9,12 +9,13 @@ import pytest
 
 import netkf
 from netkf.checks.storage import save_verdict
-from netkf.ensembles.directory import runs_to_directory
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.run import run_to_directory
 from netkf.scenario.writing import resolve_defaults, to_toml
 from netkf.studies.compare_filters import compare_filters, write_comparison
-from netkf.studies.sweep import sweep_to_directory
+from netkf.studies.sweep import plan_sweep, sweep_to_directory
 from netkf.studies.tables import filters_text
 from tests.conftest import SCENARIOS
 
@@ -30,7 +31,7 @@ def short():
 def kept(short, tmp_path_factory):
     """The directory of an ensemble of five runs that kept all traces."""
     folder = tmp_path_factory.mktemp("kept") / "many"
-    runs_to_directory(short, 5, folder, trace="full", workers=1)
+    runs_to_directory(short, 5, folder, EnsembleOptions(trace="full", pool=PoolOptions(1)))
     return folder
 
 
@@ -105,7 +106,7 @@ def test_a_sweep_comes_back_as_it_was(short, tmp_path):
         "network.activation.rate": [1.0, 4.0],
         "filter": [{"kind": "local"}, {"kind": "central"}],
     }
-    done = sweep_to_directory(short, vary, 2, tmp_path / "sweep", workers=1)
+    done = sweep_to_directory(plan_sweep(short, vary, 2), tmp_path / "sweep", PoolOptions(1))
     found = netkf.open(tmp_path / "sweep")
     assert found.keys == tuple(vary)
     assert (found.status, found.scenario.name) == ("complete", short.name)
@@ -184,7 +185,9 @@ def test_what_was_interrupted_has_what_was_kept(short, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        runs_to_directory(short, 40, tmp_path / "many", workers=1, progress=after_two)
+        runs_to_directory(
+            short, 40, tmp_path / "many", EnsembleOptions(pool=PoolOptions(1)), progress=after_two
+        )
     found = netkf.open(tmp_path / "many")
     done = int(found.runs[0])
     assert (found.status, 0 < done < 40) == ("interrupted", True)
@@ -192,7 +195,10 @@ def test_what_was_interrupted_has_what_was_kept(short, tmp_path):
     np.testing.assert_allclose(found.mean_P, whole.mean_P, rtol=1e-10)
     with pytest.raises(KeyboardInterrupt):
         sweep_to_directory(
-            short, {"seed": [1, 2]}, 1, tmp_path / "s", workers=1, progress=interrupt
+            plan_sweep(short, {"seed": [1, 2]}),
+            tmp_path / "s",
+            PoolOptions(1),
+            progress=interrupt,
         )
     found = netkf.open(tmp_path / "s")
     assert (found.status, len(found.table)) == ("interrupted", 1)

@@ -13,6 +13,7 @@ import scipy.stats
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError, TheoryError
+from netkf.ensembles.pools import PoolOptions
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.reading import from_table
 from netkf.studies.compare import compare
@@ -28,7 +29,7 @@ from netkf.studies.metrics import (
 )
 from netkf.studies.parameter_grid import parse_grid, parse_interval
 from netkf.studies.size import size
-from netkf.studies.sweep import sweep, sweep_to_directory
+from netkf.studies.sweep import plan_sweep, sweep, sweep_to_directory
 from netkf.studies.tables import answer
 from netkf.studies.targets import Target, parse_target, quantity_by_simulation
 from tests.conftest import SCENARIOS
@@ -218,7 +219,10 @@ def test_an_interrupted_sweep_keeps_its_rows(short, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         sweep_to_directory(
-            short, {RATE: [1.0, 2.0]}, out=tmp_path / "o", workers=1, progress=impatient
+            plan_sweep(short, {RATE: [1.0, 2.0]}),
+            tmp_path / "o",
+            PoolOptions(1),
+            progress=impatient,
         )
     manifest = json.loads((tmp_path / "o" / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"
