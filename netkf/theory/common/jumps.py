@@ -146,8 +146,8 @@ class ClockJumps:
         return found
 
     @cached_property
-    def _all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """The pairs of all ticks together."""
+    def all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """Pairs of ways of one tick, of all ticks, and the rates (S, P) at which both arrive."""
         first, second = (np.concatenate([pair[k] for pair in self._pairs]) for k in (0, 1))
         return first, second, np.concatenate([rates for *_, rates in self._pairs], axis=1)
 
@@ -157,18 +157,23 @@ class ClockJumps:
         assert self.ways is not None
         return [self.ways.mean(self.nodes, among) for _, among in self.ticks]
 
-    def inflow(self, X: FloatArray) -> FloatArray:
-        """Return what jumps add to the second moments (S, M, M) per second beyond the mean drift
-        ``flows``, a positive map: ``dX/dt = B X + X B' + inflow(X) + noise``.
-        """
+    def sampled(self, X: FloatArray) -> FloatArray:
+        """Return the part of ``inflow`` (S, M, M) that samples add."""
         found = np.zeros_like(X)
         for node, rate, lost in self.samples:
             own = _block(X, self.nodes, node)
             _block(found, self.nodes, node)[...] += rate * lost @ own @ lost.T
+        return found
+
+    def inflow(self, X: FloatArray) -> FloatArray:
+        """Return what jumps add to the second moments (S, M, M) per second beyond the mean drift
+        ``flows``, a positive map: ``dX/dt = B X + X B' + inflow(X) + noise``.
+        """
+        found = self.sampled(X)
         if self.ways is None or not self.ticks:
             return found
         if self.ways.steps is None:
-            return np.asarray(found + self.ways.products(*self._all_pairs, X))
+            return np.asarray(found + self.ways.products(*self.all_pairs, X))
         for k, (rate, _) in enumerate(self.ticks):
             chains, (first, second, rates) = self._chains[k], self._pairs[k]
             stepped = self.ways.advance(X, chains)

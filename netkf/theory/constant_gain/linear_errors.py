@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock, Periodic
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
 from netkf.theory.common.random_links import Ways, poisson_ticks, ways_of
 from netkf.theory.hybrid.samples import sampling_clock
@@ -62,9 +64,12 @@ class SampledNode(NamedTuple):
     noise: FloatArray
 
 
-def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
+def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     """Return the system under Poisson clocks of links, directions or nodes, or that from tick to
     tick of clocks that all tick together.
+
+    Raises TheoryError where clocks are others, delays random or, for bursts under Poisson clocks,
+    not 0.
     """
     flow, samples, weights = _flow(scenario), _samples(scenario), link_weights(scenario)
     clock = scenario.network.activation
@@ -73,9 +78,11 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
     if isinstance(clock, Periodic) and talks and delay is not None:
         together = ways_of(scenario, weights, clock.period)
         return _from_tick_to_tick(clock, flow, samples, together, delay)
-    if delay != 0.0:
-        raise TheoryError("exact mean squares under clocks are known where messages take no time")
-    ways = ways_of(scenario, weights, 0.0) if talks else None
+    ways = ways_of(scenario, weights, math.inf) if talks else None
+    if delay and ways is not None and ways.modes > 1:
+        raise TheoryError(
+            "exact mean squares of bursts under Poisson clocks are known if messages take no time"
+        )
     N, n = len(scenario.nodes), scenario.plant.n
     noise, found = flow.noise.copy(), []
     for one in samples:
@@ -86,7 +93,10 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | SlotJumps:
         found.append((one.node, rate, one.lost))
     drift = block_diagonal(list(flow.drift))
     ticks = poisson_ticks(scenario, list(weights)) if talks else ()
-    return ClockJumps(N, drift, noise, tuple(found), ways, ticks)
+    instant = ClockJumps(N, drift, noise, tuple(found), ways, ticks)
+    if not delay or not ticks:
+        return instant
+    return DelayedJumps(instant, scenario.truth.A, scenario.truth.B @ scenario.truth.B.T, delay)
 
 
 def _own(k: int, n: int) -> slice:

@@ -1,0 +1,295 @@
+"""Second moments of errors with constant gains under Poisson clocks, where messages take d seconds.
+
+A message sent at t - d arrives at t, predicted over d; its error ``m_j(t)`` is that of the
+prediction, ``e^{A d} e_j(t - d)`` and the plant's noise of d seconds. Messages arrive as a Poisson
+process, and the errors before an arrival do not depend on it: those of the sender are older than
+its tick, and nothing else of that tick has arrived. So jumps are a mean drift and white noise,
+
+    dE = (B E + G m) dt + dxi,    E[dxi dxi'] = Phi dt,    Phi = inflow(E[(E, m) (E, m)'])
+
+With ``K(s) = E[E(t) E(t - s)']`` for s in [0, d], H = G e^{A d} and the plant's noise in messages,
+``F(s) = E[m(t) E(t - s)'] - e^{A d} K(d - s)'``, steady moments obey (derived; Kharitonov 2013,
+Time-Delay Systems, chapter 2, for systems of this form with white noise)
+
+    dK/ds = B K(s) + H K(d - s)' + G F(s),    K(0) = K(0)',
+    0 = B K(0) + K(0) B' + H K(d)' + K(d) H' + G F(0) + F(0)' G' + noise + Phi,
+
+a linear boundary value problem, solved by collocation at Chebyshev points (Trefethen 2000, Spectral
+Methods in MATLAB, chapters 6 and 12). Mean squares are bounded if the mean of the errors is stable
+and the map from Phi to inflow has a spectral radius below 1 (a renewal equation, derived).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.theory.common.jumps import ClockJumps, LyapunovInverse
+from netkf.theory.common.random_links import Ways
+
+MIN_POINTS, MAX_POINTS = 12, 80
+MAX_DENSE, MAX_DENSE_MEAN = 1200, 600
+"""Unknowns up to which the boundary value problem, and the map of means over d, are matrices."""
+KRYLOV_VECTORS, MAX_ROUNDS = 40, 10
+TOLERANCE, CORRECTION = 1e-12, 1e-3
+"""Relative, of solutions of the boundary value problem and of what is added to refine them."""
+
+
+@dataclass(frozen=True, eq=False)
+class DelayedJumps:
+    """A filter whose clocks are Poisson processes and whose messages take ``delay`` seconds.
+
+    instant : the system as if messages took no time, of one mode
+    A, Q    : (n, n) drift and noise a second of the plant
+    delay   : seconds, positive
+
+    Raises TheoryError if the errors change too often during a delay.
+    """
+
+    instant: ClockJumps
+    A: FloatArray
+    Q: FloatArray
+    delay: float
+
+    def __post_init__(self) -> None:
+        _ = self.points
+
+    @property
+    def nodes(self) -> int:
+        """N."""
+        return self.instant.nodes
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(1, M, M) of Phi, as of the second moments."""
+        return self.instant.shape
+
+    @cached_property
+    def _ways(self) -> Ways:
+        """The links with messages as senders, which are counted behind the N nodes."""
+        ways = self.instant.ways
+        assert ways is not None
+        return ways._replace(sender=ways.sender + self.nodes)
+
+    @cached_property
+    def _mean(self) -> tuple[FloatArray, FloatArray]:
+        """B and G (M, M)."""
+        N, M = self.nodes, len(self.instant.drift)
+        moved = np.zeros((M, 2 * M))
+        moved[:, :M] = self.instant.drift
+        for node, rate, lost in self.instant.samples:
+            own = slice(node * len(self.A), (node + 1) * len(self.A))
+            moved[own, own] -= rate * lost
+        for rate, among in self.instant.ticks:
+            moved += rate * self._ways.mean(2 * N, among)[0, :M]
+        return moved[:, :M], moved[:, M:]
+
+    @cached_property
+    def points(self) -> int:
+        """The number k of intervals between collocation points."""
+        B, G = (float(np.linalg.norm(one, 2)) for one in self._mean)
+        growth = float(np.linalg.norm(self.A, 2))
+        changes = self.delay * (B + growth + G * np.exp(growth * self.delay))
+        # The Chebyshev series of e^{c x} over [0, 1] falls like (c / 4)^k / k!.
+        points = MIN_POINTS + int(min(np.ceil(1.2 * changes), 10.0 * MAX_POINTS))
+        if points > MAX_POINTS:
+            raise TheoryError(
+                f"errors change {changes:.3g} times during a delay of {self.delay:g} s; exact mean "
+                "squares are computed for at most 50: give a shorter delay or lower rates"
+            )
+        return points
+
+    @cached_property
+    def _integral(self) -> FloatArray:
+        """Integrals (k + 1, k + 1) from 0 to each point over values at the points."""
+        return self.delay * chebyshev_integrals(self.points)
+
+    @cached_property
+    def _own(self) -> FloatArray:
+        """The blocks (N, n, n) of B, which has no others."""
+        N, n = self.nodes, len(self.A)
+        return self._mean[0].reshape(N, n, N, n)[np.arange(N), :, np.arange(N)]
+
+    @cached_property
+    def _coupling(self) -> scipy.sparse.csr_array:
+        """H (M, M)."""
+        late = scipy.linalg.expm(self.delay * self.A)
+        return scipy.sparse.csr_array(self._mean[1] @ np.kron(np.eye(self.nodes), late))
+
+    @cached_property
+    def _moves(self) -> FloatArray:
+        """The inverse (N, (k + 1) n, (k + 1) n) of ``y -> y - integral B_i y``, which carries a
+        node's error over the delay.
+        """
+        size = (self.points + 1) * len(self.A)
+        coupled = np.einsum("kl,aij->akilj", self._integral, self._own).reshape(-1, size, size)
+        return np.linalg.inv(np.eye(size) - coupled)
+
+    def _moved(self, y: FloatArray) -> FloatArray:
+        """Apply the inverse to y (k + 1, M, columns)."""
+        N, (K, M, columns) = self.nodes, y.shape
+        by_node = y.reshape(K, N, -1, columns).swapaxes(0, 1).reshape(N, -1, columns)
+        found = (self._moves @ by_node).reshape(N, K, -1, columns)
+        return np.asarray(found.swapaxes(0, 1).reshape(K, M, columns))
+
+    @cached_property
+    def _common(self) -> tuple[FloatArray, FloatArray]:
+        """F (k + 1, n, M) of one message, all of which have the same noise, and Q_d (n, n).
+
+        An impulse of the plant's noise moves errors by h, ``dh/ds = B h + G e^{U s}``, and messages
+        that are under way by e^{A s}: ``F(s) = e^{A s} int_0^{d - s} e^{A u} Q h(u)' du``.
+        """
+        N, n, G = self.nodes, len(self.A), self._mean[1]
+        times = self.delay * chebyshev_points(self.points)
+        E = np.stack([scipy.linalg.expm(s * self.A) for s in times])
+        alike = np.tile(E, (1, N, 1))
+        start = np.tile(np.eye(n), (N, 1))
+        h = self._moved(start + np.tensordot(self._integral, G @ alike, 1))
+        both = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(h, 1, 2), 1)
+        noise = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(E, 1, 2), 1)
+        return E @ both[::-1], symmetric(noise[-1])
+
+    def _heard(self, K: FloatArray) -> FloatArray:
+        """Return H K(d - s)' (k + 1, M, M) at the points, which lie symmetrically."""
+        k, M, _ = K.shape
+        columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
+        return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
+
+    def _right(self, Phi: FloatArray, noise: bool) -> FloatArray:
+        """Return the inhomogeneous part (k + 1, M, M) of the problem, see ``_residual``."""
+        found = np.zeros((self.points + 1, *Phi.shape))
+        found[0] = Phi
+        if noise:
+            heard = self._mean[1] @ np.tile(self._common[0], (1, self.nodes, 1))
+            found[0] += self.instant.noise + 2.0 * symmetric(heard[0])
+            found[1:] = np.tensordot(self._integral, heard, 1)[1:]
+        return found
+
+    def _residual(self, K: FloatArray, right: FloatArray) -> FloatArray:
+        """Return the residuals (k + 1, M, M) of the problem: that of its second equation, and those
+        of the integrated first one.
+        """
+        k, M, _ = K.shape
+        driven = (self._own @ K.reshape(k, self.nodes, -1, M)).reshape(K.shape)
+        heard = self._heard(K)
+        found = right + K[0] - K + np.tensordot(self._integral, driven + heard, 1)
+        # Its antisymmetric part says that K(0) is symmetric.
+        found[0] = right[0] + 2.0 * symmetric(driven[0] + heard[0]) + 0.5 * (K[0].T - K[0])
+        return np.asarray(found)
+
+    @cached_property
+    def _lyapunov(self) -> LyapunovInverse:
+        return LyapunovInverse(self._mean[0][None])
+
+    def _alone(self, right: FloatArray) -> FloatArray:
+        """Return the solution K (k + 1, M, M) for nodes that hear nothing."""
+        equation = symmetric(right[:1])
+        first = 2.0 * (right[:1] - equation) + self._lyapunov(equation)
+        return self._moved(np.concatenate([first, right[1:] + first]))
+
+    @cached_property
+    def _factors(self) -> Any:
+        """The LU factors of the problem, None if it is large."""
+        M = len(self.instant.drift)
+        size = (self.points + 1) * M * M
+        if size > MAX_DENSE:
+            return None
+        units = np.eye(size).reshape(size, -1, M, M)
+        columns = [-self._residual(one, np.zeros_like(one)).ravel() for one in units]
+        return scipy.linalg.lu_factor(np.stack(columns, axis=1))
+
+    def _solved(self, right: FloatArray, tolerance: float) -> FloatArray:
+        """Return the solution K (k + 1, M, M) of the problem to a relative ``tolerance``."""
+        if self._factors is not None:
+            found = scipy.linalg.lu_solve(self._factors, right.ravel())
+            return np.asarray(found.reshape(right.shape))
+        none = np.zeros_like(right)
+
+        def apply(x: FloatArray) -> FloatArray:
+            return -self._alone(self._residual(x.reshape(right.shape), none)).ravel()
+
+        whole = scipy.sparse.linalg.LinearOperator((right.size, right.size), matvec=apply)
+        start = self._alone(right).ravel()
+        found, _ = scipy.sparse.linalg.gmres(
+            whole, start, rtol=tolerance, atol=0.0, restart=KRYLOV_VECTORS, maxiter=5
+        )
+        return np.asarray(found).reshape(right.shape)
+
+    def autocovariances(self, Phi: FloatArray, noise: bool) -> FloatArray:
+        """Return K (k + 1, M, M) at the points for white noise Phi (M, M) a second, with or without
+        the noises of plant and readings. Raises TheoryError if it is not found.
+        """
+        right = self._right(Phi, noise)
+        K = self._solved(right, TOLERANCE)
+        for _ in range(MAX_ROUNDS):
+            change = self._solved(self._residual(K, right), CORRECTION)
+            K, size = K + change, float(np.abs(change).max())
+            if size <= TOLERANCE * np.abs(K).max():
+                return K
+        raise TheoryError(f"delayed mean squares were solved to {size:.1e} only")
+
+    def moments(self, Phi: FloatArray, noise: bool) -> FloatArray:
+        """Return E[(E, m) (E, m)'] (2 M, 2 M), see ``autocovariances``."""
+        K = self.autocovariances(Phi, noise)
+        late = np.kron(np.eye(self.nodes), scipy.linalg.expm(self.delay * self.A))
+        X, across = symmetric(K[0]), K[-1] @ late.T
+        sent = late @ X @ late.T
+        if noise:
+            F, Q = self._common
+            across = across + np.tile(F[0].T, (1, self.nodes))
+            sent = sent + np.tile(Q, (self.nodes, self.nodes))
+        return np.block([[X, across], [across.T, symmetric(sent)]])
+
+    def excited(self, Phi: FloatArray, noise: bool = False) -> FloatArray:
+        """Return the Phi (1, M, M) that jumps make of errors driven by one, a positive map."""
+        M, Z = Phi.shape[-1], self.moments(Phi[0], noise)[None]
+        heard = self._ways.products(*self.instant.all_pairs, Z)[:, :M, :M]
+        return symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)
+
+    def covariance(self, Phi: FloatArray) -> FloatArray:
+        """Return E[E E'] (1, M, M) under all noises and jumps of covariance Phi (1, M, M)."""
+        return symmetric(self.autocovariances(Phi[0], True)[:1])
+
+    @cached_property
+    def mean_is_stable(self) -> bool:
+        """True if the mean of the errors dies out: the spectral radius of the map from the errors
+        of d seconds to those of the next d is below 1 (Breda, Maset and Vermiglio 2015, Stability
+        of Linear Delay Differential Equations, chapter 6).
+        """
+        K, M = self.points + 1, len(self.instant.drift)
+
+        def ahead(y: FloatArray) -> FloatArray:
+            past = y.reshape(K, M)
+            heard = self._integral @ (self._coupling @ past.T).T
+            return self._moved((past[-1] + heard)[:, :, None]).ravel()
+
+        size = K * M
+        if size <= MAX_DENSE_MEAN:
+            values = np.linalg.eigvals(np.stack([ahead(one) for one in np.eye(size)], axis=1))
+        else:
+            whole = scipy.sparse.linalg.LinearOperator((size, size), matvec=ahead)
+            values = scipy.sparse.linalg.eigs(whole, k=4, return_eigenvectors=False)
+        return bool(np.abs(values).max() < 1.0)
+
+
+def chebyshev_points(K: int) -> FloatArray:
+    """Return the K + 1 extreme points of the Chebyshev polynomial of degree K on [0, 1]."""
+    return np.asarray(0.5 * (1.0 - np.cos(np.pi * np.arange(K + 1) / K)))
+
+
+def chebyshev_integrals(K: int) -> FloatArray:
+    """Return the matrix (K + 1, K + 1) of integrals from 0 to each of the points over polynomials
+    of degree K that are given at the points of [0, 1].
+    """
+    x = 2.0 * chebyshev_points(K) - 1.0
+    coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, K))
+    whole = np.polynomial.chebyshev.chebint(coefficients, lbnd=-1.0, axis=0)
+    return np.asarray(0.5 * np.polynomial.chebyshev.chebval(x, whole).T)
