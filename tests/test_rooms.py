@@ -1,6 +1,7 @@
 """The structure of the package: no circles of imports, and no public name with two meanings."""
 
 import ast
+import re
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -46,7 +47,10 @@ def test_no_modules_import_each_other():
     assert circles == []
 
 
-PER_ROOM = ("testing", "scenario", "network", "plants", "trace", "rng", "core", "engines.simpy")
+PER_ROOM = (
+    *("testing", "scenario", "network", "plants", "trace", "rng", "core", "engines.simpy"),
+    *("runs", "ensembles", "figures", "report", "studies", "cli"),
+)
 """Rooms in which no public class or function has a name that the same room uses twice."""
 
 
@@ -58,6 +62,32 @@ def test_a_room_defines_each_public_name_once():
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 defined[room, node.name].append(name)
     assert {key: where for key, where in defined.items() if len(where) > 1} == {}
+
+
+def is_registered(tree):
+    """A module of a table: a built-in filter, a command, or the promises of one paper."""
+    targets = [ast.unparse(t) for n in tree.body if isinstance(n, ast.Assign) for t in n.targets]
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    decorators = [ast.unparse(d) for node in classes for d in node.decorator_list]
+    return {"COMMAND", "CHECKS"} & set(targets) or any(d.startswith("built_in") for d in decorators)
+
+
+def test_the_readme_of_a_room_names_all_of_its_modules_and_no_others():
+    missing, unknown = [], []
+    for readme in sorted(ROOT.rglob("README.md")):
+        room, text = readme.parent, readme.read_text(encoding="utf-8")
+        for file in sorted(room.glob("*.py")):
+            name = ".".join(("netkf", *file.relative_to(ROOT).with_suffix("").parts))
+            special = file.stem.startswith("__") or file.parent == ROOT
+            if special or is_registered(modules()[name]):
+                continue
+            if not re.search(rf"`{file.stem}(\.py)?`", text):
+                missing.append(str(file.relative_to(ROOT)))
+        files = {file.name for file in ROOT.parent.rglob("*.py")}
+        unknown += [
+            f"{readme}: {name}" for name in re.findall(r"`(\w+\.py)`", text) if name not in files
+        ]
+    assert (missing, unknown) == ([], [])
 
 
 def test_files_that_run_first_are_there():

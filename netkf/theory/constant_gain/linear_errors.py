@@ -45,7 +45,7 @@ def slot_ways(scenario: Scenario) -> Ways | None:
     return ways_of(scenario, weights, scenario.phase_length) if weights else None
 
 
-class ErrorFlow(NamedTuple):
+class JointErrorFlow(NamedTuple):
     """Errors between ticks: ``drift`` (N, n, n) of each node's, ``noise`` (N n, N n) a second."""
 
     drift: FloatArray
@@ -103,7 +103,7 @@ def _own(k: int, n: int) -> slice:
     return slice(k * n, (k + 1) * n)
 
 
-def _flow(scenario: Scenario) -> ErrorFlow:
+def _flow(scenario: Scenario) -> JointErrorFlow:
     """Return the errors between events; increments are used all the time."""
     gains, truth = _gains(scenario), scenario.truth
     N, n = len(gains), len(truth.A)
@@ -113,7 +113,7 @@ def _flow(scenario: Scenario) -> ErrorFlow:
         if len(H):
             drift[k] -= L @ H
             noise[_own(k, n), _own(k, n)] += L @ R @ L.T
-    return ErrorFlow(drift, noise)
+    return JointErrorFlow(drift, noise)
 
 
 def _samples(scenario: Scenario) -> list[SampledNode]:
@@ -129,7 +129,7 @@ def _samples(scenario: Scenario) -> list[SampledNode]:
 
 
 def _from_tick_to_tick(
-    clock: Periodic, flow: ErrorFlow, samples: list[SampledNode], ways: Ways, delay: float
+    clock: Periodic, flow: JointErrorFlow, samples: list[SampledNode], ways: Ways, delay: float
 ) -> SlotJumps:
     """Return the system from one exchange of clocks that all tick together to the next.
 
@@ -176,7 +176,7 @@ def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
             raise TheoryError("sensors do not sample at the ticks of the network's periodic clock")
 
 
-def _move_errors(flow: ErrorFlow, gap: float) -> tuple[FloatArray, FloatArray]:
+def _move_errors(flow: JointErrorFlow, gap: float) -> tuple[FloatArray, FloatArray]:
     """Return the transition (N n, N n) of errors over a gap, and the covariance that it adds."""
     drift = block_diagonal(list(flow.drift))
     M = len(drift)
