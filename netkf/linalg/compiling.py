@@ -18,6 +18,7 @@ from functools import cache, cached_property, update_wrapper
 from pathlib import Path
 from typing import Any, TypeVar, cast, overload
 
+from netkf.linalg.compile_once import SharedCache
 from netkf.linalg.linking import linked_once
 from netkf.linalg.shortcuts import kernel_compiler, without_collection
 
@@ -131,14 +132,16 @@ class Kernel:
         # numba looks at the file of the function alone, and what it calls may have changed.
         config.CACHE_DIR = str(_folder(before))
         try:
-            made: Callable[..., Any] = numba.njit(
-                cache=True, pipeline_class=self._compiler, **self._options
-            )(self._loops)
+            made: Any = numba.njit(cache=True, pipeline_class=self._compiler, **self._options)(
+                self._loops
+            )
         finally:
             config.CACHE_DIR = before
+        # Of processes that start side by side one compiles, and the others wait for it.
+        made._cache = SharedCache(made._cache, self._loops.__name__)
         # numba's level is global: it is set while this function compiles.
         _moderately_optimised(made, config)
-        return made
+        return cast(Callable[..., Any], made)
 
 
 def _registered(
@@ -185,6 +188,7 @@ def _moderately_optimised(made: Any, config: Any) -> None:
                 return compile_for(*args, **kwargs)
         finally:
             config.OPT = before
+            made._cache.release()
             _spent.append(time.perf_counter() - began)
 
     made._compile_for_args = moderately
