@@ -139,6 +139,8 @@ class Struct(metaclass=StructClass):
         elif isinstance(kind, int):
             self.__dict__[name] = value
         else:
+            if type(value) is not kind:
+                raise TypeError(f"{type(self).__name__}.{name} is a {kind.__name__}")
             self.memory[word] = value.address
             self.__dict__[name] = value
 

@@ -42,12 +42,14 @@ class Draw:
         return path.name
 
 
-def drawn_table(seed, folder):
-    """The table of the scenario of a seed; all kinds of filters come in turn."""
+def drawn_table(seed, folder, sizes):
+    """The table of the scenario of a seed, with as many states as one of ``sizes``; all kinds of
+    filters come in turn.
+    """
     draw = Draw(seed, folder)
     kind = list(FILTERS)[seed % len(FILTERS)]
     at = FILTERS[kind][seed // len(FILTERS) % len(FILTERS[kind])]
-    n, nodes = int(draw.random.integers(1, 5)), int(draw.random.integers(2, 6))
+    n, nodes = int(draw.one(*sizes)), int(draw.random.integers(2, 6))
     horizon = draw.number(3.0, 6.0, 1)
     links, graph = _graph(draw, nodes, at)
     return {
@@ -71,9 +73,9 @@ def drawn_table(seed, folder):
     }
 
 
-def drawn_scenario(seed, folder):
+def drawn_scenario(seed, folder, sizes):
     """The scenario of a seed."""
-    return from_table(drawn_table(seed, folder), folder)
+    return from_table(drawn_table(seed, folder, sizes), folder)
 
 
 def _graph(draw, nodes, at):

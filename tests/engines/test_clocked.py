@@ -8,15 +8,17 @@ from tests.engines.agreement import assert_agree
 from tests.engines.drawn import FILTERS, drawn_scenario
 
 FEW, MANY, TOGETHER = 64, 360, 8
+SIZES = 1, 2, 5
+"""Numbers of states: loops are unrolled up to 4, by code that is compiled for each."""
 
 
-def agree(seeds, folder):
+def agree(seeds, folder, sizes=SIZES):
     """Runs of the scenarios of these seeds."""
     runs = {}
     for seed in seeds:
         place = folder / str(seed)
         place.mkdir()
-        scenario = drawn_scenario(seed, place)
+        scenario = drawn_scenario(seed, place, sizes)
         runs[seed] = scenario, assert_agree(scenario)
     return runs
 
@@ -28,7 +30,7 @@ def test_drawn_scenarios_agree(first, tmp_path):
 
 @pytest.mark.slow
 def test_many_drawn_scenarios_agree_and_leave_nothing_out(tmp_path):
-    runs = agree(range(FEW, FEW + MANY), tmp_path)
+    runs = agree(range(FEW, FEW + MANY), tmp_path, range(1, 6))
     filters = collections.Counter(type(scenario.hosted).__name__ for scenario, _ in runs.values())
     assert len(filters) == len(FILTERS)
     assert min(filters.values()) >= 30

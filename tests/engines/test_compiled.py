@@ -150,7 +150,7 @@ PROBES = st.sampled_from([0.5, 0.37, [0.0, 0.111, 0.112, 1.9], [3.0]])
 
 @st.composite
 def scenarios(draw):
-    n = draw(st.integers(1, 3))
+    n = draw(st.integers(1, 2))
     sensors = [
         {"nodes": nodes, "H": draw(entries(1, n)), "R": [[draw(st.floats(0.01, 1.0))]]}
         for nodes in ([0], [0, 1])

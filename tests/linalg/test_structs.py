@@ -69,6 +69,9 @@ def test_fields_are_of_one_type():
     for wrong in (np.zeros(3), np.zeros((2, 3), dtype=np.int64), np.zeros((3, 2)).T):
         with pytest.raises(TypeError, match="position"):
             walk.position = wrong
+    # Kernels would read it as what it is not.
+    with pytest.raises(TypeError, match="clock is a Clock"):
+        walk.clock = walk
     with pytest.raises(TypeError, match="fields times, next"):
         Clock(times=np.zeros(3))
     with pytest.raises(AttributeError):

@@ -338,9 +338,9 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scratch_arrays(
-    table: FlowTable, gains: Gains, instants: Instants
+    table: FlowTable, gains: Gains, instants: Instants, unrolled: bool
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
-    """Scratch arrays for all that is computed."""
+    """Scratch arrays for all that is computed; ``unrolled``: of types for their n."""
     n, most, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
     # Rows of the reading of each sample, then the largest sum over one instant.
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
@@ -359,7 +359,7 @@ def scratch_arrays(
         H=np.zeros((q, n)),
         root_R=np.zeros((q, q)),
     )
-    return scratch, flow_scratch(table, unrolled=True), update_scratch(n, q, unrolled=True)
+    return scratch, flow_scratch(table, unrolled), update_scratch(n, q, unrolled)
 
 
 def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
