@@ -30,9 +30,9 @@ def read_columns(
     with _open_table(source) as (header, rows):
         _demand(source, header, required)
         names = [name for name in (*required, *optional) if name in header]
-        places = [header.index(name) for name in names]
+        indices = [header.index(name) for name in names]
         for line, row in rows:
-            numbers.extend(finite_numbers(source, line, header, row, places))
+            numbers.extend(finite_numbers(source, line, header, row, indices))
     columns = np.array(numbers, dtype=np.float64).reshape(-1, len(names)).T
     return dict(zip(names, columns, strict=True))
 
@@ -84,9 +84,9 @@ def _open_table(
 
 
 def finite_numbers(
-    source: SourceFile, line: int, header: list[str], entries: list[str], places: list[int]
+    source: SourceFile, line: int, header: list[str], entries: list[str], indices: list[int]
 ) -> list[float]:
-    """Return the entries of a row in the columns ``places``, as numbers.
+    """Return the entries of a row in the columns ``indices``, as numbers.
 
     Raises ScenarioError if one is not finite or the row is not as long as the header.
     """
@@ -96,21 +96,23 @@ def finite_numbers(
             "path", f"{where} must have {len(header)} entries", entries, "mend the row"
         )
     numbers = []
-    for place in places:
+    for column in indices:
         try:
-            value = float(entries[place])
+            value = float(entries[column])
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
             raise ScenarioError(
                 "path",
-                f"{where}: {header[place]} must be a finite number",
-                entries[place],
+                f"{where}: {header[column]} must be a finite number",
+                entries[column],
                 "mend the row, or leave it out",
             )
         if abs(value) > MAX_MAGNITUDE:
-            rule = f"{where}: {header[place]} must be at most {MAX_MAGNITUDE:g} in size"
-            raise ScenarioError("path", rule, entries[place], "mend the row, or choose other units")
+            rule = f"{where}: {header[column]} must be at most {MAX_MAGNITUDE:g} in size"
+            raise ScenarioError(
+                "path", rule, entries[column], "mend the row, or choose other units"
+            )
         numbers.append(value)
     return numbers
 

@@ -156,13 +156,13 @@ def whiteness_figure(subject: Subject) -> Picture:
 def _draw_correlations(
     axes: Any, curves: dict[int, FloatArray], worst: int, band: float, lags: int
 ) -> None:
-    places = np.arange(1, lags + 1)
+    positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
     axes.axhline(0.0, color=EXACT, lw=0.8)
     whole = np.array(list(curves.values()))
     if len(curves) > 1:
         axes.fill_between(
-            places,
+            positions,
             whole.min(axis=0),
             whole.max(axis=0),
             color=SKY,
@@ -170,10 +170,10 @@ def _draw_correlations(
             lw=0,
             label="range of all nodes",
         )
-        axes.plot(places, whole.mean(axis=0), "-o", color=INK, ms=3.5, label="mean of all nodes")
+        axes.plot(positions, whole.mean(axis=0), "-o", color=INK, ms=3.5, label="mean of all nodes")
     name = "all readings" if worst < 0 else f"node {worst}"
     label = f"{name}, the largest" if len(curves) > 1 else name
-    axes.plot(places, curves[worst], "--s", color=SENSING, ms=3.5, label=label)
+    axes.plot(positions, curves[worst], "--s", color=SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")
     axes.xaxis.get_major_locator().set_params(integer=True)
     top = max(1.3 * float(np.abs(whole).max()), 2.0 * band)

@@ -233,10 +233,10 @@ def _nees_claim(rows: list[dict[str, Any]], key: str, scale: float) -> str:
 def _draw_ratios(
     axes: Any, subject: Subject, rows: list[dict[str, Any]], key: str, scale: float
 ) -> None:
-    places = np.arange(len(rows))
+    positions = np.arange(len(rows))
     values = scale * np.array([row[key] for row in rows])
     widths = scale * LEVEL * np.array([_number(row.get(f"{key}_se")) for row in rows])
-    axes.hlines(places, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
+    axes.hlines(positions, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
     has = np.array([row["node"] in subject.scenario.placed for row in rows])
     for group, colour, marker, label in (
         (has, SENSING, "s", "with a sensor"),
@@ -245,7 +245,7 @@ def _draw_ratios(
         if group.any():
             bars = widths[group] if subject.runs > 1 else None
             style = {"fmt": marker, "color": colour, "mec": INK, "mew": 0.5, "ms": 4.5, "lw": 1.2}
-            axes.errorbar(values[group], places[group], xerr=bars, label=label, **style)
-    axes.set_yticks(places, [str(row["node"]) for row in rows], fontsize=6.5)
+            axes.errorbar(values[group], positions[group], xerr=bars, label=label, **style)
+    axes.set_yticks(positions, [str(row["node"]) for row in rows], fontsize=6.5)
     axes.margins(x=0.08)
     axes.set_ylim(-0.7, len(rows) - 0.3)

@@ -113,15 +113,16 @@ def draw_network(
     """Draw the links as wide as they delivered, and the nodes in the colours of their ``shades``
     with a colour bar: squares with a sensor, circles without.
     """
-    places = positions_of(subject.scenario.topology) if positions is None else positions
-    _draw_links(axes, subject, places)
-    dots = _draw_nodes(axes, subject, places, shades)
+    if positions is None:
+        positions = positions_of(subject.scenario.topology)
+    _draw_links(axes, subject, positions)
+    dots = _draw_nodes(axes, subject, positions, shades)
     away = 1.0 + 0.5 * math.sqrt(_dot_size(subject))
     if len(subject.nodes) <= MAX_LABELLED_NODES:
         for node in subject.nodes:
             style: dict[str, Any] = {"fontsize": 6.5, "color": MUTED, "zorder": 3}
             offset: dict[str, Any] = {"xytext": (away, away), "textcoords": "offset points"}
-            axes.annotate(str(node), places[node], **offset, **style)
+            axes.annotate(str(node), positions[node], **offset, **style)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.13)
     axes.axis("off")

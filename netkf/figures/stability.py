@@ -103,8 +103,8 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
 
 
 def _draw_curve(axes: Any, table: Any, keys: list[str]) -> str:
-    places, labels = _axis_positions(axes.set_xscale, table[keys[0]])
-    order = np.argsort(places, kind="stable")
+    positions, labels = _axis_positions(axes.set_xscale, table[keys[0]])
+    order = np.argsort(positions, kind="stable")
     series = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
     for (name, label), look in zip(series, SERIES, strict=False):
         bars = 1.96 * table[f"{name}_se"].fillna(0.0).to_numpy()[order]
@@ -115,10 +115,14 @@ def _draw_curve(axes: Any, table: Any, keys: list[str]) -> str:
             "ms": 4,
             "capsize": 2,
         }
-        axes.errorbar(places[order], table[name].to_numpy()[order], yerr=bars, label=label, **style)
+        axes.errorbar(
+            positions[order], table[name].to_numpy()[order], yerr=bars, label=label, **style
+        )
     bound = np.sqrt(table["bound"].to_numpy(dtype=np.float64))[order]
     if np.isfinite(bound).any():
-        axes.plot(places[order], bound, color=EXACT, ls=":", marker="_", label="root of the bound")
+        axes.plot(
+            positions[order], bound, color=EXACT, ls=":", marker="_", label="root of the bound"
+        )
     if labels:
         axes.set_xticks(
             range(len(labels)), labels, rotation=15 if sum(map(len, labels)) > 70 else 0
@@ -174,15 +178,15 @@ def _describe_best(table: Any, keys: Sequence[str]) -> str:
 
 
 def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
-    """Return places on the axis: numbers on a scale, others side by side with labels."""
+    """Return positions on the axis: numbers on a scale, others side by side with labels."""
     if values.dtype.kind in "iuf":
-        places = values.to_numpy(dtype=np.float64)
-        if places.min() > 0.0 and places.max() > SPREAD * places.min():
+        positions = values.to_numpy(dtype=np.float64)
+        if positions.min() > 0.0 and positions.max() > SPREAD * positions.min():
             set_scale("log")
-        return places, []
+        return positions, []
     names = list(dict.fromkeys(values.astype(str)))
-    places = np.array([names.index(str(v)) for v in values], dtype=np.float64)
-    return places, [_short(name) for name in names]
+    positions = np.array([names.index(str(v)) for v in values], dtype=np.float64)
+    return positions, [_short(name) for name in names]
 
 
 def _short(value: Any) -> str:

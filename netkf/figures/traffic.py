@@ -57,8 +57,8 @@ def age_figure(subject: Subject) -> Picture:
     """Draw the age of information over time, quantiles over the nodes, and its mean per node."""
     log = subject.log
     end = _end(subject)
-    places = np.arange(GRID)
-    grid = end * (places + places * GOLDEN % 1.0) / GRID
+    positions = np.arange(GRID)
+    grid = end * (positions + positions * GOLDEN % 1.0) / GRID
     receivers = [node for node in subject.nodes if subject.scenario.topology.degrees.get(node, 0)]
     ages = {node: age_at(grid, *freshest(log, node)) for node in receivers}
     if not ages:
@@ -169,7 +169,7 @@ def links_figure(subject: Subject) -> Picture:
     begin, end = _window(chosen, _end(subject))
     figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(chosen)))
     axes = figure.add_subplot()
-    for place, one in enumerate(chosen):
+    for row, one in enumerate(chosen):
         for times, marker, colour, size in (
             (one.delivered, "|", INK, 5.0),
             (one.lost, "x", LOST, 4.0),
@@ -182,7 +182,7 @@ def links_figure(subject: Subject) -> Picture:
                 "color": colour,
                 "mew": 0.9,
             }
-            axes.plot(inside, np.full(len(inside), place), **style)
+            axes.plot(inside, np.full(len(inside), row), **style)
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
     axes.set_yticks(
@@ -253,25 +253,25 @@ def _draw_shares(
     channel says, None if it says nothing.
     """
     order = np.argsort(shares, kind="stable")
-    places = np.arange(len(order))
+    positions = np.arange(len(order))
     axes.vlines(
-        places,
+        positions,
         *ends[order].T,
         color=SKY,
         lw=max(0.4, min(3.0, 150.0 / len(order))),
         label="95% interval",
     )
-    axes.plot(places, shares[order], ls="", marker=".", color=INK, ms=4, label="delivered")
+    axes.plot(positions, shares[order], ls="", marker=".", color=INK, ms=4, label="delivered")
     said = np.array([_expected(subject, found[k]) for k in order.tolist()])
     outside = None
     if np.isfinite(said).any():
         style = {"ls": "", "marker": "_", "ms": 5, "color": SENSING}
-        axes.plot(places, said, **style, label="the channel of the scenario")
+        axes.plot(positions, said, **style, label="the channel of the scenario")
         outside = int(((said < ends[order, 0]) | (said > ends[order, 1])).sum())
     axes.set_ylim(-0.02, 1.04)
     if len(found) <= 16:
         names = [f"{found[k].sender}>{found[k].receiver}" for k in order.tolist()]
-        axes.set_xticks(places, names, fontsize=6.5, rotation=90 if len(found) > 8 else 0)
+        axes.set_xticks(positions, names, fontsize=6.5, rotation=90 if len(found) > 8 else 0)
         axes.set_xlabel("direction, sender > receiver")
     else:
         axes.set_xlabel(f"{len(found)} directions, in the order of their share")

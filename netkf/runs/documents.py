@@ -131,11 +131,11 @@ def require(value: Any, form: Any, where: str = "") -> None:
         _demand(isinstance(value, dict), "a table", where)
         for key, inner in form.items():
             name = key.removesuffix("?")
-            place = f"{where}.{name}" if where else name
+            path = f"{where}.{name}" if where else name
             if name in value:
-                require(value[name], inner, place)
+                require(value[name], inner, path)
             elif name == key:
-                raise DamagedError(f"lacks {place}")
+                raise DamagedError(f"lacks {path}")
     elif isinstance(form, list):
         _demand(isinstance(value, list), "a list", where)
         for item in value:

@@ -78,8 +78,8 @@ def noting_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
         """The filter on states that know their node and time."""
 
         def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Noted:
-            place = -1 if base.pooled else node.node
-            return Noted(base.init(self, model, mean, cov, node), place, 0.0, (mean, None))
+            noted_node = -1 if base.pooled else node.node
+            return Noted(base.init(self, model, mean, cov, node), noted_node, 0.0, (mean, None))
 
         def predict(self, state: Noted, gap: float) -> Noted:
             start = base.estimate(self, state.inner)

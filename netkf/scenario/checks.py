@@ -128,12 +128,12 @@ def _check_sensors(scenario: DerivedScenario) -> None:
             demand_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
             p = len(sensor.H)
             demand_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
-        for place, node in enumerate(sensor.nodes):
+        for index, node in enumerate(sensor.nodes):
             if node not in known:
                 left_out = node in scenario.topology.left_out
                 why = "none of its links reaches network.graph.minimum, lower that; "
                 raise ScenarioError(
-                    f"{key}.nodes[{place}]",
+                    f"{key}.nodes[{index}]",
                     "must be a node of the graph",
                     node,
                     f"{why if left_out else ''}node ids here are {_ids(scenario.nodes)}",

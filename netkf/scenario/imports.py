@@ -46,15 +46,15 @@ def find_class(kind: str, origin: Origin) -> Any:
     Raises ScenarioError if it may not be imported, or cannot be.
     """
     module_name, _, class_name = kind.partition(":")
-    places = None if origin.trust else _Places(origin.folder)
-    if places is not None:
-        places.demand(kind, module_name, class_name)
+    allowed = None if origin.trust else _AllowedPaths(origin.folder)
+    if allowed is not None:
+        allowed.demand(kind, module_name, class_name)
     if not origin.imports and not is_loaded(module_name, class_name, origin.folder):
         return None
     beside = [p for p in (str(origin.folder), str(Path.cwd())) if p not in sys.path]
-    with _import_path([*beside, *sys.path] if places is None else places.path):
+    with _import_path([*beside, *sys.path] if allowed is None else allowed.path):
         try:
-            if places is None:
+            if allowed is None:
                 forget_other(module_name, origin.folder)
             return getattr(importlib.import_module(module_name), class_name)
         except (Exception, SystemExit) as error:
@@ -99,8 +99,8 @@ def _is_other(loaded: ModuleType | None, module_name: str, folder: Path) -> bool
     return other is None or not Path(other).exists() or not beside.samefile(other)
 
 
-class _Places:
-    """The places from which modules are imported for a scenario without trust.
+class _AllowedPaths:
+    """The folders from which modules are imported for a scenario without trust.
 
     These are the import path without the scenario's folder, the current folder, and what lies
     below them; packages installed there (site-packages, editable installs) remain.
@@ -138,17 +138,17 @@ class _Places:
         except (OSError, ValueError):
             return False
 
-    def _allows(self, place: Path) -> bool:
-        """Return True if code at a resolved place belongs to an installed package, or lies outside
-        of both folders.
+    def _allows(self, location: Path) -> bool:
+        """Return True if code at a resolved location belongs to an installed package, or lies
+        outside of both folders.
         """
-        if any(place.is_relative_to(root) for root in _site_folders()):
+        if any(location.is_relative_to(root) for root in _site_folders()):
             return True
-        named = [root for root in self._editable if place.is_relative_to(root)]
-        chosen = [root for root in _python_path() if place.is_relative_to(root)]
-        if place.is_relative_to(self._scenario):
+        named = [root for root in self._editable if location.is_relative_to(root)]
+        chosen = [root for root in _python_path() if location.is_relative_to(root)]
+        if location.is_relative_to(self._scenario):
             return any(_is_below(root, self._scenario) for root in (*named, *chosen))
-        if place.is_relative_to(self._current):
+        if location.is_relative_to(self._current):
             return bool(named) or any(_is_below(root, self._current) for root in chosen)
         return True
 
@@ -166,7 +166,9 @@ class _Places:
             if spec is None:
                 return None
             path = [
-                place for place in spec.submodule_search_locations or () if self._may_hold(place)
+                location
+                for location in spec.submodule_search_locations or ()
+                if self._may_hold(location)
             ]
             files = [spec.origin or ""] if spec.has_location else path
             if not files or not all(map(self._may_hold, files)):
@@ -182,8 +184,10 @@ class _Places:
                 continue
             spec = finder.find_spec(name, None)
             if spec is not None and spec.origin is not None:
-                place = Path(spec.origin).resolve()
-                self._editable.append(place.parent if spec.submodule_search_locations else place)
+                location = Path(spec.origin).resolve()
+                self._editable.append(
+                    location.parent if spec.submodule_search_locations else location
+                )
                 return spec
         return None
 
@@ -204,8 +208,8 @@ class _Places:
         return any(self._is_part(*found, seen) for found in source.ancestors(name))
 
 
-def _is_below(place: Path, folder: Path) -> bool:
-    return place != folder and place.is_relative_to(folder)
+def _is_below(location: Path, folder: Path) -> bool:
+    return location != folder and location.is_relative_to(folder)
 
 
 def _is_replaced(spec: ModuleSpec) -> bool:

@@ -256,15 +256,15 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
     """
     made = list(labels)
     for label in {one for one in labels if labels.count(one) > 1}:
-        places = [k for k, one in enumerate(labels) if one == label]
-        objects = [filters[k] for k in places]
+        indices = [k for k, one in enumerate(labels) if one == label]
+        objects = [filters[k] for k in indices]
         # A kind or a table beside an object of that kind: nothing tells what differs.
         if not all(isinstance(one, Filter) for one in objects):
             continue
         settings = [_settings(one) for one in objects]
         names = dict.fromkeys(name for one in settings for name in one)
         differing = [name for name in names if len({one.get(name) for one in settings}) > 1]
-        for k, own in zip(places, settings, strict=True):
+        for k, own in zip(indices, settings, strict=True):
             # What is left out of a table is at its default.
             values = {name: own.get(name, str(getattr(filters[k], name))) for name in differing}
             made[k] = _label(label, {name: shorten(value) for name, value in values.items()})

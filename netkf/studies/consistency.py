@@ -257,8 +257,9 @@ class Consistency(Shown):
 
     def __repr__(self) -> str:
         broken = sum(row.verdict.startswith("BROKEN") for row in self.rows)
-        told = f"{broken} of {len(self.rows)} nodes BROKEN" if broken else f"{len(self.rows)} nodes"
-        return f"<netkf consistency of {self.scenario!r}: {told}; {self.runs:,} runs>"
+        nodes = f"{len(self.rows)} nodes"
+        nodes = f"{broken} of {nodes} BROKEN" if broken else nodes
+        return f"<netkf consistency of {self.scenario!r}: {nodes}; {self.runs:,} runs>"
 
     def __bool__(self) -> bool:
         return not any(row.verdict.startswith("BROKEN") for row in self.rows)

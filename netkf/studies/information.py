@@ -87,12 +87,12 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     outcome = np.full(len(rows), UNDER_WAY)
     arrived, used = np.full(len(rows), np.nan), np.full(len(rows), NEVER)
     lost = np.flatnonzero(kind == CODES["lost"])
-    outcome[links.places(log["node"][lost], log["peer"][lost], log["message"][lost])] = LOST
+    outcome[links.indices(log["node"][lost], log["peer"][lost], log["message"][lost])] = LOST
     late = np.flatnonzero(kind == CODES["late"])
-    at = links.places(log["peer"][late], log["node"][late], log["message"][late])
+    at = links.indices(log["peer"][late], log["node"][late], log["message"][late])
     outcome[at], arrived[at] = (LATE if slotted else REFUSED), log["t"][late]
     came = np.flatnonzero(kind == CODES["deliver"])
-    at = links.places(log["peer"][came], log["node"][came], log["message"][came])
+    at = links.indices(log["peer"][came], log["node"][came], log["message"][came])
     arrived[at], used[at] = log["t"][came], _next_use(log, came)
     outcome[at] = np.where(used[at] == NEVER, UNDER_WAY, USED)
     if swaps:
@@ -103,7 +103,7 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
 
 
 class _Links(NamedTuple):
-    """Directed links in the order of ``sender`` and ``receiver``; ``start`` is the place of the
+    """Directed links in the order of ``sender`` and ``receiver``; ``start`` is the index of the
     first message of each.
     """
 
@@ -111,8 +111,8 @@ class _Links(NamedTuple):
     receiver: IntArray
     start: IntArray
 
-    def places(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
-        """Return the places of messages among those of all links."""
+    def indices(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
+        """Return the indices of messages among those of all links."""
         if not len(self.start):
             return np.empty(0, dtype=np.int64)
         ids = np.unique(np.concatenate([self.sender, self.receiver]))
@@ -128,8 +128,8 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
     keys = np.searchsorted(ids, log["node"][uses]) * length + uses
     order = np.argsort(keys)
     node = np.searchsorted(ids, log["node"][rows])
-    place = np.searchsorted(keys[order], node * length + rows)
-    found = np.append(uses[order], NEVER)[place]
+    position = np.searchsorted(keys[order], node * length + rows)
+    found = np.append(uses[order], NEVER)[position]
     return np.where((found >= 0) & (log["node"][found] == log["node"][rows]), found, NEVER)
 
 
@@ -245,8 +245,8 @@ def _swaps(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Fl
     start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])
     order = np.lexsort((start, node))
     node, start = node[order], start[order]
-    places, length = np.searchsorted(nodes, node), rows + 1
-    keys = places * length + start
+    indices, length = np.searchsorted(nodes, node), rows + 1
+    keys = indices * length + start
 
     def segment(who: IntArray, row: IntArray) -> IntArray:
         wanted = np.searchsorted(nodes, who) * length + row
@@ -334,7 +334,7 @@ class KeptReadings:
         In slots a node with sensors reads in every slot, but a record may lack rows.
         """
         scenario = self._scenario
-        sensors = [scenario.sensors[place.entry] for place in scenario.placed[node]]
+        sensors = [scenario.sensors[position.entry] for position in scenario.placed[node]]
         if not scenario.slotted or not all(isinstance(s, RecordedSensor) for s in sensors):
             return rows
         recorded = [s.row_times for s in sensors if isinstance(s, RecordedSensor)]

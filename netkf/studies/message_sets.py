@@ -196,4 +196,4 @@ def _is_joined(chosen: Sequence[Candidate]) -> bool:
     """Return False if a member of a set cannot matter: too few others of it lead to the node."""
     # Whoever needs two others needs one of those that need one other.
     needed = sorted(candidate.needed for candidate in chosen)
-    return all(count <= place for place, count in enumerate(needed, start=1))
+    return all(count <= position for position, count in enumerate(needed, start=1))

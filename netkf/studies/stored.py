@@ -145,8 +145,10 @@ class StoredVerdict(Shown):
 
     def __repr__(self) -> str:
         counts = Counter(row["verdict"] for row in self.document["rows"])
-        told = one_line(", ".join(f"{count} {name}" for name, count in sorted(counts.items())))
-        return f"<netkf verdict on {self.scenario.name!r}: {told or 'no row'}; {self.runs:,} runs>"
+        verdicts = one_line(", ".join(f"{count} {name}" for name, count in sorted(counts.items())))
+        return (
+            f"<netkf verdict on {self.scenario.name!r}: {verdicts or 'no row'}; {self.runs:,} runs>"
+        )
 
 
 def read_verdict(directory: Path, trust: bool = False) -> StoredVerdict:

@@ -188,8 +188,8 @@ def comparison_text(found: Comparison) -> str:
     lines += ["", table(["", *numbered], rows, left=1)]
     notes = [
         f"note: {mark} {shorten(note, 500)}"
-        for mark, told in zip(numbered, found.notes, strict=True)
-        for note in told
+        for mark, texts in zip(numbered, found.notes, strict=True)
+        for note in texts
     ]
     lines += ["", *notes] if notes else []
     methods = {e.method for row in found.rows for e in row.entries if e.method}

@@ -121,7 +121,7 @@ def test_names_move_copies_stay_and_places_are_clean():
     columns = stack.inputs(2)
     stack.put("a", np.zeros((1, 0)))
     stack.add("a", columns, np.array([[1.0, 2.0]]))
-    stack.matrices[stack.place("a")] = 3.0
+    stack.matrices[stack.index("a")] = 3.0
     stack.copy("a", "b")
     stack.rename("a", "c")
     assert sorted(stack.names) == ["b", "c"]
@@ -129,7 +129,7 @@ def test_names_move_copies_stay_and_places_are_clean():
     stack.put("c", np.array([[5.0]]))
     assert stack.form("b").tolist() == [[1.0, 2.0]]
     assert stack.form("c").tolist() == [[5.0, 0.0]]
-    assert stack.matrices[stack.place("b")].item() == 3.0
+    assert stack.matrices[stack.index("b")].item() == 3.0
     stack.drop(["b"])
     stack.put("d", np.zeros((1, 0)))
     assert not stack.form("d").any()

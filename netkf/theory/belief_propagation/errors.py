@@ -50,7 +50,7 @@ class BeliefRule(ErrorRule):
         """Set a piece of evidence."""
         self._evidence.add(name)
         self.errors.stack.put(name, s)
-        self.errors.stack.matrices[self.errors.stack.place(name)] = U
+        self.errors.stack.matrices[self.errors.stack.index(name)] = U
 
     def _drop(self, names: Sequence[Hashable]) -> None:
         self._evidence.difference_update(names)
@@ -60,7 +60,7 @@ class BeliefRule(ErrorRule):
         """Return U (n, n) and the form of s (n, inputs) of several pieces of evidence together."""
         stack, n = self.errors.stack, self.errors.n
         known = [name for name in names if name in self._evidence]
-        U = sum((stack.matrices[stack.place(name)] for name in known), np.zeros((n, n)))
+        U = sum((stack.matrices[stack.index(name)] for name in known), np.zeros((n, n)))
         return U, sum((stack.form(name) for name in known), np.zeros((n, stack.used)))
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
@@ -71,7 +71,7 @@ class BeliefRule(ErrorRule):
     def _move(self, back: FloatArray) -> None:
         stack = self.errors.stack
         for name in self._evidence:
-            U = stack.matrices[stack.place(name)]
+            U = stack.matrices[stack.index(name)]
             self._put(name, back.T @ U @ back, back.T @ stack.form(name))
 
     def _begin_slot(self) -> None:

@@ -37,11 +37,11 @@ class Roots:
         return name in self._owner
 
     def __getitem__(self, name: Hashable) -> FloatArray:
-        root: FloatArray = self._stack.matrices[self._stack.place(name)].copy()
+        root: FloatArray = self._stack.matrices[self._stack.index(name)].copy()
         return root
 
     def __setitem__(self, name: Hashable, root: FloatArray) -> None:
-        self._stack.matrices[self._stack.place(name)] = root
+        self._stack.matrices[self._stack.index(name)] = root
 
 
 class StackedErrors:
@@ -125,7 +125,7 @@ class StackedErrors:
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the hosts."""
         # P = S S'
-        S = self.stack.matrices[self.stack.places(range(self.hosts))]
+        S = self.stack.matrices[self.stack.indices(range(self.hosts))]
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
     def copy(self, name: Hashable, new: Hashable, owner: int | None) -> None:
@@ -162,8 +162,8 @@ class StackedErrors:
         if not len(observation.H):
             return
         stack, (H, R, root) = self.stack, map(as_kernel_array, observation)
-        place, first = stack.place(name), columns.start
-        update_estimate(stack.table, stack.matrices, place, stack.used, H, R, root, first)
+        index, first = stack.index(name), columns.start
+        update_estimate(stack.table, stack.matrices, index, stack.used, H, R, root, first)
 
     def multiply(self, name: Hashable, matrix: FloatArray, root: FloatArray) -> None:
         """Multiply an error by a matrix (n, n) and set the root of its P."""
@@ -184,13 +184,13 @@ class StackedErrors:
         """Predict all estimates, and the state; return the columns of the plant's inputs."""
         stack, noise = self.stack, step.error_noise
         columns = stack.inputs(noise.shape[1])
-        places = stack.places(self.owner)
+        indices = stack.indices(self.owner)
         x = stack.form(STATE) if self.follows else None
         # e+ = F e + D x + w for all estimates, and x+ = F x + w for the state
         predict_estimates(
             stack.table,
             stack.matrices,
-            places,
+            indices,
             stack.used,
             as_kernel_array(step.error),
             as_kernel_array(noise),
@@ -198,7 +198,7 @@ class StackedErrors:
             columns.start,
         )
         if x is not None:
-            stack.table[places, :, : stack.used] += step.follow @ x
+            stack.table[indices, :, : stack.used] += step.follow @ x
             stack.put(STATE, step.state @ x)
             stack.add(STATE, columns, step.state_noise)
         return columns
@@ -300,14 +300,14 @@ class ErrorPropagator:
         columns: tuple[slice, int],
     ) -> None:
         """Propagate estimates with one flow whose errors depend on the state's form x."""
-        errors, (shared, place) = self._errors, columns
+        errors, (shared, column) = self._errors, columns
         moved = flow.transition(np.stack([errors.roots[name] for name in names]), gap)
         forms = moved.transition @ errors.stack.forms(names) + moved.follow @ x
         forms[:, :, shared] += moved.response
         for k, name in enumerate(names):
             if flow.observes:
-                forms[k, :, place : place + moved.own.shape[2]] += moved.own[k]
-                place += errors.n
+                forms[k, :, column : column + moved.own.shape[2]] += moved.own[k]
+                column += errors.n
             errors.roots[name] = moved.root[k]
         errors.stack.put_all(dict(zip(names, forms, strict=True)))
 

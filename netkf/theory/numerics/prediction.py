@@ -226,7 +226,7 @@ class ErrorFlow:
         flow_estimates(
             stack.table,
             stack.matrices,
-            stack.places(names),
+            stack.indices(names),
             stack.used,
             columns,
             self._tables,

@@ -22,14 +22,14 @@ SPARE_INPUTS = 192  # columns kept beyond the number of rows between two reducti
 class GaussianStack:
     """Named Gaussian vectors of n entries; a name is any hashable value.
 
-    table    : (places, n, width), the forms; kernels work on it
-    matrices : (places, n, n), a matrix that belongs to each vector, such as a root of P
+    table    : (vectors, n, width), the forms; kernels work on it
+    matrices : (vectors, n, n), a matrix that belongs to each vector, such as a root of P
     used     : number of columns that count
     """
 
     def __init__(self, n: int) -> None:
         self._n = n
-        self._place: dict[Hashable, int] = {}
+        self._index: dict[Hashable, int] = {}
         self._free: list[int] = []
         self._settled = 0
         self.used = 0
@@ -37,20 +37,20 @@ class GaussianStack:
         self.matrices: FloatArray = np.zeros((0, n, n))
 
     def __contains__(self, name: Hashable) -> bool:
-        return name in self._place
+        return name in self._index
 
     @property
     def names(self) -> tuple[Hashable, ...]:
         """Names of the vectors, in the order in which they were added."""
-        return tuple(self._place)
+        return tuple(self._index)
 
-    def place(self, name: Hashable) -> int:
-        """Return the place of a vector in the tables."""
-        return self._place[name]
+    def index(self, name: Hashable) -> int:
+        """Return the index of a vector in the tables."""
+        return self._index[name]
 
-    def places(self, names: Iterable[Hashable]) -> IntArray:
-        """Return the places (K,) of K vectors."""
-        return np.array([self._place[name] for name in names], dtype=np.int64)
+    def indices(self, names: Iterable[Hashable]) -> IntArray:
+        """Return the indices (K,) of K vectors."""
+        return np.array([self._index[name] for name in names], dtype=np.int64)
 
     def inputs(self, count: int) -> slice:
         """Add ``count`` inputs, independent of all before, and return their columns.
@@ -58,7 +58,7 @@ class GaussianStack:
         The columns are valid until the next call.
         """
         if self.used + count > self.table.shape[2]:
-            self._reduce(self._place, count)
+            self._reduce(self._index, count)
         columns = slice(self.used, self.used + count)
         self.used += count
         return columns
@@ -68,17 +68,17 @@ class GaussianStack:
         inputs in the same columns, and the vectors do not depend on any others.
         """
         first = set(names)
-        others = [name for name in self._place if name not in first]
+        others = [name for name in self._index if name not in first]
         self._reduce([*names, *others], 0)
         # Below a triangle of zeros, the first rows end within as many columns.
         self._settled = min(self.used, self._settled + len(names) * self._n)
-        return self.table[self.places(names), :, : self._settled]
+        return self.table[self.indices(names), :, : self._settled]
 
     def _reduce(self, names: Iterable[Hashable], count: int) -> None:
         """Rotate the inputs that are not settled so that few are left, the first ones for the first
         names, and make space for ``count`` more.
         """
-        rows = self.places(names)
+        rows = self.indices(names)
         stacked = self.table[rows, :, self._settled : self.used].reshape(len(rows) * self._n, -1)
         # Only T T' matters, so that T may be multiplied by any orthogonal matrix from the right:
         # T' = Q R, so T T' = R' R, and R' replaces T and has no more columns than rows.
@@ -92,24 +92,24 @@ class GaussianStack:
 
     def form(self, name: Hashable) -> FloatArray:
         """Return a copy (n, inputs) of the form of one vector."""
-        return self.table[self._place[name], :, : self.used].copy()
+        return self.table[self._index[name], :, : self.used].copy()
 
     def forms(self, names: Sequence[Hashable]) -> FloatArray:
         """Return a copy (K, n, inputs) of the forms of K vectors."""
-        return self.table[[self._place[name] for name in names], :, : self.used]
+        return self.table[[self._index[name] for name in names], :, : self.used]
 
     def put(self, name: Hashable, form: FloatArray) -> None:
         """Add or overwrite a vector; inputs newer than ``form`` (n, inputs) get zero columns."""
-        place = self._place_for(name)
-        self.table[place, :, : form.shape[1]] = form
-        # The place may hold columns of an earlier vector.
-        self.table[place, :, form.shape[1] : self.used] = 0.0
+        index = self._index_for(name)
+        self.table[index, :, : form.shape[1]] = form
+        # The index may hold columns of an earlier vector.
+        self.table[index, :, form.shape[1] : self.used] = 0.0
 
-    def _place_for(self, name: Hashable) -> int:
-        place = self._place.get(name)
-        if place is None:
-            place = self._place[name] = self._free.pop() if self._free else self._grow()
-        return place
+    def _index_for(self, name: Hashable) -> int:
+        index = self._index.get(name)
+        if index is None:
+            index = self._index[name] = self._free.pop() if self._free else self._grow()
+        return index
 
     def put_all(self, forms: Mapping[Hashable, FloatArray]) -> None:
         """Add or overwrite several vectors."""
@@ -118,32 +118,32 @@ class GaussianStack:
 
     def add(self, name: Hashable, columns: slice, matrix: FloatArray) -> None:
         """Add ``matrix`` (n, k) times the inputs in ``columns`` to a vector."""
-        self.table[self._place[name], :, columns] += matrix
+        self.table[self._index[name], :, columns] += matrix
 
     def mix(self, sources: Sequence[Hashable], factors: FloatArray) -> FloatArray:
         """Return the form (n, inputs) of the sum of vectors times ``factors`` (K, n, n)."""
-        return mixed_form(self.table, self.places(sources), factors, self.used)
+        return mixed_form(self.table, self.indices(sources), factors, self.used)
 
     def copy(self, name: Hashable, new: Hashable) -> None:
         """Copy a vector and its matrix to another name."""
-        target = self._place_for(new)
-        source = self._place[name]
+        target = self._index_for(new)
+        source = self._index[name]
         self.table[target, :, : self.used] = self.table[source, :, : self.used]
         self.matrices[target] = self.matrices[source]
 
     def drop(self, names: Iterable[Hashable]) -> None:
         """Remove vectors; their storage is reused."""
         for name in names:
-            place = self._place.pop(name)
+            index = self._index.pop(name)
             # All columns: what is stored here next finds no rest in inputs that are newer.
-            self.table[place, :, : self.used] = 0.0
-            self._free.append(place)
+            self.table[index, :, : self.used] = 0.0
+            self._free.append(index)
 
     def rename(self, name: Hashable, other: Hashable) -> None:
         """Store the vector ``name`` under the name ``other``, overwriting what was there."""
-        if other in self._place:
+        if other in self._index:
             self.drop([other])
-        self._place[other] = self._place.pop(name)
+        self._index[other] = self._index.pop(name)
 
     def covariance(self, names: Sequence[Hashable]) -> FloatArray:
         """Return the joint covariance (K n, K n) of K vectors."""
@@ -151,7 +151,7 @@ class GaussianStack:
         return np.asarray(stacked @ stacked.T)
 
     def _grow(self) -> int:
-        """Double the storage and return a free place."""
+        """Double the storage and return a free index."""
         count = len(self.table)
         more = max(4, 2 * count) - count
         self.table, self.matrices = (

@@ -94,9 +94,9 @@ class AveragingRule(ErrorRule):
             laplacian = np.diag(received.sum(axis=1)) - received
             mixing = mixing - laplacian @ mixing / self._delta
         stack = self.errors.stack
-        places = stack.places(hosts)
-        forms = stack.table[places, :, : stack.used].reshape(self._N, -1)
-        stack.table[places, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
+        indices = stack.indices(hosts)
+        forms = stack.table[indices, :, : stack.used].reshape(self._N, -1)
+        stack.table[indices, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
 
     def _received(self, slot: int, phase: int, step: int) -> FloatArray:
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
@@ -151,12 +151,12 @@ class RunningTotalsRule(ErrorRule):
         """Set a total: its weight, its information U (n, n) and the form of its error."""
         stack, self._totals[name] = self.errors.stack, weight
         stack.put(name, form)
-        stack.matrices[stack.place(name)] = U
+        stack.matrices[stack.index(name)] = U
 
     def _information(self, name: Hashable) -> FloatArray:
         """Return a copy of the information U (n, n) of a total."""
         stack = self.errors.stack
-        U: FloatArray = stack.matrices[stack.place(name)].copy()
+        U: FloatArray = stack.matrices[stack.index(name)].copy()
         return U
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
@@ -168,7 +168,7 @@ class RunningTotalsRule(ErrorRule):
         inverse = np.asarray(scipy.linalg.expm(-gap * self._A), order="C")
         fading, stack = math.exp(-2.0 * self._rate * gap), self.errors.stack
         fade_totals(
-            *(stack.table, stack.matrices, stack.places(self._totals), stack.used),
+            *(stack.table, stack.matrices, stack.indices(self._totals), stack.used),
             *(inverse, fading, as_kernel_array(noise), columns.start),
         )
 
