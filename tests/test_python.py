@@ -221,7 +221,7 @@ def test_results_show_themselves_in_a_line_and_as_a_table(ring):
         assert page.count("<tr>") + page.count("<tr ") > len(short.nodes) or name == "size"
         assert not [attribute for attribute in dir(result) if attribute.startswith("_")]
     assert "20 runs" in str(shown["verdict"])
-    run, table = shown["run"], shown["run"]._shown_table()
+    run, table = shown["run"], shown["run"]._notebook_table()
     after = run.times > 0.0
     rms = np.sqrt(((run.x[after, None] - run.xhat[after]) ** 2).sum(axis=2).mean(axis=0))
     np.testing.assert_allclose(table["RMS error"], rms)

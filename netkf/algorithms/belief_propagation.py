@@ -131,7 +131,7 @@ class BeliefPropagation(Filter):
         return self.steps
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BeliefState:
-        """Nothing was read or heard."""
+        """Return the first state, in which nothing was read or heard."""
         root, nothing = first_root(cov), ReadingEvidence(np.zeros(0), np.zeros((0, len(mean))))
         prior = evidence_of(mean, root)
         return BeliefState(mean, root, model, prior, nothing, (), (), node.node)

@@ -259,7 +259,7 @@ class InformationConsensus(Filter):
         return state._replace(xhat=xhat, root=root, parts=None)
 
     def _intersect(self, state: ConsensusState, messages: Sequence[Message]) -> ConsensusState:
-        """Under clocks: one step of consensus on the pairs of those heard, predicted to now."""
+        """Do, under clocks, one step of consensus on the pairs of those heard, predicted to now."""
         weights, means, roots = weighted_pairs(state, messages)
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)

@@ -114,7 +114,7 @@ class Intermittent(Filter):
     slot_kernel = staticmethod(intermittent_slots)
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Nodes send their readings."""
+        """Return True: nodes send their readings."""
         return has_sensor
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
@@ -149,7 +149,7 @@ class Intermittent(Filter):
         return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
 
     def update(self, state: IntermittentState, reading: Reading) -> IntermittentState:
-        """R (15)-(18), and keep the reading to be sent."""
+        """Use the reading, R (15)-(18), and keep the reading to be sent."""
         return _use(state, reading)._replace(unsent=reading if len(reading.y) else None)
 
     def emit(

@@ -506,7 +506,9 @@ class PushSum(Filter):
         return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
 
     def slot_stopping(self) -> tuple[int, bool]:
-        """Nodes stop when they have exchanged mass; by the paper's rule they send none then."""
+        """Return where nodes stop: after an exchange of mass; by the paper's rule they send none
+        then.
+        """
         # Without exchanges of mass there is nothing to stop.
         stops = not self.asymptotic and self.stop != "never"
         return (MASS if stops else -1), stops and self.stop == "paper"
@@ -583,7 +585,7 @@ class PushSum(Filter):
         return self.gamma or 1 if phase == AVERAGE else 1
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """Links that are held keep the outcome of the first averaging step."""
+        """Return True unless links that are held keep the outcome of the first averaging step."""
         return self.links == "fresh" or step == 0
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
@@ -601,7 +603,7 @@ class PushSum(Filter):
         return state, None if silent else share(state.mass, state.degree)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Steps 2.2 and 2.3, or step 5.2."""
+        """Use messages by steps 2.2 and 2.3, or step 5.2."""
         if isinstance(state, RunningSums):
             return running_sums.absorb_totals(state, messages)
         received = [message.payload for message in messages]
@@ -643,7 +645,7 @@ class PushSum(Filter):
         return state._replace(network=found, stopped=stopped)
 
     def update(self, state: Any, reading: Reading) -> Any:
-        """Steps 3 and 4 after the prediction, P (7) and (8)."""
+        """Use a reading by steps 3 and 4 after the prediction, P (7) and (8)."""
         if isinstance(state, RunningSums):
             return running_sums.update_sums(state, reading)
         root = state.network.root

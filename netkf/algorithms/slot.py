@@ -97,7 +97,9 @@ class SlotFilter(Component):
         return state
 
     def steps(self, phase: int) -> int:
-        """How often exchange number ``phase`` of a slot is repeated; its time is shared evenly."""
+        """Return how often exchange number ``phase`` of a slot is repeated; its time is shared
+        evenly.
+        """
         return 1
 
     def redraws(self, phase: int, step: int) -> bool:

@@ -43,7 +43,7 @@ from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
-from netkf.core.shown import Shown
+from netkf.core.notebook import NotebookTable
 from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.ensembles.pools import PoolOptions
@@ -66,7 +66,7 @@ TWIN_TOLERANCE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class Verdict(Shown):
+class Verdict(NotebookTable):
     """Evidence for every promise; true if none is broken.
 
     ``confidence``: all intervals of all rows, of earlier looks too, hold together with at least

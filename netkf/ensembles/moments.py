@@ -25,7 +25,9 @@ class Moments(NamedTuple):
     M2: FloatArray
 
     def standard_error(self) -> FloatArray:
-        """Standard error of the mean (S, C); nan where there are fewer than two values."""
+        """Return the standard error of the mean (S, C); nan where there are fewer than
+        two values.
+        """
         size = self.size[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = self.M2 / np.where(size > 1.0, size - 1.0, np.nan)
@@ -33,8 +35,8 @@ class Moments(NamedTuple):
 
 
 def moments_of(values: FloatArray, size: FloatArray) -> Moments:
-    """Moments of R observations (R, S, C), merged in the binary tree over them; ``size`` (R, S) is
-    1 where an observation exists and 0 where it does not. Both arrays are overwritten.
+    """Return the moments of R observations (R, S, C), merged in the binary tree over them; ``size``
+    (R, S) is 1 where an observation exists and 0 where it does not. Both arrays are overwritten.
     """
     _, rows, columns = values.shape
     mean, M2 = np.empty((rows, columns)), np.empty((rows, columns))
@@ -43,7 +45,7 @@ def moments_of(values: FloatArray, size: FloatArray) -> Moments:
 
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
-    """Moments of both samples together."""
+    """Return the moments of both samples together."""
     size, mean, M2 = (_stack_pair(*pair) for pair in zip(a, b, strict=True))
     merge_two(size, mean, M2)
     return Moments(size[0], mean[0], M2[0])

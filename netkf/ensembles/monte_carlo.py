@@ -11,7 +11,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer
-from netkf.core.shown import Shown
+from netkf.core.notebook import NotebookTable
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate_blocks
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
@@ -29,7 +29,7 @@ LOAD = "load it first: netkf.monte_carlo(netkf.load(path), runs)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Ensemble(Shown):
+class Ensemble(NotebookTable):
     """What many runs of one scenario came to.
 
     times (T,), nodes (N,), ``runs`` (T,): how many have that sample (runs that diverge end early);
@@ -61,7 +61,7 @@ class Ensemble(Shown):
     seed: int
     engine: str
     fingerprint: str
-    shown: bool = True
+    truth_known: bool = True
     rounding_from: float = np.inf
     scenario: Scenario | None = None
 
@@ -72,6 +72,11 @@ class Ensemble(Shown):
             f"seed {self.seed}>"
         )
 
+    @property
+    def shown(self) -> bool:
+        """Former name of ``truth_known``."""
+        return self.truth_known
+
     def plot(self, figure: str = "error") -> Any:
         """Return a figure of the ensemble as a matplotlib Figure, as ``netkf plot`` draws it:
         overview, error, quantiles, ratios, network, nees, stability or law; those of single runs
@@ -79,7 +84,7 @@ class Ensemble(Shown):
         """
         return plot_by_name(self, figure)
 
-    def _shown_table(self) -> pd.DataFrame:
+    def _notebook_table(self) -> pd.DataFrame:
         """Return averages over the samples after time 0, a row per node and one for all."""
         import pandas as pd
 
@@ -194,7 +199,7 @@ def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray,
 
 
 def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
-    """Named columns, a row a time and node; errors only where the truth is shown."""
+    """Return named columns, a row a time and node; errors only where the truth is known."""
     n, rows = ensemble.mean_P.shape[-1], len(ensemble.times) * len(ensemble.nodes)
     i, j = np.triu_indices(n)
 
@@ -213,5 +218,5 @@ def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
         ensemble.se_nees.reshape(rows),
     ]
     names = ensemble_columns(n)
-    kept = len(names) if ensemble.shown else 3 + 2 * len(i)
+    kept = len(names) if ensemble.truth_known else 3 + 2 * len(i)
     return dict(zip(names[:kept], columns[:kept], strict=True))

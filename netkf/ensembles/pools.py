@@ -112,7 +112,7 @@ class AdaptivePool(LocalPool):
         self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
 
     def submit(self, job: Job) -> Future[Any]:
-        """Done here, or handed to the processes once they are worth it."""
+        """Do the block here, or hand it to the processes once they are worth it."""
         if job.scenario is not self._scenario:
             self._scenario, self._size = job.scenario, 1
             self._begun, self._seconds, self._runs = False, 0.0, 0
@@ -282,7 +282,7 @@ class ProcessPool(RemotePool):
 
 
 def cores() -> int:
-    """Processor cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 

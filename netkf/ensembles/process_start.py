@@ -24,7 +24,9 @@ PRELOADED = ["netkf.ensembles.statistics"]
 
 
 def context() -> Any:
-    """Processes that begin without this one's threads and memory; quickly where they can."""
+    """Return a context whose processes begin without this one's threads and memory; quickly where
+    they can.
+    """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     made = multiprocessing.get_context("forkserver")
@@ -79,7 +81,7 @@ def signals_blocked() -> Iterator[None]:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Numerical libraries read these when a process loads them."""
+    """Set the variables that numerical libraries read when a process loads them."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:

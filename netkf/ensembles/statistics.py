@@ -63,7 +63,7 @@ class RunStatistics(NamedTuple):
 
 
 def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
-    """Statistics of the runs of ``a`` followed by those of ``b``."""
+    """Return the statistics of the runs of ``a`` followed by those of ``b``."""
     conserved = {
         name: (merge_moments(sums, b.conserved[name][0]), max(drift, b.conserved[name][1], key=abs))
         for name, (sums, drift) in a.conserved.items()
@@ -101,8 +101,8 @@ def block_statistics(
 def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
 ) -> Iterator[tuple[RunBatch, tuple[Trace, ...]]]:
-    """Batches, and the traces of those that are a single traced run; the batch of replica 0 has a
-    fingerprint.
+    """Yield batches, and the traces of those that are a single traced run; the batch of replica 0
+    has a fingerprint.
     """
     for replica in range(replicas.start, min(traces, replicas.stop)):
         yield _traced_run(scenario, seed, replica, engine)
@@ -128,14 +128,14 @@ def _traced_run(
 class RunValues(NamedTuple):
     """Values of R runs that statistics are over, and of K ``pieces`` of them.
 
-    ``samples`` of each piece, the moments (T, F (2 u + 1)) of F filters, each ``shown`` by so many
-    nodes (N where the filter is pooled, else 1); ``averages`` (R, N + 1, 3); ``messages`` (R, 5);
-    ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
+    ``samples`` of each piece, the moments (T, F (2 u + 1)) of F filters, each for so many nodes
+    (``copies``: N where the filter is pooled, else 1); ``averages`` (R, N + 1, 3); ``messages``
+    (R, 5); ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
     """
 
     pieces: Sequence[slice]
     samples: Sequence[Moments]
-    shown: int
+    copies: int
     averages: FloatArray
     messages: FloatArray
     events: np.ndarray
@@ -153,13 +153,13 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
     places = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
     pieces = [slice(at - first, at - first + (1 << level)) for at, level in places]
     reduced, nodes = reduce_batch(batch, pieces), len(scenario.nodes)
-    shown, averages = nodes // batch.error.shape[2], reduced.averages
-    if shown > 1:
+    copies, averages = nodes // batch.error.shape[2], reduced.averages
+    if copies > 1:
         averages = np.repeat(averages, nodes, axis=1)
     return RunValues(
         pieces,
         reduced.samples,
-        shown,
+        copies,
         np.concatenate([averages, _mean_of_nodes(averages)], axis=1),
         count_messages(batch.counts, scenario.slotted),
         batch.counts.sum(axis=1),
@@ -177,7 +177,7 @@ def _mean_of_nodes(averages: FloatArray) -> FloatArray:
 
 
 def merge_runs(values: RunValues, piece: int) -> RunStatistics:
-    """Statistics of one piece of the runs, merged by the tree over them."""
+    """Return the statistics of one piece of the runs, merged by the tree over them."""
     runs, found = values.pieces[piece], values.samples[piece]
     averages, messages = values.averages[runs], values.messages[runs]
     count, one = len(messages), np.ones((len(messages), 1))
@@ -188,9 +188,9 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
         )
         for name, sums in values.sums.items()
     }
-    if values.shown > 1:
+    if values.copies > 1:
         # All nodes show the same filter.
-        found = Moments(found.size, *(np.tile(v, values.shown) for v in (found.mean, found.M2)))
+        found = Moments(found.size, *(np.tile(v, values.copies) for v in (found.mean, found.M2)))
     # Averages and messages in one call: columns do not see each other.
     both = np.concatenate([averages.reshape(count, -1), messages], axis=1)
     size, mean, M2 = moments_of(both[:, None], one)

@@ -94,7 +94,7 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
         seed=int(manifest["seed"]),
         engine=str(manifest.get("engine", "")),
         fingerprint=str(manifest.get("fingerprint", "")),
-        shown=scenario.plant.truth_known,
+        truth_known=scenario.plant.truth_known,
         rounding_from=np.inf if blurred is None else float(blurred),
         scenario=scenario,
         **kept,

@@ -54,9 +54,9 @@ def summarise_ensemble(
 
 
 def _chi_square(scenario: Scenario, found: RunStatistics) -> dict[str, float]:
-    """Bounds on the mean NEES of one sample over the runs that hold with ``confidence`` where P is
-    exact, since the sum is chi-square; over n they bound the ANEES. ``inside``: the share of all
-    samples after time 0 that every run has and that rounding does not blur.
+    """Return bounds on the mean NEES of one sample over the runs that hold with ``confidence``
+    where P is exact, since the sum is chi-square; over n they bound the ANEES. ``inside``: the
+    share of all samples after time 0 that every run has and that rounding does not blur.
     """
     n, runs = scenario.plant.n, found.runs
     low, high = nees_bounds(n, runs)

@@ -147,7 +147,7 @@ class Subject:
         return ""
 
     def _departures(self, about: str) -> list[str]:
-        """Sentences on how a run differs from what its paper assumes."""
+        """Return sentences on how a run differs from what its paper assumes."""
         notes = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
         return [f"Note: {note}." for note, kind in notes if about in (kind, "both")]
 

@@ -63,38 +63,38 @@ class Diffusion(Plant):
         self,
         random: np.random.Generator,
         probing: np.random.Generator,
-        shown: FloatArray,
+        probe_times: FloatArray,
         sampling: np.random.Generator | None = None,
         sampled: FloatArray = NO_TIMES,
         horizon: float = 0.0,
         frames: bool = False,
     ) -> DiffusionPath:
         """Return a path of its own that can be asked for its state on the sensing grid and at the
-        times ``sampled`` and ``shown`` (increasing). ``sampling`` is used only for times sampled
-        off the grid, ``probing`` only for those shown off both. With ``frames``, states are local,
-        see ``truth``, in frames that begin before the ``horizon``.
+        times ``sampled`` and ``probe_times`` (increasing). ``sampling`` is used only for times
+        sampled off the grid, ``probing`` only for those probed off both. With ``frames``, states
+        are local, see ``truth``, in frames that begin before the ``horizon``.
         """
-        own, shows = GeneratorNormals([random]), GeneratorNormals([probing])
+        own, probes = GeneratorNormals([random]), GeneratorNormals([probing])
         samples = GeneratorNormals([] if sampling is None else [sampling])
-        paths = self.paths(own, shows, shown, samples, sampled, frames)
+        paths = self.paths(own, probes, probe_times, samples, sampled, frames)
         return DiffusionPath(paths, horizon)
 
     def paths(
         self,
         normals: Normals,
         probing: Normals,
-        shown: FloatArray,
+        probe_times: FloatArray,
         sampling: Normals | None = None,
         sampled: FloatArray = NO_TIMES,
         frames: bool = False,
     ) -> DiffusionPaths:
-        """Return the paths of several runs together, which are sampled and shown at the
+        """Return the paths of several runs together, which are sampled and probed at the
         same times.
         """
         start = self.starts(normals)
         cuts = [] if sampling is None or not len(sampled) else [Cuts(sampled, sampling)]
         steps = self.frame_steps if frames else None
-        return DiffusionPaths(self.laws, start, normals, [*cuts, Cuts(shown, probing)], steps)
+        return DiffusionPaths(self.laws, start, normals, [*cuts, Cuts(probe_times, probing)], steps)
 
     def start(self, random: np.random.Generator) -> FloatArray:
         """Draw x(0) (n,)."""

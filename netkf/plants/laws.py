@@ -32,7 +32,7 @@ _NODES, _WEIGHTS = gauss_legendre(20)
 
 
 def grid_time(period: float, k: int) -> float:
-    """Rounded so that lattices of other periods meet it."""
+    """Return a time of the grid, rounded so that lattices of other periods meet it."""
     return float(round(k * period, 12))
 
 
@@ -166,7 +166,9 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
 
 
 def course_width(n: int) -> int:
-    """Columns of ``course_table``: whole lanes for two integrals of n states."""
+    """Return the number of columns of ``course_table``: whole lanes for two integrals of
+    n states.
+    """
     return -(-2 * n // LANES) * LANES
 
 

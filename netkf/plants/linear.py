@@ -96,7 +96,7 @@ class Readings(Protocol):
     """The readings of one sensor on one node in slots."""
 
     def matrix(self, slot: int) -> FloatArray:
-        """H (p, n) of a slot not before the last one asked for."""
+        """Return H (p, n) of a slot not before the last one asked for."""
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """Return the reading (p,) of that slot, in which the state is x."""
@@ -189,7 +189,7 @@ class SlotReadings:
         self._slot, self._v = -1, np.zeros(len(R))
 
     def matrix(self, slot: int) -> FloatArray:
-        """H (p, n) of a slot not before the last one asked for."""
+        """Return H (p, n) of a slot not before the last one asked for."""
         return self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:

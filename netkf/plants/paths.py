@@ -5,7 +5,7 @@ two moments of x over the step (core/legendre), all from one stream and whatever
 Between grid points, filters that are woken by the network need part of a step. There the path is
 the response to the state at the grid point plus the cubic that agrees with the step's end and with
 its two moments; what that leaves out of a reading is of third order in h and less than 1e-4 h^3 of
-the noise intensity. Where a state is *sampled* or *shown* off the grid, the step is cut there
+the noise intensity. Where a state is *sampled* or *probed* off the grid, the step is cut there
 beforehand: state and moments are drawn from their exact law given the step, from streams of their
 own, the sampled ones first. On frames see ``truth``.
 """
@@ -43,7 +43,7 @@ class PathStep(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Some steps S as K pieces, since a step is cut where a state is shown: ``start, end`` (K,), x
+    """Some steps S as K pieces, since a step is cut where a state is probed: ``start, end`` (K,), x
     at both (K, n), ``moments`` (K, 2, n), ``cubic`` (K, 4, n) and whose ``step`` (K,) each is;
     ``ends`` (S,) of the steps. What is random comes for B paths at once, (B, K, ...).
     """
@@ -76,7 +76,7 @@ class Cuts(NamedTuple):
 
 class DiffusionPaths:
     """The paths of B runs, which are cut at the same times: ``start`` (B, n), the normals of each,
-    and where states are sampled or shown (``cuts``, one after the other).
+    and where states are sampled or probed (``cuts``, one after the other).
 
     With ``frame_steps``, states are local: they start again from zero every so many steps, so that
     a piece may end at a state that the next one does not start from.
@@ -98,7 +98,9 @@ class DiffusionPaths:
         self._x, self._drawn = start, 0
 
     def following(self, blocks: int = 1, most: int | None = None) -> Block:
-        """The next steps of the sensing grid, ``blocks`` times BLOCK, but ``most`` at most."""
+        """Return the next steps of the sensing grid, ``blocks`` times BLOCK, but ``most``
+        at most.
+        """
         laws, (count, n) = self.laws, self._x.shape
         total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
         x_start, x_end = (np.empty((count, total, n)) for _ in range(2))
@@ -128,27 +130,27 @@ class DiffusionPaths:
             step=np.arange(total),
             ends=times[1:],
         )
-        # One kind of cuts after the other: shown states are drawn given those that were sampled.
+        # One kind of cuts after the other: probed states are drawn given those that were sampled.
         for cuts in self._cuts:
             first, last = np.searchsorted(cuts.times, times[[0, -1]], side="right")
-            shown = cuts.times[first:last]
+            due = cuts.times[first:last]
             # A time at the end of a piece needs no cut.
-            inside = shown[~np.isin(shown, block.end)]
+            inside = due[~np.isin(due, block.end)]
             if len(inside):
                 block = self._cut(block, inside, cuts.normals)
         return block
 
-    def _cut(self, block: Block, shown: FloatArray, source: Normals) -> Block:
-        """Return the block with pieces that also end at the times ``shown``, inside its
+    def _cut(self, block: Block, times: FloatArray, source: Normals) -> Block:
+        """Return the block with pieces that also end at the ``times``, inside its
         own pieces.
         """
         # The piece that each time is in.
-        owners = np.searchsorted(block.end, shown)
-        normals = source.draw((len(shown), 3 * self.laws.n))
+        owners = np.searchsorted(block.end, times)
+        normals = source.draw((len(times), 3 * self.laws.n))
         # A piece with m cuts becomes m + 1 rows, copies of it at first.
         counts = 1 + np.bincount(owners, minlength=len(block.end))
         # A piece cut twice is cut at the first time, and what is left of it at the second.
-        turn = np.arange(len(shown)) - np.searchsorted(owners, owners)
+        turn = np.arange(len(times)) - np.searchsorted(owners, owners)
         which = np.repeat(np.arange(len(block.end)), counts)
         pieces = Block(
             start=block.start[which],
@@ -169,12 +171,12 @@ class DiffusionPaths:
             # The conditional law depends on the length and on the cut alone: equal ones are drawn
             # together. Rounding unites lengths that differ by rounding.
             lengths = np.round(pieces.end[rows[chosen]] - pieces.start[rows[chosen]], 12)
-            lefts = np.round(shown[chosen] - pieces.start[rows[chosen]], 12)
+            lefts = np.round(times[chosen] - pieces.start[rows[chosen]], 12)
             laws = np.unique(np.stack([lengths, lefts]), axis=1, return_inverse=True)[1].ravel()
             for law in range(int(laws.max()) + 1):
                 same = np.flatnonzero(chosen)[laws == law]
                 self._split(
-                    pieces, rows[same], stops[same], shown[same], np.take(normals, same, axis=1)
+                    pieces, rows[same], stops[same], times[same], np.take(normals, same, axis=1)
                 )
         return pieces
 
@@ -447,11 +449,11 @@ class DiffusionPath:
         return np.asarray(times[times < horizon])
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) in the present frame, on the sensing grid or at a time sampled or shown,
+        """Return x (n,) in the present frame, on the sensing grid or at a time sampled or probed,
         not before the last one asked for; 0 at a frame time.
         """
         step = self._at(time)
-        assert time in (step.start, step.end), f"{time} is neither on the grid nor shown"
+        assert time in (step.start, step.end), f"{time} is neither on the grid nor probed"
         # The step that ends at the frame time still has coordinates of the frame before.
         if self._begins_frame(time):
             return np.zeros(self.laws.n)

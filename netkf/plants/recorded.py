@@ -326,7 +326,9 @@ class RecordedReadings:
         self._H, self._table = H, table
 
     def matrix(self, slot: int) -> FloatArray:
-        """H (p, n) as the filters take it to be, or as it is recorded; zeros without a row."""
+        """Return H (p, n) as the filters take it to be, or as it is recorded; zeros
+        without a row.
+        """
         row = self._table.get(slot)
         if row is None:
             return np.zeros_like(self._H)

@@ -193,8 +193,8 @@ class SensorPath:
 
 
 def step_noise(normals: FloatArray, period: float) -> FloatArray:
-    """Moments (..., 2, p) of unit white noise over ``period`` seconds: independent, with variances
-    g and g / 3.
+    """Return moments (..., 2, p) of unit white noise over ``period`` seconds: independent, with
+    variances g and g / 3.
     """
     return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
 
@@ -238,8 +238,8 @@ def fill_reading(
 def cut(
     rest: FloatArray, normals: FloatArray, u: float, length: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Moments (2, p) of the first share ``u`` of an interval of ``length`` seconds and of what is
-    left, given those of the whole, from standard ``normals`` (2, p).
+    """Return moments (2, p) of the first share ``u`` of an interval of ``length`` seconds and of
+    what is left, given those of the whole, from standard ``normals`` (2, p).
     """
     # Copies, so that callers keep their arrays.
     first, left = np.empty(rest.shape), rest.copy()
@@ -251,7 +251,7 @@ def cut(
 def divide(
     lanes: Lanes, first: FloatArray, rest: FloatArray, normals: FloatArray, u: Any, length: Any
 ) -> None:
-    """``cut`` in place: of ``rest`` (2, p, L) its first share goes to ``first``, and what is left
+    """Cut in place: of ``rest`` (2, p, L) its first share goes to ``first``, and what is left
     stays. With a share of 1 that is all, and nothing.
 
     Exact conditional law of four independent moments (variances g, g/3 on each part) given their

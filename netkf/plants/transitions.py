@@ -105,7 +105,8 @@ class Transitions:
 
 
 def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lower triangular ``S`` (K, n, n) and rows ``D`` (K, n, c) with ``S D = noise`` (K, n, c).
+    """Return lower triangular ``S`` (K, n, n) and rows ``D`` (K, n, c) with ``S D = noise``
+    (K, n, c).
 
     The rows of D are orthonormal, or zero (as is the column of S) where a row of ``noise``
     depends on those before it. Modified Gram-Schmidt, twice (Kahan and Parlett): unlike
@@ -144,8 +145,8 @@ GROWTH = 10.0 * math.log(2.0)
 
 
 def frame_period(A: FloatArray) -> float | None:
-    """Longest seconds between two frames of ``dx = A x dt``: growth e^{a g} of at most 2^10 for the
-    spectral abscissa a of ``A`` (n, n); None for a plant that is not unstable.
+    """Return the longest time (seconds) between two frames of ``dx = A x dt``: growth e^{a g} of at
+    most 2^10 for the spectral abscissa a of ``A`` (n, n); None for a plant that is not unstable.
     """
     abscissa = float(np.linalg.eigvals(A).real.max())
     return _round(GROWTH / abscissa) if abscissa > 0.0 else None
@@ -157,8 +158,8 @@ def _round(seconds: float) -> float:
 
 
 def frame_slots(F: FloatArray) -> int | None:
-    """Slots between two frames of ``x[k+1] = F x[k]``: growth of at most 2^10 for the spectral
-    radius of ``F`` (n, n); None for a plant that is not unstable.
+    """Return the slots between two frames of ``x[k+1] = F x[k]``: growth of at most 2^10 for the
+    spectral radius of ``F`` (n, n); None for a plant that is not unstable.
     """
     radius = float(np.abs(np.linalg.eigvals(F)).max())
     return max(1, int(_round(GROWTH / math.log(radius)))) if radius > 1.0 else None

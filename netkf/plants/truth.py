@@ -46,7 +46,7 @@ class ContinuousTruth(Protocol):
 
 
 def multiples(period: float | None, horizon: float) -> FloatArray:
-    """Multiples of ``period`` in (0, horizon)."""
+    """Return the multiples of ``period`` in (0, horizon)."""
     if period is None or period >= horizon:
         return np.empty(0)
     times = period * np.arange(1, int(horizon / period) + 2)

@@ -60,8 +60,8 @@ class Streams:
         return ReplicaStreams(self.seed, self.replica, 1).generators(purpose, entities)
 
     def with_seeds(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
-        """The same streams, with the seeds of these purposes and entities made all at once: numpy
-        takes some 30 microseconds for one. Entities have as many numbers each.
+        """Return the same streams, with the seeds of these purposes and entities made all at once:
+        numpy takes some 30 microseconds for one. Entities have as many numbers each.
         """
         made: dict[tuple[str, tuple[int, ...]], _Words] = {}
         if entities and _small_ids(tuple(entities)) is not None:

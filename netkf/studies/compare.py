@@ -17,8 +17,8 @@ import scipy.special
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, number
+from netkf.core.notebook import NotebookTable
 from netkf.core.printable import shorten
-from netkf.core.shown import Shown
 from netkf.runs.documents import (
     COUNT,
     ENDED,
@@ -195,7 +195,7 @@ def damage_named(directory: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Comparison(Shown):
+class Comparison(NotebookTable):
     """Rows side by side; all marks together are right with probability ``confidence``.
 
     ``notes`` are those of the summaries, on what their averages leave out.

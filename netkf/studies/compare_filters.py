@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from netkf.algorithms.filter import Filter
 from netkf.core.errors import EngineError, ScenarioError, nearest
 from netkf.core.fields import integer, number
+from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
-from netkf.core.shown import Shown
 from netkf.ensembles.pools import Pool, PoolOptions
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.documents import file_digests, write_sealed
@@ -99,7 +99,7 @@ class ComparedFilter:
 
 
 @dataclass(frozen=True)
-class FilterComparison(Shown):
+class FilterComparison(NotebookTable):
     """Filters side by side; all intervals of differences from the first that can run hold together
     with probability ``confidence``.
     """

@@ -21,7 +21,7 @@ import scipy.special
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
-from netkf.core.shown import Shown
+from netkf.core.notebook import NotebookTable
 from netkf.engines.base import Engine
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
@@ -238,7 +238,7 @@ class NodeConsistency:
 
 
 @dataclass(frozen=True)
-class Consistency(Shown):
+class Consistency(NotebookTable):
     """Rows by node; false if the errors of one are not what they should be.
 
     ``low`` and ``high`` are the chi-square bounds on the mean NEES of one sample over the runs if P

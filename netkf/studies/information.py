@@ -239,7 +239,7 @@ def _carry_readings(combination: str, messages: Messages) -> IntArray:
 
 
 def _swaps(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
-    """Segments that begin with each swap."""
+    """Return the segments that begin with each swap."""
     swapped = np.flatnonzero(used)
     node = np.concatenate([nodes, messages.receiver[swapped]])
     start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])

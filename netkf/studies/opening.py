@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path
+from netkf.core.notebook import NotebookTable
 from netkf.core.printable import shorten
-from netkf.core.shown import Shown
 from netkf.ensembles.stored import StoredEnsemble, read_ensemble
 from netkf.runs.documents import TEXT, DamagedError, check_files, require
 from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbers, read_texts
@@ -29,7 +29,7 @@ RESULTS = ("worst_rms", "mean_rms", "mean_trace", "worst_trace", "bound", "centr
 
 
 @dataclass(frozen=True, eq=False)
-class StoredSweep(Shown):
+class StoredSweep(NotebookTable):
     """A sweep that is read back from ``directory``.
 
     ``scenario`` is what was varied, ``keys`` the paths of its keys that were varied, ``table`` has

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from netkf.core.errors import ScenarioError
-from netkf.core.shown import Shown
+from netkf.core.notebook import NotebookTable
 from netkf.ensembles.blocks import BlockTask
 from netkf.ensembles.pools import Pool
 from netkf.ensembles.replicas import replicate_blocks
@@ -60,7 +60,7 @@ class Probe(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sizing(Shown):
+class Sizing(NotebookTable):
     """The result of a search; true if a value reaches the target.
 
     ``value`` is the smallest value that reaches it (``grows`` False: the quantity falls as the key

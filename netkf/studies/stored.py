@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line
-from netkf.core.shown import Shown
 from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, DamagedError, check_files, require
 from netkf.runs.parquet_files import read_flags, read_numbers, read_texts
 from netkf.runs.stored import read_form
@@ -109,7 +109,7 @@ def _require_confidence(document: dict[str, Any]) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class StoredVerdict(Shown):
+class StoredVerdict(NotebookTable):
     """A verdict of ``netkf check`` that is read back from ``directory``; true if no promise is
     broken. ``document`` is the contents of verdict.json.
     """

@@ -126,7 +126,7 @@ def _state(found: Explanation) -> Iterator[str]:
 
 
 def _heard(found: Explanation) -> Iterator[str]:
-    """Whom the node heard directly."""
+    """Yield whom the node heard directly."""
     neighbours = [s for s in found.sources if s.neighbour]
     if not neighbours:
         yield f"No other node sends to node {found.node}."

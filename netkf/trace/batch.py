@@ -84,7 +84,7 @@ class BatchSink(Sink):
         self._fingerprint = ""
 
     def events(self, rows: np.ndarray) -> None:
-        """Counted by the recorder."""
+        """Ignore events, which the recorder counts."""
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray

@@ -10,8 +10,8 @@ from netkf.linalg.small import solve_inplace
 
 
 def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared error and NEES ``e' P^-1 e`` (...) of errors (..., n) and covariances (..., n, n);
-    NEES is nan where P is singular or nan.
+    """Return the squared error and NEES ``e' P^-1 e`` (...) of errors (..., n) and covariances
+    (..., n, n); NEES is nan where P is singular or nan.
     """
     n, shape = e.shape[-1], e.shape[:-1]
     flat, nees = np.ascontiguousarray(e).reshape(-1, n), np.empty(shape)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from netkf.core.errors import ScenarioError, quote
-from netkf.core.shown import Shown
+from netkf.core.notebook import NotebookTable
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.nees import errors
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
@@ -26,7 +26,7 @@ the largest one are rounding themselves.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Run(Shown):
+class Run(NotebookTable):
     """The samples and events of one run.
 
     times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n), nan where the filter gives no
@@ -114,7 +114,7 @@ class Run(Shown):
         """
         return plot_by_name(self, figure)
 
-    def _shown_table(self) -> pd.DataFrame:
+    def _notebook_table(self) -> pd.DataFrame:
         """Return averages over the samples after time 0, a row per node."""
         import pandas as pd
 

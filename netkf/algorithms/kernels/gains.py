@@ -74,7 +74,7 @@ def gain_table(
 
 
 def longest_interval(A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> float:
-    """Seconds; the longest interval whose reading the gains can use."""
+    """Return the longest interval (seconds) whose reading the gains can use."""
     return longest_interval_for(A, Q, H.T @ np.linalg.solve(R, H))
 
 

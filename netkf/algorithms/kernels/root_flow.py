@@ -218,8 +218,8 @@ def whitened(H: FloatArray, R: FloatArray) -> FloatArray:
 def transition_series(
     A: FloatArray, Q: FloatArray, seen: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Taylor coefficients of exp(A g), F, Q_g and G_g around gaps ``middles`` (C,), in extended
-    precision: (C, TERMS, n, n) each.
+    """Return Taylor coefficients of exp(A g), F, Q_g and G_g around gaps ``middles`` (C,), in
+    extended precision: (C, TERMS, n, n) each.
 
     ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``.
     """
@@ -252,8 +252,8 @@ def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
 def transitions_at(
     A: FloatArray, Q: FloatArray, seen: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """exp(A g), F, Q_g and G_g (C, n, n) at g = 0 and 3/2, 5/2, ... of a unit, from the flow of
-    the Hamiltonian.
+    """Return exp(A g), F, Q_g and G_g (C, n, n) at g = 0 and 3/2, 5/2, ... of a unit, from the flow
+    of the Hamiltonian.
     """
     n, count = len(A), len(middles)
     E, F, grown, G = wide_zeros(4, count, n, n)
@@ -282,7 +282,7 @@ def transitions_at(
 
 
 def wide_zeros(*shape: int) -> Any:
-    """Zeros in extended precision."""
+    """Return zeros in extended precision."""
     return np.zeros(shape, dtype=WIDE)
 
 
@@ -298,7 +298,9 @@ def wide_inverse(matrix: FloatArray) -> FloatArray:
 def information_blocks(
     seen: FloatArray, F: FloatArray, unit: float
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Blocks (TERMS, q n) of the series of ``c_j / (g^j sqrt(2 j + 1))``, and their bounds."""
+    """Return blocks (TERMS, q n) of the series of ``c_j / (g^j sqrt(2 j + 1))``, and
+    their bounds.
+    """
     q, n = seen.shape
     blocks: list[FloatArray] = []
     bounds: list[float] = []
@@ -373,7 +375,9 @@ def doubled(
 
 
 def upper_root(rows: FloatArray) -> FloatArray:
-    """U (n, n), upper triangular with ``U' U = rows' rows``, in the precision of ``rows``."""
+    """Return U (n, n), upper triangular with ``U' U = rows' rows``, in the precision of
+    ``rows``.
+    """
     n = rows.shape[1]
     work = np.concatenate([rows, np.zeros((n, n))]).astype(WIDE)
     for i in range(n):
@@ -396,7 +400,7 @@ def upper_root(rows: FloatArray) -> FloatArray:
 
 
 def cholesky_root(Q: FloatArray) -> FloatArray:
-    """Lower triangular root of Q (n, n); pivots that are rounding count as 0."""
+    """Return the lower triangular root of Q (n, n); pivots that are rounding count as 0."""
     n = len(Q)
     L = np.zeros_like(Q)
     for j in range(n):
@@ -758,8 +762,8 @@ def use_readings(
 
 @kernel(inlined=True, fused=True)
 def take_root(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> None:
-    """Cholesky's root T (n, n, L) of a lower triangle packed by rows; pivots that are rounding
-    count as 0.
+    """Write Cholesky's root T (n, n, L) of a lower triangle packed by rows; pivots that are
+    rounding count as 0.
     """
     n = len(size)
     for j in range(n):

@@ -26,9 +26,9 @@ def lower_triangular(array: FloatArray) -> FloatArray:
 
 @kernel
 def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
-    """Householder's reflection of the first ``columns`` that leaves row ``i`` nothing right of its
-    diagonal, in place, for the rows from ``i`` up to ``rows``. What is right of the diagonal in row
-    ``i`` itself is rubbish then, to be taken for zeros.
+    """Apply Householder's reflection of the first ``columns`` that leaves row ``i`` nothing right
+    of its diagonal, in place, for the rows from ``i`` up to ``rows``. What is right of the diagonal
+    in row ``i`` itself is rubbish then, to be taken for zeros.
     """
     size = 0.0
     for j in range(i, columns):

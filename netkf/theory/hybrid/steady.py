@@ -48,7 +48,7 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _steady_bound(scenario: Scenario) -> FloatArray:
-    """Kept, because several promises are about it."""
+    """Return the steady bound, cached because several promises are about it."""
     equations = coupled_riccati(scenario)
     P = steady_state(equations)
     if P is None:
