@@ -12,10 +12,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Estimate, Exchange, Filter, Message, NodeInfo
+from netkf.algorithms.information_consensus import INFORMATION, Hcmci
 from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
-from netkf.core.fields import field, number
+from netkf.core.fields import Rule, field, number, row
 from netkf.linalg.arrays import FloatArray
 
 
@@ -47,15 +48,35 @@ class TriggeredState(NamedTuple):
         return self.root @ self.root.T
 
 
-@built_in("event-triggered-ci")
+def _is_information_consensus(value: Any) -> Filter:
+    if not isinstance(value, Hcmci) or type(value) is not Hcmci:
+        raise TypeError
+    if value.consensus != INFORMATION or value.steps != 1:
+        raise ValueError
+    return value
+
+
+INNER = Rule(
+    "must be consensus on information with one step a slot",
+    _is_information_consensus,
+    'write inner = { kind = "hcmci", consensus = "information" }',
+)
+NOT_NEGATIVE = number(low=0.0)
+THRESHOLDS = row(
+    NOT_NEGATIVE, NOT_NEGATIVE, what="two numbers [estimate, covariance] that are not negative"
+)
+
+
+@built_in("event-triggered", trigger="consensus")
 @dataclass(frozen=True, eq=False)
 class EventTriggeredCi(Filter):
     """Consensus on information with one step a slot, in which a node sends only if its neighbours
     could not predict its estimate well enough; else they use what they have predicted.
 
-    alpha  a node is silent while ``(xhat - xbar)' P^-1 (xhat - xbar) < alpha``, where xbar and Pbar
-           are what it sent last, predicted to now,
-    delta  and while ``P <= (1 + delta) Pbar`` and ``Pbar <= (1 + delta) P``
+    inner       consensus on information with one step a slot
+    thresholds  [alpha, delta]: a node is silent while ``(xhat - xbar)' P^-1 (xhat - xbar) < alpha``
+                where xbar and Pbar are what it sent last, predicted to now, and while
+                ``P <= (1 + delta) Pbar`` and ``Pbar <= (1 + delta) P``
 
     In place of a silent neighbour's pair there is xbar with ``(1 + alpha^1/2)^2 (1 + delta) Pbar``,
     which bounds the second moment of its error (derived): with d = xhat - xbar that of e + d is at
@@ -63,8 +84,8 @@ class EventTriggeredCi(Filter):
     consensus on information. A lost message is not noticed by its sender: links should be sure.
     """
 
-    alpha: float = field(number(low=0.0), default=1.0)
-    delta: float = field(number(low=0.0), default=1.0)
+    inner: Filter = field(INNER, default=Hcmci(consensus=INFORMATION))
+    thresholds: tuple[float, float] = field(THRESHOLDS, default=(1.0, 1.0))
 
     paper: ClassVar[str] = "event_triggered"
     P_by_design: ClassVar[tuple[str, str]] = ("larger", "")
@@ -83,7 +104,7 @@ class EventTriggeredCi(Filter):
         if sure and channel.delay.fixed is not None:
             return ()
         return (
-            "event-triggered-ci: messages may be lost, and a sender takes its neighbours to have "
+            "event-triggered: messages may be lost, and a sender takes its neighbours to have "
             "what it sent; P may then be too small",
         )
 
@@ -116,8 +137,9 @@ class EventTriggeredCi(Filter):
         gap = np.linalg.solve(state.root, state.xhat - sent.xhat)
         # Eigenvalues of P^-1 Pbar, as squares of the singular values of S^-1 Sbar.
         ratios = np.linalg.svd(np.linalg.solve(state.root, sent.root), compute_uv=False) ** 2
-        within = ratios.min() * (1.0 + self.delta) >= 1.0 and ratios.max() <= 1.0 + self.delta
-        return bool(gap @ gap < self.alpha and within)
+        alpha, delta = self.thresholds
+        within = ratios.min() * (1.0 + delta) >= 1.0 and ratios.max() <= 1.0 + delta
+        return bool(gap @ gap < alpha and within)
 
     def absorb(
         self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
@@ -129,7 +151,8 @@ class EventTriggeredCi(Filter):
         if not known:
             return state
         senders = tuple(sorted(known))
-        wider = (1.0 + math.sqrt(self.alpha)) * math.sqrt(1.0 + self.delta)
+        alpha, delta = self.thresholds
+        wider = (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
         pairs = [(state.xhat, state.root)]
         pairs += [
             (known[j].xhat, known[j].root if j in fresh else wider * known[j].root) for j in senders

@@ -379,6 +379,11 @@ class Filter(Component):
         """Return the largest number of neighbours for which the weights make sense."""
         return np.inf
 
+    @property
+    def wrapped(self) -> Filter | None:
+        """The filter that this one runs on its nodes, if it runs another."""
+        return None
+
 
 def _takes(method: Any, count: int) -> bool:
     """Return True if a method takes ``count`` arguments and none by the name of SlotFilter's."""
@@ -392,8 +397,10 @@ def commutes(algorithm: Filter) -> bool:
     """Return True if the class declares that the filter commutes with a shift of the truth.
 
     It declares so if ``shift`` is defined by the class that defines the last of its STEPS, or by
-    one derived from that.
+    one derived from that; a filter that it runs has to declare so, too.
     """
+    if algorithm.wrapped is not None and not commutes(algorithm.wrapped):
+        return False
     order = type(algorithm).__mro__
 
     def owner(name: str) -> int:

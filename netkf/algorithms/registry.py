@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import TypeVar
 
@@ -33,19 +33,32 @@ TRAITS = ("schedule", "clocks", "predicts", "first_slot", "pairwise", "talks", "
 """Class variables that theorems rely on."""
 
 
-def built_in(name: str) -> Callable[[F], F]:
-    """Register a filter class under its ``name`` in scenario files."""
+def built_in(kind: str, **choice: str) -> Callable[[F], F]:
+    """Register a filter class under its ``kind`` in scenario files; where several classes share a
+    kind, a key and its value are the ``choice`` of this one.
+    """
 
     def register(cls: F) -> F:
-        _REGISTERED[name] = cls
+        _REGISTERED[choice_name(kind, choice)] = cls
         return cls
 
     return register
 
 
+def choice_name(kind: str, choice: Mapping[str, str]) -> str:
+    """Return the name of a class: its kind, and ``kind key=value`` where several share that."""
+    return " ".join([kind, *(f"{key}={value}" for key, value in choice.items())])
+
+
+def split_choice(name: str) -> tuple[str, dict[str, str]]:
+    """Return kind and choice of a name."""
+    kind, *choice = name.split(" ")
+    return kind, dict(one.split("=", 1) for one in choice)
+
+
 @cache
 def built_in_filters() -> dict[str, type[Filter]]:
-    """All built-in filters by name."""
+    """All built-in filters by name (``choice_name``)."""
     for module in pkgutil.iter_modules(netkf.algorithms.__path__, "netkf.algorithms."):
         if not module.ispkg:
             importlib.import_module(module.name)

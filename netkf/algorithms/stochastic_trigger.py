@@ -8,15 +8,39 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.delegate import FORWARDED, Delegate, forwarded
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
-from netkf.core.fields import field, positive
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import definite_covariance, either, field, instance, nested, positive
 from netkf.linalg.arrays import FloatArray
+
+
+def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
+    """Return Y (p, p) for a reading of so many rows: a number is that times the identity."""
+    return np.asarray(Y if isinstance(Y, np.ndarray) else Y * np.eye(rows))
+
+
+def entries_at(scenario: Any, node: int) -> list[int]:
+    """Return the entries of the sensors of a node."""
+    return [place.entry for place in scenario.placed.get(node, ())]
+
+
+def silence_noise(R: FloatArray, Y: float | FloatArray) -> FloatArray:
+    """Return ``R + Y^-1`` (p, p), the noise of the reading that silence stands for."""
+    return np.asarray(R + np.linalg.inv(trigger_matrix(Y, len(R))))
+
+
+def is_silent(z: FloatArray, Y: float | FloatArray, uniform: float) -> bool:
+    """Return True if an innovation z (p,) is not sent: with probability ``exp(-z' Y z / 2)``."""
+    return uniform < math.exp(-0.5 * float(z @ trigger_matrix(Y, len(z)) @ z))
 
 
 class ScheduledState(NamedTuple):
@@ -40,21 +64,15 @@ class ScheduledState(NamedTuple):
         return self.root @ self.root.T
 
 
-@built_in("stochastic-trigger")
 @dataclass(frozen=True, eq=False)
-class StochasticTrigger(Filter):
-    """Every node broadcasts its reading y unless a uniform number is below ``exp(-z' Y z / 2)``,
-    with its innovation ``z = y - H xbar``; all who hear nothing use that, too.
+class ScheduledReadings(Filter):
+    """Every node broadcasts its reading y or is silent, and all who hear nothing use that, too.
 
-    strength  Y is ``strength`` times R^-1
-
-    Silence is as informative as a reading ``H xbar`` with noise ``R + Y^-1``, so that errors stay
-    Gaussian with covariance P, and a node sends with probability ``1 - det(I + Pi Y)^-1/2``,
-    ``Pi = H Pbar H' + R``. That is so where everyone hears everyone and no message is lost: who
-    misses one takes it for silence. Own readings count when they are sent, and the first is sent.
+    Silence is as informative as a reading ``H xbar`` with noise ``R + Y^-1``. Own readings count
+    when they are sent, and the first is sent.
     """
 
-    strength: float = field(positive, default=1.0)
+    Y: float | FloatArray
 
     paper: ClassVar[str] = "stochastic_trigger"
     combination: ClassVar[str] = "scheduled readings"
@@ -89,9 +107,8 @@ class StochasticTrigger(Filter):
         if reading is None:
             return state, None
         z = reading.y - reading.H @ state.prior
-        square = self.strength * float(z @ np.linalg.solve(reading.R, z))
         # The sender is known from its first message on: that is sent in any case.
-        if -1 in state.senders and exchange.uniform < math.exp(-0.5 * square):
+        if -1 in state.senders and is_silent(z, self.Y, exchange.uniform):
             return state, None
         return state._replace(sent=True), reading
 
@@ -109,8 +126,8 @@ class StochasticTrigger(Filter):
             if sender in arrived:
                 xhat, root = sample_update(xhat, root, arrived[sender].y, H, R)
             else:
-                # R + Y^-1, and no innovation with respect to the prediction.
-                wider = (1.0 + 1.0 / self.strength) * R
+                # No innovation with respect to the prediction.
+                wider = silence_noise(R, self.Y)
                 xhat, root = sample_update(xhat, root, H @ state.prior, H, wider)
         known = tuple(sorted(sensors))
         return state._replace(
@@ -127,3 +144,149 @@ class StochasticTrigger(Filter):
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
         """Move a reading."""
         return payload._replace(y=payload.y + payload.H @ offset)
+
+
+class TriggeredState(NamedTuple):
+    """The state of the wrapped filter, ``inner``; the innovation z (p,) of the last reading, None
+    without one; if the node has ``begun`` to send after readings; if it is ``silent`` until the
+    next one, None before that is decided.
+    """
+
+    inner: Any
+    z: FloatArray | None = None
+    begun: bool = False
+    silent: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TriggeredMessages(Filter):
+    """A filter whose nodes send nothing after readings that bring little news.
+
+    The filter takes a message that is not sent for one that is lost. Nodes use their own readings
+    in any case, and those without a reading send.
+    """
+
+    Y: float | FloatArray
+    inner: Filter
+
+    clocks: ClassVar[tuple[str, ...]] = ()
+    randomised: ClassVar[bool] = True
+    paper: ClassVar[str] = ""
+    combination: ClassVar[str] = ""
+    # Who is heard depends on data.
+    P_by_design: ClassVar[tuple[str, str]] = ("", "")
+    slot_kernel: ClassVar[Any] = None
+
+    @property
+    def wrapped(self) -> Filter:
+        """The filter that the trigger belongs to."""
+        return self.inner
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TriggeredState:
+        """Nothing is decided yet."""
+        return TriggeredState(self.inner.init(model, mean, cov, node))
+
+    def predict(self, state: TriggeredState, gap: float) -> TriggeredState:
+        """Predict."""
+        return state._replace(inner=self.inner.predict(state.inner, gap))
+
+    def update(self, state: TriggeredState, reading: Reading) -> TriggeredState:
+        """Keep the innovation for the decision, and use the reading."""
+        z = None
+        if len(reading.y):
+            z = reading.y - reading.H @ self.inner.estimate(state.inner)[0]
+        return TriggeredState(self.inner.update(state.inner, reading), z, state.begun)
+
+    def emit(self, state: TriggeredState, exchange: Exchange) -> tuple[TriggeredState, Any]:
+        """Send what the filter sends, or nothing until the next reading."""
+        silent = state.silent
+        if silent is None:
+            # After the first reading a node sends in any case.
+            silent = (
+                state.z is not None and state.begun and is_silent(state.z, self.Y, exchange.uniform)
+            )
+            begun = state.begun or state.z is not None
+            state = state._replace(silent=silent, begun=begun)
+        if silent:
+            return state, None
+        inner, payload = self.inner.emit(state.inner, exchange)
+        return state._replace(inner=inner), payload
+
+    def absorb(
+        self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
+    ) -> TriggeredState:
+        """Use what was sent."""
+        return state._replace(inner=self.inner.absorb(state.inner, messages, exchange))
+
+    def estimate(self, state: TriggeredState) -> tuple[FloatArray, FloatArray | None]:
+        """Return the estimate of the filter."""
+        return self.inner.estimate(state.inner)
+
+    def shift(self, state: TriggeredState, offset: FloatArray) -> TriggeredState:
+        """The trigger looks at innovations, which do not move."""
+        return state._replace(inner=self.inner.shift(state.inner, offset))
+
+    def stopped(self, state: TriggeredState) -> bool:
+        """Return True once the filter has stopped."""
+        return self.inner.stopped(state.inner)
+
+    def conserved(self, state: TriggeredState) -> Any:
+        """Return what the filter conserves."""
+        return self.inner.conserved(state.inner)
+
+
+for _name in set(FORWARDED) - vars(TriggeredMessages).keys():
+    setattr(TriggeredMessages, _name, forwarded(_name))
+
+
+@built_in("event-triggered", trigger="stochastic")
+@dataclass(frozen=True, eq=False)
+class StochasticTrigger(Delegate):
+    """A node is silent after a reading with probability ``exp(-z' Y z / 2)``, with the innovation
+    ``z = y - H xbar``, Han et al. 2015, closed loop; never after its first reading.
+
+    inner  the filter, which runs in slots and sends. With "intermittent" silence is used: it is as
+           informative as a reading `H xbar` with noise `R + Y^-1`. Others take it for a loss
+    Y      positive definite, of as many rows as each reading; a number is that times the identity
+
+    With "intermittent" errors stay Gaussian with covariance P, and a node sends with probability
+    ``1 - det(I + Pi Y)^-1/2``, ``Pi = H Pbar H' + R``, where everyone hears everyone and no message
+    is lost: who misses one takes it for silence. Own readings count when they are sent. With other
+    filters a node uses its reading in any case, and is silent until the next one.
+    """
+
+    clocks: ClassVar[tuple[str, ...]] = ()
+    talks: ClassVar[bool] = True
+
+    inner: Filter = field(instance(Filter))
+    Y: float | FloatArray = field(either(positive, definite_covariance, nested(1)))
+
+    @cached_property
+    def wrapped(self) -> Filter:
+        """The filter that runs."""
+        if type(self.inner) is Intermittent:
+            return ScheduledReadings(self.Y)
+        return TriggeredMessages(self.Y, self.inner)
+
+    def check_scenario(self, scenario: Any) -> None:
+        """Raise ScenarioError where the filter or Y do not fit."""
+        inner = self.inner
+        if isinstance(inner, Delegate) or inner.schedule is None or not inner.talks:
+            raise ScenarioError(
+                "filter.inner",
+                "must be a filter in slots whose nodes send messages, without a trigger",
+                type(inner).__name__,
+                'write inner = { kind = "intermittent" }, or another one',
+            )
+        inner.check_scenario(scenario)
+        if not isinstance(self.Y, np.ndarray):
+            return
+        for node in scenario.nodes:
+            rows = sum(len(scenario.sensors[k].R) for k in entries_at(scenario, node))
+            if rows not in (0, len(self.Y)):
+                raise ScenarioError(
+                    "filter.Y",
+                    f"must be {rows} x {rows} for the readings of node {node}",
+                    f"{len(self.Y)} x {len(self.Y)}",
+                    "write a number, which is that times the identity",
+                )

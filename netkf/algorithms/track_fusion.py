@@ -41,6 +41,7 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
 
 TRACE, DETERMINANT = "trace", "determinant"
+INTERSECTION = 'rule = "ci"'
 NEGLIGIBLE = 1e-12
 """Relative variance of differences of tracks that is rounding: these tracks are the same."""
 
@@ -167,7 +168,7 @@ class PairFusion(Filter):
     shift = Filter.shift  # affine: the gains of both estimates sum to I, and only P decides them
 
 
-@built_in("optimised-covariance-intersection")
+@built_in("track-fusion", rule="ci")
 @dataclass(frozen=True, eq=False)
 class OptimisedIntersection(PairFusion):
     """Covariance intersection with the best weight, ``P^-1 = w P_a^-1 + (1 - w) P_b^-1``, Julier
@@ -178,7 +179,7 @@ class OptimisedIntersection(PairFusion):
     P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
 
 
-@built_in("inverse-covariance-intersection")
+@built_in("track-fusion", rule="ici")
 @dataclass(frozen=True, eq=False)
 class InverseIntersection(PairFusion):
     """Inverse covariance intersection, Noack et al. 2017: ``P^-1 = P_a^-1 + P_b^-1 - M^-1`` with
@@ -224,7 +225,7 @@ class TrackState(NamedTuple):
         return self.fused_root @ self.fused_root.T
 
 
-@built_in("bar-shalom-campo")
+@built_in("track-fusion", rule="cross-covariance")
 @dataclass(frozen=True, eq=False)
 class BarShalomCampo(Filter):
     """Every node runs a Kalman filter on its own readings, sends this track, and shows the best
@@ -245,14 +246,14 @@ class BarShalomCampo(Filter):
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where tracks do not begin alike or H varies."""
         why = "where cross-covariances begin"
-        require_common_start(scenario, why, "optimised-covariance-intersection")
+        require_common_start(scenario, why, INTERSECTION)
         for k, sensor in enumerate(scenario.sensors):
             if sensor.varying:
                 raise ScenarioError(
                     f"sensors[{k}]",
                     "must have a fixed H, from which other nodes compute cross-covariances",
                     None,
-                    "use a sensor with a fixed H, or optimised-covariance-intersection",
+                    f"use a sensor with a fixed H, or {INTERSECTION}",
                 )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:

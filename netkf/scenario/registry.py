@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.registry import built_in_filters
+from netkf.algorithms.registry import built_in_filters, split_choice
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, nearest
@@ -110,7 +114,8 @@ KINDS: dict[str, dict[str, type[Component]]] = {
 KINDS["slot filter"] = {
     name: cls for name, cls in KINDS["filter"].items() if getattr(cls, "schedule", None)
 }
-"""The classes by family and kind. "slot activation" is for plants in slots; "slot filter" is the
+"""The classes by family and name: the kind, with a choice (algorithms.registry.choice_name) where
+several classes share it. "slot activation" is for plants in slots; "slot filter" is the
 part of "filter" that runs in slots.
 """
 
@@ -132,27 +137,57 @@ def explain_kind_of_time(slotted: bool) -> str:
     return f"belongs to plants {needs}, and this plant is {has}"
 
 
-def find(family: str, kind: object, origin: Origin) -> type[Component] | None:
-    """Return the class of ``kind``: a name of the table, or ``"package.module:Class"``.
+def names_of_kind(family: str, kind: object) -> dict[str, dict[str, str]]:
+    """Return the names of the table that are of a kind, with the choice that each one is; more than
+    one where a key beside ``kind`` chooses the class.
+    """
+    split = {name: split_choice(name) for name in KINDS[family]}
+    return {name: choice for name, (known, choice) in split.items() if known == kind}
+
+
+def kinds_of(family: str) -> list[str]:
+    """Return the kinds of a family, each once."""
+    return list(dict.fromkeys(split_choice(name)[0] for name in KINDS[family]))
+
+
+def find(
+    family: str, kind: object, origin: Origin, choices: Mapping[str, Any] = MappingProxyType({})
+) -> type[Component] | None:
+    """Return the class of ``kind``: a kind of the table, or ``"package.module:Class"``. Where
+    several classes share the kind, ``choices`` has the key that tells which.
 
     It is None if the class waits for its import, see :class:`Origin`. Raises ScenarioError if there
     is no such class, or if it may not be imported.
     """
-    names = KINDS[family]
-    if isinstance(kind, str) and kind in names:
-        return names[kind]
+    named = names_of_kind(family, kind)
+    if named:
+        return KINDS[family][_chosen_name(named, choices)]
     if isinstance(kind, str) and ":" in kind:
         return _custom(family, kind, origin)
     reason = other_time(family, kind)
     if reason is not None:
         raise ScenarioError("kind", reason, kind, "change the plant or choose another kind")
-    listed = ", ".join(f'"{name}"' for name in names)
+    kinds = kinds_of(family)
+    listed = ", ".join(f'"{name}"' for name in kinds)
     raise ScenarioError(
         "kind",
         f"must be one of {listed}",
         kind,
-        f'{nearest(kind, names)}choose one, or write "package.module:Class"',
+        f'{nearest(kind, kinds)}choose one, or write "package.module:Class"',
     )
+
+
+def _chosen_name(named: Mapping[str, Mapping[str, str]], choices: Mapping[str, Any]) -> str:
+    """Return the one of several names that is chosen; raises ScenarioError if none is."""
+    for name, choice in named.items():
+        if all(choices.get(key) == value for key, value in choice.items()):
+            return name
+    key = next(iter(next(iter(named.values()))))
+    values = [choice[key] for choice in named.values()]
+    listed = ", ".join(f'"{value}"' for value in values)
+    if key not in choices:
+        raise ScenarioError(key, "is missing", None, f"add {key}, one of {listed}")
+    raise ScenarioError(key, f"must be one of {listed}", choices[key], "choose one of them")
 
 
 def _custom(family: str, kind: str, origin: Origin) -> type[Component] | None:
@@ -181,7 +216,7 @@ def _is_abstract(attribute: object) -> bool:
 
 
 def name_of(family: str, part: Component) -> str:
-    """The ``kind`` that :func:`find` would turn into the class of ``part``."""
+    """Return the name of the class of ``part`` in the table, or its ``package.module:Class``."""
     others = (KINDS.get(f"{time} {family}", {}) for time in ("slot", "continuous"))
     for table in (KINDS[family], *others):
         for name, candidate in table.items():

@@ -13,10 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from netkf.algorithms.filter import Filter
+from netkf.algorithms.registry import split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
-from netkf.scenario.registry import KINDS
+from netkf.scenario.registry import KINDS, kinds_of
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import FORMAT
 
@@ -37,6 +39,7 @@ OWN_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Channel, "loss"): {"$ref": "#/$defs/loss"},
     (Channel, "delay"): {"$ref": "#/$defs/delay"},
     (Filtering, "model"): {"$ref": "#/$defs/model"},
+    (Filter, "inner"): {"$ref": "#/$defs/filter"},
 }
 """Keys whose values are tables with kinds of their own, or with keys of another class."""
 SAMPLING: Schema = {"anyOf": [{"const": "continuous"}, {"$ref": "#/$defs/sampling"}]}
@@ -150,9 +153,11 @@ def _family(name: str, parts: Sequence[str]) -> Schema:
 
 
 def _variant(kind: str, cls: type[Component], shared: Sequence[KeyOf], optional: bool) -> Schema:
-    found = _table([*keys_of(cls), *shared], first={"kind": {"const": kind}})
+    name, choice = split_choice(kind)
+    first = {key: {"const": value} for key, value in {"kind": name, **choice}.items()}
+    found = _table([*keys_of(cls), *shared], first=first)
     if not optional:
-        found["required"] = ["kind", *found["required"]]
+        found["required"] = [*first, *found["required"]]
     return {"title": kind, "description": summary(cls), **found}
 
 
@@ -165,21 +170,20 @@ def _kinds_of_time() -> list[Schema]:
         return {"properties": {"plant": has}, "required": ["plant"]}
 
     def then(activations: str, filters: Sequence[str]) -> Schema:
-        kinds = [*(k for k in KINDS[activations])]
-        limits = {"activation": _kind_among(kinds)}
+        limits = {"activation": _kind_among(kinds_of(activations))}
         network = {"type": "object", "properties": limits}
         return {"properties": {"network": network, "filter": _kind_among(filters)}}
 
     slots = {"anyOf": [plant({"const": "linear"}), plant(recorded, "F")]}
     flow = {"anyOf": [plant({"const": "diffusion"}), plant(recorded, "A")]}
-    clocked = [
-        name
+    clocked = {
+        split_choice(name)[0]: None
         for name, cls in KINDS["filter"].items()
         if getattr(cls, "clocks", ()) or not getattr(cls, "talks", True)
-    ]
+    }
     return [
-        {"if": slots, "then": then("slot activation", [*KINDS["slot filter"]])},
-        {"if": flow, "then": then("activation", clocked)},
+        {"if": slots, "then": then("slot activation", kinds_of("slot filter"))},
+        {"if": flow, "then": then("activation", [*clocked])},
     ]
 
 

@@ -10,6 +10,7 @@ from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.schema import KeyOf, keys_of, summary
+from netkf.scenario.writing import part_as_table, toml_text
 
 TABLES: dict[str, type[Component]] = {
     "The file": Scenario,
@@ -68,6 +69,8 @@ def _table(keys: Sequence[KeyOf]) -> Iterator[str]:
 def _default(key: KeyOf) -> str:
     if key.required:
         return "-"
+    if isinstance(key.default, Component):
+        return f"`{toml_text(part_as_table(key.default))}`"
     if isinstance(key.default, bool):
         return str(key.default).lower()
     if isinstance(key.default, str):

@@ -15,7 +15,7 @@ from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.plugins import blame, describe_error, is_ours
-from netkf.scenario.registry import KINDS, SLOTTED, find
+from netkf.scenario.registry import KINDS, SLOTTED, find, names_of_kind
 from netkf.scenario.writing import as_table, part_as_table
 
 FORMAT = 1
@@ -207,8 +207,15 @@ def _kind(family: str, origin: Origin, value: Any, default: str | None = None) -
     kind = table.pop("kind", default)
     if kind is None:
         raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
-    others = ("kind", "mean", "cov", "model") if family == "filter" else ("kind",)
-    cls = find(family, kind, origin)
+    cls = find(family, kind, origin, table)
+    keys = [key for choice in names_of_kind(family, kind).values() for key in choice]
+    others = ("kind", *dict.fromkeys(keys))
+    for key in others[1:]:
+        del table[key]
+    if family == "filter":
+        others = (*others, "mean", "cov", "model")
+    if isinstance(table.get("inner"), (Mapping, Component)):
+        table["inner"] = _under("inner", partial(_kind, family, origin), table["inner"])
     return WAITING if cls is None else _part(cls, table, origin, others)
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.filter import Filter
+from netkf.algorithms.registry import split_choice
 from netkf.core.fields import Component, SourceFile
 from netkf.network.channels import Channel
 from netkf.network.graphs import RandomGraph
@@ -106,7 +108,8 @@ def _filtering(filtering: Filtering, defaults: bool) -> dict[str, Any]:
 
 
 def _kind(family: str, part: Component, defaults: bool) -> dict[str, Any]:
-    return {"kind": name_of(family, part), **_fields(part, defaults)}
+    kind, choice = split_choice(name_of(family, part))
+    return {"kind": kind, **choice, **_fields(part, defaults)}
 
 
 def _fields(part: Component, defaults: bool) -> dict[str, Any]:
@@ -117,16 +120,17 @@ def _fields(part: Component, defaults: bool) -> dict[str, Any]:
             value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
         )
         if value is not None and (defaults or not is_default):
-            table[field.name] = _toml_value(value)
+            table[field.name] = _toml_value(value, defaults)
     return table
 
 
-def _toml_value(value: Any) -> Any:
+def _toml_value(value: Any, defaults: bool) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, tuple):
-        return [_toml_value(item) for item in value]
-    return value
+        return [_toml_value(item, defaults) for item in value]
+    # A filter inside another one.
+    return _kind("filter", value, defaults) if isinstance(value, Filter) else value
 
 
 def to_toml(table: dict[str, Any]) -> str:

@@ -21,10 +21,11 @@ from tests.algorithms.test_literature import (
 )
 from tests.theory.test_replay import close, engine_covariance
 
-BEST = "optimised-covariance-intersection"
-INVERSE = "inverse-covariance-intersection"
+BEST = "ci"
+INVERSE = "ici"
 PAIRS = list(itertools.product((BEST, INVERSE), ("trace", "determinant")))
-TRACKS = {"kind": "bar-shalom-campo"}
+CROSS = "cross-covariance"
+TRACKS = {"kind": "track-fusion", "rule": CROSS}
 
 
 def fused(a, b, kind, minimise):
@@ -82,7 +83,9 @@ def expected_states(scenario, run, kind, minimise):
 @pytest.mark.parametrize(("kind", "minimise"), PAIRS)
 def test_the_textbook(kind, minimise, tmp_path):
     for n in (1, 2, 4):
-        scenario = scenario_of({"kind": kind, "minimise": minimise}, tmp_path, 1, n)
+        scenario = scenario_of(
+            {"kind": "track-fusion", "rule": kind, "minimise": minimise}, tmp_path, 1, n
+        )
         for engine in ("simpy", "compiled"):
             run = netkf.simulate(scenario, engine=engine)
             xhat, P = expected_states(scenario, run, kind, minimise)
@@ -90,10 +93,10 @@ def test_the_textbook(kind, minimise, tmp_path):
             np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [BEST, INVERSE, "bar-shalom-campo"])
+@pytest.mark.parametrize("kind", [BEST, INVERSE, CROSS])
 def test_both_engines_make_the_same_run_and_theory_follows_it(kind, tmp_path):
     settings = {"horizon": 4.0, "probe": [0.0, 1.0, 2.0, 3.0]}
-    scenario = scenario_of({"kind": kind}, tmp_path, 1, **settings)
+    scenario = scenario_of({"kind": "track-fusion", "rule": kind}, tmp_path, 1, **settings)
     fast, slow = (netkf.simulate(scenario, engine=engine) for engine in ("auto", "simpy"))
     assert netkf.first_difference(fast, slow) is None
     np.testing.assert_allclose(fast.P, slow.P, rtol=1e-10, atol=1e-12)
@@ -103,7 +106,7 @@ def test_both_engines_make_the_same_run_and_theory_follows_it(kind, tmp_path):
 
 
 def test_many_runs_side_by_side_are_the_single_ones(tmp_path):
-    scenario = scenario_of({"kind": BEST}, tmp_path)
+    scenario = scenario_of({"kind": "track-fusion", "rule": BEST}, tmp_path)
     (batch,) = CompiledEngine().run_many(scenario, 7, range(11))
     for replica in (0, 10):
         run = netkf.simulate(scenario, seed=7, replica=replica, engine="compiled")
@@ -260,7 +263,7 @@ def test_tracks_know_their_errors_and_checks_say_so(tmp_path):
 
 @pytest.mark.parametrize(("kind", "promised"), [(BEST, True), (INVERSE, False)])
 def test_intersection_never_claims_too_much(kind, promised, tmp_path):
-    scenario = scenario_of({"kind": kind}, tmp_path, 2, horizon=9.0)
+    scenario = scenario_of({"kind": "track-fusion", "rule": kind}, tmp_path, 2, horizon=9.0)
     table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
     bound = "P is at least the covariance of the error, given the events"
     assert (bound in table.index) == promised
@@ -273,12 +276,12 @@ def test_inverse_intersection_is_surer_and_right_in_a_network(tmp_path):
     """
     for seed in range(2):
         ours, other = (
-            netkf.simulate(scenario_of({"kind": kind}, tmp_path, seed, 3))
+            netkf.simulate(scenario_of({"kind": "track-fusion", "rule": kind}, tmp_path, seed, 3))
             for kind in (INVERSE, BEST)
         )
         sizes = [np.trace(run.P[-1], axis1=-2, axis2=-1) for run in (ours, other)]
         assert (sizes[0] < sizes[1] + 1e-12).all()
-        scenario = scenario_of({"kind": INVERSE}, tmp_path, seed, 3)
+        scenario = scenario_of({"kind": "track-fusion", "rule": INVERSE}, tmp_path, seed, 3)
         gap = ours.P - theory.error_covariance(scenario, ours)
         assert np.linalg.eigvalsh(gap)[..., 0].min() > -1e-12
 
@@ -292,7 +295,9 @@ def test_under_clocks(at, tmp_path):
         "activation": {"kind": "poisson", "rate": 2.0, "at": at},
         "channel": {"delay": {"kind": "constant", "seconds": 0.3}},
     }
-    scenario = clocked({"kind": BEST}, tmp_path, {}, sampling, probe=0.5, network=network)
+    scenario = clocked(
+        {"kind": "track-fusion", "rule": BEST}, tmp_path, {}, sampling, probe=0.5, network=network
+    )
     run = netkf.simulate(scenario)
     gap = run.P - theory.error_covariance(scenario, run)
     assert np.linalg.eigvalsh(gap)[..., 0].min() > -1e-10

@@ -2,23 +2,29 @@
 
 import math
 
+import jsonschema
 import numpy as np
 import pytest
 
 import netkf
+from netkf.scenario.schema import scenario_schema
+from netkf.scenario.writing import as_table, to_toml
 from netkf.trace.schema import CODES
 from tests.algorithms.test_literature import ALL, GRAPH, scenario_of, states
 from tests.algorithms.test_track_fusion import kalman
 
-EVENT = {"kind": "event-triggered-ci", "alpha": 1.0, "delta": 3.0}
+EVENT = {"kind": "event-triggered", "trigger": "consensus", "thresholds": [1.0, 3.0]}
 SURE = {"graph": GRAPH, "activation": {"kind": "broadcast"}}
-STOCHASTIC = {"kind": "stochastic-trigger", "strength": 0.8}
+STOCHASTIC = {
+    **{"kind": "event-triggered", "trigger": "stochastic", "Y": 2.0},
+    "inner": {"kind": "intermittent"},
+}
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_without_thresholds_it_is_consensus_on_information(seed, tmp_path):
     """Sends in every slot, and with losses too."""
-    ours = {**EVENT, "alpha": 0.0, "delta": 0.0}
+    ours = {**EVENT, "thresholds": [0.0, 0.0]}
     hcmci = {"kind": "hcmci", "consensus": "information"}
     xhat, P = states(ours, tmp_path, seed=seed, network=SURE)
     x, C = states(hcmci, tmp_path, seed=seed, network=SURE)
@@ -29,7 +35,7 @@ def test_without_thresholds_it_is_consensus_on_information(seed, tmp_path):
 def test_event_triggers_by_plain_formulas(tmp_path):
     """Who is silent, and what is used in its place: the whole filter once more."""
     alpha, delta = 1.5, 2.0
-    algorithm = {**EVENT, "alpha": alpha, "delta": delta}
+    algorithm = {**EVENT, "thresholds": [alpha, delta]}
     scenario = scenario_of(algorithm, tmp_path, 1, network=SURE, horizon=12.0, probe=1.0)
     run = netkf.simulate(scenario)
     N, F, Q = 5, scenario.plant.F, scenario.plant.Q
@@ -114,7 +120,7 @@ def test_event_triggers_send_less_and_claim_no_more(tmp_path):
 def test_stochastic_triggers_by_plain_formulas(tmp_path):
     scenario = scenario_of(STOCHASTIC, tmp_path, 1, network=ALL, horizon=20.0, probe=1.0)
     run = netkf.simulate(scenario)
-    F, Q, strength = scenario.plant.F, scenario.plant.Q, STOCHASTIC["strength"]
+    F, Q = scenario.plant.F, scenario.plant.Q
     sends = run.log[run.log["kind"] == CODES["send"]]
     happened = {(int(t), node) for t, node in zip(sends["t"], sends["node"], strict=True)}
     readings, x, P, silent = readings_of(scenario, run), np.zeros(2), scenario.plant.cov, 0
@@ -125,7 +131,7 @@ def test_stochastic_triggers_by_plain_formulas(tmp_path):
             if (slot, i) in happened:
                 x, P = kalman(x, P, (y, H, R))
             else:
-                x, P = kalman(x, P, (H @ prior, H, R + R / strength))
+                x, P = kalman(x, P, (H @ prior, H, R + np.eye(len(H)) / STOCHASTIC["Y"]))
                 silent += 1
         np.testing.assert_allclose(run.P[slot], [P] * 5, rtol=1e-9, atol=1e-11)
         np.testing.assert_allclose(run.xhat[slot], [x] * 5, rtol=1e-9, atol=1e-10)
@@ -149,8 +155,7 @@ def test_the_rate_is_that_of_han_and_errors_are_as_large_as_p_says(tmp_path):
     run = netkf.simulate(scenario)
     # Pi from the P of the slot before, from the second slot with an exchange on.
     P = 0.81 * run.P[1:-1, 1, 0, 0] + 0.5
-    Y = STOCHASTIC["strength"] / 0.4
-    p = 1.0 - 1.0 / np.sqrt(1.0 + (P + 0.4) * Y)
+    p = 1.0 - 1.0 / np.sqrt(1.0 + (P + 0.4) * STOCHASTIC["Y"])
     sends = run.log[(run.log["kind"] == CODES["send"]) & (run.log["node"] == 0)]
     count = len(sends) - 1
     z = (count - p.sum()) / math.sqrt((p * (1.0 - p)).sum())
@@ -213,14 +218,14 @@ def test_theory_follows_silence_and_checks_the_rate(tmp_path):
 
 def test_nodes_that_send_too_often_break_the_rate(tmp_path, monkeypatch):
     """Coins that fall on silence half as often as they should."""
-    from netkf.algorithms.stochastic_trigger import StochasticTrigger
+    from netkf.algorithms.stochastic_trigger import ScheduledReadings
 
-    emit = StochasticTrigger.emit
+    emit = ScheduledReadings.emit
 
     def eager(self, state, exchange):
         return emit(self, state, exchange._replace(uniform=0.5 + 0.5 * exchange.uniform))
 
-    monkeypatch.setattr(StochasticTrigger, "emit", eager)
+    monkeypatch.setattr(ScheduledReadings, "emit", eager)
     scenario = scenario_of(STOCHASTIC, tmp_path, 1, network=ALL, horizon=15.0)
     assert table_of(scenario, 20).loc[RATE, "verdict"] == "broken"
 
@@ -245,3 +250,85 @@ def test_what_is_promised_of_event_triggers(tmp_path):
         more = {"network": network} if network else {}
         table = table_of(scenario_of(EVENT, tmp_path, 1, horizon=9.0, **more), 30)
         assert table.loc[bound, "verdict"] in verdicts
+
+
+def wrapped(inner, Y):
+    return {"kind": "event-triggered", "trigger": "stochastic", "inner": inner, "Y": Y}
+
+
+INNER = [
+    {"kind": "hcmci", "steps": 2},
+    {"kind": "diffusion-kalman"},
+    {"kind": "push-sum", "gamma": 2, "delta": 5.0},
+    {"kind": "track-fusion", "rule": "cross-covariance"},
+]
+
+
+@pytest.mark.parametrize("inner", INNER, ids=[str(one["kind"]) for one in INNER])
+def test_a_trigger_that_always_fires_changes_nothing(inner, tmp_path):
+    """And one that never does leaves the first slot with a reading, and those without sensors."""
+    alone, always, never = (
+        netkf.simulate(scenario_of(table, tmp_path, 2), engine="simpy")
+        for table in (inner, wrapped(inner, 1e30), wrapped(inner, 1e-30))
+    )
+    np.testing.assert_array_equal(always.xhat, alone.xhat)
+    np.testing.assert_array_equal(always.P, alone.P)
+    assert always.count("send") == alone.count("send")
+    sends = never.log[never.log["kind"] == CODES["send"]]
+    # Node 4 of the scenario has no sensor.
+    assert set(sends["node"][sends["t"] >= 3.0].tolist()) == {4}
+    assert set(sends["node"].tolist()) == {0, 1, 2, 3, 4}
+
+
+def test_nodes_around_another_filter_send_as_often_as_their_innovations_say(tmp_path):
+    """The sum of the probabilities ``1 - exp(-z' Y z / 2)`` given all that happened before."""
+    more = {"horizon": 2001.0, "probe": 1.0, **SCALAR}
+    scenario = scenario_of(wrapped({"kind": "hcmci", "steps": 2}, [[1.5]]), tmp_path, n=1, **more)
+    run = netkf.simulate(scenario)
+    readings = readings_of(scenario, run)
+    z = [readings(slot)[0][0][0] - 0.9 * run.xhat[slot - 1, 0, 0] for slot in range(1, 2001)]
+    p = 1.0 - np.exp(-0.5 * 1.5 * np.square(z[1:]))
+    sends = run.log[(run.log["kind"] == CODES["send"]) & (run.log["node"] == 0)]
+    # Two steps a slot; the first slot sends in any case.
+    count = len(sends) / 2 - 1
+    assert 0.3 < p.mean() < 0.8
+    assert abs(count - p.sum()) < 4.0 * math.sqrt((p * (1.0 - p)).sum())
+
+
+@pytest.mark.parametrize(
+    ("table", "key"),
+    [
+        (wrapped({"kind": "central"}, 1.0), "filter.inner"),
+        (wrapped({"kind": "hybrid", "epsilon": 0.2}, 1.0), "filter"),
+        (wrapped(STOCHASTIC, 1.0), "filter.inner"),
+        (wrapped({"kind": "kcf", "epsilon": -1.0}, 1.0), "filter.inner.epsilon"),
+        (wrapped({"kind": "nothing"}, 1.0), "filter.inner.kind"),
+        (wrapped(3, 1.0), "filter.inner"),
+        (wrapped({"kind": "kcf"}, [[1.0, 0.0], [0.0, 0.0]]), "filter.Y"),
+        (wrapped({"kind": "kcf"}, np.eye(5).tolist()), "filter.Y"),
+        (wrapped({"kind": "kcf"}, -1.0), "filter.Y"),
+        ({**EVENT, "inner": {"kind": "hcmci", "steps": 2}}, "filter.inner"),
+        ({**EVENT, "thresholds": [1.0]}, "filter.thresholds"),
+        ({**EVENT, "thresholds": [1.0, -1.0]}, "filter.thresholds"),
+        ({"kind": "event-triggered", "Y": 1.0}, "filter.trigger"),
+        ({**EVENT, "trigger": "sometimes"}, "filter.trigger"),
+        ({"kind": "track-fusion"}, "filter.rule"),
+        ({"kind": "track-fusion", "rule": ["ci"]}, "filter.rule"),
+    ],
+)
+def test_wrong_settings_are_refused_by_their_key(table, key, tmp_path):
+    with pytest.raises(netkf.ScenarioError) as refused:
+        scenario_of(table, tmp_path)
+    assert str(refused.value).startswith(key)
+
+
+@pytest.mark.parametrize(
+    "table", [STOCHASTIC, EVENT, wrapped({"kind": "track-fusion", "rule": "ici"}, [[2.0]])]
+)
+def test_filters_within_filters_are_written_as_they_are_read(table, tmp_path):
+    sensors = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.3]]}]
+    scenario = scenario_of(table, tmp_path, sensors=sensors)
+    jsonschema.validate(as_table(scenario), scenario_schema())
+    (tmp_path / "again.toml").write_text(to_toml(as_table(scenario)))
+    assert netkf.load(tmp_path / "again.toml").filter == scenario.filter
+    assert scenario.replace({"filter": table}).filter == scenario.filter

@@ -82,12 +82,13 @@ def both(algorithm, folder, **more):
 
 
 SLOT_FILTERS = ["hcmci", "icf", "kcf", "diffusion", "diffusion-kalman", "local", "central"]
-SLOT_FILTERS += ["intermittent", "optimised-covariance-intersection", "one-bit"]
+SLOT_FILTERS += ["intermittent", "track-fusion", "one-bit"]
 
 
 @pytest.mark.parametrize("kind", SLOT_FILTERS)
 def test_with_a_linear_h_it_is_the_linear_filter(kind, tmp_path):
-    linear, extended = both({"kind": kind}, tmp_path)
+    rule = {"rule": "ci"} if kind == "track-fusion" else {}
+    linear, extended = both({"kind": kind, **rule}, tmp_path)
     np.testing.assert_allclose(extended.xhat, linear.xhat, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(extended.P, linear.P, rtol=1e-12, atol=1e-13)
     assert netkf.first_difference(linear, extended) is None
@@ -192,7 +193,7 @@ def test_positions_are_those_of_the_graph_or_must_be_given(tmp_path):
 
 def test_filters_with_a_fixed_h_and_sensors_without_a_clock_are_refused(tmp_path, tracking):
     with pytest.raises(netkf.ScenarioError, match="must have a fixed H"):
-        tracking.replace({"filter": {"kind": "bar-shalom-campo"}})
+        tracking.replace({"filter": {"kind": "track-fusion", "rule": "cross-covariance"}})
     network = {"graph": {"kind": "cycle", "nodes": 4}}
     network["activation"] = {"kind": "poisson", "rate": 2.0}
     settings = {"plant": ROTATION, "network": network, "sensors": [RANGES], "probe": 0.5}

@@ -124,13 +124,16 @@ FILTERS: tuple[dict[str, Any], ...] = (
     {"kind": "kcf", "epsilon": 0.1, "share_readings": False},
     {"kind": "diffusion-kalman", "weights": "metropolis"},
     {"kind": "one-bit"},
-    {"kind": "optimised-covariance-intersection", "minimise": "trace"},
-    {"kind": "inverse-covariance-intersection", "minimise": "determinant"},
-    {"kind": "bar-shalom-campo"},
+    {"kind": "track-fusion", "rule": "ci", "minimise": "trace"},
+    {"kind": "track-fusion", "rule": "ici", "minimise": "determinant"},
+    {"kind": "track-fusion", "rule": "cross-covariance"},
     {"kind": "belief-propagation", "steps": 2, "memory": "slot"},
     {"kind": "consensus-innovations"},
-    {"kind": "event-triggered-ci", "alpha": 1.0, "delta": 1.0},
-    {"kind": "stochastic-trigger", "strength": 1.0},
+    {"kind": "event-triggered", "trigger": "consensus", "thresholds": [1.0, 1.0]},
+    {
+        **{"kind": "event-triggered", "trigger": "stochastic", "Y": [[1.0]]},
+        "inner": {"kind": "intermittent"},
+    },
     {"kind": "constant-gain", "gain": [[0.1], [0.1], [0.1], [0.1]]},
 )
 """Filters to compare with, with their keys; seeds that are odd put them into scenarios."""

@@ -28,14 +28,18 @@ SOUND = {
     "hcmci": [parts.Hcmci(consensus="information", steps=2)],
     "icf": [parts.Icf()],
     "one-bit": [parts.OneBit()],
-    "optimised-covariance-intersection": [
+    "track-fusion rule=ci": [
         parts.OptimisedIntersection(),
         parts.OptimisedIntersection(minimise="determinant"),
     ],
-    "inverse-covariance-intersection": [parts.InverseIntersection()],
-    "bar-shalom-campo": [parts.BarShalomCampo()],
-    "event-triggered-ci": [parts.EventTriggeredCi()],
-    "stochastic-trigger": [parts.StochasticTrigger()],
+    "track-fusion rule=ici": [parts.InverseIntersection()],
+    "track-fusion rule=cross-covariance": [parts.BarShalomCampo()],
+    "event-triggered trigger=consensus": [parts.EventTriggeredCi()],
+    "event-triggered trigger=stochastic": [
+        parts.StochasticTrigger(parts.Intermittent(), 1.0),
+        parts.StochasticTrigger(parts.Hcmci(steps=2), 1.0),
+        parts.StochasticTrigger(parts.DiffusionKalman(), 1.0),
+    ],
     "belief-propagation": [
         parts.BeliefPropagation(steps=2),
         parts.BeliefPropagation(memory="all"),

@@ -49,8 +49,9 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
     and clocks, in the order of the nodes; in slots as samples show it.
 
     By one generalised Lyapunov equation, for filters whose gains are constant: ``constant-gain``,
-    ``kcf`` in slots with its own readings or without losses, ``bar-shalom-campo``, ``local`` and
-    ``central`` in slots. Losses may be independent, by link or bursty (Gilbert-Elliott, few links),
+    ``kcf`` in slots with its own readings or without losses, ``track-fusion`` by
+    cross-covariances, ``local`` and ``central`` in slots. Losses may be independent, by link or
+    bursty (Gilbert-Elliott, few links),
     delays none or fixed (not beside bursts under Poisson clocks; below the period of periodic
     clocks; in slots a message that is late is lost), clocks Poisson, or periodic and all together
     (the mean is then that at exchanges, after them); at most 200 errors of all nodes together.

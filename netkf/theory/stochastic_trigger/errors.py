@@ -12,8 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from netkf.algorithms.stochastic_trigger import StochasticTrigger
+from netkf.algorithms.stochastic_trigger import StochasticTrigger, silence_noise
 from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
@@ -50,7 +51,7 @@ class ScheduleRule(ErrorRule):
         super().__init__(scenario, errors)
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, StochasticTrigger)
-        self._strength, self._sent = algorithm.strength, decisions(scenario, run)
+        self._Y, self._sent = algorithm.Y, decisions(scenario, run)
         self._seen: HostObservations = {}
 
     def sense(self, time: float, observations: HostObservations) -> None:
@@ -61,16 +62,16 @@ class ScheduleRule(ErrorRule):
         """Update all nodes by all sensors."""
         columns = self.errors.reading_noises(self._seen)
         for host, one in self._seen.items():
-            used = one if (slot, host) in self._sent else silence(one, self._strength)
+            used = one if (slot, host) in self._sent else silence(one, self._Y)
             for hearer in range(self.errors.hosts):
                 self.errors.update(hearer, used, columns[host])
 
 
-def silence(reading: Observation, strength: float) -> Observation:
+def silence(reading: Observation, Y: float | FloatArray) -> Observation:
     """Return the reading that silence stands for, with the noise R + Y^-1."""
-    more = reading.R / strength
-    root = np.asarray(np.linalg.cholesky(reading.root @ reading.root.T + more))
-    return Observation(reading.H, reading.R + more, root)
+    R = silence_noise(reading.R, Y)
+    root = np.asarray(np.linalg.cholesky(reading.root @ reading.root.T + R - reading.R))
+    return Observation(reading.H, R, root)
 
 
 def rule(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.algorithms.stochastic_trigger import StochasticTrigger
+from netkf.algorithms.stochastic_trigger import StochasticTrigger, trigger_matrix
 from netkf.linalg.arrays import ArrayLike, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
@@ -35,7 +35,7 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
     """
     algorithm, sent = scenario.filter.algorithm, decisions(scenario, run)
     assert isinstance(algorithm, StochasticTrigger)
-    (F, Q), strength = scenario.slot_belief, algorithm.strength
+    (F, Q), Y = scenario.slot_belief, algorithm.Y
     P = np.asarray(scenario.start(scenario.nodes[0])[1])
     sensors = {
         k: Observation(H, R, np.asarray(np.linalg.cholesky(R)))
@@ -48,10 +48,10 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
         if slot > 1:
             for k, (H, R, _) in sensors.items():
                 count += (slot, k) in sent
-                expected += trigger_rate(P, H, R, strength * np.linalg.inv(R))
+                expected += trigger_rate(P, H, R, trigger_matrix(Y, len(R)))
         root = square_root(P)
         for k, one in sensors.items():
-            used = one if (slot, k) in sent else silence(one, strength)
+            used = one if (slot, k) in sent else silence(one, Y)
             root = update_covariance_root(root, used)[2]
         P, slot = root @ root.T, slot + 1
     return count, expected

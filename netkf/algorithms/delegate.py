@@ -1,0 +1,68 @@
+"""Filters that run as another one, which their settings choose."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo
+from netkf.linalg.arrays import FloatArray
+
+FORWARDED = (
+    "schedule", "clocks", "predicts", "first_slot", "pairwise", "one_way", "inverts", "talks",
+    "pooled", "needs_samples", "newest_only", "fixed_sensors", "randomised", "needs_network",
+    "paper", "combination", "P_by_design", "slot_kernel",
+    "shift_payload", "accepts", "max_measurement_interval", "steps", "exchange_steps",
+    "redraws_links", "sends_in_slots", "payload_numbers", "slot_stopping", "slot_arrays", "stopped",
+    "conserved", "weight", "pair_weights", "check_scenario", "scenario_notes", "largest_degree",
+)  # fmt: skip
+"""What the wrapped filter says of itself; methods that take a state stand in Delegate."""
+
+
+def forwarded(name: str) -> property:
+    """Return a property that is an attribute of the wrapped filter."""
+    return property(lambda self: getattr(self.wrapped, name))
+
+
+@dataclass(frozen=True, eq=False)
+class Delegate(Filter):
+    """A filter whose states are those of ``wrapped``, which does everything."""
+
+    @property
+    @abstractmethod
+    def wrapped(self) -> Filter:
+        """The filter that runs."""
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
+        """Return the state at time 0."""
+        return self.wrapped.init(model, mean, cov, node)
+
+    def predict(self, state: Any, gap: float) -> Any:
+        """Return the state ``gap`` seconds later."""
+        return self.wrapped.predict(state, gap)
+
+    def update(self, state: Any, reading: Any) -> Any:
+        """Return the state after a reading."""
+        return self.wrapped.update(state, reading)
+
+    def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
+        """Return the state after sending, and the payload."""
+        return self.wrapped.emit(state, exchange)
+
+    def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
+        """Return the state after the messages of an instant."""
+        return self.wrapped.absorb(state, messages, exchange)
+
+    def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
+        """Return ``xhat`` (n,) and ``P`` (n, n) now."""
+        return self.wrapped.estimate(state)
+
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """Return the state with ``offset`` (n,) added to the estimate."""
+        return self.wrapped.shift(state, offset)
+
+
+for _name in set(FORWARDED) - vars(Delegate).keys():
+    setattr(Delegate, _name, forwarded(_name))
