@@ -13,6 +13,8 @@ HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not pr
 VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
 MAX_RUNS = 1e9
 """Number of runs beyond which ``Evidence.needed`` gives none."""
+FORECAST_MARGIN = 1.1
+"""Factor on the number of runs that decides a row on average."""
 GAUSSIAN = "noises are Gaussian"
 """Name of the assumption of tests that take squared errors for chi-square variables."""
 
@@ -61,6 +63,8 @@ class Finding(NamedTuple):
     blurred : rounding of a large state has left no errors to judge by
     horizon : seconds after which the limit would be reached, nan if that is not known
     most_runs : number of runs after which further ones leave the interval as it is
+    forecast : upper limit of the distance from the promise with so many times the runs, if what is
+        seen of it now is chance; by default it shrinks as 1 / sqrt(runs)
     seen, expected, off, detectable, replica : see :class:`Evidence`; ``off`` is by default how far
         the margin is below 0
     """
@@ -77,6 +81,7 @@ class Finding(NamedTuple):
     detectable: float = math.nan
     replica: int | None = None
     most_runs: float = math.inf
+    forecast: Callable[[float], float] | None = None
 
 
 @dataclass(frozen=True)
@@ -167,9 +172,8 @@ def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict = HOLDS
     else:
         verdict = UNDECIDED
-        # If the promise holds, a negative ``low`` is chance and shrinks as 1 / sqrt(runs).
         used = min(runs, finding.most_runs)
-        wanted = 1.1 * used * (-low / tolerance) ** 2 if tolerance > 0.0 else math.inf
+        wanted = FORECAST_MARGIN * used * _factor_needed(finding, MAX_RUNS / used)
         needed = math.ceil(wanted) if wanted < min(MAX_RUNS, finding.most_runs) else None
         if wanted > finding.most_runs:
             message = (
@@ -194,6 +198,26 @@ def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
         needed,
         finding.replica if verdict == BROKEN else None,
     )
+
+
+def _factor_needed(finding: Finding, most: float) -> float:
+    """Return the factor on the runs at which a promise that holds is decided; inf above ``most``.
+
+    What is seen of a distance that is 0 is chance, which shrinks as 1 / sqrt(runs); limits shrink
+    as the finding says.
+    """
+    low, tolerance = finding.margin[1], finding.tolerance
+    if not tolerance > 0.0:
+        return math.inf
+    if finding.forecast is None:
+        return (low / tolerance) ** 2
+    if not finding.forecast(most) <= tolerance:
+        return math.inf
+    near, far = 1.0, most
+    while far > 1.01 * near:
+        middle = math.sqrt(near * far)
+        near, far = (near, middle) if finding.forecast(middle) <= tolerance else (middle, far)
+    return far
 
 
 def _describe_horizon(seconds: float) -> str:

@@ -42,7 +42,7 @@ from netkf.checks.points import all_sampled, check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
 from netkf.checks.statistics import (
-    Interval,
+    band_around,
     band_width,
     deviation_interval,
     probability_interval,
@@ -270,8 +270,7 @@ def _sensors_together(samples: GossipSamples, level: float) -> Finding:
             (together, sum(widths), "all sensors together"),
             (most, widths[0] / N + widths[1], "one sensor's over N"),
         ):
-            interval = Interval(value, max(0.0, value - width), min(1.0, value + width))
-            found.append((interval, f"at slot {slot}, {name}"))
+            found.append((band_around(value, width), f"at slot {slot}, {name}"))
     return find_largest(found, LAW_TOLERANCE, "largest excess of P(tr P_n >= x)")
 
 

@@ -24,7 +24,7 @@ from netkf.checks.laws import exact_start, find_largest
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_times, sampled_indices
 from netkf.checks.samples import RunSamples, check_replay
-from netkf.checks.statistics import Interval, eigenvalue_interval
+from netkf.checks.statistics import Interval, affine, eigenvalue_interval
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import Poisson, Renewal
@@ -117,8 +117,7 @@ def _excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
     ratio = eigenvalue_interval(white.T @ P @ white, level)
     # A reset that so few runs have not shown may take P to 0; it is as rare as this.
     unseen = min(1.0, math.log(1.0 / level) / len(P))
-    low = ratio.low * (1.0 - unseen) - 1.0
-    return ratio._replace(value=ratio.value - 1.0, low=low, high=ratio.high - 1.0)
+    return affine(ratio, 1.0, -1.0)._replace(low=ratio.low * (1.0 - unseen) - 1.0)
 
 
 def _bound_settles(samples: HybridSamples, level: float) -> Finding:

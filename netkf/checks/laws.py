@@ -51,7 +51,11 @@ def find_largest(
     text = f"{message} in {len(distances)} comparisons, {label}"
     margin = -chosen.value, -widest, -chosen.low
     found = Finding(margin, tolerance, text, detectable=detectable)
-    return found._replace(seen=chosen.seen, expected=chosen.expected)
+
+    def forecast(factor: float) -> float:
+        return max(interval.expected_high(factor) for interval, _ in distances)
+
+    return found._replace(seen=chosen.seen, expected=chosen.expected, forecast=forecast)
 
 
 EVERYTHING = "all times, nodes and runs together"
@@ -79,6 +83,7 @@ def pool(
         seen=pooled.seen,
         expected=pooled.expected,
         detectable=pooled.detectable,
+        forecast=pooled.expected_high,
     )
 
 

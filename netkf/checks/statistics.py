@@ -30,7 +30,8 @@ class Interval(NamedTuple):
 
     ``detectable``: the distance of the truth from its expected value at which the interval leaves
     the expected value out with probability POWER. An interval for a distance knows the two values
-    that are apart, ``seen`` and ``expected``.
+    that are apart, ``seen`` and ``expected``. ``again``: the two limits around another value with a
+    factor of that many times the samples; by default their distance shrinks as 1 / sqrt(factor).
     """
 
     value: float
@@ -39,6 +40,21 @@ class Interval(NamedTuple):
     detectable: float = math.nan
     seen: float = math.nan
     expected: float = math.nan
+    again: Callable[[float, float], tuple[float, float]] | None = None
+
+    def limits(self, value: float, factor: float) -> tuple[float, float]:
+        """Return the limits around ``value`` with ``factor`` times the samples."""
+        if self.again is not None:
+            return self.again(value, factor)
+        root = math.sqrt(factor)
+        return value - (self.value - self.low) / root, value + (self.high - self.value) / root
+
+    def expected_high(self, factor: float) -> float:
+        """Return the upper limit of a distance with ``factor`` times the samples, if what is seen
+        of the distance is chance.
+        """
+        value = self.value / math.sqrt(factor) if self.value > 0.0 else self.value
+        return self.limits(value, factor)[1]
 
 
 def detectable_shift(deviation: float, level: float) -> float:
@@ -52,8 +68,14 @@ def student_interval(value: float, deviation: float, count: int, level: float) -
     """Return the interval of Student for an estimate whose standard deviation was estimated from so
     many independent values.
     """
-    reach = -deviation * float(scipy.special.stdtrit(count - 1.0, level / 2.0))
-    return Interval(value, value - reach, value + reach, detectable_shift(deviation, level))
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        quantile = -float(scipy.special.stdtrit(factor * count - 1.0, level / 2.0))
+        reach = deviation / math.sqrt(factor) * quantile
+        return value - reach, value + reach
+
+    low, high = limits(value, 1.0)
+    return Interval(value, low, high, detectable_shift(deviation, level), again=limits)
 
 
 def _normal_quantile(probability: float) -> float:
@@ -63,18 +85,54 @@ def _normal_quantile(probability: float) -> float:
 def probability_interval(successes: int, trials: int, level: float) -> Interval:
     """Return the interval of Clopper and Pearson, exact for independent trials."""
     low = high = detectable = math.nan
+
+    def limits(share: float, factor: float) -> tuple[float, float]:
+        hits = min(max(share, 0.0), 1.0) * trials * factor
+        missed = trials * factor - hits
+        low = float(scipy.special.betaincinv(hits, missed + 1, level / 2)) if hits else 0.0
+        high = float(scipy.special.betaincinv(hits + 1, missed, 1 - level / 2)) if missed else 1.0
+        return low, high
+
     if trials:
-        missed = trials - successes
-        low = (
-            float(scipy.special.betaincinv(successes, missed + 1, level / 2)) if successes else 0.0
-        )
-        high = (
-            float(scipy.special.betaincinv(successes + 1, missed, 1 - level / 2)) if missed else 1.0
-        )
+        low, high = limits(successes / trials, 1.0)
         # At least one half of a trial on either side: a fraction of 0 or 1 has a spread too.
         p = (successes + 0.5) / (trials + 1.0)
         detectable = detectable_shift(math.sqrt(p * (1.0 - p) / trials), level)
-    return Interval(successes / max(trials, 1), low, high, detectable)
+    return Interval(successes / max(trials, 1), low, high, detectable, again=limits)
+
+
+def affine(found: Interval, scale: float, shift: float) -> Interval:
+    """Return the interval of ``scale`` times a quantity plus ``shift``; the scale is positive."""
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        low, high = found.limits((value - shift) / scale, factor)
+        return scale * low + shift, scale * high + shift
+
+    value, low, high = (scale * end + shift for end in found[:3])
+    return Interval(value, low, high, scale * found.detectable, again=limits)
+
+
+def widen(found: Interval, slack: float) -> Interval:
+    """Return the interval with both limits moved apart by ``slack``, which no sample reduces."""
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        low, high = found.limits(value, factor)
+        return low - slack, high + slack
+
+    return found._replace(low=found.low - slack, high=found.high + slack, again=limits)
+
+
+def with_drawn(found: Interval, drawn: Callable[[float], float]) -> Interval:
+    """Return the interval of samples that do not grow with the runs: a factor on the runs is one of
+    ``drawn(factor)`` on them.
+    """
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        more = drawn(factor)
+        # The value has been taken for one that shrinks with the runs.
+        return found.limits(value * math.sqrt(factor / more), more)
+
+    return found._replace(again=limits)
 
 
 def deviation_interval(expected: float, found: Interval) -> Interval:
@@ -83,7 +141,13 @@ def deviation_interval(expected: float, found: Interval) -> Interval:
     ends = abs(found.low - expected), abs(found.high - expected)
     low = 0.0 if inside else min(ends)
     apart = abs(found.value - expected)
-    return Interval(apart, low, max(ends), found.detectable, found.value, expected)
+    side = math.copysign(1.0, found.value - expected)
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        ends = found.limits(expected + side * value, factor)
+        return 0.0, max(abs(end - expected) for end in ends)
+
+    return Interval(apart, low, max(ends), found.detectable, found.value, expected, limits)
 
 
 def band_width(samples: int, level: float) -> float:
@@ -104,19 +168,20 @@ def law_distance(
     one: FloatArray, other: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
     """Return an interval for the largest difference between the distribution functions behind two
-    samples (S,) and (S',), which may depend on each other.
+    samples (S,) and (S',), which may depend on each other; further runs add to the first one.
 
     Values that differ by less than ``rounding``, or in the last of DIGITS digits, count as equal.
     """
     gaps = np.abs(_ecdf_gaps(one, other, rounding))
-    return _band_interval(gaps, len(one), len(other), level)
+    return _band_interval(gaps, len(one), len(other), level, grow=False)
 
 
 def law_excess(one: FloatArray, other: FloatArray, level: float, rounding: float = 0.0) -> Interval:
     """Return an interval for the largest ``P(other > x) - P(one > x)`` over all x; see
-    :func:`law_distance` for ``rounding``.
+    :func:`law_distance` for ``rounding``. Further runs add to both samples.
     """
-    return _band_interval(_ecdf_gaps(one, other, rounding), len(one), len(other), level)
+    gaps = _ecdf_gaps(one, other, rounding)
+    return _band_interval(gaps, len(one), len(other), level, grow=True)
 
 
 def _ecdf_gaps(one: FloatArray, other: FloatArray, rounding: float) -> FloatArray:
@@ -130,13 +195,21 @@ def _ecdf_gaps(one: FloatArray, other: FloatArray, rounding: float) -> FloatArra
     return np.asarray(ranks[0] - ranks[1])
 
 
-def _band_interval(gaps: FloatArray, a: int, b: int, level: float) -> Interval:
+def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -> Interval:
     value = max(0.0, float(gaps.max()))
-    width = band_width(a, level / 2.0) + band_width(b, level / 2.0)
+    widths = band_width(a, level / 2.0), band_width(b, level / 2.0)
+    width = sum(widths)
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        first, second = widths[0] / math.sqrt(factor), widths[1]
+        reach = first + (second / math.sqrt(factor) if grow else second)
+        return value - reach, value + reach
+
     # At one point the difference of the two has at most this deviation.
     spread = 0.5 * math.sqrt(1.0 / a + 1.0 / b)
     detectable = min(1.0, width + _normal_quantile(POWER) * spread)
-    return Interval(value, max(0.0, value - width), min(1.0, value + width), detectable)
+    ends = max(0.0, value - width), min(1.0, value + width)
+    return Interval(value, *ends, detectable, again=limits)
 
 
 def distance_to_law(
@@ -156,20 +229,41 @@ def distance_to_law(
     width = band_width(len(values), level)
     spread = 0.5 / math.sqrt(len(values))
     detectable = min(1.0, width + _normal_quantile(POWER) * spread)
-    return Interval(value, max(0.0, value - width), min(1.0, value + width), detectable)
+    return band_around(value, width, detectable)
+
+
+def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
+    """Return the interval for a difference of probabilities that is off by at most ``width``."""
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        reach = width / math.sqrt(factor)
+        return value - reach, value + reach
+
+    ends = max(0.0, value - width), min(1.0, value + width)
+    return Interval(value, *ends, detectable, again=limits)
 
 
 def scale_interval(total: float, freedom: float, level: float) -> Interval:
     """Return an interval for c if ``total`` is c times a chi-square variable with ``freedom``
     degrees of freedom.
     """
-    upper = 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, 1.0 - level / 2.0))
-    lower = 2.0 * float(scipy.special.gammaincinv(freedom / 2.0, level / 2.0))
+
+    def quantiles(freedom: float) -> tuple[float, float]:
+        tails = 1.0 - level / 2.0, level / 2.0
+        upper, lower = (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p)) for p in tails)
+        return upper, lower
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        more = factor * freedom
+        upper, lower = quantiles(more)
+        return value * more / upper, value * more / lower
+
+    upper, lower = quantiles(freedom)
     # c times a chi-square variable leaves the interval with probability POWER.
     up = upper / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, 1.0 - POWER)))
     down = lower / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, POWER)))
     detectable = max(up - 1.0, 1.0 - down)
-    return Interval(total / freedom, total / upper, total / lower, detectable)
+    return Interval(total / freedom, total / upper, total / lower, detectable, again=limits)
 
 
 def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:
@@ -194,7 +288,9 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
         for chance in (1.0 - POWER, POWER)
     )
     detectable = max(upper / up - 1.0, 1.0 - lower / down)
-    return Interval(total / mean, total / upper, total / lower, detectable)
+    # With more runs: as the chi-square variable of the same spread.
+    again = scale_interval(freedom, freedom, level).again
+    return Interval(total / mean, total / upper, total / lower, detectable, again=again)
 
 
 def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:

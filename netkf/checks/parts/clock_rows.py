@@ -35,6 +35,7 @@ from netkf.checks.statistics import (
     deviation_interval,
     scale_interval,
     student_interval,
+    with_drawn,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -108,17 +109,24 @@ def _counts_of_each(clocks: Clocks) -> np.ndarray:
     only the clocks are drawn, as it takes to find that one rate is off by WANTED_RATE.
     """
     counts = clocks.counts.ticks.sum(axis=1)
-    runs, rates = len(counts), clocks.rates * clocks.scenario.horizon
-    wanted = min(
-        math.ceil(ENOUGH_TICKS / rates.min()) - runs,
-        DRAWN_PER_RUN * runs,
-        int(MAX_DRAWN / len(rates)),
-        int(MAX_DRAWN_TICKS / rates.sum()),
-    )
-    if wanted <= 0:
+    runs = len(counts)
+    wanted = _number_drawn(clocks, runs)
+    if not wanted:
         return np.asarray(counts)
     more = _drawn_counts(clocks.draw, clocks.scenario, clocks.seed, runs, wanted)
     return np.concatenate([counts, more])
+
+
+def _number_drawn(clocks: Clocks, runs: float) -> int:
+    """Return the number of replicas of which the clocks are drawn beside those of the runs."""
+    rates = clocks.rates * clocks.scenario.horizon
+    wanted = min(
+        math.ceil(ENOUGH_TICKS / rates.min() - runs),
+        int(DRAWN_PER_RUN * runs),
+        int(MAX_DRAWN / len(rates)),
+        int(MAX_DRAWN_TICKS / rates.sum()),
+    )
+    return int(max(wanted, 0))
 
 
 def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
@@ -139,8 +147,14 @@ def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
     if poisson:
         intervals += _rates_by_window(windows, float(expected.sum()), level / 3.0)
     share = level / (3.0 * len(expected))
+    runs = len(windows)
+
+    def drawn(factor: float) -> float:
+        """Return the factor on the times that a clock is drawn, for a factor on the runs."""
+        return (factor * runs + _number_drawn(clocks, factor * runs)) / len(each)
+
     singles = [
-        _count_interval(each[:, k], float(expected[k]), share, poisson, begun[k])
+        with_drawn(_count_interval(each[:, k], float(expected[k]), share, poisson, begun[k]), drawn)
         for k in range(len(expected))
     ]
     intervals += zip(singles, clocks.group.labels, strict=True)
@@ -203,21 +217,35 @@ def _count_interval(
     their counts, and a difference of ``first_ticks`` says nothing.
     """
     total, runs = float(values.sum()), len(values)
-    slack = 0.0 if poisson else first_ticks / mean
-    if poisson:
-        low = float(scipy.special.gammaincinv(total, level / 2.0)) if total else 0.0
-        high = float(scipy.special.gammaincinv(total + 1.0, 1.0 - level / 2.0))
-        spread = math.sqrt(runs * mean)
-    else:
-        spread = math.sqrt(max(float(values.var(ddof=1)), 0.25) * runs)
-        _, low, high = student_interval(total, spread, runs, level)[:3]
     whole = runs * mean
-    ratio = Interval(
-        total / whole, low / whole, high / whole, detectable_shift(spread, level) / whole
-    )
-    apart = deviation_interval(1.0, ratio)
+    if poisson:
+        return deviation_interval(1.0, _poisson_interval(total, whole, level))
+    slack = first_ticks / mean
+    spread = math.sqrt(max(float(values.var(ddof=1)), 0.25) * runs)
+    apart = deviation_interval(1.0, student_interval(total / whole, spread / whole, runs, level))
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        low, high = apart.limits(value, factor)
+        return max(0.0, low - slack), max(0.0, high - slack)
+
     value, low, high = (max(0.0, end - slack) for end in apart[:3])
-    return apart._replace(value=value, low=low, high=high, detectable=apart.detectable + slack)
+    found = apart._replace(value=value, low=low, high=high, again=limits)
+    return found._replace(detectable=apart.detectable + slack)
+
+
+def _poisson_interval(total: float, mean: float, level: float) -> Interval:
+    """Return an interval for the mean of a Poisson number of which ``total`` was seen, relative to
+    ``mean``.
+    """
+
+    def limits(ratio: float, factor: float) -> tuple[float, float]:
+        seen, expected = ratio * mean * factor, mean * factor
+        low = float(scipy.special.gammaincinv(seen, level / 2.0)) if seen else 0.0
+        high = float(scipy.special.gammaincinv(seen + 1.0, 1.0 - level / 2.0))
+        return low / expected, high / expected
+
+    detectable = detectable_shift(1.0 / math.sqrt(mean), level)
+    return Interval(total / mean, *limits(total / mean, 1.0), detectable, again=limits)
 
 
 def _gaps(group: Group, samples: PartSamples, level: float) -> Finding:

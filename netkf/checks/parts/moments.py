@@ -180,10 +180,15 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
     seen, by Fisher's transformation.
     """
     spread = 1.0 / math.sqrt(max(count - 3.0, 1.0))
-    centre = math.atanh(min(max(value, -1.0 + 1e-12), 1.0 - 1e-12))
     reach = -spread * float(scipy.special.ndtri(level / 2.0))
-    low, high = math.tanh(centre - reach), math.tanh(centre + reach)
-    return Interval(value, low, high, math.tanh(detectable_shift(spread, level)))
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        centre = math.atanh(min(max(value, -1.0 + 1e-12), 1.0 - 1e-12))
+        wide = reach / math.sqrt(factor)
+        return math.tanh(centre - wide), math.tanh(centre + wide)
+
+    detectable = math.tanh(detectable_shift(spread, level))
+    return Interval(value, *limits(value, 1.0), detectable, again=limits)
 
 
 def _between(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:

@@ -24,10 +24,12 @@ from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.sources import stated_part
 from netkf.checks.statistics import (
     Interval,
+    affine,
     deviation_interval,
     probability_interval,
     scale_interval,
     student_interval,
+    widen,
 )
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
@@ -130,11 +132,16 @@ def _share_of_bounded_runs(
     scale = most * runs / float(sent.sum())
     # From 0 to 1 in each run, up to directions that lose unequal shares.
     found = min(max(expected + float(excess.mean()) / most, 0.0), 1.0)
-    limit = math.log(2.0 / level) / runs
-    ends = [_share_at(found, end, limit) for end in (0.0, 1.0)]
-    low, high = (expected + scale * (end - expected) for end in ends)
-    reach = max(expected - low, high - expected)
-    return Interval(expected + scale * (found - expected), low, high, reach)
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        near = min(max(expected + (value - expected) / scale, 0.0), 1.0)
+        limit = math.log(2.0 / level) / (factor * runs)
+        low, high = (_share_at(near, end, limit) for end in (0.0, 1.0))
+        return expected + scale * (low - expected), expected + scale * (high - expected)
+
+    value = expected + scale * (found - expected)
+    low, high = limits(value, 1.0)
+    return Interval(value, low, high, max(expected - low, high - expected), again=limits)
 
 
 def _share_at(found: float, end: float, limit: float) -> float:
@@ -301,8 +308,8 @@ def _mean_correlation(ratio: Interval, links: int) -> Interval:
     sum of their variances, widened by what is not known of these.
     """
     scale = 1.0 / max(links - 1, 1)
-    value, low, high = ((end - 1.0) * scale for end in ratio[:3])
-    return Interval(value, low - 0.02 * scale, high + 0.02 * scale, ratio.detectable * scale)
+    found = affine(ratio, scale, -scale)
+    return widen(found, 0.02 * scale)
 
 
 @lru_cache(maxsize=8)
