@@ -1,0 +1,183 @@
+"""Errors of parts are found with probability 0.9 at the size that their rows state, within 1.5.
+
+Counts are drawn as events would give them, without runs.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from netkf.checks.exact import _length_interval
+from netkf.checks.parts.clock_rows import _count_interval, largest_correlation
+from netkf.checks.parts.events import FateCounts, PairCounts, reversed_directions
+from netkf.checks.parts.moments import CELLS, compare_cells, correlation_interval
+from netkf.checks.parts.network_rows import _bursts, _losses_apart, _matchings, pair_probabilities
+from netkf.checks.parts.samples import PartSamples
+from netkf.checks.parts.ticks import correlate_neighbours
+from netkf.checks.statistics import deviation_interval, probability_interval
+from netkf.scenario.reading import from_table
+from tests.checks.parts.test_parts import SLOTS
+
+LEVEL, RUNS, TRIALS, SLACK = 2e-3, 200, 40, 1.5
+WINDOWS, MESSAGES = 4, 8  # of a run, and of a direction in each of them
+
+
+def _scenario(folder, loss, activation=None):
+    channel = {"loss": loss, "symmetric": False}
+    network = {**SLOTS["network"], "channel": channel}
+    if activation:
+        network["activation"] = activation
+    return from_table({**SLOTS, "network": network}, folder)
+
+
+def _samples(scenario, fates=None, pairs=None):
+    return PartSamples(scenario, 1, None, fates, pairs, None, None, None, None)
+
+
+def _count(scenario, lost):
+    """Count losses (R, W M, D) as `count_fates` does."""
+    runs, _, directions = lost.shape
+    parts = lost.reshape(runs, WINDOWS, MESSAGES, directions)
+    return FateCounts(
+        np.full((runs, WINDOWS, directions), MESSAGES),
+        parts.sum(axis=2),
+        lost[:, :-1].sum(axis=1),
+        (lost[:, 1:] & lost[:, :-1]).sum(axis=1),
+        (lost & lost[..., reversed_directions(scenario)]).sum(axis=1),
+    )
+
+
+def _of(finding):
+    """Return if a row is broken, and the error that it states."""
+    return finding.margin[2] < 0.0, finding.detectable
+
+
+def _interval(interval):
+    return interval.low > 0.0, interval.detectable
+
+
+def _losses_between_links(folder):
+    scenario = _scenario(folder, {"kind": "bernoulli", "delivery": 0.7})
+    directions = scenario.topology.directions
+    first = directions[0]
+    other = next(k for k, d in enumerate(directions) if d[0] < d[1] and set(d) != set(first))
+
+    def draw(size, random):
+        lost = random.random((RUNS, WINDOWS * MESSAGES, len(directions))) < 0.3
+        same = random.random(lost.shape[:2]) < size
+        lost[..., other] = np.where(same, lost[..., 0], lost[..., other])
+        return _of(_losses_apart(_samples(scenario, _count(scenario, lost)), LEVEL))
+
+    return draw
+
+
+def _bursts_of_losses(folder):
+    to_good, share = 0.3, 0.25
+    loss = {"kind": "gilbert-elliott", "to_good": to_good, "to_bad": to_good * share / (1 - share)}
+    scenario = _scenario(folder, loss)
+    size_of = (RUNS, len(scenario.topology.directions))
+
+    def draw(size, random):
+        leaves = to_good - size  # a loss is followed by another one more often
+        arrives, steps = leaves * share / (1.0 - share), [random.random(size_of) < share]
+        for u in random.random((WINDOWS * MESSAGES - 1, *size_of)):
+            steps.append(np.where(steps[-1], u >= leaves, u < arrives))
+        lost = np.swapaxes(np.array(steps), 0, 1)
+        return _of(_bursts(_samples(scenario, _count(scenario, lost)), LEVEL))
+
+    return draw
+
+
+def _matchings_of_slots(folder):
+    activation = {"kind": "matching", "protocol": "independent", "p": 0.3}
+    scenario = _scenario(folder, {"kind": "bernoulli", "delivery": 1.0}, activation)
+    p, slots = pair_probabilities(scenario), 20
+
+    def draw(size, random):
+        paired = random.random((RUNS, slots, len(p))) < p + size / len(p)
+        again = (paired[:, 1:] & paired[:, :-1]).sum(axis=1)
+        pairs = PairCounts(paired.sum(axis=1), again, np.full(RUNS, float(slots)))
+        return _of(_matchings(_samples(scenario, pairs=pairs), LEVEL))
+
+    return draw
+
+
+def _clocks_together(folder):
+    def draw(size, random):
+        common = math.sqrt(size) * random.standard_normal((500, 1))
+        values = random.standard_normal((500, 6))
+        values[:, :2] = common + math.sqrt(1.0 - size) * values[:, :2]
+        return _interval(largest_correlation(values, LEVEL)[0])
+
+    return draw
+
+
+def _renewal_clock(folder):
+    mean, shape = 20.0, 4.0
+
+    def draw(size, random):
+        gaps = random.gamma(shape, 1.0 / shape / (1.0 + size), (RUNS, 60))
+        ticks = (np.cumsum(gaps, axis=1) < mean).sum(axis=1)
+        return _interval(_count_interval(ticks, mean, LEVEL, False, 1.0))
+
+    return draw
+
+
+def _law_of_gaps(folder):
+    # The share of one of the cells, at the cost of all others.
+    def draw(size, random):
+        shares = np.full(CELLS, (1.0 - 1.0 / CELLS - size) / (CELLS - 1))
+        shares[3] = 1.0 / CELLS + size
+        counts = random.multinomial(5000, shares).astype(float)[:, None]
+        return _of(compare_cells(counts, ["all"], LEVEL, "gaps"))
+
+    return draw
+
+
+def _gaps_in_time(folder):
+    def draw(size, random):
+        u = random.random(2000)
+        # Each number is the one before with this probability.
+        for k in np.flatnonzero(random.random(len(u)) < size)[1:].tolist():
+            u[k] = u[k - 1]
+        sums = correlate_neighbours(u, np.zeros(len(u), dtype=bool))
+        found = correlation_interval(float(sums[0] / sums[1]), float(sums[2]), LEVEL)
+        return _interval(deviation_interval(0.0, found))
+
+    return draw
+
+
+def _bias_of_errors(folder):
+    spread = np.array([[0.1, 0.02], [0.0, 0.04]])
+    worst = np.linalg.svd(spread)[2][0] / np.linalg.svd(spread)[1][0]
+
+    def draw(size, random):
+        return _interval(_length_interval(spread, random.standard_normal(2) + size * worst, LEVEL))
+
+    return draw
+
+
+STUDIES = {
+    "losses of two links": _losses_between_links,
+    "losses in bursts": _bursts_of_losses,
+    "pairs in a slot": _matchings_of_slots,
+    "two clocks": _clocks_together,
+    "rate of a renewal clock": _renewal_clock,
+    "law of gaps and delays": _law_of_gaps,
+    "gaps and delays in time": _gaps_in_time,
+    "bias of errors": _bias_of_errors,
+}
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_rows_about_parts_find_what_they_state(name, tmp_path):
+    draw, random = STUDIES[name](tmp_path), np.random.default_rng(3)
+    stated = float(np.median([draw(0.0, random)[1] for _ in range(5)]))
+    above, below = (
+        sum(bool(draw(stated * factor, random)[0]) for _ in range(TRIALS))
+        for factor in (SLACK, 1.0 / SLACK)
+    )
+    assert probability_interval(above, TRIALS, 1e-3).high >= 0.9, (name, stated, above)
+    assert above >= 0.8 * TRIALS, (name, stated, above)
+    assert probability_interval(below, TRIALS, 1e-3).low <= 0.9, (name, stated, below)
