@@ -22,7 +22,7 @@ from netkf.checks.exact import (
 )
 from netkf.checks.laws import exact_start
 from netkf.checks.paper import PaperChecks
-from netkf.checks.rounding import compare_identities
+from netkf.checks.rounding import compare_identities, first_wrong
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
 from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
@@ -49,7 +49,9 @@ def _mass_conserved(samples: RunSamples, level: float) -> Finding:
     if isinstance(clock, LinkClock):
         rate = sum(clock.mean_rate(entity) for entity in clock.entities(scenario.topology))
     terms = 1.0 + scenario.horizon * float(np.nan_to_num(rate))
-    return compare_identities(drift, np.ones_like(drift), terms, MASS_TOLERANCE, message)
+    limits = np.ones_like(drift), terms, MASS_TOLERANCE
+    found = compare_identities(drift, *limits, message)
+    return found._replace(replica=first_wrong(drift, *limits))
 
 
 REACH, START = "exact errors are within reach", "the filters start"

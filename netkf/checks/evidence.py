@@ -136,7 +136,9 @@ def judge(
     found = []
     for promise, rows in zip(promises, failing, strict=True):
         if rows:
-            why = "; ".join(f"{row.assumption} [{row.source}]: {row.evidence}" for row in rows)
+            why = "; ".join(
+                f"it assumes that {row.assumption} [{row.source}]: {row.evidence}" for row in rows
+            )
             found.append(_reject(promise, why))
         else:
             found.append(

@@ -36,7 +36,7 @@ from netkf.checks.points import (
     sampled_indices,
 )
 from netkf.checks.rounding import EPS, OPERATIONS, compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples
+from netkf.checks.samples import ReplicaSummary, RunSamples, with_departure
 from netkf.checks.statistics import (
     POWER,
     Interval,
@@ -279,8 +279,9 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
     below = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
     message = f"least eigenvalue of P - Sigma relative to its trace in {below.size:,} covariances"
-    terms = samples.largest_terms(samples.runs.replayed[:most])
-    return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
+    limits = size, samples.largest_terms(samples.runs.replayed[:most]), BOUND_TOLERANCE
+    found = compare_identities(below, *limits, message)
+    return with_departure(found, samples, below, limits)
 
 
 @gaussian_test

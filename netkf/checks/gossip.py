@@ -40,7 +40,7 @@ from netkf.checks.mode_sequences import (
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay, with_departure
 from netkf.checks.statistics import (
     band_around,
     band_width,
@@ -207,7 +207,9 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     )
     # The root of the bound is computed from one of size UNKNOWN, and has the roundings of that.
     terms = np.maximum(UNKNOWN * np.sqrt(size), samples.largest_terms(P))
-    return compare_identities(below, size, terms, BOUND_TOLERANCE, message)
+    limits = size, terms, BOUND_TOLERANCE
+    found = compare_identities(below, *limits, message)
+    return with_departure(found, samples, below, limits)
 
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:

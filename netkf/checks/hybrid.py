@@ -331,7 +331,7 @@ def _settling_rows(scenario: Scenario) -> list[Assumption]:
         try:
             steady_covariance_bound(scenario)
         except TheoryError as error:
-            why = f"the proposition is false here: {error}"
+            why = f"H Proposition 4 is false here: {error}"
     return [Assumption("H(12) has a steady state", "H (12), (16)", settles, why)]
 
 

@@ -43,8 +43,8 @@ from netkf.checks.mode_sequences import (
 )
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
-from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
+from netkf.checks.rounding import compare_identities, first_wrong
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay, with_departure
 from netkf.checks.statistics import (
     deviation_interval,
     distance_to_law,
@@ -246,8 +246,9 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
         gap = np.linalg.eigvalsh(np.nan_to_num(samples.runs.P - least, nan=-np.inf, posinf=-1e300))
     below = np.maximum(-gap[..., 0], 0.0)
     message = f"{size.size:,} covariances against the path without losses"
-    terms = samples.largest_terms(samples.runs.P)
-    return compare_identities(below, np.nan_to_num(size), terms, BOUND_TOLERANCE, message)
+    limits = np.nan_to_num(size), samples.largest_terms(samples.runs.P), BOUND_TOLERANCE
+    found = compare_identities(below, *limits, message)
+    return with_departure(found, samples, below, limits)
 
 
 def _in_support(samples: IntermittentSamples, level: float) -> Finding:
@@ -269,7 +270,9 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     least = np.nan_to_num(_least_roots(samples.scenario))
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
     terms = np.sum(_roots_above(starts, least)[known] ** 2, axis=(-2, -1))
-    found = compare_identities(gap, size, terms, SUPPORT_TOLERANCE, message)
+    limits = size, terms, SUPPORT_TOLERANCE
+    found = compare_identities(gap, *limits, message)
+    found = found._replace(replica=first_wrong(gap, *limits))
     if forgotten.any() or found.margin[0] < 0.0:
         return found
     end = samples.scenario.horizon

@@ -48,7 +48,8 @@ def find_largest(
     chosen, label = max(distances, key=lambda item: (item[0].low, item[0].value))
     widest = max(interval.high for interval, _ in distances)
     detectable = max(interval.detectable for interval, _ in distances)
-    text = f"{message} in {len(distances)} comparisons, {label}"
+    number = "1 comparison" if len(distances) == 1 else f"{len(distances)} comparisons"
+    text = f"{message} in {number}, {label}"
     margin = -chosen.value, -widest, -chosen.low
     found = Finding(margin, tolerance, text, detectable=detectable)
 
@@ -75,7 +76,7 @@ def pool(
     if off or not pooled.value >= 0.0:
         return single
     margin = -pooled.value, -pooled.high, -pooled.low
-    text = f"{what}; {single.message}: {max(0.0, -single.margin[0]):.3g}"
+    text = f"{what}; one by one: {single.message}: {max(0.0, -single.margin[0]):.3g}"
     return single._replace(
         margin=margin,
         tolerance=tolerance,

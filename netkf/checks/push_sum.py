@@ -32,7 +32,7 @@ from netkf.checks.exact import (
 from netkf.checks.laws import exact_start, find_largest
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices
-from netkf.checks.rounding import compare_identities
+from netkf.checks.rounding import compare_identities, first_wrong
 from netkf.checks.samples import (
     REPLAY_TOLERANCE,
     ReplicaSummary,
@@ -127,7 +127,9 @@ def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
     """Compare the totals of weight and number at the end with 1 and N."""
     drift = np.abs(samples.runs.drift)
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
-    return compare_identities(drift, np.ones_like(drift), _exchanges(samples), 1e-9, message)
+    limits = np.ones_like(drift), _exchanges(samples), 1e-9
+    found = compare_identities(drift, *limits, message)
+    return found._replace(replica=first_wrong(drift, *limits))
 
 
 def _exchanges(samples: PushSumSamples) -> float:

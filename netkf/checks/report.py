@@ -73,8 +73,10 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
     lines = []
     for row in broken:
         values = ""
-        if math.isfinite(row.seen) and math.isfinite(row.expected):
+        if math.isfinite(row.seen) and math.isfinite(row.expected) and row.low < row.high:
             values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"
+        elif math.isfinite(row.off):
+            values = f": off by {row.off:.3g}"
         lines.append(f"BROKEN: {row.promise}  [{row.source}]{values}")
         if command and row.replica is not None:
             lines.append(f"        replay it: {command} {row.replica}")
@@ -82,22 +84,25 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
 
 
 def _describe(row: Evidence) -> str:
-    """Return the evidence of a row, how far off it is and what would have been seen, or the
+    """Return how far off a row is and what would have been seen, then its evidence; or the
     assumptions that fail.
     """
-    message = row.evidence
     if row.verdict == NOT_PROMISED:
-        message = row.assumptions
-    elif row.low < row.high:
+        return row.assumptions
+    parts = [f"needs about {row.needed:,} runs"] if row.needed is not None else []
+    if row.low < row.high:
+        parts.append(f"off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}{_limits(row)}")
         if math.isfinite(row.seen) and math.isfinite(row.expected):
-            message += f"; seen {row.seen:.4g}, expected {row.expected:.4g}"
-        message += f"; off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}"
-        if row.detectable > 0.0:
-            message += f"; an error of {row.detectable:.2g} would have been seen"
-        message += f"; {row.tolerance:g} is tolerated" if row.tolerance else ""
-    if row.needed is not None:
-        message += f"; needs about {row.needed:,} runs"
-    return message
+            parts.append(f"seen {row.seen:.4g}, expected {row.expected:.4g}")
+    return "; ".join([*parts, row.evidence])
+
+
+def _limits(row: Evidence) -> str:
+    """Return what a row tolerates and what it would have found, in brackets; or nothing."""
+    found = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
+    if row.detectable > 0.0:
+        found.append(f"an error of {row.detectable:.2g} would have been seen")
+    return f" ({'; '.join(found)})" if found else ""
 
 
 def verdict_json(verdict: Verdict) -> dict[str, Any]:

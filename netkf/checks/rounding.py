@@ -20,6 +20,15 @@ def allowed_deviation(size: FloatArray, terms: ArrayLike, base: float) -> FloatA
     return np.asarray(np.maximum(base * np.asarray(size), OPERATIONS * EPS * largest))
 
 
+def first_wrong(gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float) -> int | None:
+    """Return the first run whose deviations ``gap`` (R, ..) exceed what rounding explains, or None;
+    on the arguments see :func:`compare_identities`.
+    """
+    wrong = ~(np.asarray(gap) <= allowed_deviation(size, terms, base))
+    runs = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))
+    return int(runs[0]) if len(runs) else None
+
+
 def compare_identities(
     gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float, message: str
 ) -> Finding:

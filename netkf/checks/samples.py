@@ -13,7 +13,7 @@ from netkf.checks.evidence import Finding, find_unknown
 from netkf.checks.laws import Pair, compare_growth
 from netkf.checks.points import check_slots, check_times, sampled_nodes
 from netkf.checks.rounding import allowed_deviation, compare_identities, largest_terms
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import ArrayLike, FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
 
 REPLAY_TOLERANCE = 1e-7
@@ -132,14 +132,31 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
         f"{gap.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
-    terms = samples.largest_terms(expected)
-    finding = compare_identities(gap, size, terms, REPLAY_TOLERANCE, message)
-    wrong = ~(gap <= allowed_deviation(size, terms, REPLAY_TOLERANCE))
+    limits = size, samples.largest_terms(expected), REPLAY_TOLERANCE
+    found = compare_identities(gap, *limits, message)
+    return with_departure(found, samples, gap, limits, np.flatnonzero(replayed))
+
+
+def with_departure(
+    finding: Finding,
+    samples: RunSamples,
+    gap: FloatArray,
+    limits: tuple[FloatArray, ArrayLike, float],
+    replicas: IntArray | None = None,
+) -> Finding:
+    """Return the finding on deviations ``gap`` (R, K', N) with the run, time and node at which they
+    first exceed what rounding explains; ``limits`` are those of ``allowed_deviation``.
+
+    The K' times are the last ones of those that are looked at, and the R runs are ``replicas``, by
+    default the first ones.
+    """
+    wrong = ~(gap <= allowed_deviation(*limits))
     if not wrong.any():
         return finding
     # The earliest time of all runs, and there the first run and node.
     time, run, node = np.argwhere(np.swapaxes(wrong, 0, 1))[0].tolist()
-    replica = int(np.flatnonzero(replayed)[run])
+    replica = run if replicas is None else int(replicas[run])
+    time += len(samples.time_labels) - wrong.shape[1]
     label = samples.point_labels[time * len(samples.nodes) + node]
     text = f"{finding.message}; first seen to depart in run {replica} at {label}"
     return finding._replace(message=text, replica=replica)

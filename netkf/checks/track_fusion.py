@@ -14,7 +14,7 @@ from netkf.checks.exact import most_replayed, with_promised_filter
 from netkf.checks.kalman_consensus import EquationChecks
 from netkf.checks.points import check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import RunSamples
+from netkf.checks.samples import RunSamples, with_departure
 from netkf.scenario.scenario import Scenario
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 
@@ -29,9 +29,9 @@ def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
     P, Sigma = samples.runs.P[:most], samples.runs.Sigma[:most]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(np.abs(P - Sigma).max(axis=(-1, -2)), nan=1e300, posinf=1e300)
-    terms = samples.largest_terms(samples.runs.replayed[:most])
+    limits = size, samples.largest_terms(samples.runs.replayed[:most]), EXACT_TOLERANCE
     message = f"largest entry of P - Sigma relative to its trace in {gap.size:,} covariances"
-    return compare_identities(gap, size, terms, EXACT_TOLERANCE, message)
+    return with_departure(compare_identities(gap, *limits, message), samples, gap, limits)
 
 
 EXACT = Promise(

@@ -3,21 +3,37 @@
 import dataclasses
 import json
 import math
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.stats
 
+import netkf
 from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED, Evidence, Promise, judge
 from netkf.checks.laws import find_largest
 from netkf.checks.looks import is_decided, keep_decisions, level_of_look, next_runs
+from netkf.checks.parts.clock_rows import _poisson_interval
+from netkf.checks.parts.moments import correlation_interval
 from netkf.checks.report import verdict_text
-from netkf.checks.statistics import deviation_interval, scale_interval
+from netkf.checks.statistics import (
+    band_around,
+    band_width,
+    deviation_interval,
+    probability_interval,
+    scale_interval,
+    student_interval,
+)
 from netkf.checks.storage import load_verdict, save_verdict
+from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.scenario.reading import from_table
 from tests.checks.test_check import GOSSIP, INTERMITTENT
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
 def scenario_of(table, folder, **changes):
@@ -69,27 +85,90 @@ def test_looking_often_breaks_no_more_than_the_level():
     assert scipy.stats.binom.sf(wrong - 1, trials, level) > 1e-3
 
 
-def test_forecasts_of_an_interval_hold_within_a_factor():
+def _sums(draw, most):
+    """Return a function from a number of runs to the sum of what they drew."""
+    sums = np.cumsum(draw(most))
+    return lambda runs: float(sums[runs - 1])
+
+
+LEVEL = 1e-3
+KINDS = {
+    # What a run draws, the interval after so many runs from their sum, and what is tolerated.
+    "a variance": (
+        lambda random: lambda most: random.chisquare(1.0, most),
+        lambda total, runs: deviation_interval(1.0, scale_interval(total, runs, LEVEL)),
+        0.05,
+        4000,
+    ),
+    "a variance of few values": (
+        lambda random: lambda most: random.chisquare(1.0, most),
+        lambda total, runs: deviation_interval(1.0, scale_interval(total, runs, LEVEL)),
+        0.3,
+        20,
+    ),
+    "rare losses": (
+        lambda random: lambda most: random.random(most) < 0.002,
+        lambda total, runs: deviation_interval(
+            0.002, probability_interval(int(total), runs, LEVEL)
+        ),
+        0.01,
+        150,
+    ),
+    "no losses": (
+        lambda random: np.zeros,
+        lambda total, runs: deviation_interval(0.0, probability_interval(0, runs, LEVEL)),
+        0.005,
+        60,
+    ),
+    "few ticks": (
+        lambda random: lambda most: random.poisson(0.7, most),
+        lambda total, runs: deviation_interval(1.0, _poisson_interval(total, 0.7 * runs, LEVEL)),
+        0.2,
+        50,
+    ),
+    "the mean of few runs": (
+        lambda random: random.standard_normal,
+        lambda total, runs: deviation_interval(
+            0.0, student_interval(total / runs, 1.0 / math.sqrt(runs), runs, LEVEL)
+        ),
+        0.25,
+        20,
+    ),
+    "a correlation": (
+        lambda random: lambda most: random.standard_normal(most) * random.standard_normal(most),
+        lambda total, runs: deviation_interval(
+            0.0, correlation_interval(total / runs, runs, LEVEL)
+        ),
+        0.2,
+        40,
+    ),
+    "a distribution function": (
+        lambda random: lambda most: random.random(most) < 0.5,
+        lambda total, runs: band_around(abs(total / runs - 0.5), band_width(runs, LEVEL)),
+        0.25,
+        12,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_forecasts_of_all_kinds_of_intervals_hold_within_a_factor(kind):
     # Runs that decide a healthy row: the forecast against what it takes.
-    random, level, tolerance = np.random.default_rng(5), 1e-3, 0.05
-    ratios = []
+    source, interval, tolerance, first = KINDS[kind]
+    random, ratios = np.random.default_rng(5), []
+    grid = np.unique(np.geomspace(first, 40 * first, 120).astype(int)).tolist()
     for _ in range(60):
-        values = random.chisquare(1.0, 60_000)
-        sums = np.cumsum(values)
+        total = _sums(source(random), 40 * first)
 
-        def judged(runs, sums=sums):
-            interval = scale_interval(float(sums[runs - 1]), runs, level)
-            finding = find_largest([(deviation_interval(1.0, interval), "it")], tolerance, "c")
-            promise = Promise("c is 1", "here", (), lambda _, __: finding)
-            return judge([promise], None, [], runs, level)[0]
+        def judged(runs, total=total):
+            found = find_largest([(interval(total(runs), runs), "it")], tolerance, "c")
+            promise = Promise("c is as stated", "here", (), lambda _, __: found)
+            return judge([promise], None, [], runs, LEVEL)[0]
 
-        first = judged(4000)
-        if first.verdict != UNDECIDED:
-            continue
-        grid = np.unique(np.geomspace(4000, 60_000, 80).astype(int)).tolist()
-        decided = next((runs for runs in grid if judged(runs).verdict == HOLDS), None)
-        if decided is not None:
-            ratios.append(first.needed / decided)
+        row = judged(first)
+        if row.verdict == UNDECIDED:
+            decided = next((runs for runs in grid if judged(runs).verdict == HOLDS), math.nan)
+            ratios.append(row.needed / decided)
     assert len(ratios) > 30
     assert 1.0 / 1.5 < np.median(ratios) < 1.5
 
@@ -196,6 +275,47 @@ def test_broken_rows_come_first_and_again_with_their_command(tmp_path):
     assert len(replays) == len(shown)
     assert "[G ...]" in text
     assert "[H ...]" not in text
+
+
+OWN_CLASS = """
+from dataclasses import dataclass
+
+from netkf.parts import Hybrid
+
+
+@dataclass(frozen=True, eq=False)
+class Mine(Hybrid):
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages, exchange)._replace(root=state.root)
+"""
+
+
+def test_the_printed_command_replays_a_broken_run(tmp_path, monkeypatch, capsys):
+    """In an empty folder beside the files, for a user's class: the first departure is there."""
+    (tmp_path / "mine_too.py").write_text(OWN_CLASS)
+    monkeypatch.chdir(tmp_path)
+    path = str(SCENARIOS / "threshold.toml")
+    sets = ["--set", "horizon=2.0", "--set", 'filter.kind="mine_too:Mine"']
+    assert main(["check", path, "--trust", "--runs", "10", "--no-plot", *sets]) == 1
+    text = capsys.readouterr().out
+    # Each broken row has the command of a run that shows it.
+    command = re.search(r"BROKEN: P follows.+\n\s+replay it: netkf (.+)", text)[1]
+    assert re.search(r"BROKEN: P is at least.+\n\s+replay it: netkf run", text)
+    found = re.search(r"first seen to depart in run (\d+)\s+at ([0-9.]+) s, node (\d+)", text)
+    assert command.endswith(f"--replica {found[1]}")
+    more = ["--out", "replayed", "--no-plot", "--set", "probe=0.25"]
+    assert main([*shlex.split(command), *more]) == 0
+    run = netkf.open("replayed", trust=True)
+    changes = {"horizon": 2.0, "probe": 0.25}
+    exact = netkf.simulate(netkf.load(path, changes), run.seed, int(found[1]))
+    apart = np.abs(run.P - exact.P).max(axis=(2, 3))
+    time, node = (
+        int(np.argmin(np.abs(run.times - float(found[2])))),
+        exact.nodes.index(int(found[3])),
+    )
+    assert run.times[time] == pytest.approx(float(found[2]))
+    assert apart[time, node] > 1e-6
+    assert apart[0].max() < 1e-12
 
 
 def test_rows_that_use_some_of_the_runs_do_not_ask_for_more_than_help():
