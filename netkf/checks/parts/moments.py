@@ -32,6 +32,10 @@ of the share of one.
 """
 LEAST = 1e-10
 """Share of the largest variance below which a direction has no noise."""
+FURTHER, PARTS = 3, 4
+"""Lags beyond the first at which each entry is compared with itself, and parts of a series in which
+all variances together are.
+"""
 MIN_COUNT, MIN_COUNT_OF_ANY_LAW = 20, 200
 """Numbers from which means and variances are judged; of the latter if the law is not known."""
 
@@ -41,6 +45,14 @@ class NoiseMoments(NamedTuple):
     were there ``together`` (d, d), sums of z (d,), of z z' (d, d), and of z z' with the z
     before it (d, d), of which there are ``pairs`` (d, d); how many of each lie in the ``cells``
     (CELLS, d), which standard normal numbers fill evenly; and sums of z^4, ``fourth`` (d,).
+
+    further  : (FURTHER, 2, d) number and sum of products of each entry with itself two and more
+        noises before
+    sizes    : (4, d) number of neighbours, and sums of r, of r^2 and of the products of neighbours,
+        r the rank of |z| among those of standard normal numbers
+    variance : (PARTS, 2) number and sum of z^2 of all entries in each part of the series
+    states   : (2, n, d) number and sum of products of z with n numbers with variance 1 at most that
+        tell the state which a noise is added to
     """
 
     together: FloatArray
@@ -50,13 +62,23 @@ class NoiseMoments(NamedTuple):
     pairs: FloatArray
     cells: FloatArray
     fourth: FloatArray
+    further: FloatArray
+    sizes: FloatArray
+    variance: FloatArray
+    states: FloatArray
 
 
-def moments(z: FloatArray) -> NoiseMoments:
-    """Return the sums over a series z (S, d), in which missing entries are nan."""
+def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
+    """Return the sums over a series z (S, d), in which missing entries are nan, and with numbers
+    ``states`` (S, n, d) that tell the state to which each was added.
+    """
     known = np.isfinite(z)
     there = known.astype(float)
     z = np.where(known, z, 0.0)
+    rank = np.where(known, 2.0 * scipy.special.ndtr(np.abs(z)) - 1.0, 0.0)
+    later = [(there[k:] * there[:-k], z[k:] * z[:-k]) for k in range(2, FURTHER + 2)]
+    parts = zip(np.array_split(there, PARTS), np.array_split(z, PARTS), strict=True)
+    shown = np.zeros((len(z), 0, z.shape[1])) if states is None else np.nan_to_num(states)
     return NoiseMoments(
         there.T @ there,
         z.sum(axis=0),
@@ -65,6 +87,17 @@ def moments(z: FloatArray) -> NoiseMoments:
         there[1:].T @ there[:-1],
         count_cells(scipy.special.ndtr(z), known),
         (z**4).sum(axis=0),
+        np.array([[pairs.sum(axis=0), products.sum(axis=0)] for pairs, products in later]),
+        np.array(
+            [
+                (there[1:] * there[:-1]).sum(axis=0),
+                rank.sum(axis=0),
+                (rank**2).sum(axis=0),
+                (rank[1:] * rank[:-1]).sum(axis=0),
+            ]
+        ),
+        np.array([[number.sum(), (part**2).sum()] for number, part in parts]),
+        np.array([(there[:, None] * (shown != 0.0)).sum(axis=0), (z[:, None] * shown).sum(axis=0)]),
     )
 
 
@@ -105,8 +138,14 @@ def compare_variances(
         return deviation_interval(1.0, scale)
 
     sums = float(squares.sum()), float(found.fourth.sum()), float(counts.sum())
-    intervals = [(interval(*sums, level / 2.0), f"all {what} together")]
-    share = level / (2.0 * len(squares))
+    intervals = [(interval(*sums, level / 3.0), f"all {what} together")]
+    for k, (count, square) in enumerate(found.variance.tolist()):
+        if count >= MIN_COUNT:
+            # The fourth moment is that of all parts.
+            part = square, sums[1] * count / sums[2] * (square / count * sums[2] / sums[0]) ** 2
+            label = f"all {what} in part {k + 1} of {PARTS} of a run"
+            intervals.append((interval(*part, count, level / (3.0 * PARTS)), label))
+    share = level / (3.0 * len(squares))
     for k, label in enumerate(labels):
         if counts[k] >= MIN_COUNT:
             one = float(squares[k]), float(found.fourth[k]), float(counts[k])
@@ -116,11 +155,12 @@ def compare_variances(
 
 
 def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Finding:
-    """Test that every entry has the mean 0."""
+    """Test that every entry has the mean 0, whatever the state is: none is correlated with it."""
     counts = np.diagonal(found.together)
     if counts.max() < MIN_COUNT:
         return nothing_to_see(MEAN_TOLERANCE)
-    share, intervals = level / len(labels), []
+    states = _with_states(found, labels)
+    share, intervals = level / ((2.0 if states else 1.0) * len(labels)), []
     for total_, count, label in zip(found.first.tolist(), counts.tolist(), labels, strict=True):
         if count < MIN_COUNT:
             continue
@@ -129,12 +169,28 @@ def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Findi
         reach = deviation * -float(scipy.special.ndtri(share / 2.0))
         mean = Interval(value, value - reach, value + reach, detectable_shift(deviation, share))
         intervals.append((deviation_interval(0.0, mean), label))
+    for value, count, label in states:
+        related = correlation_interval(value, count, level / (2.0 * len(states)))
+        intervals.append((deviation_interval(0.0, related), label))
     return find_largest(intervals, MEAN_TOLERANCE, "largest mean in standard deviations")
 
 
+def _with_states(found: NoiseMoments, labels: list[str]) -> list[tuple[float, float, str]]:
+    """Return correlation, count and label of all entries with the states they are added to."""
+    counts, sums = found.states
+    return [
+        (float(sums[j, i] / counts[j, i]), float(counts[j, i]), f"{label} with state {j}")
+        for i, label in enumerate(labels)
+        for j in range(len(counts))
+        if counts[j, i] >= MIN_COUNT
+    ]
+
+
 def compare_correlations(found: NoiseMoments, labels: list[str], level: float) -> Finding:
-    """Test that different entries are not correlated, and none with any entry just before."""
-    entries = [*_between(found, labels), *_in_time(found, labels)]
+    """Test that different entries are not correlated, none with any entry just before, nor with
+    itself before that, and that large ones do not follow large or small ones.
+    """
+    entries = [*_between(found, labels), *_in_time(found, labels), *_in_size(found, labels)]
     entries = [entry for entry in entries if entry[1] >= MIN_COUNT]
     if not entries:
         return nothing_to_see(CORRELATION_TOLERANCE)
@@ -206,6 +262,25 @@ def _in_time(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, fl
         for j, before in enumerate(labels):
             pairs = float(found.pairs[i, j])
             yield float(related[i, j]), pairs, f"{label} and {before} just before"
+
+
+def _in_size(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
+    """Yield correlation, count and label of each entry with itself some noises before, and of its
+    size with that just before.
+    """
+    count, square = np.diagonal(found.together), np.diagonal(found.second)
+    for i, label in enumerate(labels):
+        if not square[i] > 0.0:
+            continue
+        for k, (pairs, products) in enumerate(found.further[:, :, i].tolist()):
+            if pairs:
+                value = products / pairs * count[i] / square[i]
+                yield float(value), pairs, f"{label} and itself {k + 2} before"
+        pairs, first, second, products = found.sizes[:, i].tolist()
+        mean, spread = first / count[i], second / count[i] - (first / count[i]) ** 2
+        if pairs and spread > 0.0:
+            value = (products / pairs - mean**2) / spread
+            yield float(value), pairs, f"the size of {label} and of that just before"
 
 
 def _correlations(found: NoiseMoments, products: FloatArray, counts: FloatArray) -> FloatArray:

@@ -35,13 +35,15 @@ VISIBLE = 1e-5
 
 class PathLaw(NamedTuple):
     """Times (S + 1,) in seconds of the states that are compared, and the law of what each step
-    adds: ``x(t + gap) = Phi x(t) + w``, and the matrix (d, n) that whitens w.
+    adds: ``x(t + gap) = Phi x(t) + w``, and the matrix (d, n) that whitens w; ``sizes`` (S, n) are
+    the root mean squares of the states before the steps.
     """
 
     times: FloatArray
     Phi: FloatArray
     white: FloatArray
     deviation: float
+    sizes: FloatArray
 
 
 @lru_cache(maxsize=8)
@@ -49,17 +51,25 @@ def path_law(scenario: Scenario) -> PathLaw | None:
     """Return the law of the path by the matrices of the scenario; None without a drawn one."""
     if not scenario.plant.is_random:
         return None
+    stated: Any = stated_part(scenario.plant, "plant")
     if scenario.slotted:
-        plant: Any = stated_part(scenario.plant, "plant")
-        slots = min(MAX_STEPS, int(scenario.horizon / plant.period))
-        times = plant.period * np.arange(slots + 1)
-        Phi, W = np.asarray(plant.F), np.asarray(plant.Q)
+        slots = min(MAX_STEPS, int(scenario.horizon / stated.period))
+        times = stated.period * np.arange(slots + 1)
+        Phi, W = np.asarray(stated.F), np.asarray(stated.Q)
     else:
-        stated: Any = stated_part(scenario.plant, "plant")
         times = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
         Phi, W = _discretised(stated.A, stated.B, float(times[1]))
     size = float(np.sqrt(np.diagonal(W).max()))
-    return PathLaw(times, Phi, whitening_matrix(W), size)
+    return PathLaw(times, Phi, whitening_matrix(W), size, _sizes(stated, Phi, W, len(times) - 1))
+
+
+def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray:
+    """Return the root mean squares (steps, n) of the states before each step."""
+    mean, covariance, found = plant.start_mean, plant.start_cov, []
+    for _ in range(steps):
+        found.append(np.sqrt(np.diagonal(covariance) + mean**2))
+        mean, covariance = Phi @ mean, Phi @ covariance @ Phi.T + W
+    return np.array(found).reshape(steps, len(W))
 
 
 def _discretised(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
@@ -82,7 +92,14 @@ def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
     # Differences of states that have grown far beyond the noise are rounding.
     seen = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
     kept = len(seen) if seen.all() else int(np.argmin(seen))
-    return moments(w[:kept] @ law.white.T)
+    z = w[:kept] @ law.white.T
+    states = _standardise(x[:kept], law.sizes[:kept])
+    return moments(z, np.repeat(states[:, :, None], z.shape[1], axis=2))
+
+
+def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return states x (S, n) in units of their root mean squares; 0 where these are 0."""
+    return np.divide(x, sizes, out=np.zeros_like(x), where=sizes > 0.0)
 
 
 def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
@@ -174,16 +191,22 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     if not laws:
         return None
     columns = [_noises(scenario, streams, law) for law in laws]
-    length = max(len(column) for column in columns)
-    whole = [
-        np.pad(column, ((0, length - len(column)), (0, 0)), constant_values=np.nan)
-        for column in columns
-    ]
-    return moments(np.concatenate(whole, axis=1))
+    length = max(len(z) for z, _ in columns)
+    n = scenario.plant.n
+    z = np.full((length, sum(z.shape[1] for z, _ in columns)), np.nan)
+    shown = np.zeros((length, n, z.shape[1]))
+    place = 0
+    for noises, states in columns:
+        among = slice(place, place + noises.shape[1])
+        z[: len(noises), among], shown[: len(noises), :, among] = noises, states[:, :, None]
+        place = among.stop
+    return moments(z, shown)
 
 
-def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> FloatArray:
-    """Return the whitened noises (S, p) of a sensor's first readings in one run."""
+def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> tuple[FloatArray, FloatArray]:
+    """Return the whitened noises (S, p) of a sensor's first readings in one run, and the states
+    (S, n) that it was shown, in units of their root mean squares.
+    """
     random = streams.generator("check readings", law.node, law.place.ordinal)
     if scenario.slotted:
         count = min(MAX_STEPS, int(scenario.horizon / scenario.slot_plant.period))
@@ -194,21 +217,34 @@ def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> FloatArray:
         path = scenario.sample_path(streams, law.node, law.place)
     else:
         # A run may be shorter than one step of the sensor, and then has no reading.
-        nothing = np.empty((0, len(law.root)))
-        return np.concatenate([nothing, *_increment_noises(scenario, streams, law, random)])
+        nothing = np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
+        pieces = [nothing, *_increment_noises(scenario, streams, law, random)]
+        noises, states = (np.concatenate(part) for part in zip(*pieces, strict=True))
+        return noises, states
     x = _shown_states(scenario, random, count)
     if not count:
-        return np.empty((0, len(law.root)))
+        return np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
     y, H = path.several(range(count), x)
     expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
-    return np.asarray(np.linalg.solve(law.root, (y - expected).T).T)
+    return np.linalg.solve(law.root, (y - expected).T).T, _standardise(x, _shown_sizes(scenario, x))
 
 
 def _shown_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
     """Return states (count, n) of the size of the first ones and of what some steps add."""
+    root = square_root(_shown_covariance(scenario))
     plant: Any = scenario.plant
-    root = square_root(plant.start_cov + 10.0 * np.asarray(plant.Q))
     return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
+
+
+def _shown_covariance(scenario: Scenario) -> FloatArray:
+    plant: Any = scenario.plant
+    return np.asarray(plant.start_cov + 10.0 * np.asarray(plant.Q))
+
+
+def _shown_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
+    """Return the root mean squares of the states x (S, n) that sensors are shown, (S, n)."""
+    sizes = np.sqrt(np.diagonal(_shown_covariance(scenario)) + scenario.plant.start_mean**2)
+    return np.asarray(np.broadcast_to(sizes, x.shape))
 
 
 class _Grid(NamedTuple):
@@ -224,8 +260,8 @@ class _Grid(NamedTuple):
 
 def _increment_noises(
     scenario: Scenario, streams: Streams, law: SensorLaw, random: np.random.Generator
-) -> Iterator[FloatArray]:
-    """Yield whitened noises (2, p): of some steps whole, of others cut in two.
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield whitened noises (2, p), of some steps whole, of others cut in two, and states (2, n).
 
     Each part of a step has two moments, with the variances R length and R length / 3.
     """
@@ -240,10 +276,12 @@ def _increment_noises(
         # Whole steps and cut ones take turns.
         cuts = [end] if k % 2 else [start + 0.3 * period, end]
         for stop in cuts:
-            seen = _shown_states(scenario, random, 2) * (stop - start)
+            x = _shown_states(scenario, random, 2)
+            seen = x * (stop - start)
             dy = path.moments(_Grid(period, end), seen, start, stop)
             scale = np.sqrt((stop - start) * np.array([[1.0], [1.0 / 3.0]]))
-            yield np.linalg.solve(law.root, ((dy - seen @ law.H.T) / scale).T).T
+            noises = np.linalg.solve(law.root, ((dy - seen @ law.H.T) / scale).T).T
+            yield noises, _standardise(x, _shown_sizes(scenario, x))
             start = stop
 
 

@@ -13,11 +13,13 @@ from netkf.checks.evidence import BROKEN, HOLDS, judge
 from netkf.checks.parts.delays import delay_law
 from netkf.checks.parts.moments import (
     CELLS,
+    NoiseMoments,
     compare_cells,
     compare_correlations,
     compare_means,
     compare_variances,
     moments,
+    total,
     whitening_matrix,
 )
 from netkf.checks.parts.network_rows import (
@@ -308,7 +310,8 @@ TESTS = {
 def test_moments_keep_their_level(name):
     random, wrong, trials, level = np.random.default_rng(7), 0, 1500, 0.05
     for _ in range(trials):
-        found = TESTS[name](moments(random.standard_normal((200, 3))), level)
+        states = random.standard_normal((200, 2, 3))
+        found = TESTS[name](moments(random.standard_normal((200, 3)), states), level)
         wrong += found.margin[2] < 0.0
     low = probability_interval(wrong, trials, 0.001).low
     assert low <= level
@@ -331,6 +334,44 @@ def test_moments_find_what_they_say(name):
         found += TESTS[name](moments(z), level).margin[2] < 0.0
     assert probability_interval(found, trials, 0.001).high >= 0.9
     assert found >= 0.8 * trials
+
+
+def _three_before(z, states):
+    for k in range(3, len(z)):
+        z[k, 1] = 0.2 * z[k - 3, 1] + math.sqrt(0.96) * z[k, 1]
+
+
+def _every_other_louder(z, states):
+    z *= np.sqrt(1.0 + 0.4 * (-1.0) ** np.arange(len(z)))[:, None]
+
+
+def _growing(z, states):
+    z *= np.sqrt(np.linspace(0.85, 1.15, len(z)))[:, None]
+
+
+def _follows_the_state(z, states):
+    z[:, 2] += 0.15 * states[:, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "label"),
+    [
+        (_three_before, "correlations", "b and itself 3 before"),
+        (_every_other_louder, "correlations", "the size of"),
+        (_growing, "variances", "of a run"),
+        (_follows_the_state, "means", "c with state 1"),
+    ],
+)
+def test_noises_with_the_right_covariance_that_are_not_white_are_found(change, name, label):
+    random, runs = np.random.default_rng(3), []
+    for _ in range(60):
+        z, states = random.standard_normal((50, 3)), random.standard_normal((50, 2, 3))
+        change(z, states)
+        runs.append(moments(z, states))
+    stacked = NoiseMoments(*(np.array(part) for part in zip(*runs, strict=True)))
+    found = TESTS[name](total(stacked), 1e-3)
+    assert found.margin[2] < 0.0
+    assert label in found.message
 
 
 @pytest.mark.parametrize("q", [0.03, 0.1, 0.5])
