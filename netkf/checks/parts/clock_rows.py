@@ -268,7 +268,7 @@ def _lattice(group: Group, samples: PartSamples, level: float) -> Finding:
     """Compare ticks of clocks without randomness with where they should be."""
     counts, horizon = group(samples).counts, samples.scenario.horizon
     off, ticks = float(counts.off.max()), counts.ticks.sum()
-    message = f"{ticks:,.0f} ticks, in seconds, of the run's length"
+    message = f"{ticks:,.0f} ticks, times in units of the length of a run"
     return find_identity(off / horizon, LATTICE_TOLERANCE, message)
 
 

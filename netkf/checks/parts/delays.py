@@ -108,7 +108,7 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
 def _fixed(samples: Any, level: float) -> Finding:
     """Compare all delays with the constant that they should be."""
     off, horizon = float(samples.delays.off.max()), samples.scenario.horizon
-    return find_identity(off / horizon, FIXED_TOLERANCE, "in seconds, of the run's length")
+    return find_identity(off / horizon, FIXED_TOLERANCE, "delays in units of the length of a run")
 
 
 def _law(samples: Any, level: float) -> Finding:
