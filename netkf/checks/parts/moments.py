@@ -21,6 +21,7 @@ from netkf.checks.statistics import (
     deviation_interval,
     probability_interval,
     scale_interval,
+    student_interval,
 )
 from netkf.linalg.arrays import FloatArray
 
@@ -36,6 +37,8 @@ FURTHER, PARTS = 3, 4
 """Lags beyond the first at which each entry is compared with itself, and parts of a series in which
 all variances together are.
 """
+MIN_RUNS = 10
+"""Runs from whose spread an interval is computed."""
 MIN_COUNT, MIN_COUNT_OF_ANY_LAW = 20, 200
 """Numbers from which means and variances are judged; of the latter if the law is not known."""
 
@@ -51,8 +54,8 @@ class NoiseMoments(NamedTuple):
     sizes    : (4, d) number of neighbours, and sums of r, of r^2 and of the products of neighbours,
         r the rank of |z| among those of standard normal numbers
     variance : (PARTS, 2) number and sum of z^2 of all entries in each part of the series
-    states   : (2, n, d) number and sum of products of z with n numbers with variance 1 at most that
-        tell the state which a noise is added to
+    states   : (4, n, d) products of z with n numbers that tell the state which a noise is added to:
+        how many there are, their sum in a run, its square, and 1 for the run if there are any
     """
 
     together: FloatArray
@@ -79,6 +82,7 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
     later = [(there[k:] * there[:-k], z[k:] * z[:-k]) for k in range(2, FURTHER + 2)]
     parts = zip(np.array_split(there, PARTS), np.array_split(z, PARTS), strict=True)
     shown = np.zeros((len(z), 0, z.shape[1])) if states is None else np.nan_to_num(states)
+    number, added = (there[:, None] * (shown != 0.0)).sum(axis=0), (z[:, None] * shown).sum(axis=0)
     return NoiseMoments(
         there.T @ there,
         z.sum(axis=0),
@@ -97,7 +101,7 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
             ]
         ),
         np.array([[number.sum(), (part**2).sum()] for number, part in parts]),
-        np.array([(there[:, None] * (shown != 0.0)).sum(axis=0), (z[:, None] * shown).sum(axis=0)]),
+        np.array([number, added, added**2, number > 0.0]),
     )
 
 
@@ -127,7 +131,8 @@ def compare_variances(
     be Gaussian are judged by their own fourth moment.
     """
     counts, squares = np.diagonal(found.together), np.diagonal(found.second)
-    if counts.max() < (MIN_COUNT if gaussian else MIN_COUNT_OF_ANY_LAW):
+    least = MIN_COUNT if gaussian else MIN_COUNT_OF_ANY_LAW
+    if counts.max() < least:
         return nothing_to_see(VARIANCE_TOLERANCE)
 
     def interval(square: float, fourth: float, count: float, part: float) -> Interval:
@@ -140,7 +145,7 @@ def compare_variances(
     sums = float(squares.sum()), float(found.fourth.sum()), float(counts.sum())
     intervals = [(interval(*sums, level / 3.0), f"all {what} together")]
     for k, (count, square) in enumerate(found.variance.tolist()):
-        if count >= MIN_COUNT:
+        if count >= least:
             # The fourth moment is that of all parts.
             part = square, sums[1] * count / sums[2] * (square / count * sums[2] / sums[0]) ** 2
             label = f"all {what} in part {k + 1} of {PARTS} of a run"
@@ -159,7 +164,7 @@ def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Findi
     counts = np.diagonal(found.together)
     if counts.max() < MIN_COUNT:
         return nothing_to_see(MEAN_TOLERANCE)
-    states = _with_states(found, labels)
+    states = _with_states(found, labels, level / 2.0)
     share, intervals = level / ((2.0 if states else 1.0) * len(labels)), []
     for total_, count, label in zip(found.first.tolist(), counts.tolist(), labels, strict=True):
         if count < MIN_COUNT:
@@ -169,21 +174,28 @@ def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Findi
         reach = deviation * -float(scipy.special.ndtri(share / 2.0))
         mean = Interval(value, value - reach, value + reach, detectable_shift(deviation, share))
         intervals.append((deviation_interval(0.0, mean), label))
-    for value, count, label in states:
-        related = correlation_interval(value, count, level / (2.0 * len(states)))
-        intervals.append((deviation_interval(0.0, related), label))
-    return find_largest(intervals, MEAN_TOLERANCE, "largest mean in standard deviations")
+    return find_largest(
+        [*intervals, *states], MEAN_TOLERANCE, "largest mean in standard deviations"
+    )
 
 
-def _with_states(found: NoiseMoments, labels: list[str]) -> list[tuple[float, float, str]]:
-    """Return correlation, count and label of all entries with the states they are added to."""
-    counts, sums = found.states
-    return [
-        (float(sums[j, i] / counts[j, i]), float(counts[j, i]), f"{label} with state {j}")
-        for i, label in enumerate(labels)
-        for j in range(len(counts))
-        if counts[j, i] >= MIN_COUNT
-    ]
+def _with_states(
+    found: NoiseMoments, labels: list[str], level: float
+) -> list[tuple[Interval, str]]:
+    """Return correlations and labels of all entries with the states that they are added to.
+
+    States of one run may be much alike, so that runs are what is independent.
+    """
+    counts, sums, squares, runs = found.states
+    used = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
+    intervals = []
+    for j, i in used:
+        count, spread = float(counts[j, i]), math.sqrt(squares[j, i])
+        related = student_interval(
+            float(sums[j, i]) / count, spread / count, int(runs[j, i]), level / len(used)
+        )
+        intervals.append((deviation_interval(0.0, related), f"{labels[i]} with state {j}"))
+    return intervals
 
 
 def compare_correlations(found: NoiseMoments, labels: list[str], level: float) -> Finding:

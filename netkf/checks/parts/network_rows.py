@@ -17,6 +17,7 @@ from netkf.checks.parts.events import reversed_directions
 from netkf.checks.parts.moments import (
     CORRELATION_TOLERANCE,
     MIN_COUNT,
+    MIN_RUNS,
     nothing_to_see,
     with_best,
 )
@@ -40,8 +41,8 @@ from netkf.network.recorded import RecordedLoss
 from netkf.scenario.scenario import Scenario
 
 PROBABILITY_TOLERANCE = 0.05
-MIN_RUNS, MIN_EVENTS = 10, 20
-"""Runs from whose spread an interval is computed, and those in which something has to happen."""
+MIN_EVENTS = 20
+"""Runs in which something has to happen before their spread is used."""
 
 
 def _stated_loss(scenario: Scenario) -> Any:
