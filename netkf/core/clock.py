@@ -87,7 +87,7 @@ def next_ticks(
         whose = {1: "node", 2: "link"}.get(len(entity), "entity")
         rule = f"{type(clock).__name__}: ticks of {whose} {list(entity)} must increase, "
         raise ScenarioError(
-            key, rule + f"after {now:g} s", t[:3].tolist(), "mend ticks of the class"
+            key, rule + f"after {now:g} s", t[:3].tolist(), "correct ticks of the class"
         )
     return t
 

@@ -80,7 +80,7 @@ def _open_table(
             yield header, ((reader.line_num, row) for row in reader if row)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         rule = f"{source.name} cannot be read as a UTF-8 table of comma-separated values"
-        raise ScenarioError("path", rule, str(error), "mend the file") from None
+        raise ScenarioError("path", rule, str(error), "correct the file") from None
 
 
 def finite_numbers(
@@ -93,7 +93,7 @@ def finite_numbers(
     where = f"{source.name} line {line}"
     if len(entries) != len(header):
         raise ScenarioError(
-            "path", f"{where} must have {len(header)} entries", entries, "mend the row"
+            "path", f"{where} must have {len(header)} entries", entries, "correct the row"
         )
     numbers = []
     for column in indices:
@@ -106,12 +106,12 @@ def finite_numbers(
                 "path",
                 f"{where}: {header[column]} must be a finite number",
                 entries[column],
-                "mend the row, or leave it out",
+                "correct the row, or leave it out",
             )
         if abs(value) > MAX_MAGNITUDE:
             rule = f"{where}: {header[column]} must be at most {MAX_MAGNITUDE:g} in size"
             raise ScenarioError(
-                "path", rule, entries[column], "mend the row, or choose other units"
+                "path", rule, entries[column], "correct the row, or choose other units"
             )
         numbers.append(value)
     return numbers
@@ -125,6 +125,6 @@ def whole(source: SourceFile, name: str, column: FloatArray) -> list[int]:
             "path",
             f"{source.name}: {name} must hold integers from 0 to 2^53",
             float(column[wrong[0]]),
-            "mend the row",
+            "correct the row",
         )
     return [int(value) for value in column]

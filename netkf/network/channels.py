@@ -466,7 +466,7 @@ def checked_delivery_probability(
             f"{type(loss).__name__}: the delivery probability of message {message} on link "
             f"{list(link)} must be in [0, 1]"
         )
-        remedy = "mend delivery_probability of the class"
+        remedy = "correct delivery_probability of the class"
         raise ScenarioError("network.channel.loss", rule, value, remedy)
     return value
 
@@ -484,7 +484,7 @@ def checked_delay(delay: Delay, link: Link, message: int, drawn: float) -> float
             f"{type(delay).__name__}: the delay of message {message} on link {list(link)} must "
             "not be negative"
         )
-        remedy = "mend message_delay of the class"
+        remedy = "correct message_delay of the class"
         raise ScenarioError("network.channel.delay", rule, seconds, remedy)
     return seconds
 

@@ -164,7 +164,7 @@ class Poisson(LinkClock):
             if entity not in known or entity in named:
                 again = f"names a {what} again"
                 rule = again if entity in named else f"must name a {what} of the graph"
-                raise ScenarioError(f"rates[{k}]", rule, list(given[:-1]), "remove or mend it")
+                raise ScenarioError(f"rates[{k}]", rule, list(given[:-1]), "remove or correct it")
             named.add(entity)
         bare = sorted(known - self._own.keys())
         if self.rate is None and bare:

@@ -139,7 +139,7 @@ def demand_nodes(source: SourceFile, nodes: Iterable[int], topology: Topology) -
     unknown = sorted(set(nodes) - topology.index.keys())
     if unknown:
         rule = f"{source.name} names a node that the graph does not have"
-        raise ScenarioError("path", rule, unknown[0], "mend the row or the graph")
+        raise ScenarioError("path", rule, unknown[0], "correct the row or the graph")
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,7 +357,7 @@ class Edges(Graph):
         for k, edge in enumerate(self.edges):
             if self.nodes is not None and max(edge) >= self.nodes:
                 rule = f"node ids must be 0 .. {self.nodes - 1}"
-                remedy = "mend the pair or raise nodes"
+                remedy = "correct the pair or raise nodes"
                 raise ScenarioError(f"edges[{k}]", rule, list(edge), remedy)
         for k, (i, j) in enumerate(self.edges):
             if i == j:
@@ -437,7 +437,7 @@ class CsvGraph(Graph):
         for i, j, p in zip(senders, receivers, values, strict=True):
             if i == j or not 0.0 <= p <= 1.0:
                 rule = f"{self.path.name}: rows must join two nodes with a probability"
-                raise ScenarioError("path", rule, [i, j, p], "mend the row")
+                raise ScenarioError("path", rule, [i, j, p], "correct the row")
         pairs = list(zip(senders, receivers, strict=True))
         repeated = next((pair for pair, count in Counter(pairs).items() if count > 1), None)
         if repeated is not None:

@@ -271,7 +271,7 @@ class RecordedSlots(SlotActivation):
             link = (min(i, j), max(i, j)) if matching else (i, j)
             if matching and link not in listed and (i == j or _meets(link, listed)):
                 rule = f"{self.path.name}: a node may be paired once a slot"
-                raise ScenarioError("path", rule, [slot, i, j], "mend the row")
+                raise ScenarioError("path", rule, [slot, i, j], "correct the row")
             if link not in listed:
                 listed.append(link)
         return {key: sorted(listed) for key, listed in pairs.items()}

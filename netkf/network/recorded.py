@@ -86,7 +86,7 @@ def read_messages(
         if not allowed(value) or listed.setdefault(message, value) != value:
             shown = int(value) if value.is_integer() else value
             row = [sender, receiver, message, shown]
-            raise ScenarioError("path", f"{source.name}: {rule}", row, "mend the row")
+            raise ScenarioError("path", f"{source.name}: {rule}", row, "correct the row")
     return MessageTable(source, values)
 
 

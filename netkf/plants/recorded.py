@@ -259,7 +259,7 @@ class RecordedSensor(Sensor):
         for place in beyond:
             if entries[place].strip().lower() not in ("", "nan", "0", "0.0"):
                 rule = f"{self.path.name} line {line}: {header[place]} has no row in H"
-                raise ScenarioError("path", rule, entries[place], "leave it empty or mend H")
+                raise ScenarioError("path", rule, entries[place], "leave it empty or correct H")
 
     def table(self, node: int, period: float) -> Table:
         """Return the readings (p,) of a node, with their regressors where there are any, by slot of
@@ -299,7 +299,7 @@ class RecordedSensor(Sensor):
         )
         if len(times) and times[0] < 0.0:
             rule = f"{self.path.name}: t must be at least 0"
-            raise ScenarioError("path", rule, float(times[0]), "mend the row")
+            raise ScenarioError("path", rule, float(times[0]), "correct the row")
         twice = np.flatnonzero(np.diff(times) <= 0.0)
         if twice.size:
             rule = f"{self.path.name}: there may be one row of node {node} a time"
@@ -366,7 +366,7 @@ def by_slot(
         slot = round(t / period)
         if slot < 0 or abs(t - slot * period) > 1e-9 * max(period, abs(t)):
             rule = f"{source.name}: t must be a slot, a multiple of the period {period:g}"
-            raise ScenarioError("path", rule, t, "mend the row")
+            raise ScenarioError("path", rule, t, "correct the row")
         if slot in table:
             rule = f"{source.name}: there may be one row{whose} a slot"
             raise ScenarioError("path", rule, f"two at t = {t:g}", "remove one")

@@ -54,7 +54,7 @@ def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
     """
     scenario: Scenario = run.scenario
     if not isinstance(scenario.filter.algorithm, Filter):
-        raise NetkfError("filters of the former contracts keep their readings to themselves")
+        raise NetkfError("filters of the deprecated contracts do not say how they use readings")
     if len(run.log) > most:
         raise NetkfError(f"a run of more than {most:,} events is not replayed")
     algorithm: Filter = scenario.filter.algorithm

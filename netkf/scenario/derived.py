@@ -209,7 +209,7 @@ class DerivedScenario(ScenarioModel):
         # Thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
             H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]
-            R = [self.noise(entry, believed) for entry in entries]
+            R = [self.noise(entry, believed=believed) for entry in entries]
             empty = np.zeros((0, self.plant.n))
             self._stacks[entries, believed] = np.concatenate([empty, *H]), block_diagonal(R)
         return self._stacks[entries, believed]
@@ -253,7 +253,10 @@ class DerivedScenario(ScenarioModel):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
         else:
             pairs = [*zip(self.belief, (self.truth.A, self.truth.Q), strict=True)]
-        pairs += [(self.noise(k, True), self.noise(k, False)) for k in range(len(self.sensors))]
+        pairs += [
+            (self.noise(k, believed=True), self.noise(k, believed=False))
+            for k in range(len(self.sensors))
+        ]
         return all(np.array_equal(believed, true) for believed, true in pairs)
 
     @cached_property

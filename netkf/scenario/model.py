@@ -235,7 +235,7 @@ class ScenarioModel(Component):
         """True if runs draw the state and all readings; records of them follow no known law."""
         return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
 
-    def noise(self, entry: int, believed: bool) -> FloatArray:
+    def noise(self, entry: int, *, believed: bool) -> FloatArray:
         """Return the true or the believed R (p, p) of a ``[[sensors]]`` entry."""
         R = self.filter.model.R
         if not believed or R is None:

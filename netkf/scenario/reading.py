@@ -63,12 +63,12 @@ def _parse_file(path: Path) -> dict[str, Any]:
         raise ScenarioError("", rule, None, "check the path") from None
     except RecursionError:
         rule = "is not valid TOML: nested too deep"
-        raise ScenarioError("", rule, None, "mend the brackets") from None
+        raise ScenarioError("", rule, None, "correct the brackets") from None
     except ScenarioError:
         raise
     except ValueError as error:  # TOMLDecodeError among them
         rule = f"is not valid TOML: {' '.join(str(error).split())[:120]}"
-        raise ScenarioError("", rule, None, "mend that line") from None
+        raise ScenarioError("", rule, None, "correct that line") from None
 
 
 def _text(path: Path) -> str:
@@ -93,7 +93,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     for number, line in enumerate(lines, 1):
         if line.count(".") > MAX_DOTS and _MANY_PARTS.search(line):
             rule = f"line {number} has a key of more than {MAX_DOTS} parts"
-            raise ScenarioError("", rule, None, "mend that line")
+            raise ScenarioError("", rule, None, "correct that line")
     arrays: dict[str, Any] = {}
     if len(text) > LONG_TEXT and '"""' not in text and "'''" not in text:
         mark = secrets.token_hex(16)

@@ -46,7 +46,7 @@ def _readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> No
     for node in sensor.listed:
         if node not in scenario.topology.index:
             rule = f"{sensor.path.name} names a node that the graph does not have"
-            raise ScenarioError(f"{key}.path", rule, node, "mend the row or the graph")
+            raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
     if scenario.slotted:
         _under(key, lambda: sensor.demand(scenario.slot_plant.period))
 
@@ -77,7 +77,7 @@ def _exchanges(scenario: DerivedScenario) -> None:
                 "network.activation.path",
                 f"{activation.path.name}: the filter has no such step, only {limits}",
                 f"slot {slot}, phase {phase}, step {step}",
-                "phases and steps count from 0; mend the row",
+                "phases and steps count from 0; correct the row",
             )
 
 

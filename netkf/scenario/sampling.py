@@ -143,7 +143,7 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
         for node in clock.listed:
             if node not in scenario.topology.index:
                 rule = f"{clock.path.name} names a node that the graph does not have"
-                remedy = "mend the row or the graph"
+                remedy = "correct the row or the graph"
                 raise ScenarioError(f"{key}.sampling.path", rule, node, remedy)
     if getattr(clock, "rates", ()):
         raise ScenarioError(

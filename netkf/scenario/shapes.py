@@ -15,5 +15,5 @@ def demand_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why
         wanted = " x ".join("any" if want is None else str(want) for want in shape)
         got = " x ".join(map(str, value.shape))
         raise ScenarioError(
-            key, f"must be {wanted}, not {got}, because {why}", value, "mend the shape"
+            key, f"must be {wanted}, not {got}, because {why}", value, "correct the shape"
         )

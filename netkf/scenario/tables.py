@@ -192,7 +192,7 @@ def _make(cls: type[Any], values: dict[str, Any]) -> Any:
             rule = blame(tuple(values.values()), error) or ""
         if not rule:
             raise
-        raise ScenarioError("", rule, None, "mend the class or its settings") from error
+        raise ScenarioError("", rule, None, "correct the class or its settings") from error
 
 
 def _plant(value: Any, origin: Origin) -> Any:

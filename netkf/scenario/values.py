@@ -31,7 +31,7 @@ def typed_value(option: str, key: str, text: str) -> Any:
     except (ValueError, RecursionError):
         if text[0] in "[{\"'" or not text.isprintable() or len(text) > MAX_WORD:
             rule = f"value of {key} is not valid TOML"
-            remedy = "mend it; quote the argument for your shell"
+            remedy = "correct it; quote the argument for your shell"
             raise ScenarioError(option, rule, text, remedy) from None
         return text
 

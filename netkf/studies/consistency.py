@@ -170,7 +170,7 @@ class _Innovations:
             return
         sensors = [self._scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
         believed_R, true_R = (
-            block_diagonal([self._scenario.noise(p.entry, believed) for p in placed])
+            block_diagonal([self._scenario.noise(p.entry, believed=believed) for p in placed])
             for believed in (True, False)
         )
         for k, slot, noise in zip(self._samples, self._slots, self._noise, strict=True):

@@ -43,7 +43,7 @@ def _evenly(key: str, start: str, stop: str, count: str) -> list[Any]:
         whole = []
     if not _finite(start, stop) or not 2 <= int(count) <= MAX_POINTS:
         rule = f"range of {key} must be START:STOP:COUNT with two numbers and a count of at least 2"
-        raise ScenarioError("--vary", rule, f"{start}:{stop}:{count}", "mend it")
+        raise ScenarioError("--vary", rule, f"{start}:{stop}:{count}", "correct it")
     values = np.linspace(low, high, number)
     if whole and np.array_equal(values, np.round(values)):
         return [int(value) for value in values]

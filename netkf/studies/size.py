@@ -140,7 +140,7 @@ def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
             raise ScenarioError("--vary", rule, f"{low}:{high}", "leave out the decimals")
     if not low < high:
         rule = f"range of {key} must go from a lower to a higher number"
-        raise ScenarioError("--vary", rule, f"{low}:{high}", "swap or mend the ends")
+        raise ScenarioError("--vary", rule, f"{low}:{high}", "swap or correct the ends")
     for end in (low, high):
         scenario.replace({key: end})
     return whole

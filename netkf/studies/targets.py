@@ -64,7 +64,7 @@ def parse_target(text: Any) -> Target:
     except ValueError:
         limit = math.nan
     if not (math.isfinite(limit) and limit > 0.0):
-        raise ScenarioError("--target", "limit must be a number above 0", found[2], "mend it")
+        raise ScenarioError("--target", "limit must be a number above 0", found[2], "correct it")
     return Target(found[1], limit)
 
 

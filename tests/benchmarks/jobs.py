@@ -130,7 +130,9 @@ def regressors_of(case):
 
 def diffusion(case):
     entries = range(len(case.sensors))
-    (R,), (believed,) = ({case.noise(k, which).item() for k in entries} for which in (False, True))
+    (R,), (believed,) = (
+        {case.noise(k, believed=which).item() for k in entries} for which in (False, True)
+    )
     plant = np.array(case.plant.F), root_of(case.plant.Q)
     _, Q = case.slot_belief
     mean, cov = case.start(case.nodes[0])

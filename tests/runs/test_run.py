@@ -254,7 +254,7 @@ def test_an_error_in_a_class_of_netkf_is_not_covered_up(ring, tmp_path, monkeypa
 def test_a_class_that_cannot_be_made_is_refused(plugged):
     with pytest.raises(netkf.ScenarioError, match=r"filter: Picky could not .*not today"):
         netkf.load(plugged("Picky"))
-    words = r"toml: failing_filters:Limitless failed in largest_degree: AttributeError.*; mend"
+    words = r"toml: failing_filters:Limitless failed in largest_degree: AttributeError.*; correct"
     with pytest.raises(netkf.ScenarioError, match=words):
         netkf.load(plugged("Limitless"))
 

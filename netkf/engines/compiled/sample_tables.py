@@ -81,7 +81,7 @@ def _instants(
     pooled, n = scenario.hosted.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)
     host = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
-    parts = [(scenario.sensors[p.entry], scenario.noise(p.entry, True)) for _, p in placed]
+    parts = [(scenario.sensors[p.entry], scenario.noise(p.entry, believed=True)) for _, p in placed]
     rows = np.array([len(R) for _, R in parts], dtype=np.int64)
     most = int(rows.max(initial=1))
     root, H = np.zeros((len(parts), most, most)), np.zeros((len(parts), most, n))

@@ -36,8 +36,8 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
     # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
     return [
         (
-            as_kernel_array(scenario.noise(k, True)),
-            np.asarray(np.linalg.cholesky(scenario.noise(k, False))),
+            as_kernel_array(scenario.noise(k, believed=True)),
+            np.asarray(np.linalg.cholesky(scenario.noise(k, believed=False))),
         )
         for k in range(len(scenario.sensors))
     ]

@@ -207,7 +207,7 @@ class _PiecewiseSolution:
         refused: TheoryError | None = None
         for parts in PARTS:  # shorter steps reduce the error of the dense output between them
             max_step = (end - begin) / parts if parts > 1 else np.inf
-            solved = self._choose_method(begin, end, slope, max_step, growth)
+            solved = self._integrate_piece(begin, end, slope, max_step, growth)
             if not solved.success:
                 raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
             assert solved.sol is not None
@@ -221,7 +221,7 @@ class _PiecewiseSolution:
         assert refused is not None
         raise refused
 
-    def _choose_method(
+    def _integrate_piece(
         self, begin: float, end: float, slope: Slope, max_step: float, growth: float
     ) -> Any:
         """Solve by an explicit method unless the equations are stiff, else by an implicit one."""

@@ -129,7 +129,7 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
         sensor = scenario.sensors[place.entry]
         clock = sampling_clock(sensor)
         assert clock is not None
-        rate, R = clock.mean_rate((node, place.ordinal)), scenario.noise(place.entry, True)
+        rate, R = clock.mean_rate((node, place.ordinal)), scenario.noise(place.entry, believed=True)
         # All nodes have the covariance of a pooled filter, which uses the readings of each.
         for reader in range(size) if pooled else [index[node]]:
             entry = (reader, np.asarray(sensor.H), R, rate, index[node])
@@ -171,7 +171,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     for (node, ordinal), place in places.items():
         sensor = scenario.sensors[place.entry]
         path = sample_path(scenario, streams, node, place) if sensor.varying else None
-        R = scenario.noise(place.entry, True)
+        R = scenario.noise(place.entry, believed=True)
         for k, time in enumerate(times[node, ordinal].tolist()):
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
             by_time.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))
