@@ -109,7 +109,7 @@ class EventTriggeredCi(Filter):
         )
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TriggeredState:
-        """Nothing was sent or heard."""
+        """Return the first state, in which nothing was sent or heard."""
         return TriggeredState(mean, first_root(cov), model)
 
     def predict(self, state: TriggeredState, gap: float) -> TriggeredState:
@@ -166,7 +166,7 @@ class EventTriggeredCi(Filter):
         )
 
     def shift(self, state: TriggeredState, offset: FloatArray) -> TriggeredState:
-        """Affine given what is sent, and the triggers look at differences."""
+        """Return the state shifted by ``offset``: the triggers look at differences."""
         sent = state.sent
         if sent is not None:
             sent = sent._replace(xhat=sent.xhat + offset)

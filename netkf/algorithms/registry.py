@@ -58,7 +58,7 @@ def split_choice(name: str) -> tuple[str, dict[str, str]]:
 
 @cache
 def built_in_filters() -> dict[str, type[Filter]]:
-    """All built-in filters by name (``choice_name``)."""
+    """Return all built-in filters by name (``choice_name``)."""
     for module in pkgutil.iter_modules(netkf.algorithms.__path__, "netkf.algorithms."):
         if not module.ispkg:
             importlib.import_module(module.name)
@@ -66,7 +66,7 @@ def built_in_filters() -> dict[str, type[Filter]]:
 
 
 def built_in_class(algorithm: object) -> type[Filter] | None:
-    """The built-in class of a filter, or the one that a user's class is derived from."""
+    """Return the built-in class of a filter, or the one that a user's class is derived from."""
     known = set(built_in_filters().values())
     return next((cls for cls in type(algorithm).__mro__ if cls in known), None)
 

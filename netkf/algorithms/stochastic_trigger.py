@@ -83,11 +83,11 @@ class ScheduledReadings(Filter):
     fixed_sensors: ClassVar[bool] = True
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """A message is a reading; sensors do not change and are not counted."""
+        """Return the numbers of a message, a reading; sensors do not change and are not counted."""
         return rows
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ScheduledState:
-        """No sensor is known yet."""
+        """Return the first state of a node, to which no sensor is known yet."""
         return ScheduledState(mean, first_root(cov), model, mean)
 
     def predict(self, state: ScheduledState, gap: float) -> ScheduledState:
@@ -135,7 +135,7 @@ class ScheduledReadings(Filter):
         )
 
     def shift(self, state: ScheduledState, offset: FloatArray) -> ScheduledState:
-        """Affine given what is sent, and the trigger looks at innovations."""
+        """Return the state shifted by ``offset``: the trigger looks at innovations."""
         reading = state.reading
         if reading is not None:
             reading = reading._replace(y=reading.y + reading.H @ offset)

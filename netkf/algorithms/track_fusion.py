@@ -67,23 +67,23 @@ def fusion_slots(
     plan: SlotPlan,
     links: SlotLinks,
     samples: SlotSamples,
-    room: SlotScratch,
+    scratch: SlotScratch,
     arrays: FusionArrays,
 ) -> None:
     """Carry filters that fuse pairs of estimates through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
-                predict_all(nodes, room, b)
-                read_all(nodes, readings, room, b, s)
+                predict_all(nodes, scratch, b)
+                read_all(nodes, readings, scratch, b, s)
             if plan.exchanged[s]:
                 # What was sent: all estimates from before the exchange.
-                copy_pairs(nodes, room, b)
+                copy_pairs(nodes, scratch, b)
                 for h in range(len(nodes.rows)):
-                    for q in range(len(room.lanes)):
-                        fuse_heard(nodes, plan, links, room, arrays, (b, s, h, q))
-            show(nodes, plan, samples, room, b, s)
-            rebase(nodes, readings, room, b, s)
+                    for q in range(len(scratch.lanes)):
+                        fuse_heard(nodes, plan, links, scratch, arrays, (b, s, h, q))
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
 
 
 @kernel
@@ -91,7 +91,7 @@ def fuse_heard(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,
-    room: SlotScratch,
+    scratch: SlotScratch,
     arrays: FusionArrays,
     place: tuple[int, int, int, int],
 ) -> None:
@@ -104,9 +104,9 @@ def fuse_heard(
         # The weight of a link is not used: whoever is heard counts by its covariance.
         sender = links.sender[m]
         if not heard:
-            copy_track(arrays.x, arrays.root, room.xhat, room.root, h, q)
+            copy_track(arrays.x, arrays.root, scratch.xhat, scratch.root, h, q)
             heard = True
-        copy_track(arrays.other_x, arrays.other, room.xhat, room.root, sender, q)
+        copy_track(arrays.other_x, arrays.other, scratch.xhat, scratch.root, sender, q)
         fuse_pair(
             arrays.x, arrays.root, arrays.other_x, arrays.other, arrays.inverse, arrays.trace,
             arrays.pair,
@@ -257,11 +257,11 @@ class BarShalomCampo(Filter):
                 )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """A message is a track; sensors do not change and are not counted."""
+        """Return the numbers of a message, a track; sensors do not change and are not counted."""
         return n
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TrackState:
-        """The node shows its own track."""
+        """Return the first state of a node, which shows its own track."""
         root = first_root(cov)
         return TrackState(mean, root, model, mean, root, 0, (-1,), ((model.H, model.R),), cov, cov)
 
@@ -302,7 +302,7 @@ class BarShalomCampo(Filter):
         return state.fused, state.P
 
     def shift(self, state: TrackState, offset: FloatArray) -> TrackState:
-        """Affine: tracks enter by their differences."""
+        """Return the state shifted by ``offset``: tracks enter by their differences."""
         return state._replace(xhat=state.xhat + offset, fused=state.fused + offset)
 
 

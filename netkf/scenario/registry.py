@@ -123,7 +123,7 @@ SLOTTED = (LinearPlant,)
 
 
 def other_time(family: str, kind: object) -> str | None:
-    """Words about a kind that exists in the other kind of time only."""
+    """Return why a kind is unknown that exists in the other kind of time only, or None."""
     other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
     if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
         return None
@@ -131,7 +131,7 @@ def other_time(family: str, kind: object) -> str | None:
 
 
 def explain_kind_of_time(slotted: bool) -> str:
-    """Words about a part that belongs to the other kind of time than that of the plant."""
+    """Return the rule that a part of the other kind of time than the plant breaks."""
     slots, flow = "in slots (linear)", "in continuous time (diffusion)"
     needs, has = (flow, slots) if slotted else (slots, flow)
     return f"belongs to plants {needs}, and this plant is {has}"
@@ -226,6 +226,6 @@ def name_of(family: str, part: Component) -> str:
 
 
 def kind_name(part: Component, family: str = "filter") -> str:
-    """The kind of a part in a sentence: its name, or that of a user's class."""
+    """Return the kind of a part in a sentence: its name, or that of a user's class."""
     name = name_of(family, part)
     return type(part).__name__.lower() if ":" in name else name

@@ -54,7 +54,7 @@ def explain_left_over(error: ScenarioError, changes: Mapping[str, Any]) -> Scena
 
 
 def source_files(part: Any) -> list[SourceFile]:
-    """Every file that a scenario names."""
+    """Return every file that a scenario names."""
     if isinstance(part, SourceFile):
         return [part]
     if isinstance(part, tuple):
@@ -66,7 +66,7 @@ def source_files(part: Any) -> list[SourceFile]:
 
 
 def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of the table with the values at some key paths replaced or added."""
+    """Return a copy of the table with the values at some key paths replaced or added."""
     for path, value in changes.items():
         keys = path.replace("[", ".").replace("]", "").split(".")
         if len(keys) > MAX_DEPTH:
