@@ -214,3 +214,17 @@ def test_what_a_stream_cannot_encode_is_escaped(tmp_path):
     )
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"\\xe9\\u4e2d" in done.stdout
+
+
+def test_names_that_are_not_ascii_may_stand_on_a_machine_that_knows_no_others(tmp_path):
+    """There Python has such names with surrogates, which are no text that others can encode."""
+    folder = os.fsencode(tmp_path) + "/r\u00e9seau".encode()
+    os.mkdir(folder)
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    netkf = [sys.executable, "-m", "netkf"]
+    run = [*netkf, "run", str(RING), "--set", "horizon=1.0", "--no-plot", "--out", folder + b"/out"]
+    for words in (run, [*netkf, "compare", folder + b"/out"]):
+        done = subprocess.run(words, env=os.environ | plain, capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr
+    files = set(os.listdir(folder + b"/out"))
+    assert {b"events.parquet", b"states.parquet", b"manifest.json"} <= files

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -40,13 +41,13 @@ def read_numbers(
     Raises DamagedError for any other file, for one with more than MAX_READ_ROWS rows, and for
     empty cells that are not allowed.
     """
-    with reading_file(path, path.name), pq.ParquetFile(path) as file:
+    with _reading(path) as source, pq.ParquetFile(source) as file:
         names, types = file.schema_arrow.names, file.schema_arrow.types
         known = dict(zip(names, types, strict=True))
         wrong = [name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])]
         if wrong:
             raise DamagedError(f"{path.name} has no column {wrong[0]} of numbers")
-        table = _read(file, path, columns, run)
+        table = _read(file, path.name, source, columns, run)
         empty = [name for name in columns if table[name].null_count]
         if not all(missing and pa.types.is_floating(known[name]) for name in empty):
             raise DamagedError(f"{path.name} has missing values")
@@ -58,11 +59,12 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
     """Return a column of texts of a Parquet file, of one ``run`` if it is given; raises
     DamagedError for any other file.
     """
-    with reading_file(path, path.name), pq.ParquetFile(path) as file:
+    with _reading(path) as source, pq.ParquetFile(source) as file:
         names = file.schema_arrow.names
         if names.count(column) != 1:
             raise DamagedError(f"{path.name} has no column {column}")
-        texts = _read(file, path, [column], run)[column].cast(pa.string()).combine_chunks()
+        found = _read(file, path.name, source, [column], run)[column]
+        texts = found.cast(pa.string()).combine_chunks()
         if texts.null_count:
             raise DamagedError(f"{path.name} has missing values")
         return pd.Series(texts.dictionary_encode().to_pandas())
@@ -70,36 +72,48 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
 
 def read_flags(path: Path, column: str) -> np.ndarray:
     """Return a column of truth values of a Parquet file; raises DamagedError for any other file."""
-    with reading_file(path, path.name), pq.ParquetFile(path) as file:
+    with _reading(path) as source, pq.ParquetFile(source) as file:
         known = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
         if not pa.types.is_boolean(known.get(column, pa.null())):
             raise DamagedError(f"{path.name} has no column {column} of truth values")
-        found = _read(file, path, [column], None)[column]
+        found = _read(file, path.name, source, [column], None)[column]
         if found.null_count:
             raise DamagedError(f"{path.name} has missing values")
         return np.asarray(found.to_numpy(), dtype=bool)
 
 
-def _read(file: Any, path: Path, columns: Sequence[str], run: int | None) -> Any:
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[Any]:
+    """Open a file for pyarrow; raises DamagedError for what goes wrong inside."""
+    with reading_file(path, path.name), _open(path, "rb") as source:
+        yield source
+
+
+def _open(path: Path, mode: str) -> Any:
+    # As bytes: pyarrow writes texts as UTF-8, which need not be the encoding of file names.
+    return pa.OSFile(os.fsencode(path), mode)
+
+
+def _read(file: Any, name: str, source: Any, columns: Sequence[str], run: int | None) -> Any:
     """Return an Arrow table with the columns, of those rows that are of ``run``."""
     if file.metadata.num_rows > MAX_READ_ROWS:
-        raise DamagedError(f"{path.name} has more than {MAX_READ_ROWS:,} rows")
+        raise DamagedError(f"{name} has more than {MAX_READ_ROWS:,} rows")
     if run is None:
         return file.read(columns=list(columns))
     # Row groups of other runs are not even read where their statistics say so.
-    return pq.read_table(path, columns=list(columns), filters=[("run", "==", run)])
+    return pq.read_table(source, columns=list(columns), filters=[("run", "==", run)])
 
 
 def column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file; raises DamagedError."""
-    with reading_file(path, path.name):
-        return list(pq.read_schema(path).names)
+    with _reading(path) as source:
+        return list(pq.read_schema(source).names)
 
 
 def is_numeric_column(path: Path, name: str) -> bool:
     """Return True if a column of a Parquet file holds numbers; raises DamagedError."""
-    with reading_file(path, path.name):
-        return _is_numeric(pq.read_schema(path).field(name).type)
+    with _reading(path) as source:
+        return _is_numeric(pq.read_schema(source).field(name).type)
 
 
 def _is_numeric(kind: Any) -> bool:
@@ -235,6 +249,7 @@ class _Table:
     def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
         self._path, self._part = path, path.with_name(path.name + ".part")
         self._encoding = encoding or {}
+        self._file: Any = None
         self._writer: Any = None
         self._closed = False
 
@@ -243,7 +258,8 @@ class _Table:
         with self._or_nothing():
             if self._writer is None:
                 schema, how = table.schema, self._encoding
-                self._writer = pq.ParquetWriter(self._part, schema, compression="zstd", **how)
+                self._file = _open(self._part, "wb")
+                self._writer = pq.ParquetWriter(self._file, schema, compression="zstd", **how)
             self._writer.write_table(table)
 
     def close(self, empty: Callable[[], dict[str, Any]] | None) -> None:
@@ -256,6 +272,7 @@ class _Table:
         if self._writer is not None:
             with self._or_nothing():
                 self._writer.close()
+                self._file.close()
                 publish(self._part, self._path)
 
     def discard(self) -> None:
@@ -263,9 +280,10 @@ class _Table:
         if self._closed:
             return
         self._closed = True
-        if self._writer is not None:
-            with contextlib.suppress(OSError, pa.ArrowException):
-                self._writer.close()
+        for one in (self._writer, self._file):
+            if one is not None:
+                with contextlib.suppress(OSError, pa.ArrowException):
+                    one.close()
         with contextlib.suppress(OSError):
             self._part.unlink(missing_ok=True)
 
