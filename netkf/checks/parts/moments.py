@@ -51,8 +51,8 @@ class NoiseMoments(NamedTuple):
 
     further  : (FURTHER, 2, d) number and sum of products of each entry with itself two and more
         noises before
-    sizes    : (4, d) number of neighbours, and sums of r, of r^2 and of the products of neighbours,
-        r the rank of |z| among those of standard normal numbers
+    sizes    : (5, d) number of pairs of neighbours, and sums over them of r, of the r before, of
+        r^2 and of their products, r the rank of |z| among those of standard normal numbers
     variance : (PARTS, 2) number and sum of z^2 of all entries in each part of the series
     states   : (4, n, d) products of z with n numbers that tell the state which a noise is added to:
         how many there are, their sum in a run, its square, and 1 for the run if there are any
@@ -95,8 +95,9 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
         np.array(
             [
                 (there[1:] * there[:-1]).sum(axis=0),
-                rank.sum(axis=0),
-                (rank**2).sum(axis=0),
+                (rank[1:] * there[:-1]).sum(axis=0),
+                (there[1:] * rank[:-1]).sum(axis=0),
+                (rank[1:] ** 2 * there[:-1]).sum(axis=0),
                 (rank[1:] * rank[:-1]).sum(axis=0),
             ]
         ),
@@ -174,9 +175,9 @@ def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Findi
         reach = deviation * -float(scipy.special.ndtri(share / 2.0))
         mean = Interval(value, value - reach, value + reach, detectable_shift(deviation, share))
         intervals.append((deviation_interval(0.0, mean), label))
-    return find_largest(
-        [*intervals, *states], MEAN_TOLERANCE, "largest mean in standard deviations"
-    )
+    message = "largest mean in standard deviations"
+    message += ", or correlation with a state," if states else ""
+    return find_largest([*intervals, *states], MEAN_TOLERANCE, message)
 
 
 def _with_states(
@@ -194,7 +195,7 @@ def _with_states(
         related = student_interval(
             float(sums[j, i]) / count, spread / count, int(runs[j, i]), level / len(used)
         )
-        intervals.append((deviation_interval(0.0, related), f"{labels[i]} with state {j}"))
+        intervals.append((deviation_interval(0.0, related), f"{labels[i]} and state {j}"))
     return intervals
 
 
@@ -288,10 +289,10 @@ def _in_size(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, fl
             if pairs:
                 value = products / pairs * count[i] / square[i]
                 yield float(value), pairs, f"{label} and itself {k + 2} before"
-        pairs, first, second, products = found.sizes[:, i].tolist()
-        mean, spread = first / count[i], second / count[i] - (first / count[i]) ** 2
-        if pairs and spread > 0.0:
-            value = (products / pairs - mean**2) / spread
+        pairs, after, before, square_, products = found.sizes[:, i].tolist()
+        spread = pairs * square_ - after**2
+        if pairs >= MIN_COUNT_OF_ANY_LAW and spread > 0.0:
+            value = (pairs * products - after * before) / spread
             yield float(value), pairs, f"the size of {label} and of that just before"
 
 

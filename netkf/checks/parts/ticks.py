@@ -23,7 +23,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-WINDOWS, MAX_WINDOWED = 8, 200
+WINDOWS, MAX_WINDOWED = 8, 600
 """Windows of a run in which ticks and losses are counted, up to so many clocks or directions."""
 
 

@@ -362,7 +362,7 @@ def _follows_the_state(z, states):
         (_three_before, "correlations", "b and itself 3 before"),
         (_every_other_louder, "correlations", "the size of"),
         (_growing, "variances", "of a run"),
-        (_follows_the_state, "means", "c with state 1"),
+        (_follows_the_state, "means", "c and state 1"),
     ],
 )
 def test_noises_with_the_right_covariance_that_are_not_white_are_found(change, name, label):
@@ -375,6 +375,17 @@ def test_noises_with_the_right_covariance_that_are_not_white_are_found(change, n
     found = TESTS[name](total(stacked), 1e-3)
     assert found.margin[2] < 0.0
     assert label in found.message
+
+
+@pytest.mark.parametrize("steps", [4, 20])
+def test_correlations_within_short_runs_keep_their_level(steps):
+    """Neighbours are those of one run: what their ends leave out must not look like correlation."""
+    random, wrong, trials, level = np.random.default_rng(9), 0, 250, 0.05
+    for _ in range(trials):
+        found = [moments(random.standard_normal((steps, 2))) for _ in range(240 // steps)]
+        stacked = NoiseMoments(*(np.array(part) for part in zip(*found, strict=True)))
+        wrong += compare_correlations(total(stacked), ["a", "b"], level).margin[2] < 0.0
+    assert probability_interval(wrong, trials, 0.001).low <= level
 
 
 @pytest.mark.parametrize("q", [0.03, 0.1, 0.5])
