@@ -146,7 +146,7 @@ class ScheduledReadings(Filter):
         return payload._replace(y=payload.y + payload.H @ offset)
 
 
-class TriggeredState(NamedTuple):
+class WrappedState(NamedTuple):
     """The state of the wrapped filter, ``inner``; the innovation z (p,) of the last reading, None
     without one; if the node has ``begun`` to send after readings; if it is ``silent`` until the
     next one, None before that is decided.
@@ -182,22 +182,22 @@ class TriggeredMessages(Filter):
         """The filter that the trigger belongs to."""
         return self.inner
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TriggeredState:
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
         """Nothing is decided yet."""
-        return TriggeredState(self.inner.init(model, mean, cov, node))
+        return WrappedState(self.inner.init(model, mean, cov, node))
 
-    def predict(self, state: TriggeredState, gap: float) -> TriggeredState:
+    def predict(self, state: WrappedState, gap: float) -> WrappedState:
         """Predict."""
         return state._replace(inner=self.inner.predict(state.inner, gap))
 
-    def update(self, state: TriggeredState, reading: Reading) -> TriggeredState:
+    def update(self, state: WrappedState, reading: Reading) -> WrappedState:
         """Keep the innovation for the decision, and use the reading."""
         z = None
         if len(reading.y):
             z = reading.y - reading.H @ self.inner.estimate(state.inner)[0]
-        return TriggeredState(self.inner.update(state.inner, reading), z, state.begun)
+        return WrappedState(self.inner.update(state.inner, reading), z, state.begun)
 
-    def emit(self, state: TriggeredState, exchange: Exchange) -> tuple[TriggeredState, Any]:
+    def emit(self, state: WrappedState, exchange: Exchange) -> tuple[WrappedState, Any]:
         """Send what the filter sends, or nothing until the next reading."""
         silent = state.silent
         if silent is None:
@@ -213,24 +213,24 @@ class TriggeredMessages(Filter):
         return state._replace(inner=inner), payload
 
     def absorb(
-        self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
-    ) -> TriggeredState:
+        self, state: WrappedState, messages: Sequence[Message], exchange: Exchange
+    ) -> WrappedState:
         """Use what was sent."""
         return state._replace(inner=self.inner.absorb(state.inner, messages, exchange))
 
-    def estimate(self, state: TriggeredState) -> tuple[FloatArray, FloatArray | None]:
+    def estimate(self, state: WrappedState) -> tuple[FloatArray, FloatArray | None]:
         """Return the estimate of the filter."""
         return self.inner.estimate(state.inner)
 
-    def shift(self, state: TriggeredState, offset: FloatArray) -> TriggeredState:
+    def shift(self, state: WrappedState, offset: FloatArray) -> WrappedState:
         """The trigger looks at innovations, which do not move."""
         return state._replace(inner=self.inner.shift(state.inner, offset))
 
-    def stopped(self, state: TriggeredState) -> bool:
+    def stopped(self, state: WrappedState) -> bool:
         """Return True once the filter has stopped."""
         return self.inner.stopped(state.inner)
 
-    def conserved(self, state: TriggeredState) -> Any:
+    def conserved(self, state: WrappedState) -> Any:
         """Return what the filter conserves."""
         return self.inner.conserved(state.inner)
 

@@ -91,7 +91,7 @@ class Sums(Struct):
     regular: np.ndarray
 
 
-class Scratch(Struct):
+class ReductionScratch(Struct):
     """Scratch for S times and C = F (2 u + 1) columns of L runs, with some memory behind.
 
     ``lines`` (L, S F n n) as they are in a batch; in lanes ``error`` (S F n, L), ``P``
@@ -128,7 +128,7 @@ class Scratch(Struct):
     times: int
 
 
-def reduction_scratch(filters: int, n: int, largest: int) -> Scratch:
+def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
     """Return scratch for so many filters of n states, in pieces of at most so many runs."""
     columns = filters * (n * (n + 1) + 1)
     times = max(1, TOGETHER // columns)
@@ -140,7 +140,7 @@ def reduction_scratch(filters: int, n: int, largest: int) -> Scratch:
     def in_lanes(numbers: int) -> FloatArray:
         return np.asarray(aligned((wide * numbers + LANES, LANES)))
 
-    return Scratch(
+    return ReductionScratch(
         lines=np.empty((LANES, wide * filters * n * n + LANES)),
         error=in_lanes(filters * n),
         P=in_lanes(filters * n * n),
@@ -173,7 +173,7 @@ class _ScratchCache(threading.local):
     def __init__(self) -> None:
         self._sizes, self._scratch = (0, 0, 0), reduction_scratch(1, 1, 1)
 
-    def of(self, filters: int, n: int, largest: int) -> Scratch:
+    def of(self, filters: int, n: int, largest: int) -> ReductionScratch:
         """Return scratch as ``reduction_scratch`` makes it, with anything in it."""
         if filters * n * n > MAX_SCRATCH_ENTRIES:
             return reduction_scratch(filters, n, largest)
@@ -247,7 +247,9 @@ def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
 
 
 @kernel
-def reduce_runs(lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: Scratch) -> None:
+def reduce_runs(
+    lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: ReductionScratch
+) -> None:
     """Find the sums of R runs, of which piece k holds ``bounds[k]`` to ``bounds[k + 1]``."""
     for k in range(len(bounds) - 1):
         # Some times in all runs of a piece: what is found is merged before the next.
@@ -276,7 +278,7 @@ def reduce_runs(lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch:
 
 
 @kernel
-def join_nodes(scratch: Scratch, depth: int, count: int) -> int:
+def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
     """Merge the last two of the nodes that wait; return how many there are then."""
     for s in range(count):
         merge_pair(scratch.node_size, scratch.mean, scratch.M2, depth - 2, depth - 1, s, s)
@@ -285,7 +287,7 @@ def join_nodes(scratch: Scratch, depth: int, count: int) -> int:
 
 @kernel
 def add_node(
-    lanes: Lanes, scratch: Scratch, active: int, count: int, node: int, whole: bool
+    lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, whole: bool
 ) -> None:
     """Merge the ``active`` rows of a group of runs in the tree over them, as a new node. They are
     ``whole`` if none lacks a sample.
@@ -304,7 +306,7 @@ def add_node(
 
 
 @kernel
-def merge_whole(lanes: Lanes, scratch: Scratch, count: int, node: int) -> None:
+def merge_whole(lanes: Lanes, scratch: ReductionScratch, count: int, node: int) -> None:
     """Merge L rows as ``merge_row`` does, where all sizes are equal, L columns at a time."""
     rows, work, mean_of, M2_of = scratch.rows, scratch.work, scratch.mean, scratch.M2
     for s in range(count):
@@ -353,7 +355,7 @@ def reduce_group(
     lanes: Lanes,
     b: Batch,
     sums: Sums,
-    scratch: Scratch,
+    scratch: ReductionScratch,
     first: int,
     active: int,
     t: int,
@@ -394,7 +396,9 @@ def reduce_group(
 
 
 @kernel
-def mark_missing(b: Batch, scratch: Scratch, first: int, active: int, t: int, count: int) -> None:
+def mark_missing(
+    b: Batch, scratch: ReductionScratch, first: int, active: int, t: int, count: int
+) -> None:
     """Give samples that a run has size 1, and those that it lacks size 0 and zeros."""
     for q in range(active):
         for s in range(count):
@@ -409,7 +413,7 @@ def reduce_sample(
     lanes: Lanes,
     b: Batch,
     sums: Sums,
-    scratch: Scratch,
+    scratch: ReductionScratch,
     first: int,
     active: int,
     t: int,
@@ -462,7 +466,9 @@ def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> 
 
 
 @kernel
-def nees_alone(b: Batch, sums: Sums, scratch: Scratch, r: int, t: int, f: int, q: int) -> None:
+def nees_alone(
+    b: Batch, sums: Sums, scratch: ReductionScratch, r: int, t: int, f: int, q: int
+) -> None:
     """Write NEES of one sample into lane ``q``, and note where its P is singular."""
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
     if not fill_nees(error, P, scratch.alone, scratch.one, scratch.solved):
@@ -471,7 +477,9 @@ def nees_alone(b: Batch, sums: Sums, scratch: Scratch, r: int, t: int, f: int, q
 
 
 @kernel
-def choose_counted(b: Batch, sums: Sums, scratch: Scratch, first: int, active: int, t: int) -> None:
+def choose_counted(
+    b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
+) -> None:
     """Note in which runs sample ``t`` counts in the averages, by the rule of
     ``runs.summary.averaged_samples``: in those of errors (``clear``), in that of P (``traced``).
     """
@@ -503,7 +511,7 @@ def divide_averages(b: Batch, sums: Sums, r: int) -> None:
 
 
 @kernel(inlined=True)
-def nees_of_lanes(lanes: Lanes, scratch: Scratch) -> Any:
+def nees_of_lanes(lanes: Lanes, scratch: ReductionScratch) -> Any:
     """Write ``e' P^-1 e`` of L errors, and which P are not positive definite, or nan; return flags
     of the latter.
     """
@@ -528,7 +536,14 @@ def nees_of_lanes(lanes: Lanes, scratch: Scratch) -> Any:
 
 @kernel(inlined=True)
 def find_blur(
-    lanes: Lanes, b: Batch, sums: Sums, scratch: Scratch, first: int, active: int, t: int, s: int
+    lanes: Lanes,
+    b: Batch,
+    sums: Sums,
+    scratch: ReductionScratch,
+    first: int,
+    active: int,
+    t: int,
+    s: int,
 ) -> None:
     """Note the time of sample ``t``, the ``s``-th of a group, in the runs where it is blurred."""
     # Squares tell without a root where it is surely not. A nan is no number here: what is blurred
