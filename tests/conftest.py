@@ -46,7 +46,6 @@ LONGEST = (
     "benchmarks/test_by_hand.py",
     "scenario/test_malformed.py",
     "engines/test_visits.py",
-    "scenario/test_types.py",
     "linalg/test_portable.py",
     "test_process.py",
 )

@@ -260,7 +260,7 @@ def test_broken_gossip_is_caught(kind, caught, not_seen, tmp_path):
     scenario = scenario_of(
         GOSSIP, tmp_path, filter={"kind": f"tests.checks.broken:{kind}"}, horizon=16.0
     )
-    found = check(scenario, runs=200, workers=1)
+    found = check(scenario, runs=60, workers=1)
     assert not found
     broken = {row.source for row in found.rows if row.verdict == BROKEN}
     assert caught <= broken
@@ -270,7 +270,7 @@ def test_broken_gossip_is_caught(kind, caught, not_seen, tmp_path):
 def test_a_wrong_mean_matching_is_caught(tmp_path):
     activation = {"kind": "tests.checks.broken:Reluctant", "protocol": "one-edge"}
     scenario = scenario_of(GOSSIP, tmp_path, **{"network.activation": activation})
-    found = rows_of(check(scenario, runs=300, workers=1))
+    found = rows_of(check(scenario, runs=150, workers=1))
     assert found["G Proposition 6"].verdict == BROKEN
     assert found["G (10), (19), Proposition 7"].verdict == "holds"
 
@@ -278,9 +278,9 @@ def test_a_wrong_mean_matching_is_caught(tmp_path):
 def test_arrivals_of_the_wrong_probability_are_caught(tmp_path):
     loss = {"kind": "tests.checks.broken:Lossier", "delivery": 0.7}
     many = scenario_of(INTERMITTENT, tmp_path, **{"network.channel.loss": loss})
-    assert rows_of(check(many, runs=300, workers=1))["R (12)"].verdict == BROKEN
+    assert rows_of(check(many, runs=150, workers=1))["R (12)"].verdict == BROKEN
     scalar = scenario_of(SCALAR, tmp_path, **{"network.channel.loss": loss})
-    found = rows_of(check(scalar, runs=800, workers=1))
+    found = rows_of(check(scalar, runs=500, workers=1))
     assert found["R (12)"].verdict == BROKEN
     assert found["R Proposition 24, derived"].verdict == BROKEN
     assert found["R (15)-(18)"].verdict == "holds"

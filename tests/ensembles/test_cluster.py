@@ -27,9 +27,12 @@ def begin(stack, module, *arguments):
     return process
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    """The address of a scheduler, two worker processes, and the scheduler itself."""
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """The address of a scheduler, two worker processes, and the scheduler itself: for tests that
+    leave a worker, in their order, and last for that which kills the scheduler.
+    """
+    tmp_path = tmp_path_factory.mktemp("cluster")
     file = tmp_path / "scheduler.json"
     with contextlib.ExitStack() as stack:
         local = ["--host", "127.0.0.1", "--port", "0"]
@@ -42,6 +45,15 @@ def cluster(tmp_path):
         one = ["--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path)]
         workers = [begin(stack, "dask_worker", address, *one) for _ in range(2)]
         yield address, workers, scheduler
+
+
+def test_workers_with_other_versions_are_refused_in_one_line(ring, cluster, monkeypatch):
+    short = ring.replace({"horizon": 1.0})
+    here = {**pools.versions(), "numpy": "0.1"}
+    monkeypatch.setattr(pools, "versions", lambda: here)
+    with pytest.raises(EngineError, match=r"numpy [\d.]+ instead of 0\.1; install") as refused:
+        netkf.monte_carlo(short, 4, scheduler=cluster[0])
+    assert str(refused.value).isprintable()
 
 
 def test_a_cluster_that_loses_a_worker_gives_the_same_bits(ring, cluster):
@@ -58,15 +70,6 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bits(ring, cluster):
     assert 16 <= killed[0] < 60
     assert workers[1].poll() is None
     assert_same_bits(ensemble, netkf.monte_carlo(short, 60, workers=1))
-
-
-def test_workers_with_other_versions_are_refused_in_one_line(ring, cluster, monkeypatch):
-    short = ring.replace({"horizon": 1.0})
-    here = {**pools.versions(), "numpy": "0.1"}
-    monkeypatch.setattr(pools, "versions", lambda: here)
-    with pytest.raises(EngineError, match=r"numpy [\d.]+ instead of 0\.1; install") as refused:
-        netkf.monte_carlo(short, 4, scheduler=cluster[0])
-    assert str(refused.value).isprintable()
 
 
 def test_a_scheduler_that_is_not_there_is_told_in_one_line(ring, monkeypatch):
@@ -116,7 +119,7 @@ def listen():
 
 @pytest.mark.parametrize("treat", [silent, closes, is_a_web_server, sends_noise])
 def test_what_is_no_scheduler_is_told_in_one_line(ring, monkeypatch, listen, treat):
-    monkeypatch.setattr("netkf.ensembles.pools.PATIENCE", 4)
+    monkeypatch.setattr("netkf.ensembles.pools.PATIENCE", 2)
     address, began = listen(treat), time.monotonic()
     before = threading.active_count()
     with pytest.raises(netkf.ScenarioError, match="no Dask scheduler answers there"):
