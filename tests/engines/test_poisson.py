@@ -87,8 +87,7 @@ def test_ticks_that_crowd_are_put_in_order():
     link = random.permutation(len(t))
     found = poisson.Found(t, link, 2 * link, np.empty(0))
     ordered = poisson._room(len(t), 0)
-    place = np.empty(len(t) + 1, dtype=np.int64)
-    poisson.put_in_time_order(0.0, 1.0, len(t), found, ordered, place)
+    poisson.put_in_time_order(0.0, 1.0, len(t), found, ordered, poisson._sorting(len(t)))
     order = np.lexsort((link, t))
     for one, other in zip(ordered[:3], found[:3], strict=True):
         np.testing.assert_array_equal(one, other[order])

@@ -149,38 +149,54 @@ def draw_outcomes(
     return at
 
 
+class Sorting(NamedTuple):
+    """Scratch to put K ticks in order: where the next tick of a stretch goes, ``place`` (K + 1,),
+    and which tick goes where, ``source`` (K,). Short integers stay in the cache.
+    """
+
+    place: np.ndarray
+    source: np.ndarray
+
+
+def _sorting(ticks: int) -> Sorting:
+    return Sorting(np.empty(ticks + 1, dtype=np.int32), np.empty(ticks, dtype=np.int32))
+
+
 @kernel
 def put_in_time_order(
-    begin: float, end: float, count: int, found: Found, ordered: Found, place: np.ndarray
+    begin: float, end: float, count: int, found: Found, ordered: Found, sorting: Sorting
 ) -> None:
-    """Write the first ``count`` ticks, which lie in [begin, end), in the order of (time, entity);
-    ``place`` (count + 1,) is room to work in.
-    """
+    """Write the first ``count`` ticks, which lie in [begin, end), by (time, entity)."""
     # Ticks are evenly spread, hence about one in each of ``count`` equal stretches.
-    scale = count / (end - begin)
+    place, source, scale = sorting.place, sorting.source, count / (end - begin)
     # Counting sort by stretch: count, sum up, and place.
     for m in range(count + 1):
         place[m] = 0
     for m in range(count):
-        place[min(int((found.t[m] - begin) * scale), count - 1) + 1] += 1
+        place[stretch_of(found.t[m], begin, scale, count) + 1] += 1
     for m in range(count):
         place[m + 1] += place[m]
-    t, entity, at = ordered.t, ordered.entity, ordered.at
     for m in range(count):
         # place[k] is where the next tick of stretch k goes.
-        k = min(int((found.t[m] - begin) * scale), count - 1)
-        to = place[k]
+        k = stretch_of(found.t[m], begin, scale, count)
+        source[place[k]] = m
         place[k] += 1
-        t[to], entity[to], at[to] = found.t[m], found.entity[m], found.at[m]
     # Insertion sort mends the order inside stretches, in linear time on average, as few share one.
     # It is by (time, entity): ties keep the order of entities.
-    for m in range(1, count):
-        now, which, where = t[m], entity[m], at[m]
-        to = m
-        while to > 0 and (t[to - 1] > now or (t[to - 1] == now and entity[to - 1] > which)):
-            t[to], entity[to], at[to] = t[to - 1], entity[to - 1], at[to - 1]
-            to -= 1
-        t[to], entity[to], at[to] = now, which, where
+    t, entity, at = ordered.t, ordered.entity, ordered.at
+    for to in range(count):
+        m, k = source[to], to
+        now, which = found.t[m], found.entity[m]
+        while k > 0 and (t[k - 1] > now or (t[k - 1] == now and entity[k - 1] > which)):
+            t[k], entity[k], at[k] = t[k - 1], entity[k - 1], at[k - 1]
+            k -= 1
+        t[k], entity[k], at[k] = now, which, found.at[m]
+
+
+@kernel(inlined=True)
+def stretch_of(time: float, begin: float, scale: float, count: int) -> int:
+    """Return which of ``count`` stretches a time lies in, ``scale`` of them in a second."""
+    return min(int((time - begin) * scale), count - 1)
 
 
 class AllTicks(NamedTuple):
@@ -206,11 +222,11 @@ def draw_all_ticks(
     exponential: Ziggurat,
     found: Found,
     used: np.ndarray,
-    place: np.ndarray,
+    sorting: Sorting,
     ticks: AllTicks,
 ) -> bool:
     """Draw the ticks of all runs up to the horizon, in the order of (time, entity); ``found``,
-    ``used`` (2,) and ``place`` are scratch. False where some array is too small.
+    ``used`` (2,) and ``sorting`` are scratch. False where some array is too small.
     """
     for run in range(len(ticks.first) - 1):
         used[0] = used[1] = 0
@@ -224,7 +240,7 @@ def draw_all_ticks(
         ordered = Found(
             ticks.t[first:last], ticks.entity[first:last], ticks.at[first:last], found.delay
         )
-        put_in_time_order(0.0, horizon, used[0], found, ordered, place)
+        put_in_time_order(0.0, horizon, used[0], found, ordered, sorting)
         # ``at`` counts within the run, so that outcomes are copied without a change.
         for k in range(used[1]):
             ticks.delay[begin + k] = found.delay[k]
@@ -313,7 +329,7 @@ class PoissonSchedules:
             most = int(expected + spread * math.sqrt(expected)) + 8
             total = int(self._runs * expected + spread * math.sqrt(self._runs * expected)) + most
             found, ticks = self._space(most), self._space_for_all(total)
-            scratch = found, np.zeros(2, dtype=np.int64), np.empty(most + 1, dtype=np.int64)
+            scratch = found, np.zeros(2, dtype=np.int64), _sorting(most)
             given = self._drawing, self._horizon, self._delay, ziggurat()
             if draw_all_ticks(*given, *scratch, ticks):
                 return ticks
@@ -344,8 +360,7 @@ class PoissonSchedules:
             ticks, sends = 2 * ticks, 2 * sends
         count = int(used[0])
         ordered = _room(count, 0)._replace(delay=self._found.delay[: used[1]].copy())
-        places = np.empty(count + 1, dtype=np.int64)
-        put_in_time_order(begin, last, count, self._found, ordered, places)
+        put_in_time_order(begin, last, count, self._found, ordered, _sorting(count))
         return Window(end, *ordered)
 
     def _make_room(self, ticks: int, sends: int, used: np.ndarray) -> None:
