@@ -152,6 +152,27 @@ def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
+@_typed(names.prefetch)
+def _prefetch(_array: Any, *_place: Any) -> Any:
+    return types.none
+
+
+@lower_builtin(names.prefetch, types.VarArg(types.Any))
+def lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """A hint, to read, into all caches."""
+    places = [
+        context.cast(builder, value, number, types.intp)
+        for value, number in zip(args[1:], sig.args[1:], strict=True)
+    ]
+    pointer = builder.bitcast(
+        entry_pointer(builder, sig.args[0], args[0], places), BYTE.as_pointer()
+    )
+    kinds = ir.FunctionType(ir.VoidType(), [pointer.type, I32, I32, I32])
+    hint = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0i8")
+    builder.call(hint, [pointer, I32(0), I32(3), I32(1)])
+    return context.get_dummy_value()
+
+
 @_typed(names.turn)
 def _turn(_lanes: Any, _rows: Any, _column: Any, _out: Any) -> Any:
     return types.none
@@ -471,3 +492,85 @@ def _instruction(function: Any, name: str, arguments: int) -> None:
 _instruction(names.root_of, "sqrt", 1)
 _instruction(names.magnitude, "fabs", 1)
 _instruction(names.with_sign, "copysign", 2)
+
+
+# Roots and inverses: a unit of the processor that takes turns, or products
+
+
+@_typed(names.root_and_inverse)
+def _root_and_inverse(value: Any) -> Any:
+    return types.UniTuple(value, 2) if isinstance(value, LaneValue | types.Float) else None
+
+
+@_typed(names.inverse_of)
+def _inverse_of(value: Any) -> Any:
+    return value if isinstance(value, LaneValue | types.Float) else None
+
+
+@lower_builtin(names.root_and_inverse, types.Any)
+def lower_root_and_inverse(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Goldschmidt's iteration, or an instruction for each."""
+    (x,), kind = args, args[0].type
+    if not _estimates(context, sig.args[0]):
+        root = builder.call(_intrinsic(builder, f"llvm.sqrt.{_suffix(kind)}", kind, kind), [x])
+        inverse = builder.fdiv(_number(kind, 1.0), root)
+        return context.make_tuple(builder, sig.return_type, [root, inverse])
+    half, fma = _number(kind, 0.5), _fused(builder, kind)
+    estimate = _estimate(builder, "rsqrt14", x)
+    # root -> sqrt(x), share -> 1 / (2 sqrt(x)); each turn doubles the 14 bits that are right.
+    root, share = builder.fmul(x, estimate), builder.fmul(half, estimate)
+    for _ in range(2):
+        left = fma(builder.fneg(root), share, half)
+        root, share = fma(root, left, root), fma(share, left, share)
+    root = fma(fma(builder.fneg(root), root, x), share, root)
+    # The estimate for 0 is infinite.
+    root = builder.select(builder.fcmp_ordered("==", x, _number(kind, 0.0)), x, root)
+    return context.make_tuple(builder, sig.return_type, [root, builder.fadd(share, share)])
+
+
+@lower_builtin(names.inverse_of, types.Any)
+def lower_inverse_of(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Newton's iteration, or a division."""
+    (x,), kind = args, args[0].type
+    one = _number(kind, 1.0)
+    if not _estimates(context, sig.args[0]):
+        return builder.fdiv(one, x)
+    fma, found = _fused(builder, kind), _estimate(builder, "rcp14", x)
+    for _ in range(2):
+        found = fma(found, fma(builder.fneg(x), found, one), found)
+    return found
+
+
+def _estimates(context: Any, kind: Any) -> bool:
+    """Return True if the processor that code is made for estimates roots of so many lanes."""
+    _, _, features = context.codegen().magic_tuple()
+    return _count(kind) == 8 and "+avx512f" in features.split(",")
+
+
+def _estimate(builder: Any, name: str, x: Any) -> Any:
+    mask = ir.IntType(8)
+    kinds = ir.FunctionType(x.type, [x.type, x.type, mask])
+    full = f"llvm.x86.avx512.{name}.pd.512"
+    instruction = cgutils.get_or_insert_function(builder.module, kinds, full)
+    return builder.call(instruction, [x, ir.Constant(x.type, ir.Undefined), mask(255)])
+
+
+def _fused(builder: Any, kind: Any) -> Callable[..., Any]:
+    """Return a function that makes ``a b + c`` of values, which rounds once."""
+    instruction = _intrinsic(builder, f"llvm.fma.{_suffix(kind)}", kind, kind, kind, kind)
+    return lambda a, b, c: builder.call(instruction, [a, b, c])
+
+
+def _intrinsic(builder: Any, name: str, result: Any, *arguments: Any) -> Any:
+    kinds = ir.FunctionType(result, list(arguments))
+    return cgutils.get_or_insert_function(builder.module, kinds, name)
+
+
+def _suffix(kind: Any) -> str:
+    return f"v{kind.count}f64" if isinstance(kind, ir.VectorType) else "f64"
+
+
+def _number(kind: Any, number: float) -> Any:
+    if isinstance(kind, ir.VectorType):
+        return ir.Constant(kind, [number] * kind.count)
+    return ir.Constant(kind, number)
