@@ -38,8 +38,8 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.schema import KINDS
 
 LARGEST_BATCH = 512
-QUICK_VISITS = 1 << 15
-"""Visits of nodes that take some milliseconds."""
+QUICK_VISITS = 1 << 17
+"""Visits of nodes that take some ten milliseconds: to prepare a batch takes one or two."""
 MOST_BYTES = 1 << 25
 """Bytes that are drawn for a batch, and that its samples take."""
 
@@ -95,7 +95,8 @@ def _run_by_run(
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
     """Simulate all runs in one call, or nearly so."""
     start, runs = workspace.filters, len(draws.replicas)
-    shown = empty_samples((runs, len(scenario.times), *start.xhat.shape))
+    # Runs that diverge go on to the end: all samples of all runs are written.
+    shown = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
     arrays = _batch_arrays(scenario, start, draws)
     if is_immediate(scenario):
         group = together(len(start.nodes), runs)
@@ -165,16 +166,15 @@ def batch_size(scenario: Scenario) -> int:
 
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
-    """Return a number of runs, a power of two, that take milliseconds together: what it costs to
-    prepare a batch is shared by so many at least.
+    """Return a number of runs, a power of two, that take some ten milliseconds together: what it
+    costs to prepare a batch is shared by so many at least.
     """
     if not (drawn_together(scenario) and is_immediate(scenario)):
         return 1
     steps, nodes = steps_to_the_end(scenario), len(scenario.nodes)
     visits = steps * len(scenario.increment_sensors) + nodes * len(scenario.times)
     most = int(QUICK_VISITS / (visits + _expected_ticks(scenario)))
-    most = min(most, batch_size(scenario), together(nodes, LARGEST_BATCH))
-    return 1 << max(0, most.bit_length() - 1)
+    return 1 << max(0, min(most, batch_size(scenario)).bit_length() - 1)
 
 
 def _expected_ticks(scenario: Scenario) -> float:

@@ -7,6 +7,7 @@ and the loop does everything that happens an event at a time.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -282,12 +283,16 @@ def ticks_of(window: Window) -> Ticks:
     return Ticks(**window._replace(heard=heard)._asdict())
 
 
-def empty_samples(shape: tuple[int, int, int, int], terms: int = 0) -> SampleBuffer:
-    """Space for samples, ``shape`` (R, B, N, n), with so many terms of sums."""
+def empty_samples(
+    shape: tuple[int, int, int, int], terms: int = 0, make: Callable[..., Any] = np.zeros
+) -> SampleBuffer:
+    """Space for samples, ``shape`` (R, B, N, n), with so many terms of sums; ``make`` makes the
+    arrays of estimates and covariances.
+    """
     runs, count, _, n = shape
     return SampleBuffer(
-        xhat=np.zeros(shape),
-        P=np.zeros((*shape, n)),
+        xhat=make(shape),
+        P=make((*shape, n)),
         rows=np.zeros((runs, count), dtype=np.int64),
         counts=np.zeros((runs, count, len(schema.KINDS)), dtype=np.int64),
         piece=np.zeros((runs, count), dtype=np.int64),
