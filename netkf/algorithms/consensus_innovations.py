@@ -11,6 +11,10 @@ then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G
 gains are those of the Gauss-Markov theorem: B and M minimise the mean square error of yhat+, and K
 that of xhat+. They follow from the joint covariance of the errors of all nodes, in which nothing
 depends on data, and which is computed as if no message were lost.
+
+The text of the paper was not at hand: its construction (pseudo-states, gains by the Gauss-Markov
+theorem) is followed, without the numbers of its equations. The null space of G lies in that of each
+``H_i' R_i^-1 H_i``, so that the innovation needs no term in ``(I - G^+ G) xhat``.
 """
 
 from __future__ import annotations

@@ -169,7 +169,8 @@ def _why(source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSamp
         found.append(_startup_claim(sample.overall, worst, sample.start))
     if len(into):
         cut = float(source.cuts(np.array([worst.time]))[0])
-        found.append(_heard(into, worst, cut) + _unusual(source, run, into, worst))
+        why = _heard(into, worst, cut) + _unusual(source, run, into, worst)
+        found.append(why + _arrived(messages, into))
     if worst.by_error:
         found += _judge_error(source, run, worst)
     return found
@@ -234,6 +235,19 @@ def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:
     lost = f"{missing:,} message{'s' if missing != 1 else ''} to it had been lost or late "
     lost += "since" if parts else "by then"
     return f"Why: {listed}; {lost}"
+
+
+def _arrived(messages: np.ndarray, into: np.ndarray) -> str:
+    """Return how many messages to the node arrived in the whole run, where that is unusual."""
+    counts = [int((rows["outcome"] == DELIVERED).sum()) for rows in (into, messages)]
+    own, all_nodes = counts[0] / max(1, len(into)), counts[1] / max(1, len(messages))
+    # Four standard deviations of a share of independent messages.
+    if abs(own - all_nodes) <= 4.0 * math.sqrt(all_nodes * (1.0 - all_nodes) / max(1, len(into))):
+        return ""
+    return (
+        f". Over the whole run {own:.1%} of {len(into):,} messages to it arrived, of those to all "
+        f"nodes {all_nodes:.1%}"
+    )
 
 
 def _unusual(source: Opened, run: StoredRun, into: np.ndarray, worst: Worst) -> str:

@@ -106,7 +106,7 @@ def price_claim(source: Opened, found: Explanation, central: CentralSample) -> s
         f"{' and '.join(had)} then"
     )
     if not central.trace < best.trace * (1.0 - EQUAL_NUMBERS):
-        return f"{said}, no less than this node with no message missing"
+        return f"{said}. Its trace P is no less than that of this node with no message missing"
     what = "how rarely nodes exchange, and of how they combine what they hear"
     clock = source.scenario.network.activation
     rates = isinstance(clock, LinkClock) and hasattr(clock, "rate")

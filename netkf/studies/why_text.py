@@ -138,7 +138,7 @@ def _heard(found: Explanation) -> Iterator[str]:
         rest = f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
         yield f"It last heard {_and(parts)}{rest} (times of sending)."
     if silent:
-        yield f"It had never heard node {_and(list(map(str, silent[:MAX_LISTED])))}."
+        yield f"It had never heard node {_listed(silent)}."
     unheard = sum(s.unheard for s in neighbours)
     if unheard:
         which = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
@@ -146,7 +146,7 @@ def _heard(found: Explanation) -> Iterator[str]:
         verb = "was" if unheard == 1 else "were"
         yield (
             f"{unheard} {noun} sent to it since then {verb} lost, late or not used: "
-            f"{_and(which[:MAX_LISTED])}{', ...' if len(which) > MAX_LISTED else ''}."
+            f"{_listed(which, 'other nodes')}."
         )
 
 
@@ -154,7 +154,7 @@ def _readings(found: Explanation) -> Iterator[str]:
     """Yield the newest readings, and what kept newer ones away."""
     sensors = [s for s in found.sources if s.sensor and s.node != found.node]
     known = sorted((s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading)
-    never = [str(s.node) for s in sensors if math.isnan(s.reading)]
+    never = [s.node for s in sensors if math.isnan(s.reading)]
     if known:
         oldest = known[:MAX_LISTED]
         parts = [
@@ -163,13 +163,16 @@ def _readings(found: Explanation) -> Iterator[str]:
         which = "The oldest of its" if len(known) > MAX_LISTED else "Its"
         yield f"{which} newest readings are {_and(parts)}."
     if never:
-        yield f"No reading of node {_and(never[:MAX_LISTED])} can have reached it."
+        yield f"No reading of node {_listed(never)} can have reached it."
     kept_away = [s for s in known + [s for s in sensors if math.isnan(s.reading)] if s.missing]
     for source in kept_away[:MAX_LISTED]:
         newest = source.with_more[len(source.missing) - 1]
         messages = _and([str(m) for m in source.missing])
         age = f"{found.at - newest:.4g} s old"
         yield f"A newer reading of node {source.node}, {age}, would have come with {messages}."
+    if len(kept_away) > MAX_LISTED:
+        others = len(kept_away) - MAX_LISTED
+        yield f"Newer readings of {others} other nodes would have come too, with these or others."
     if sensors and not kept_away:
         yield "No newer reading was kept away by up to three messages that did not come."
 
@@ -179,7 +182,8 @@ def _smallest(found: Explanation) -> Iterator[str]:
     if smallest is None:
         return
     change = relative_change(whole.trace, found.trace)
-    yield f"Had no message been missing, trace P would be {whole.trace:.4g} ({change})."
+    error = "" if math.isnan(whole.error) else f" and the error {whole.error:.4g}"
+    yield f"Had no message been missing, trace P would be {whole.trace:.4g} ({change}){error}."
     if smallest.messages == ():
         yield f"No message had to come: trace P as it was is at most {_limit(found, smallest)}."
         return
@@ -303,6 +307,13 @@ def _route(source: InformationSource) -> str:
         source.route if len(source.route) <= 6 else (*source.route[:3], "..", *source.route[-2:])
     )
     return " -> ".join(map(str, shown))
+
+
+def _listed(items: Sequence[object], others: str = "others") -> str:
+    """Return the first items in words, and how many ``others`` there are."""
+    parts = [str(item) for item in items[:MAX_LISTED]]
+    more = len(items) - len(parts)
+    return _and([*parts, f"{more} {others}"] if more else parts)
 
 
 def _and(parts: Sequence[str]) -> str:

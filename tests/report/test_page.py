@@ -164,6 +164,27 @@ def test_why_counts_what_was_lost_since_the_worst_node_last_heard(ring):
     assert f"; {lost:,} message" in findings_of(ring)[1]
 
 
+def test_a_node_that_hardly_hears_anybody_is_said_to_be_one(library, ring):
+    messages = plain_messages(netkf.open(library).events)
+    worst = read_source(library).worst.explained.node
+    into = [found[1] == "delivered" for key, found in messages.items() if key[1] == worst]
+    everywhere = [found[1] == "delivered" for found in messages.values()]
+    assert np.mean(into) < 0.3 < 0.8 < np.mean(everywhere)
+    (said,) = [line for line in findings_of(library) if line.startswith("Why: ")]
+    own, all_nodes = (f"{np.mean(arrived):.1%}" for arrived in (into, everywhere))
+    assert f"run {own} of {len(into):,} messages to it arrived" in said
+    assert said.endswith(f", of those to all nodes {all_nodes}")
+    # Where chance alone explains the difference nothing is said.
+    assert not any("Over the whole run" in line for line in findings_of(ring))
+
+
+def test_lists_that_are_cut_say_how_many_are_left_out(library):
+    told = Page(make_page([library])).shown
+    run = netkf.open(library)
+    others = len(run.nodes) - 1 - 4
+    assert f"never heard node 1, 2, 3, 4 and {others} others" in told
+
+
 def hybrid_ring(folder, name, changes):
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 10.0, **changes})
     return run_to_directory(scenario, folder / name).directory

@@ -80,7 +80,16 @@ const Sequence = (() => {
       if (y > TOP) app.setTime(start + ((y - TOP) / (HEIGHT - TOP - BOTTOM)) * (end - start));
     });
     box.replaceChildren(svg);
+    showChosen(box, x, app.nodeOf(run), wide);
     note.textContent = words(run, drawn, start, end, width, app);
+  }
+
+  // On a narrow screen the chart scrolls sideways: a node that has just been chosen is in view.
+  function showChosen(box, x, node, wide) {
+    const shown = [node, ...x.keys()].join(" ");
+    if (box.dataset.shown === shown) return;
+    box.dataset.shown = shown;
+    if (x.has(node) && wide > box.clientWidth) box.scrollLeft = x.get(node) - box.clientWidth / 2;
   }
 
   function describe(run, chosen, found, start, end) {

@@ -175,7 +175,9 @@ const Why = (() => {
     const lost = found.links.reduce((sum, link) => sum + bad(run, link).length, 0);
     const oldest = found.links[0];
     if (oldest) {
-      parts.push(oldest.newest < 0 ? "It had never heard node " + run.nodes[oldest.sender] + "."
+      const silent = found.links.filter((link) => link.newest < 0).length;
+      const others = silent > 1 ? " and " + (silent - 1) + (silent > 2 ? " others" : " other") : "";
+      parts.push(silent ? "It had never heard node " + run.nodes[oldest.sender] + others + "."
         : "Oldest link: node " + run.nodes[oldest.sender] + ", heard as of " + Format.number(Math.max(0, t - oldest.sent)) + " s before.");
       parts.push(lost + (lost === 1 ? " message" : " messages") + " to it lost or late since it last heard each sender.");
     } else parts.push("No message was ever sent to it.");
