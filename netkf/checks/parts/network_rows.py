@@ -25,12 +25,9 @@ from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.sources import stated_part
 from netkf.checks.statistics import (
     Interval,
-    affine,
     deviation_interval,
     probability_interval,
-    scale_interval,
     student_interval,
-    widen,
 )
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
@@ -292,25 +289,40 @@ def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str
     interval, (a, b) = found
     first, second = (_direction_label(scenario, int(columns[k])) for k in (a, b))
     intervals = [(interval, f"correlation of losses {first} and {second}")]
-    own = float(excess.var(axis=0, ddof=1).sum())
-    if own > 0.0:
-        freedom = float(len(excess) - 1)
-        ratio = scale_interval(
-            freedom * float(excess.sum(axis=1).var(ddof=1)) / own, freedom, level / 2.0
-        )
+    mean = _mean_correlation(excess, _variances(samples)[:, columns], level / 2.0)
+    if mean is not None:
         # Correlations of some pairs cancel others only by design; a common cause adds up.
-        mean = _mean_correlation(ratio, len(columns))
         intervals.append((deviation_interval(0.0, mean), "mean correlation of losses of all links"))
     return intervals
 
 
-def _mean_correlation(ratio: Interval, links: int) -> Interval:
-    """Return the mean correlation of so many equal numbers from the variance of their sum over the
-    sum of their variances, widened by what is not known of these.
+def _variances(samples: PartSamples) -> FloatArray:
+    """Return the variance (K, D) of the losses of each direction in a part of a run, given how many
+    messages were sent in it.
     """
-    scale = 1.0 / max(links - 1, 1)
-    found = affine(ratio, scale, -scale)
-    return widen(found, 0.02 * scale)
+    sent, q = samples.fates.sent, loss_probabilities(samples.scenario)
+    return np.asarray((sent * (q * (1.0 - q))).reshape(-1, sent.shape[2]))
+
+
+def _mean_correlation(excess: FloatArray, variance: FloatArray, level: float) -> Interval | None:
+    """Return an interval for the correlation of losses of two links, the same for all of them, from
+    ``excess`` (K, L) over the means in K parts of runs; None if no part has losses of two links.
+
+    Given what was sent products of two independent links have mean 0 and the variance that those of
+    the links have as product: a part in which little was sent says little.
+    """
+    deviation = np.sqrt(variance)
+    products = (excess.sum(axis=1) ** 2 - (excess**2).sum(axis=1)) / 2.0
+    scale = float((deviation.sum(axis=1) ** 2 - variance.sum(axis=1)).sum()) / 2.0
+    spreads = (variance.sum(axis=1) ** 2 - (variance**2).sum(axis=1)) / 2.0
+    total = float(spreads.sum())
+    # As many parts as there would be if all said the same.
+    parts = total**2 / float((spreads**2).sum()) if total > 0.0 else 0.0
+    if not parts >= MIN_RUNS:
+        return None
+    # Losses of links that are related spread more than the stated ones.
+    spread = math.sqrt(max(total, float((products**2).sum())))
+    return student_interval(float(products.sum()) / scale, spread / scale, int(parts), level)
 
 
 @lru_cache(maxsize=8)

@@ -12,7 +12,13 @@ from netkf.checks.exact import _length_interval
 from netkf.checks.parts.clock_rows import _count_interval, largest_correlation
 from netkf.checks.parts.events import FateCounts, PairCounts, reversed_directions
 from netkf.checks.parts.moments import CELLS, compare_cells, correlation_interval
-from netkf.checks.parts.network_rows import _bursts, _losses_apart, _matchings, pair_probabilities
+from netkf.checks.parts.network_rows import (
+    _bursts,
+    _losses_apart,
+    _matchings,
+    _mean_correlation,
+    pair_probabilities,
+)
 from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.ticks import correlate_neighbours
 from netkf.checks.statistics import deviation_interval, probability_interval
@@ -181,3 +187,19 @@ def test_rows_about_parts_find_what_they_state(name, tmp_path):
     assert probability_interval(above, TRIALS, 1e-3).high >= 0.9, (name, stated, above)
     assert above >= 0.8 * TRIALS, (name, stated, above)
     assert probability_interval(below, TRIALS, 1e-3).low <= 0.9, (name, stated, below)
+
+
+@pytest.mark.parametrize("mean", [0.2, 1.0])
+def test_parts_of_runs_with_few_messages_accuse_nobody(mean):
+    """Most parts have no message of either link, and what is lost there does not vary."""
+    random, level, q, accused = np.random.default_rng(7), 0.02, 0.7, 0
+    for _ in range(400):
+        # Broadcasts: both links have a message at once.
+        sent = np.repeat(random.poisson(mean, (240, 1)), 2, axis=1)
+        excess = random.binomial(sent, q) - q * sent
+        found = _mean_correlation(excess, sent * q * (1.0 - q), level)
+        accused += not found.low <= 0.0 <= found.high
+    # 8 are expected at most; 18 and more have probability 0.002.
+    assert accused < 18
+    same = np.repeat(excess[:, :1], 2, axis=1)
+    assert _mean_correlation(same, sent * q * (1.0 - q), level).low > 0.0
