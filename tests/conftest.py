@@ -1,5 +1,6 @@
 """Shared by all tests: where the scenarios are and how to build one from plain values."""
 
+import gc
 import math
 import signal
 from pathlib import Path
@@ -67,6 +68,11 @@ def pytest_collection_modifyitems(items):
     """Long files first, then the others as they are found."""
     places = {ROOT / "tests" / name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
+def pytest_collection_finish():
+    """Modules and tests stay: the garbage collector need not look at them again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
