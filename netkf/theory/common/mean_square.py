@@ -55,7 +55,7 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
     delays none or fixed (not beside bursts under Poisson clocks; below the period of periodic
     clocks; in slots a message that is late is lost), clocks Poisson, or periodic and all together
     (the mean is then that at exchanges, after them); at most 200 errors of all nodes together.
-    Delays under Poisson clocks are solved to about 1e-10, in a second for 40 errors and minutes for
+    Delays under Poisson clocks are solved to about 1e-10, in 5 s for 40 errors and many minutes for
     200. Raises TheoryError with the reason where there is no such mean, or it is not known.
     """
     radius, covariance = _solve(scenario)
