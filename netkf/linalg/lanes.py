@@ -104,13 +104,6 @@ def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
     raise _only_in_kernels()
 
 
-def prefetch(array: FloatArray, *place: int) -> None:
-    """Ask for the line of the cache that ``array[place]`` is in, which will be wanted soon. The
-    place need not exist.
-    """
-    raise _only_in_kernels()
-
-
 def spread(lanes: Lanes, number: float) -> Any:
     """Return a number in all lanes as one value."""
     raise _only_in_kernels()
@@ -138,20 +131,6 @@ def any_lane(flags: Any) -> bool:
 
 def root_of(value: Any) -> Any:
     """Return the square root."""
-    raise _only_in_kernels()
-
-
-def root_and_inverse(value: Any) -> tuple[Any, Any]:
-    """Return the square root and one over it, which is anything for 0.
-
-    Where the processor has an estimate of the inverse root of all lanes (AVX-512) they are made of
-    that by Newton's iteration, to an error of a unit in the last place or two: a tenth of the time.
-    """
-    raise _only_in_kernels()
-
-
-def inverse_of(value: Any) -> Any:
-    """Return one over a number, made as in ``root_and_inverse``."""
     raise _only_in_kernels()
 
 

@@ -15,11 +15,9 @@ from netkf.linalg.lanes import (
     by_run,
     gather,
     in_lanes,
-    inverse_of,
     load,
     load_flags,
     magnitude,
-    root_and_inverse,
     root_of,
     scatter,
     select,
@@ -74,28 +72,6 @@ def test_operations_are_those_of_numbers(lanes):
             ((1.0 + x) * y - 3.0) / 2.0,
         ]
         np.testing.assert_array_equal(out, expected)
-
-
-@kernel
-def take_roots(lanes, a, out):
-    """Root, inverse root and inverse."""
-    x = load(lanes, a, 0)
-    root, inverse = root_and_inverse(x)
-    store(lanes, out, 0, root)
-    store(lanes, out, 1, inverse)
-    store(lanes, out, 2, inverse_of(x))
-
-
-@SIZES
-def test_roots_and_inverses_are_right_to_two_units_in_the_last_place(lanes):
-    random, out = np.random.default_rng(2), aligned((3, len(lanes)))
-    for _ in range(200):
-        a = 10.0 ** random.uniform(-250.0, 250.0, size=(1, len(lanes)))
-        take_roots(lanes, a, out)
-        expected = np.sqrt(a[0]), 1.0 / np.sqrt(a[0]), 1.0 / a[0]
-        np.testing.assert_allclose(out, expected, rtol=2.0 * np.finfo(float).eps)
-    take_roots(lanes, np.zeros((1, len(lanes))), out)
-    assert (out[0] == 0.0).all()
 
 
 @kernel

@@ -45,17 +45,7 @@ from netkf.algorithms.kernels.root_update import rotate_out
 from netkf.algorithms.kernels.square_root import reflect_row
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    LANES,
-    ONE,
-    Lanes,
-    aligned,
-    load,
-    root_and_inverse,
-    select,
-    spread,
-    store,
-)
+from netkf.linalg.lanes import LANES, ONE, Lanes, aligned, load, root_of, select, spread, store
 from netkf.linalg.local import local_matrix, local_vector
 from netkf.linalg.series import fill_series, with_reach
 from netkf.linalg.structs import Size, Struct, sized, struct_at
@@ -209,7 +199,7 @@ def packed(
     parts = [grown[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
     if observed:
         parts += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
-    # Rows of whole blocks of lanes, see series.fill_columns.
+    # Rows of whole blocks of lanes, see series.fill_row.
     spare = -sum(part.shape[2] for part in parts) % LANES
     parts.append(wide_zeros(*parts[0].shape[:2], spare))
     return np.concatenate(parts, axis=2).astype(np.float64)
@@ -717,7 +707,7 @@ def shrink_root(lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: 
     # V V' from the last column on, V upper triangular.
     for j in range(n - 1, -1, -1):
         # The reciprocal is stored on the diagonal: the substitution below multiplies by it.
-        pivot = root_and_inverse(load(lanes, V, j, j))[1]
+        pivot = 1.0 / root_of(load(lanes, V, j, j))
         store(lanes, V, j, j, pivot)
         for i in range(j):
             store(lanes, V, i, j, load(lanes, V, i, j) * pivot)
@@ -784,7 +774,7 @@ def take_root(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> No
             store(lanes, T, i, j, total)
         pivot = load(lanes, T, j, j)
         counts = pivot > PIVOT * load(lanes, packed, j * (j + 1) // 2 + j)
-        inverse = select(counts, root_and_inverse(select(counts, pivot, 1.0))[1], 0.0)
+        inverse = select(counts, 1.0 / root_of(select(counts, pivot, 1.0)), 0.0)
         for i in range(j, n):
             store(lanes, T, i, j, load(lanes, T, i, j) * inverse)
 

@@ -15,15 +15,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    Lanes,
-    inverse_of,
-    load,
-    magnitude,
-    root_and_inverse,
-    select,
-    store,
-)
+from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, store
 from netkf.linalg.structs import Size
 
 
@@ -76,12 +68,12 @@ def reflect_row(
     both are (n, n, L). Entry (i, i) becomes nonnegative.
     """
     n, pivot = len(size), load(lanes, wide, i, i)
-    length, _ = root_and_inverse(select(active, square, 1.0))
+    length = root_of(select(active, square, 1.0))
     # The sign that does not cancel in pivot + signed; the column is flipped so that its diagonal is
     # nonnegative.
     signed = select(pivot >= 0.0, length, -length)
     head = magnitude(pivot + signed)
-    scale = select(active, inverse_of(length * head), 0.0)
+    scale = select(active, 1.0 / (length * head), 0.0)
     inverse = scale * head
     store(lanes, wide, i, i, select(active, length, pivot))
     for r in range(i + 1, n):
