@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import Lanes, load, store, turn
-from netkf.linalg.local import local_lanes_vector
+from netkf.linalg.lanes import LANES, MANY, load, store
 
 ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
 NOTHING = 1e-30  # of the largest entry
-ORDER_8, ORDER_12, ORDER_16 = (0,) * 8, (0,) * 12, (0,) * 16
+ORDER_8, ORDER_10, ORDER_12, ORDER_16 = (0,) * 8, (0,) * 10, (0,) * 12, (0,) * 16
+MANY_TERMS = (9, 11, 13)
 OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in steps of an octave
 
 
@@ -100,35 +100,42 @@ def add_terms(
         k += 2
 
 
-@kernel(inlined=True, fused=True)
-def fill_columns(
-    lanes: Lanes,
-    out: FloatArray,
-    series: FloatArray,
-    terms: IntArray,
-    tables: IntArray,
-    gaps: FloatArray,
-    rows: FloatArray,
-) -> None:
-    """Write the sums of ``series[tables[q]]`` (T, W), W a multiple of L, at ``gaps[q]`` into lane q
-    of ``out`` (W, L), for all lanes; all but the first ``terms[tables[q]]`` are 0, and ``rows``
-    (L, W) is scratch.
+@kernel(inlined=True)
+def fill_row(out: FloatArray, row: int, series: FloatArray, m: int, cell: int, gap: float) -> None:
+    """Write the sums of the table ``series[m, cell]`` (terms, W), W a multiple of L, into a ``row``
+    of ``out``; as many terms as MANY_TERMS has are added up fastest.
     """
-    last = 0
-    for q in range(len(lanes)):
-        last = max(last, terms[tables[q]] - 1)
-    totals = local_lanes_vector(lanes, lanes, rows)
-    # Horner's rule. Each product waits for the one before it: those of all lanes take turns.
-    for j in range(0, series.shape[2], len(lanes)):
-        for q in range(len(lanes)):
-            store(lanes, totals, q, load(lanes, series, tables[q], last, j))
-        for k in range(last - 1, -1, -1):
-            for q in range(len(lanes)):
-                terms = load(lanes, series, tables[q], k, j)
-                store(lanes, totals, q, terms + gaps[q] * load(lanes, totals, q))
-        for q in range(len(lanes)):
-            store(lanes, rows, q, j, load(lanes, totals, q))
-        turn(lanes, rows, j, out)
+    terms = series.shape[2]
+    if terms == len(ORDER_8) + 1:
+        fill_blocks(ORDER_8, out, row, series, m, cell, gap)
+    elif terms == len(ORDER_10) + 1:
+        fill_blocks(ORDER_10, out, row, series, m, cell, gap)
+    elif terms == len(ORDER_12) + 1:
+        fill_blocks(ORDER_12, out, row, series, m, cell, gap)
+    else:
+        for j in range(0, series.shape[3], LANES):
+            total = load(MANY, series, m, cell, terms - 1, j)
+            for k in range(terms - 2, -1, -1):
+                total = load(MANY, series, m, cell, k, j) + gap * total
+            store(MANY, out, row, j, total)
+
+
+@kernel(inlined=True, fused=True)
+def fill_blocks(
+    order: tuple[int, ...],
+    out: FloatArray,
+    row: int,
+    series: FloatArray,
+    m: int,
+    cell: int,
+    gap: float,
+) -> None:
+    """``horner`` for whole blocks of L entries, each of which is one value of lanes."""
+    for j in range(0, series.shape[3], LANES):
+        total = load(MANY, series, m, cell, len(order), j)
+        for k in range(len(order) - 1, -1, -1):
+            total = load(MANY, series, m, cell, k, j) + gap * total
+        store(MANY, out, row, j, total)
 
 
 @kernel(allocates=True)

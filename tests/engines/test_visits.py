@@ -9,9 +9,9 @@ import scipy.linalg
 import netkf
 from netkf.engines.compiled import agenda, batches, flow, visits
 from netkf.engines.compiled.flow import Workspace
+from netkf.engines.compiled.visits import fill_row
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY
-from netkf.linalg.series import fill_columns, polynomial
+from netkf.linalg.series import polynomial
 from tests.benchmarks.cases import planar
 
 TWO_ROWS = {"nodes": [3, 5], "H": np.eye(2).tolist(), "R": [[0.5, 0.1], [0.1, 0.3]]}
@@ -106,21 +106,19 @@ def test_only_runs_whose_messages_take_no_time(ring):
         assert not agenda.is_immediate(ring.replace(change))
 
 
-@kernel(allocates=True)
-def summed(series, terms, unit, gaps, out, rows):
-    """All columns of a table of one model at L gaps."""
-    cells, since = np.zeros(LANES, np.int64), np.zeros(LANES)
-    for q in range(LANES):
-        cell = cells[q] = int(gaps[q] / unit)
-        since[q] = gaps[q] if cell == 0 else gaps[q] - (cell + 0.5) * unit
-    fill_columns(MANY, out, series, terms, cells, since, rows)
+@kernel
+def summed(series, unit, gap, out):
+    """All columns of a table of one model at a gap."""
+    cell = int(gap / unit)
+    since = gap if cell == 0 else gap - (cell + 0.5) * unit
+    fill_row(out, 0, series, 0, cell, since)
 
 
 @pytest.mark.parametrize("case", ["ring", "two axes"])
 def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
     case = ring if case == "ring" else planar(6)
     workspace = Workspace(case)
-    waiting = workspace.visits()
+    waiting, filters = workspace.visits(), workspace.filters
     A, n = np.array(case.plant.A), case.plant.n
     lower = n * (n + 1) // 2
     model = next(model for model in case.models if len(model.H))
@@ -129,12 +127,10 @@ def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
     assert (len(set(places["sensing"])) < 30) == (len(set(places["blind"])) < 10)
     for kind, longest in (("blind", 0.9), ("sensing", 0.19)):
         table = getattr(waiting, kind)
-        width = table.series.shape[2]
-        out, rows = np.empty((width, LANES)), np.empty((LANES, width))
-        gaps = longest * np.random.default_rng(1).random((4, LANES))
-        for group, q in np.ndindex(gaps.shape):
-            summed(table.series, table.terms, table.unit.min(), gaps[group], out, rows)
-            gap, values = gaps[group, q], out[table.place, q]
+        out = np.empty((1, table.series.shape[3]))
+        for gap in longest * np.random.default_rng(1).random(30):
+            summed(table.series, filters.table.unit[0], gap, out)
+            values = out[0][table.place]
             E = values[lower : lower + n * n].reshape(n, n)
             np.testing.assert_allclose(E, scipy.linalg.expm(A * gap), rtol=0.0, atol=1e-14)
             if kind == "sensing":

@@ -12,7 +12,7 @@ from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, aligned, with_spare
+from netkf.linalg.lanes import aligned, with_spare
 from netkf.linalg.portable import cholesky
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import course_width, grid_time
@@ -124,7 +124,7 @@ class Paths:
             last=ends[block.step],
             grid=ends[ends < self._horizon] if self._senses else np.empty(0),
             table=laws.course_table,
-            course=aligned((together * COURSES + LANES, len(laws.course_table), course_width(n))),
+            course=aligned((together, COURSES, len(laws.course_table), course_width(n))),
             known=np.full((together, COURSES), -1, dtype=np.int64),
         )
 
@@ -143,7 +143,7 @@ def no_path(n: int) -> PathBlock:
         grid=np.empty(0),
         **rows,
         table=np.zeros((1, 1, 1)),
-        course=np.zeros((1, 1, 1)),
+        course=np.zeros((1, 1, 1, 1)),
         known=np.zeros((1, 1), dtype=np.int64),
     )
 

@@ -9,14 +9,11 @@ from netkf.engines.base import LONGER, SHORTEST_SHARE
 from netkf.engines.compiled.state import PathBlock, Sensing, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import ONE, prefetch
+from netkf.linalg.lanes import ONE
 from netkf.linalg.small import copy_matrix
 from netkf.plants.paths import fill_course, fill_state_moments
 from netkf.plants.sensors import divide, fill_reading
 from netkf.rng.numbers import NormalZiggurat, normal_of
-
-LINE = 8
-"""Numbers in a line of the cache."""
 
 
 @kernel
@@ -50,8 +47,6 @@ def begin_step(sensing: Sensing, run: int, s: int, step: int) -> int:
     if sensing.step[k] != step:
         sensing.step[k] = step
         copy_matrix(sensing.rest[k], sensing.noise[run, s, step])
-        # Other runs come before the next step: nobody else would ask for its noise in time.
-        prefetch(sensing.noise, run, s, step + 1, 0, LINE)
     return k
 
 
@@ -69,19 +64,15 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
 
 @kernel(inlined=True)
 def know_course(state: Simulation, run: int, piece: int) -> int:
-    """Make the course of x in a piece known; returns its place."""
+    """Make the course of x in a piece known; returns its place among those of the run."""
     path, k = state.path, run - state.first_run
-    kept = path.known.shape[1]
-    here: int = piece & (kept - 1)
-    place: int = k * kept + here
+    place: int = piece & (path.known.shape[1] - 1)
     # The same for all nodes that read a part of the piece.
-    if path.known[k, here] != piece:
-        path.known[k, here] = piece
+    if path.known[k, place] != piece:
+        path.known[k, place] = piece
         length, values = path.stop[piece] - path.start[piece], state.scratch.values
-        x_start, cubic = path.x_start[run], path.cubic[run]
-        fill_course(path.course[place], path.table, length, x_start, cubic, piece, values)
-        prefetch(path.cubic, run, piece + 1, 0, LINE)
-        prefetch(path.x_start, run, piece + 1, LINE)
+        x_start, cubic, course = path.x_start[run], path.cubic[run], path.course[k, place]
+        fill_course(course, path.table, length, x_start, cubic, piece, values)
     return place
 
 
@@ -94,7 +85,7 @@ def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, e
     if now == start and end == stop:
         copy_matrix(scratch.state_moments, path.moments[run, piece])
         return
-    course = path.course[know_course(state, run, piece)]
+    course = path.course[run - state.first_run, know_course(state, run, piece)]
     seen, values = scratch.state_moments, scratch.values
     fill_state_moments(state.size, seen, course, now - start, end - now, stop - start, values)
 

@@ -18,14 +18,13 @@ from netkf.engines.compiled.increments import (
     know_course,
     piece_of,
 )
-from netkf.engines.compiled.state import Filters, PathBlock, Sensing, Simulation
+from netkf.engines.compiled.state import Filters, Sensing, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY, Lanes, gather, load, scatter, store, turn, with_spare
-from netkf.linalg.local import local_lanes_vector
+from netkf.linalg.lanes import LANES, MANY, gather, load, scatter, turn, with_spare
 from netkf.linalg.structs import Struct
 from netkf.plants.laws import course_width
-from netkf.plants.paths import fill_moments_between
+from netkf.plants.paths import fill_integrals, fill_moments_between
 from netkf.plants.sensors import divide, fill_reading
 
 
@@ -40,10 +39,10 @@ class LaneReadings(Struct):
     lanes: ``rate``, trace(P G), and ``trace`` of P (1, L).
 
     Of a reading: at which share of a piece it begins, ``first``, and its own ``share``; how long it
-    is, ``gap``, and how long what is ``left`` of the step, seconds (1, L); which ``course`` (L,) of
-    the path it is in; both ``integrals`` up to its begin and its end (2 W, L), with scratch
-    ``rows`` (L, 2 W); the moments ``x`` (2, n, L) of x. Noise: the place ``stream`` (L,) of what is
-    left of the step, ``rest``, ``early`` and ``normals`` (2, p, L).
+    is, ``gap``, and how long what is ``left`` of the step, seconds (1, L); both integrals by lane,
+    ``rows`` (L, 2 W), and all lanes together, ``integrals`` (2 W, L); the moments ``x`` (2, n, L)
+    of x. Noise: the place ``stream`` (L,) of what is left of the step, ``rest``, ``early`` and
+    ``normals`` (2, p, L).
     """
 
     moments: FloatArray
@@ -58,7 +57,6 @@ class LaneReadings(Struct):
     left: FloatArray
     first: FloatArray
     share: FloatArray
-    course: IntArray
     rows: FloatArray
     integrals: FloatArray
     x: FloatArray
@@ -90,7 +88,6 @@ def empty_readings(filters: Filters) -> LaneReadings:
         name: np.full(LANES, -1, dtype=np.int64) for name in ("model", "kind", "stream")
     }
     return LaneReadings(
-        course=np.zeros(LANES, dtype=np.int64),
         **{name: with_spare(shape) for name, shape in shapes.items()},
         **unknown,
         alone=int(several),
@@ -173,31 +170,34 @@ def begin_reading(
     start, stop = path.start[k], path.stop[k]
     if now < start or (now == start and end == stop):
         fill_moments(state, run, piece, now, end)
-        give_moments(path, readings, q, state.scratch.state_moments)
+        give_moments(readings, q, state.scratch.state_moments)
         return
-    readings.first[0, q] = (now - start) / (stop - start)
-    readings.share[0, q] = (end - now) / (stop - start)
-    readings.course[q] = know_course(state, run, k)
+    first, share = (now - start) / (stop - start), (end - now) / (stop - start)
+    readings.first[0, q], readings.share[0, q] = first, share
+    course = path.course[run - state.first_run, know_course(state, run, k)]
+    fill_integrals(readings.rows[q], course, first, first + share)
 
 
 @kernel
-def give_moments(path: PathBlock, readings: LaneReadings, q: int, moments: FloatArray) -> None:
-    """Let lane q have these moments (2, n) of x, of a whole piece or parts of several: it gets a
-    course of its own, that of a piece in which x has them.
+def give_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
+    """Let lane q have these moments (2, n) of x, of a whole piece or parts of several: its
+    integrals are those of a piece in which x has them.
     """
-    # Behind the courses of the runs: one for each lane, of which only the first row is not 0.
-    n, k = moments.shape[1], len(path.course) - LANES + q
-    readings.first[0, q], readings.share[0, q], readings.course[q] = 0.0, 1.0, k
+    rows, n = readings.rows, moments.shape[1]
+    half = rows.shape[1] // 2
+    readings.first[0, q], readings.share[0, q] = 0.0, 1.0
     for i in range(n):
-        path.course[k, 0, i] = moments[0, i]
-        path.course[k, 0, n + i] = 0.5 * (moments[0, i] + moments[1, i])
+        rows[q, i] = rows[q, n + i] = 0.0
+        rows[q, half + i] = moments[0, i]
+        rows[q, half + n + i] = 0.5 * (moments[0, i] + moments[1, i])
 
 
 @kernel
 def end_readings(state: Simulation, readings: LaneReadings) -> None:
     """Write the moments of what all lanes read."""
     r, size, p = readings, state.size, readings.rest.shape[1]
-    fill_integrals_of_lanes(MANY, r, state.path.course)
+    for j in range(0, r.rows.shape[1], LANES):
+        turn(MANY, r.rows, j, r.integrals)
     first, share = load(MANY, r.first, 0), load(MANY, r.share, 0)
     fill_moments_between(MANY, size, r.x, r.integrals, r.rows.shape[1] // 2, first, share)
     rest, streams = state.sensing.rest, r.stream
@@ -208,28 +208,3 @@ def end_readings(state: Simulation, readings: LaneReadings) -> None:
     for j in range(0, 2 * p, LANES):
         scatter(MANY, r.rest, j, rest, streams, 2 * p - j)
     fill_reading(MANY, size, r.moments, 0, p, r.x, r.H, r.early, r.root, 0)
-
-
-@kernel(inlined=True, fused=True)
-def fill_integrals_of_lanes(lanes: Lanes, r: LaneReadings, courses: FloatArray) -> None:
-    """``fill_integrals`` for all lanes at once."""
-    top, width = courses.shape[1] - 1, courses.shape[2]
-    early, late = local_lanes_vector(lanes, lanes, r.rows), local_lanes_vector(lanes, lanes, r.rows)
-    for j in range(0, width, len(lanes)):
-        for q in range(len(lanes)):
-            terms = load(lanes, courses, r.course[q], top, j)
-            store(lanes, early, q, terms)
-            store(lanes, late, q, terms)
-        # Products wait for the ones before them, so that those of all lanes take turns.
-        for d in range(top - 1, -1, -1):
-            for q in range(len(lanes)):
-                first, last = r.first[0, q], r.first[0, q] + r.share[0, q]
-                terms = load(lanes, courses, r.course[q], d, j)
-                store(lanes, early, q, terms + first * load(lanes, early, q))
-                store(lanes, late, q, terms + last * load(lanes, late, q))
-        for q in range(len(lanes)):
-            first, last = r.first[0, q], r.first[0, q] + r.share[0, q]
-            store(lanes, r.rows, q, j, first * load(lanes, early, q))
-            store(lanes, r.rows, q, width + j, last * load(lanes, late, q))
-        turn(lanes, r.rows, j, r.integrals)
-        turn(lanes, r.rows, width + j, r.integrals)

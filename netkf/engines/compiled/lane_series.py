@@ -16,36 +16,23 @@ from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import Filters, filters_at_start
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.lanes import LANES, aligned
-from netkf.linalg.series import NOTHING
+from netkf.linalg.series import MANY_TERMS, NOTHING
 from netkf.linalg.structs import Struct
 from netkf.scenario.scenario import Scenario
 
-FINER, TABLE_BYTES = 8, 1 << 17
-"""Into how many parts a cell of FlowTable is divided at most, and what a table may take. The sums
-wait for the second cache, so that fewer terms are faster than fewer cells.
-"""
 ROUNDING = 2.0**-52
 """Of the largest term of an entry, what may be left out."""
 
 
-BINOMIALS = np.array([[float(math.comb(j, k)) for k in range(64)] for j in range(64)])
-"""``[j, k]`` is binomial(j, k), for as many terms as any series has."""
-CELL_TERMS = 10
-"""About as many as tables have."""
-
-
 class LaneSeries(Struct):
-    """Power series around the middles of K cells: ``series`` (K, T, W) of columns, with so many
-    ``terms`` (K,) as the longest gap in a cell needs, then zeros; entry e of the values is column
-    ``place[e]`` (E,). Cells of model m of FlowTable are ``unit[m]`` seconds long and begin with
-    number ``first[m]``.
+    """Power series around the middles of the cells of FlowTable: ``series`` (M, cells, terms, W) of
+    columns, with as many terms as the longest gap in any cell needs; entry e of the values is
+    column ``place[e]`` (E,). Model m of FlowTable is ``row[m]`` here.
     """
 
     series: FloatArray
-    terms: IntArray
     place: IntArray
-    first: IntArray
-    unit: FloatArray
+    row: IntArray
 
 
 @once_per_scenario
@@ -124,61 +111,26 @@ def padded_gains(filters: Filters) -> FloatArray:
 
 
 def _united(series: FloatArray, unit: FloatArray, mine: np.ndarray) -> LaneSeries:
-    """The table of series (M, cells, terms, E) of cells of ``unit`` (M,) seconds, of the models
-    that are ``mine``: each column once, finer cells, and no more terms than those need.
+    """The table of series (M, cells, terms, E), of the models that are ``mine``, with each column
+    once and no more terms than cells of ``unit`` (M,) seconds need.
     """
+    terms = terms_needed(series, unit)
+    series = series[:, :, :terms]
     found: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.
     columns = np.ascontiguousarray(np.moveaxis(series, -1, 0)) + 0.0
     place = np.array([found.setdefault(column.tobytes(), len(found)) for column in columns])
     first = np.unique(place, return_index=True)[1]
-    # Whole lanes, see series.fill_columns.
-    (models, cells), width = series.shape[:2], -(-len(first) // LANES) * LANES
-    parts = FINER
-    while parts > 1 and models * cells * parts * CELL_TERMS * width * 8 > TABLE_BYTES:
-        parts //= 2
-    fine, unit = finer(series[..., first], unit, parts), unit / parts
-    terms = terms_needed(fine, unit).reshape(-1)
-    most = int(terms.max(initial=1))
-    # What a cell does not need is exactly 0: its sums have the same bits with any number of terms.
-    needed = np.arange(most) < terms[:, None]
-    made: FloatArray = aligned((len(terms), most, width))
-    made[..., : len(first)] = fine[:, :, :most].reshape(-1, most, len(first)) * needed[..., None]
-    models_before = np.cumsum(mine) - 1
-    return LaneSeries(
-        series=made,
-        terms=terms,
-        place=place.astype(np.int64),
-        first=cells * parts * models_before,
-        unit=np.append(unit, 1.0)[np.where(mine, models_before, -1)],
-    )
+    # Whole lanes, see series.fill_row.
+    width = -(-len(first) // LANES) * LANES
+    made: FloatArray = aligned((*series.shape[:2], terms, width))
+    made[:, :, : series.shape[2], : len(first)] = np.moveaxis(columns[first], 0, -1)
+    return LaneSeries(series=made, place=place.astype(np.int64), row=np.cumsum(mine) - 1)
 
 
-def finer(series: FloatArray, unit: FloatArray, parts: int) -> FloatArray:
-    """Series (M, cells, terms, E) of cells of ``unit`` (M,) seconds as those of cells a number of
-    ``parts`` shorter.
-    """
-    models, cells, terms, entries = series.shape
-    if parts == 1:
-        return series
-    # Middles of the new cells, in old ones, from the middle of the old cell.
-    away = np.tile((np.arange(parts) + 0.5) / parts - 0.5, (cells, 1))
-    # The first cell is expanded at 0, and so is the first of its parts.
-    away[0] += 0.5
-    away[0, 0] = 0.0
-    made = np.empty((models, cells, parts, terms, entries))
-    for m in range(models):
-        powers = (away * unit[m])[..., None] ** np.arange(terms)
-        # Coefficient k of the shifted series: sum over j >= k of binomial(j, k) away^(j - k) c_j.
-        for k in range(terms):
-            weights = BINOMIALS[k:terms, k] * powers[..., : terms - k]
-            made[m, :, :, k] = weights @ series[m, :, k:]
-    return made.reshape(models, cells * parts, terms, entries)
-
-
-def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
-    """Numbers of terms (M, cells) after which no entry has more than rounding left at the ends of a
-    cell, 1 at least.
+def terms_needed(series: FloatArray, unit: FloatArray) -> int:
+    """Number of terms after which no entry has more than rounding left at the ends of its cell, one
+    that ``series.fill_row`` adds up fast if there is one.
     """
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     spans = np.repeat(0.5 * unit[:, None], series.shape[1], axis=1)
@@ -187,5 +139,5 @@ def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
     left = np.cumsum(sizes[:, :, ::-1], axis=2)[:, :, ::-1]
     largest = sizes.max(axis=2, keepdims=True)
     most = ROUNDING * largest + NOTHING * largest.max(axis=3, initial=0.0, keepdims=True)
-    needed = (left > most).any(axis=3).sum(axis=2)
-    return np.asarray(np.maximum(needed, 1), dtype=np.int64)
+    needed = int((left > most).any(axis=(0, 1, 3)).sum())
+    return next((terms for terms in MANY_TERMS if terms >= needed), max(needed, series.shape[2]))

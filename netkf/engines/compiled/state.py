@@ -136,10 +136,9 @@ class PathBlock(Struct):
     K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both
     (R, K, n), moments (R, K, 2, n), cubic (R, K, 4, n), whose step (K,) it is and where that ends
     (K,); ``grid`` holds the times at which sensors wake; ``table`` is the
-    course_table of the plant's laws. The ``course`` (G C + L, D, W) of x in some pieces: those that
+    course_table of the plant's laws. The ``course`` (G, C, D, W) of x in some pieces: those that
     are ``known`` (G, C), each at the remainder of its number, of the G runs that are simulated
-    together; then one for each lane, see lane_readings. Where nothing senses increments there is
-    one piece without an end.
+    together. Where nothing senses increments there is one piece without an end.
     """
 
     end: float

@@ -47,9 +47,9 @@ from netkf.engines.compiled.lane_series import (
 from netkf.engines.compiled.state import Filters, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY, gather, load, scatter, store, with_spare
+from netkf.linalg.lanes import LANES, MANY, gather, load, scatter, store, turn, with_spare
 from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
-from netkf.linalg.series import fill_columns
+from netkf.linalg.series import fill_row
 from netkf.linalg.structs import Struct
 
 MOST_VISITS = 1 << 14
@@ -74,7 +74,9 @@ STRETCH = np.dtype(
 """The node at a place has come to ``now`` on its way to a visit, see ``next_stretch``."""
 
 
-LANE = np.dtype([("visit", np.int64), ("now", float), ("end", float)])
+LANE = np.dtype(
+    [*((name, np.int64) for name in ("visit", "model")), ("now", float), ("end", float)]
+)
 """A prediction from ``now`` to ``end`` on the way to a visit."""
 
 
@@ -114,9 +116,8 @@ class Visits(Struct):
     in_lanes: FloatArray
     blind: LaneSeries
     sensing: LaneSeries
-    cells: IntArray
-    since: FloatArray
-    rows: FloatArray
+    blind_rows: FloatArray
+    sensing_rows: FloatArray
     readings: LaneReadings
     columns: FloatArray
     values: FloatArray
@@ -151,9 +152,10 @@ def empty_visits(
         **dict.fromkeys(("S", "other_S", "V", "T"), (n, n, LANES)),
         "in_lanes": (8, LANES),
     }
-    width = max(blind.series.shape[2], sensing.series.shape[2])
-    shapes |= {"columns": (width, LANES), "rows": (LANES, width)}
-    shapes |= {"values": (n * (n + 1) + 2 * n * n, LANES), "since": (2, LANES)}
+    for name, lane_table in (("blind", blind), ("sensing", sensing)):
+        shapes[f"{name}_rows"] = (LANES, lane_table.series.shape[3])
+    width = max(blind.series.shape[3], sensing.series.shape[3])
+    shapes |= {"columns": (width, LANES), "values": (n * (n + 1) + 2 * n * n, LANES)}
     nodes = filters.nodes
     model = np.where(nodes["sensors"] > nodes["sensor"], SENSES, nodes["model"])
     return Visits(
@@ -169,8 +171,6 @@ def empty_visits(
         lanes=np.zeros((2, LANES), dtype=LANE),
         places=np.zeros((2, LANES), dtype=np.int64),
         hearing=np.zeros((2, LANES), dtype=np.int64),
-        # Lanes that nobody uses have some cell too.
-        cells=np.zeros((2, LANES), dtype=np.int64),
         known=np.full((2, LANES), UNKNOWN, dtype=np.int64),
         blind=blind,
         sensing=sensing,
@@ -281,7 +281,7 @@ def join(state: Simulation, visits: Visits, v: int, place: int) -> None:
         return
     q = visits.waiting
     visits.waiting = q + 1
-    use_lane(visits, visits.blind, BLIND, q, place, v, m, now, visit.time)
+    use_lane(visits, BLIND, q, place, v, m, now, visit.time)
     if q + 1 == LANES:
         predict_blind(state, visits)
 
@@ -349,7 +349,7 @@ def begin_stretch(state: Simulation, visits: Visits, q: int) -> None:
     m, time = state.nodes[h].model, visit.time
     end, least = next_stretch(readings.rate[0, q], now, time, stretch.least)
     if is_quick(state.table, m, end - now, readings.trace[0, q]):
-        use_lane(visits, visits.sensing, SENSING, q, place, v, m, now, end)
+        use_lane(visits, SENSING, q, place, v, m, now, end)
     else:
         visits.places[SENSING, q] = NOBODY
         use_stretch(state, visit.run, h, place, visit.piece, now, end)
@@ -359,24 +359,14 @@ def begin_stretch(state: Simulation, visits: Visits, q: int) -> None:
 
 @kernel(inlined=True)
 def use_lane(
-    visits: Visits,
-    series: LaneSeries,
-    kind: int,
-    q: int,
-    place: int,
-    v: int,
-    m: int,
-    now: float,
-    end: float,
+    visits: Visits, kind: int, q: int, place: int, v: int, m: int, now: float, end: float
 ) -> None:
-    """Give a node at a place, with model ``m``, lane q among those of its kind, which have the
-    ``series``, for its prediction from ``now`` to ``end``.
+    """Give a node at a place, with model ``m``, lane q among those of its kind, for its prediction
+    from ``now`` to ``end``.
     """
     lane = visits.lanes[kind, q]
-    lane.visit, lane.now, lane.end = v, now, end
+    lane.visit, lane.model, lane.now, lane.end = v, m, now, end
     visits.places[kind, q] = place
-    cell, since = cell_of(series.unit[m], end - now)
-    visits.cells[kind, q], visits.since[kind, q] = series.first[m] + cell, since
 
 
 @kernel
@@ -384,8 +374,7 @@ def read_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
     """Write the moments of the readings of the nodes in lanes."""
     places, readings = visits.places[SENSING], visits.readings
     for q in range(LANES):
-        # Lanes that nobody uses have some course too, of these runs.
-        readings.stream[q], readings.course[q] = NOBODY, 0
+        readings.stream[q] = NOBODY
     for q in range(count):
         if places[q] == NOBODY:
             continue
@@ -431,8 +420,11 @@ def predict_blind(state: Simulation, visits: Visits) -> None:
     if count == 0:
         return
     visits.waiting = 0
+    # What lanes do alone goes from lane to lane in short loops: a processor overlaps their turns.
+    for q in range(count):
+        fill_lane(state, visits, BLIND, q, visits.blind, visits.blind_rows)
     take_states(state, places, count, visits.x, visits.S)
-    sum_series(visits, visits.blind, BLIND)
+    turn_rows(visits.blind_rows, visits.columns)
     spread_columns(visits.columns, visits.blind.place, 0, width_of(n, False), visits.values)
     predict_lanes(state, visits, False)
     put_states(state, places, visits.x, visits.S)
@@ -442,8 +434,11 @@ def predict_blind(state: Simulation, visits: Visits) -> None:
 def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
     """Predict the nodes with sensors in lanes, whose states are there, and use their readings."""
     places = visits.places[SENSING]
+    for q in range(count):
+        if places[q] != NOBODY:
+            fill_lane(state, visits, SENSING, q, visits.sensing, visits.sensing_rows)
     read_in_lanes(state, visits, count)
-    sum_series(visits, visits.sensing, SENSING)
+    turn_rows(visits.sensing_rows, visits.columns)
     width = width_of(len(state.size), True)
     spread_columns(visits.columns, visits.sensing.place, 0, width, visits.values)
     spread_columns(visits.columns, visits.sensing.place, width, len(visits.gains), visits.gains)
@@ -454,11 +449,20 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
 
 
 @kernel
-def sum_series(visits: Visits, series: LaneSeries, kind: int) -> None:
-    """Write what the series of lanes of a kind give for their gaps into ``columns``."""
-    cells, since = visits.cells[kind], visits.since[kind]
-    table, terms = series.series, series.terms
-    fill_columns(MANY, visits.columns, table, terms, cells, since, visits.rows)
+def fill_lane(
+    state: Simulation, visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
+) -> None:
+    """Write what the series of the model in a lane give for its gap into its row."""
+    lane = visits.lanes[kind, q]
+    cell, since = cell_of(state.table.unit[lane.model], lane.end - lane.now)
+    fill_row(rows, q, series.series, series.row[lane.model], cell, since)
+
+
+@kernel
+def turn_rows(rows: FloatArray, out: FloatArray) -> None:
+    """Write rows (L, W) as (W, L)."""
+    for j in range(0, rows.shape[1], LANES):
+        turn(MANY, rows, j, out)
 
 
 @kernel
