@@ -152,27 +152,6 @@ def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_typed(names.prefetch)
-def _prefetch(_array: Any, *_place: Any) -> Any:
-    return types.none
-
-
-@lower_builtin(names.prefetch, types.VarArg(types.Any))
-def lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """A hint, to read, into all caches."""
-    places = [
-        context.cast(builder, value, number, types.intp)
-        for value, number in zip(args[1:], sig.args[1:], strict=True)
-    ]
-    pointer = builder.bitcast(
-        entry_pointer(builder, sig.args[0], args[0], places), BYTE.as_pointer()
-    )
-    kinds = ir.FunctionType(ir.VoidType(), [pointer.type, I32, I32, I32])
-    hint = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0i8")
-    builder.call(hint, [pointer, I32(0), I32(3), I32(1)])
-    return context.get_dummy_value()
-
-
 @_typed(names.turn)
 def _turn(_lanes: Any, _rows: Any, _column: Any, _out: Any) -> Any:
     return types.none

@@ -104,13 +104,6 @@ def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
     raise _only_in_kernels()
 
 
-def prefetch(array: FloatArray, *place: int) -> None:
-    """Ask for the line of the cache that ``array[place]`` is in, which will be wanted soon. The
-    place need not exist.
-    """
-    raise _only_in_kernels()
-
-
 def spread(lanes: Lanes, number: float) -> Any:
     """Return a number in all lanes as one value."""
     raise _only_in_kernels()
