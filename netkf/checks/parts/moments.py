@@ -49,8 +49,10 @@ class NoiseMoments(NamedTuple):
     before it (d, d), of which there are ``pairs`` (d, d); how many of each lie in the ``cells``
     (CELLS, d), which standard normal numbers fill evenly; and sums of z^4, ``fourth`` (d,).
 
-    further  : (FURTHER, 2, d) number and sum of products of each entry with itself two and more
-        noises before
+    squares  : (3, d, d) sums of z_i^2 where z_j was there too; of z_i^2 where z_j was there before;
+        and of that z_j^2
+    further  : (FURTHER, 4, d) number and sum of products of each entry with itself two and more
+        noises before, and of the squares of both
     sizes    : (5, d) number of pairs of neighbours, and sums over them of r, of the r before, of
         r^2 and of their products, r the rank of |z| among those of standard normal numbers
     variance : (PARTS, 2) number and sum of z^2 of all entries in each part of the series
@@ -65,6 +67,7 @@ class NoiseMoments(NamedTuple):
     pairs: FloatArray
     cells: FloatArray
     fourth: FloatArray
+    squares: FloatArray
     further: FloatArray
     sizes: FloatArray
     variance: FloatArray
@@ -79,7 +82,16 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
     there = known.astype(float)
     z = np.where(known, z, 0.0)
     rank = np.where(known, 2.0 * scipy.special.ndtr(np.abs(z)) - 1.0, 0.0)
-    later = [(there[k:] * there[:-k], z[k:] * z[:-k]) for k in range(2, FURTHER + 2)]
+    square = z**2
+    later = [
+        [
+            there[k:] * there[:-k],
+            z[k:] * z[:-k],
+            square[k:] * there[:-k],
+            there[k:] * square[:-k],
+        ]
+        for k in range(2, FURTHER + 2)
+    ]
     parts = zip(np.array_split(there, PARTS), np.array_split(z, PARTS), strict=True)
     shown = np.zeros((len(z), 0, z.shape[1])) if states is None else np.nan_to_num(states)
     number, added = (there[:, None] * (shown != 0.0)).sum(axis=0), (z[:, None] * shown).sum(axis=0)
@@ -91,7 +103,8 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
         there[1:].T @ there[:-1],
         count_cells(scipy.special.ndtr(z), known),
         (z**4).sum(axis=0),
-        np.array([[pairs.sum(axis=0), products.sum(axis=0)] for pairs, products in later]),
+        np.array([square.T @ there, square[1:].T @ there[:-1], there[1:].T @ square[:-1]]),
+        np.array([[sums.sum(axis=0) for sums in lag] for lag in later]),
         np.array(
             [
                 (there[1:] * there[:-1]).sum(axis=0),
@@ -262,7 +275,7 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
 
 def _between(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
     """Yield correlation, count and label of all pairs of entries."""
-    related = _correlations(found, found.second, found.together)
+    related = _correlations(found.second, found.squares[0], found.squares[0].T)
     for i in range(len(labels)):
         for j in range(i):
             yield float(related[i, j]), float(found.together[i, j]), f"{labels[j]} and {labels[i]}"
@@ -270,7 +283,7 @@ def _between(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, fl
 
 def _in_time(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
     """Yield correlation, count and label of all entries with all entries just before."""
-    related = _correlations(found, found.lagged, found.pairs)
+    related = _correlations(found.lagged, *found.squares[1:])
     for i, label in enumerate(labels):
         for j, before in enumerate(labels):
             pairs = float(found.pairs[i, j])
@@ -281,14 +294,11 @@ def _in_size(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, fl
     """Yield correlation, count and label of each entry with itself some noises before, and of its
     size with that just before.
     """
-    count, square = np.diagonal(found.together), np.diagonal(found.second)
+    count, *sums = np.moveaxis(found.further, 1, 0)
+    related = _correlations(*sums)
     for i, label in enumerate(labels):
-        if not square[i] > 0.0:
-            continue
-        for k, (pairs, products) in enumerate(found.further[:, :, i].tolist()):
-            if pairs:
-                value = products / pairs * count[i] / square[i]
-                yield float(value), pairs, f"{label} and itself {k + 2} before"
+        for k in range(FURTHER):
+            yield float(related[k, i]), float(count[k, i]), f"{label} and itself {k + 2} before"
         pairs, after, before, square_, products = found.sizes[:, i].tolist()
         spread = pairs * square_ - after**2
         if pairs >= MIN_COUNT_OF_ANY_LAW and spread > 0.0:
@@ -296,11 +306,12 @@ def _in_size(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, fl
             yield float(value), pairs, f"the size of {label} and of that just before"
 
 
-def _correlations(found: NoiseMoments, products: FloatArray, counts: FloatArray) -> FloatArray:
-    """Return correlations (d, d) from sums of products of so many pairs; 0 without any."""
+def _correlations(products: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return correlations from sums of products and of the squares of both, of the same pairs: few
+    pairs may be larger than all noises are. 0 without any.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
-        size = np.sqrt(np.diagonal(found.second) / np.diagonal(found.together))
-        return np.asarray(np.nan_to_num(products / counts / np.outer(size, size)))
+        return np.asarray(np.nan_to_num(products / np.sqrt(one * other)))
 
 
 def with_best(
