@@ -36,6 +36,15 @@ def section(heading):
     return re.split(r"^##", rest, flags=re.MULTILINE)[0]
 
 
+def rows(family):
+    """The rows of the table of a family by the names of registry.KINDS, which say the key and its
+    value where several classes share a kind.
+    """
+    start = re.compile(r'^\| `([^`]+)`(?: with `(\w+) = "([^"]+)"`)?')
+    found = filter(None, map(start.match, section(HEADINGS[family]).splitlines()))
+    return {one[1] + (f" {one[2]}={one[3]}" if one[2] else ""): one.string for one in found}
+
+
 def described():
     for family in HEADINGS:
         for kind, cls in KINDS[family].items():
@@ -44,9 +53,7 @@ def described():
 
 @pytest.mark.parametrize(("family", "kind", "cls"), list(described()))
 def test_every_kind_and_key_is_described(family, kind, cls):
-    lines = section(HEADINGS[family]).splitlines()
-    row = next((line for line in lines if line.startswith(f"| `{kind}`")), None)
-    assert row is not None, f"{kind} has no row"
+    row = rows(family)[kind]
     keys = {field.name for field in dataclasses.fields(cls) if field.init}
     for key in keys - (OF_NETWORKS if family == "sampling" else set()):
         assert f"`{key}`" in row, f"the row of {kind} does not mention {key}"
@@ -59,9 +66,8 @@ def test_every_family_has_a_section():
 
 
 def test_no_kind_is_described_that_does_not_exist():
-    for family, heading in HEADINGS.items():
-        named = re.findall(r"^\| `([^`]+)`", section(heading), flags=re.MULTILINE)
-        assert sorted(named) == sorted(KINDS[family])
+    for family in HEADINGS:
+        assert sorted(rows(family)) == sorted(KINDS[family])
 
 
 def test_shared_keys_columns_options_and_names_are_mentioned():

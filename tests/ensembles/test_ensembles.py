@@ -387,25 +387,26 @@ def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
     monkeypatch.setattr(pools, "cores", lambda: 2)
     monkeypatch.setattr(pools, "SAVING", SAVING)
     short = ring.replace({"horizon": 2.0})
-    here = netkf.monte_carlo(short, 200)
-    assert here.runs.max() == 200
+    # More than the first block.
+    here = netkf.monte_carlo(short, 2600)
+    assert here.runs.max() == 2600
     with pytest.raises(AssertionError, match="2 processes were started"):
-        netkf.monte_carlo(short, 200, workers=2)
+        netkf.monte_carlo(short, 2600, workers=2)
     for name in ("WARM", "SAVING"):
         monkeypatch.setattr(pools, name, 0.0)
     with pytest.raises(AssertionError, match="2 processes were started"):
-        netkf.monte_carlo(short, 200)
+        netkf.monte_carlo(short, 2600)
 
 
 @pytest.mark.parametrize("done", [0, 1, 3])
 def test_bits_do_not_depend_on_when_processes_start(short, monkeypatch, done):
     """After so many blocks in this process."""
-    alone, blocks = netkf.monte_carlo(short, 300, workers=1), []
+    alone, blocks = netkf.monte_carlo(short, 2600, workers=1), []
     monkeypatch.setattr(pools, "cores", lambda: 2)
     monkeypatch.setattr(
         pools.AdaptivePool, "_worth_processes", lambda *_: blocks.append(0) or len(blocks) > done
     )
-    assert_same_bits(netkf.monte_carlo(short, 300), alone)
+    assert_same_bits(netkf.monte_carlo(short, 2600), alone)
     assert len(blocks) == done + 1
 
 
