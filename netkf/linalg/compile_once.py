@@ -9,10 +9,16 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+MAX_WAIT, POLL = 60.0, 0.02
+"""Seconds that a process waits for another one that compiles, several times what that takes; and
+after which it looks again.
+"""
 
 
 class SharedCache:
@@ -64,7 +70,8 @@ class SharedCache:
             _wait_for(opened)
             yield
         finally:
-            # The lock ends with the file, and with the process.
+            # The lock would end with the file, were that not open in a process forked meanwhile.
+            _unlock(opened)
             os.close(opened)
 
 
@@ -73,12 +80,28 @@ if sys.platform == "win32":
     def _wait_for(opened: int) -> None:
         """Windows has no lock that waits: each process compiles for itself."""
 
+    def _unlock(opened: int) -> None:
+        """Nothing was locked."""
+
 else:
     import fcntl
 
     def _wait_for(opened: int) -> None:
-        """Wait until no other process has the file locked; some file systems have no locks."""
-        try:
-            fcntl.flock(opened, fcntl.LOCK_EX)
-        except OSError:
-            return
+        """Lock the file, once no other process has it locked; some file systems have no locks. A
+        process that was stopped while it compiled is not waited for: MAX_WAIT seconds at most.
+        """
+        end = time.monotonic() + MAX_WAIT
+        while time.monotonic() < end:
+            try:
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(POLL)
+            except OSError:
+                return
+            else:
+                return
+
+    def _unlock(opened: int) -> None:
+        """Let other processes have the file."""
+        with suppress(OSError):
+            fcntl.flock(opened, fcntl.LOCK_UN)

@@ -4,6 +4,7 @@ import threading
 
 import pytest
 
+from netkf.linalg import compile_once
 from netkf.linalg.compile_once import SharedCache
 
 
@@ -59,6 +60,23 @@ def test_the_second_waits_for_the_first_and_uses_its_code(tmp_path):
     for thread in (first, second):
         thread.join(10.0)
     assert done == ["float64", "int64"]
+
+
+def test_who_was_stopped_while_it_compiled_is_not_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(compile_once, "MAX_WAIT", 0.1)
+    disk, done = Disk(tmp_path), []
+    began, go_on = threading.Event(), threading.Event()
+
+    def stopped(sig):
+        began.set()
+        assert go_on.wait(10.0)
+
+    first = start(disk, "float64", stopped)
+    assert began.wait(10.0)
+    make(disk, "float64", done.append)
+    assert done == ["float64"]
+    go_on.set()
+    first.join(10.0)
 
 
 def test_no_entry_of_the_index_is_lost(tmp_path):
