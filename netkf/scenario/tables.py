@@ -202,7 +202,10 @@ def _plant(value: Any, origin: Origin) -> Any:
     return _kind("continuous plant" if continuous else "plant", origin, table)
 
 
-def _kind(family: str, origin: Origin, value: Any, default: str | None = None) -> Any:
+def _kind(
+    family: str, origin: Origin, value: Any, default: str | None = None, inner: bool = False
+) -> Any:
+    """Read a part by its kind; an ``inner`` one stands inside another of its family."""
     table = _table(value)
     kind = table.pop("kind", default)
     if kind is None:
@@ -212,10 +215,10 @@ def _kind(family: str, origin: Origin, value: Any, default: str | None = None) -
     others = ("kind", *dict.fromkeys(keys))
     for key in others[1:]:
         del table[key]
-    if family == "filter":
+    if family == "filter" and not inner:
         others = (*others, "mean", "cov", "model")
-    if isinstance(table.get("inner"), (Mapping, Component)):
-        table["inner"] = _under("inner", partial(_kind, family, origin), table["inner"])
+    if family == "filter" and isinstance(table.get("inner"), (Mapping, Component)):
+        table["inner"] = _under("inner", partial(_kind, family, origin, inner=True), table["inner"])
     return WAITING if cls is None else _part(cls, table, origin, others)
 
 
