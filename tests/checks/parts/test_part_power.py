@@ -11,7 +11,15 @@ import pytest
 from netkf.checks.exact import _length_interval
 from netkf.checks.parts.clock_rows import _count_interval, largest_correlation
 from netkf.checks.parts.events import FateCounts, PairCounts, reversed_directions
-from netkf.checks.parts.moments import CELLS, compare_cells, correlation_interval
+from netkf.checks.parts.moments import (
+    CELLS,
+    _between,
+    _in_size,
+    _in_time,
+    compare_cells,
+    correlation_interval,
+    moments,
+)
 from netkf.checks.parts.network_rows import (
     _bursts,
     _losses_apart,
@@ -203,3 +211,22 @@ def test_parts_of_runs_with_few_messages_accuse_nobody(mean):
     assert accused < 18
     same = np.repeat(excess[:, :1], 2, axis=1)
     assert _mean_correlation(same, sent * q * (1.0 - q), level).low > 0.0
+
+
+def test_correlations_of_noises_are_those_of_the_pairs_that_are_there():
+    random = np.random.default_rng(11)
+    z = random.standard_normal((30, 2)) * np.linspace(0.2, 5.0, 30)[:, None]
+    z[random.random(30) < 0.3, 0] = z[random.random(30) < 0.3, 1] = np.nan
+
+    def expected(a, b):
+        a, b = (one[np.isfinite(a) & np.isfinite(b)] for one in (a, b))
+        return (a @ b) / math.sqrt((a @ a) * (b @ b)), len(a)
+
+    found = moments(z)
+    seen = [one[:2] for one in (*_between(found, ["a", "b"]), *_in_time(found, ["a", "b"]))]
+    pairs = [(z[:, 1], z[:, 0]), *((z[1:, i], z[:-1, j]) for i in (0, 1) for j in (0, 1))]
+    np.testing.assert_allclose(seen, [expected(a, b) for a, b in pairs], rtol=1e-12)
+    lags = [(i, k) for i in (0, 1) for k in (2, 3, 4)]
+    seen = [one[:2] for one in _in_size(found, ["a", "b"])][: len(lags)]
+    assert len(seen) == len(lags)
+    np.testing.assert_allclose(seen, [expected(z[k:, i], z[:-k, i]) for i, k in lags], rtol=1e-12)
