@@ -26,9 +26,8 @@ from netkf.figures.subject import Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.schema import CODES
 
-GRID = 1200
-GOLDEN = 0.6180339887498949
-"""Offsets by multiples of it are spread evenly, so that periodic clocks show no false beats."""
+AGE_BINS = 160
+AGE_LEVELS = 400
 MAX_DIRECTIONS = 40
 MAX_MARKS = 3000
 CONFIDENCE = 0.95
@@ -44,69 +43,120 @@ def freshest(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
     return heard["t"], sent
 
 
-def age_at(times: FloatArray, heard: FloatArray, sent: FloatArray) -> FloatArray:
-    """Return the age of information (T,) at ``times``: the time since the freshest message that was
-    heard by then was sent; since time 0 before the first one.
+class Ages(NamedTuple):
+    """Age of information of a node as a sawtooth: segments between ``start`` and ``stop`` (K,),
+    seconds, in which it grows from ``low`` to ``low + stop - start``.
     """
-    last = np.searchsorted(heard, times, side="right") - 1
-    origin = np.where(last >= 0, sent[np.maximum(last, 0)], 0.0) if len(sent) else 0.0
-    return np.asarray(times - origin)
+
+    start: FloatArray
+    stop: FloatArray
+    low: FloatArray
+
+    def mean(self, edges: FloatArray) -> FloatArray:
+        """Return the time averages (B,) between ``edges`` (B + 1,), which begin at time 0."""
+        length = self.stop - self.start
+        before = np.concatenate([[0.0], np.cumsum(length * (self.low + 0.5 * length))])
+        k = np.clip(np.searchsorted(self.start, edges, side="right") - 1, 0, None)
+        gone = edges - self.start[k]
+        return np.asarray(np.diff(before[k] + gone * (self.low[k] + 0.5 * gone)) / np.diff(edges))
+
+    def largest(self, edges: FloatArray) -> FloatArray:
+        """Return the largest age (B,) between ``edges`` (B + 1,)."""
+        # An age is largest where a segment ends, or the bin.
+        last = np.searchsorted(self.start, edges[1:], side="left") - 1
+        found = self.low[last] + edges[1:] - self.start[last]
+        bins = np.clip(np.searchsorted(edges, self.stop, side="left") - 1, 0, len(found) - 1)
+        np.maximum.at(found, bins, self.low + self.stop - self.start)
+        return np.asarray(found)
+
+    def time_above(self, levels: FloatArray) -> FloatArray:
+        """Return for how many seconds the age is above each of the ``levels`` (L,)."""
+        top = self.low + self.stop - self.start
+        # Seconds above a level: sums of (top - level) where that is positive, less the same of low.
+        return _excess(top, levels) - _excess(self.low, levels)
+
+
+def _excess(values: FloatArray, levels: FloatArray) -> FloatArray:
+    """Return the sum of ``max(0, value - level)`` over the values (K,) for each level (L,)."""
+    ordered = np.sort(values)[::-1]
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    above = len(ordered) - np.searchsorted(ordered[::-1], levels, side="right")
+    return np.asarray(sums[above] - above * levels)
+
+
+def ages_of(log: np.ndarray, node: int, end: float) -> Ages:
+    """Return the age of information of a node up to ``end``: the time since the freshest message
+    that it has heard was sent; since time 0 before the first one.
+    """
+    heard, sent = freshest(log, node)
+    before = heard < end
+    start = np.concatenate([[0.0], heard[before]])
+    stop = np.concatenate([heard[before], [end]])
+    return Ages(start, stop, start - np.concatenate([[0.0], sent[before]]))
 
 
 def age_figure(subject: Subject) -> Picture:
-    """Draw the age of information over time, quantiles over the nodes, and its mean per node."""
-    log = subject.log
+    """Draw the age of information over time, means and maxima over the nodes, and its law."""
     end = _end(subject)
-    positions = np.arange(GRID)
-    grid = end * (positions + positions * GOLDEN % 1.0) / GRID
-    receivers = [node for node in subject.nodes if subject.scenario.topology.degrees.get(node, 0)]
-    ages = {node: age_at(grid, *freshest(log, node)) for node in receivers}
-    if not ages:
+    degrees = subject.scenario.topology.degrees
+    receivers = [node for node in subject.nodes if degrees.get(node, 0)]
+    if not receivers:
         raise UnavailableError("No node can hear another one.")
-    values = np.array(list(ages.values()))
+    ages = [ages_of(subject.log, node, end) for node in receivers]
+    means = np.array([float(each.mean(np.array([0.0, end]))[0]) for each in ages])
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.6, 1.0])
-    _draw_ages(left, grid, values)
-    _draw_age_law(right, values)
-    means = {node: float(age.mean()) for node, age in ages.items()}
-    worst = max(means, key=lambda node: means[node])
-    claim = f"On average the freshest message that a node has heard is {values.mean():.3g} s old"
+    _draw_ages(left, np.linspace(0.0, end, AGE_BINS + 1), ages)
+    _draw_age_law(right, ages, means, end)
+    worst = int(means.argmax())
+    claim = f"On average the freshest message that a node has heard is {means.mean():.3g} s old"
     if len(means) > 1:
-        claim += f"; node {worst} waits longest, {means[worst]:.3g} s"
-    note = "Age of information: time since the freshest message that a node has heard was sent."
+        claim += f"; node {receivers[worst]} waits longest, {means[worst]:.3g} s"
+    note = (
+        "Age of information: time since the freshest message that a node has heard was sent. "
+        f"Left: means and maxima over {end / AGE_BINS:.3g} s."
+    )
     finish_figure(figure, subject.claim(claim), subject.caption(note))
     return figure
 
 
-def _draw_ages(axes: Any, grid: FloatArray, values: FloatArray) -> None:
-    if len(values) > 1:
-        low, median, high = np.quantile(values, (0.05, 0.5, 0.95), axis=0)
-        axes.fill_between(grid, low, high, color=SKY, alpha=0.5, lw=0, label="90% of nodes")
-        axes.plot(
-            grid, values.max(axis=0), color=SENSING, ls="--", lw=1.0, label="worst node at the time"
-        )
-        axes.plot(grid, median, color=INK, lw=1.2, label="median node")
+def _draw_ages(axes: Any, edges: FloatArray, ages: list[Ages]) -> None:
+    # Ages are sawtooths: instants of a grid would beat with the clocks, means over bins do not.
+    centres = 0.5 * (edges[:-1] + edges[1:])
+    means = np.array([each.mean(edges) for each in ages])
+    largest = np.max([each.largest(edges) for each in ages], axis=0)
+    if len(ages) > 1:
+        low, median, high = np.quantile(means, (0.05, 0.5, 0.95), axis=0)
+        axes.fill_between(centres, low, high, color=SKY, alpha=0.5, lw=0, label="90% of nodes")
     else:
-        axes.plot(grid, values[0], color=INK, lw=1.2, label="the node that hears others")
+        median = means[0]
+    words = ("worst node", "median node") if len(ages) > 1 else ("the node", "the node")
+    label = f"{words[0]}, at its worst moment"
+    axes.plot(centres, largest, color=SENSING, ls="--", lw=1.0, label=label)
+    axes.plot(centres, median, color=INK, lw=1.2, label=f"{words[1]}, on average")
     axes.set(xlabel=SECONDS, ylabel="age of information, seconds")
-    axes.set_ylim(0.0, 1.05 * max(float(values.max()), 1e-12))
+    axes.set_ylim(0.0, 1.05 * max(float(largest.max()), 1e-12))
     draw_legend(axes)
 
 
-def _draw_age_law(axes: Any, values: FloatArray) -> None:
+def _draw_age_law(axes: Any, ages: list[Ages], means: FloatArray, end: float) -> None:
     """Draw the share of time for which the age exceeds a value: of all nodes, best and worst."""
-    means = values.mean(axis=1)
-    rows: list[tuple[FloatArray, str, str, str]] = [(values.ravel(), INK, "-", "all nodes")]
-    if len(values) > 1:
+    levels = np.linspace(
+        0.0, max(float((a.low + a.stop - a.start).max()) for a in ages), AGE_LEVELS
+    )
+    shares = np.array([each.time_above(levels) for each in ages]) / end
+    rows: list[tuple[FloatArray, str, str, str]] = [(shares.mean(axis=0), INK, "-", "all nodes")]
+    if len(ages) > 1:
         rows += [
-            (values[int(means.argmax())], SENSING, "--", "worst node"),
-            (values[int(means.argmin())], EXACT, "-.", "best node"),
+            (shares[int(means.argmax())], SENSING, "--", "worst node"),
+            (shares[int(means.argmin())], EXACT, "-.", "best node"),
         ]
-    for sample, colour, dashes, label in rows:
-        x = np.sort(sample)
-        axes.plot(x, 1.0 - np.arange(len(x)) / len(x), color=colour, ls=dashes, label=label)
+    least = 1e-4
+    for share, colour, dashes, label in rows:
+        shown = share > 0.1 * least
+        axes.plot(levels[shown], share[shown], color=colour, ls=dashes, label=label)
     axes.set_yscale("log")
-    axes.set_ylim(1.0 / values.shape[1], 1.3)
+    axes.set_ylim(least, 1.3)
     axes.set(xlabel="age, seconds", ylabel="share of time above")
     draw_legend(axes, 1)
 

@@ -8,7 +8,7 @@ import scipy.stats
 
 import netkf
 from netkf.algorithms.models import FlowModel
-from netkf.figures.traffic import age_at, directions_of, freshest, wilson
+from netkf.figures.traffic import ages_of, directions_of, wilson
 from netkf.runs.increments import Expectations
 from netkf.runs.innovations import autocorrelation, innovations
 from netkf.studies.consistency import run_consistency
@@ -16,17 +16,30 @@ from tests.conftest import SCENARIOS
 from tests.figures.conftest import one_node
 
 
-def test_the_age_of_information_is_that_of_a_plain_loop(results):
-    run = results("no truth")
-    events = run.events
-    grid = np.linspace(0.0, 1200.0, 50)
-    for node in (1, 8):
+@pytest.mark.parametrize("kind", ["no truth", "slots"])
+def test_the_age_of_information_is_that_of_a_plain_loop(results, kind):
+    """Means, maxima and shares of time of a sawtooth, against its values at many instants."""
+    run = results(kind)
+    events, end = run.events, run.scenario.horizon
+    fine = np.linspace(0.0, end, 40_000, endpoint=False)
+    for node in run.scenario.nodes[:3]:
         heard = events[(events["kind"] == "deliver") & (events["node"] == node)]
-        expected = []
-        for t in grid:
-            sent = [0.0, *(e.t - e.age for e in heard.itertuples() if e.t <= t)]
-            expected.append(t - max(sent))
-        np.testing.assert_allclose(age_at(grid, *freshest(run.log, node)), expected, atol=1e-9)
+        # The largest time of sending up to each instant, by going through all messages.
+        newest = np.zeros(len(fine))
+        for e in heard.itertuples():
+            newest[fine >= e.t] = np.maximum(newest[fine >= e.t], e.t - np.nan_to_num(e.age))
+        expected = fine - newest
+        found = ages_of(run.log, node, end)
+        edges = np.linspace(0.0, end, 9)
+        parts = np.split(expected, 8)
+        step = 2.0 * end / len(fine)
+        np.testing.assert_allclose(found.mean(edges), [np.mean(p) for p in parts], atol=step)
+        np.testing.assert_allclose(found.largest(edges), [np.max(p) for p in parts], atol=step)
+        for level in (0.0, 0.1 * expected.max(), 0.7 * expected.max(), 2.0 * expected.max()):
+            share = np.mean(expected > level)
+            above = found.time_above(np.array([level]))[0] / end
+            # At each of so many jumps an instant may lie on the other side.
+            assert abs(above - share) <= (1 + len(heard)) * 2.0 / len(fine)
 
 
 @pytest.mark.parametrize("kind", ["ring", "no truth", "slots"])
