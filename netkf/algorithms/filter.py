@@ -333,11 +333,15 @@ class Filter(Component):
         """
         return n + n * (n + 1) // 2
 
-    def slot_stopping(self) -> tuple[int, bool]:
-        """Return the exchange in which nodes may stop for good (-1: none), and whether they are
-        silent in it from then on; for compiled filters.
+    def slot_stopping(self) -> int:
+        """Return the exchange in which nodes may stop for good (-1: none); for compiled filters."""
+        return -1
+
+    def decides_in_slots(self) -> bool:
+        """Return True if a node may be silent because of what it knows: ``slot_kernel`` then writes
+        who sends (kernels.slots.SlotPlan); for compiled filters.
         """
-        return -1, False
+        return False
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int

@@ -28,6 +28,8 @@ from netkf.algorithms.kernels.mass import (
 )
 from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.slots import (
+    ARRIVING,
+    SENDING,
     ReadingBlock,
     SlotLinks,
     SlotNodes,
@@ -39,6 +41,7 @@ from netkf.algorithms.kernels.slots import (
     rebase,
     show,
     slot_scratch,
+    take_silent,
     whiten_reading,
 )
 from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, has_stopped
@@ -174,6 +177,13 @@ def push_sum_slots(
     """Carry push-sum filters through the slots of a plan, P Fig. 1."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
+            # Nodes that have stopped send no mass.
+            decides = arrays.rule == PAPER and not arrays.asymptotic
+            if decides and plan.exchanged[s] and plan.part != ARRIVING:
+                silence_stopped(plan, samples, b, s)
+                take_silent(plan, links, b, s, MASS)
+            if plan.part == SENDING:
+                continue
             # Step 3: with asymptotic gains the covariance is the limit, and only the mean is
             # predicted.
             if plan.sensed[s] and not arrays.asymptotic:
@@ -232,12 +242,6 @@ def exchange_mass(
         split_mass(scratch.lanes, arrays.mass, b, h, arrays.degree[h], arrays.share)
     if arrays.running:
         add_to_totals(arrays, scratch, b)
-    if arrays.rule == PAPER:  # nodes that have stopped send no mass
-        # The same as a link that is down, so that receivers keep the mass conserved.
-        for m in range(len(links.sender)):
-            for q in range(len(scratch.lanes)):
-                if samples.stopped[b, links.sender[m], q] < slot:
-                    plan.up[b, s, 0, links.way[m], q] = 0
     for h in range(H):
         for q in range(len(scratch.lanes)):
             arrays.silent[q] = samples.stopped[b, h, q] < slot
@@ -248,6 +252,15 @@ def exchange_mass(
         else:
             received = mix_mass(arrays, plan, links, scratch, b, s, h)
             learn(arrays, samples, scratch, b, h, received, slot)
+
+
+@kernel
+def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> None:
+    """Let nodes that stopped in an earlier slot send no mass, P step 2.3."""
+    for h in range(plan.sent.shape[3]):
+        for q in range(plan.sent.shape[4]):
+            if samples.stopped[b, h, q] < plan.first + s:
+                plan.sent[b, s, MASS, h, q] = 0
 
 
 @kernel
@@ -505,13 +518,14 @@ class PushSum(Filter):
             return n
         return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
 
-    def slot_stopping(self) -> tuple[int, bool]:
-        """Return where nodes stop: after an exchange of mass; by the paper's rule they send none
-        then.
-        """
+    def slot_stopping(self) -> int:
+        """Return where nodes stop: after an exchange of mass."""
         # Without exchanges of mass there is nothing to stop.
-        stops = not self.asymptotic and self.stop != "never"
-        return (MASS if stops else -1), stops and self.stop == "paper"
+        return MASS if not self.asymptotic and self.stop != "never" else -1
+
+    def decides_in_slots(self) -> bool:
+        """Return True for the paper's rule: a node that has stopped sends no mass."""
+        return not self.asymptotic and self.stop == "paper"
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int

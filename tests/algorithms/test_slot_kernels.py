@@ -133,7 +133,10 @@ def test_samples_show_the_covariance_and_frames_move_estimates(seed, n, framed):
         np.zeros((1, LANES)),
     )
     flags, up = np.array([True]), np.zeros((1, 1, 1, 0, LANES), dtype=np.uint8)
-    plan, room = slots.SlotPlan(0, flags, flags, np.array([0]), up), slots.slot_scratch(2, n)
+    # Who sends is nobody's choice.
+    nothing = np.zeros((0,) * 5, dtype=np.uint8), np.zeros((0,) * 5), slots.WHOLE
+    plan = slots.SlotPlan(0, flags, flags, np.array([0]), up, *nothing)
+    room = slots.slot_scratch(2, n)
     slots.show(nodes, plan, samples, room, 0, 0)
     xhat, error = (v.reshape(runs, 2, n) for v in (samples.xhat, samples.error))
     P, before = samples.P.reshape(runs, 2, n, n), nodes.xhat.copy()

@@ -64,10 +64,23 @@ class ReadingBlock(NamedTuple):
     rebased: np.ndarray
 
 
+WHOLE, SENDING, ARRIVING = range(3)
+"""Parts of a slot that a call of a kernel does."""
+
+
 class SlotPlan(NamedTuple):
     """Number of the ``first`` of S slots; whether nodes read and predict (``sensed``), whether they
     exchange, which sample a slot is or -1 (S, each); ``up`` (B, S, E, W, L): whether a message
     arrives on a direction in each of the E steps of the exchanges of a slot.
+
+    The rest is for filters whose nodes may be silent (``Filter.decides_in_slots``). ``sent``
+    (B, S, E, H, L) is 1 where a node is asked for a message; their kernel writes 0 where it sends
+    none, and takes those out of ``up`` (``take_silent``). ``uniform`` (B, S, E, H, L): the number
+    that a ``randomised`` filter is given when it is asked. Of other filters both are empty.
+
+    Where messages are made one by one, who sends must be known before anything arrives. A kernel is
+    then called twice for each slot, and does the ``part`` up to what is sent, SENDING, without
+    ``up``, and the rest, ARRIVING; else the WHOLE slot.
     """
 
     first: int
@@ -75,6 +88,9 @@ class SlotPlan(NamedTuple):
     exchanged: np.ndarray
     sample: np.ndarray
     up: np.ndarray
+    sent: np.ndarray
+    uniform: FloatArray
+    part: int
 
 
 class SlotLinks(NamedTuple):
@@ -201,6 +217,15 @@ def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, places: np.nd
     count = samples.shape[1]
     for c in range(0, count, len(lanes)):
         scatter(lanes, lines, c, samples, places, min(count - c, len(lanes)))
+
+
+@kernel
+def take_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> None:
+    """Take the messages of nodes that send none in a step out of ``up``."""
+    for m in range(len(links.sender)):
+        for q in range(plan.up.shape[4]):
+            if plan.sent[b, s, e, links.sender[m], q] == 0:
+                plan.up[b, s, e, links.way[m], q] = 0
 
 
 @kernel

@@ -75,7 +75,7 @@ class CompiledEngine(Engine):
         """Say on stderr that code is compiled, unless it is kept from an earlier run."""
         # Slots and continuous time are compiled separately.
         if scenario.slotted:
-            compiling.announce(type(scenario.hosted).slot_kernel)
+            compiling.announce(scenario.hosted.slot_kernel)
         else:
             compiling.announce(simulate_agenda if is_immediate(scenario) else simulate_runs)
 

@@ -1,8 +1,8 @@
 """Messages in slots made one by one, for channels and activations that kernels cannot draw.
 
 Losses and delays of a user's own, messages that take time, and recorded exchanges. What happens in
-a slot depends on clocks and channels alone; where nodes may fall silent for good, blocks are one
-slot long, and the filters' kernel says who has.
+a slot depends on clocks and channels alone; where nodes may be silent, blocks are one slot long,
+and the filters' kernel says who is.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterator
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -104,18 +105,30 @@ class SlotEvents:
         self._noted = True
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
         self._rows: list[Row | Closed | None] = []
+        self._sent: np.ndarray | None = None
+        # Pairs of the exchanges of a slot that are drawn before its messages, in their order.
+        self._drawn: list[tuple[list[Link], set[Link] | None]] = []
 
-    def following(self, rows: int, stopped: np.ndarray) -> tuple[int, np.ndarray]:
+    def asked(self) -> np.ndarray:
+        """Who is asked for a message in the steps of the next slot, 1 or 0 (E, N)."""
+        setup, index = self._setup, self._scenario.topology.index
+        asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
+        for step in self._steps(self._slot):
+            self._drawn.append(self._pairs(step))
+            links = self._drawn[-1][0] if self._algorithm.pairwise else self._ways
+            asked[step.step, [index[node] for link in links for node in link]] = 1
+        return asked
+
+    def following(self, rows: int, sent: np.ndarray | None) -> tuple[int, np.ndarray]:
         """The number of slots that were made, up to about so many ``rows`` of events, and ``up``
-        (1, S, E, W); ``stopped`` (N,) is the slot in which each node stopped for good.
+        (1, S, E, W); one slot if ``sent`` (E, N) says who of those ``asked`` sends.
         """
         setup, made = self._setup, []
-        self._rows, self._stopped = [], stopped
+        self._rows, self._sent = [], sent
         while self._slot < setup.slots:
             made.append(self._one_slot())
             self._slot += 1
-            # Where nodes fall silent the kernel must have seen this slot before the next is made.
-            if setup.silences or len(self._rows) >= rows:
+            if sent is not None or len(self._rows) >= rows:
                 break
         # Messages that are still under way after the last slot may be delivered or late.
         if self._slot == setup.slots:
@@ -136,31 +149,43 @@ class SlotEvents:
         # At the horizon only the sample matters: no events.
         self._noted = slot < setup.last
         if self._noted or not algorithm.predicts:
-            self._stages(slot, start, up)
+            self._stages(slot, up)
         self._noted = True
         if sampled and not algorithm.predicts:
             self._rows.append(None)
         return up
 
-    def _stages(self, slot: int, start: float, up: np.ndarray) -> None:
-        algorithm, repeats = self._algorithm, [0, 0]
-        talks = algorithm.talks and slot >= algorithm.first_slot
-        now = start
-        for step, phase, end in zip(*(c.tolist() for c in self._setup.stages[:3]), strict=True):
+    def _stages(self, slot: int, up: np.ndarray) -> None:
+        steps, now = self._steps(slot), self._scenario.slot_plant.slot_time(slot)
+        for step in self._setup.stages.step.tolist():
             if step < 0:
                 # Slot 0 of a filter that does not predict has no reading: it shows its start.
-                if slot > 0 or algorithm.predicts:
+                if slot > 0 or self._algorithm.predicts:
                     for node in self._scenario.sensing:
                         self._note((now, SENSE, node, -1, -1, -1, NAN))
-            elif talks:
-                made = Step(slot, step, phase, repeats[phase], now, start + end)
-                now, repeats[phase] = made.end, repeats[phase] + 1
+                continue
+            for made in islice(steps, 1):
+                now = made.end
                 # The number of the exchange tells messages in time from late ones.
                 self._exchanges += 1
                 self._open = self._exchanges
                 self._send_all(made)
                 self._arrivals(made.end)
                 self._close(made, up[step])
+
+    def _steps(self, slot: int) -> Iterator[Step]:
+        """Yield the steps of the exchanges of a slot, none where it has no exchange."""
+        setup, algorithm, repeats = self._setup, self._algorithm, [0, 0]
+        # At the horizon filters that predict are only sampled.
+        acts = slot < setup.last or not algorithm.predicts
+        if not (acts and algorithm.talks and slot >= algorithm.first_slot):
+            return
+        start = now = self._scenario.slot_plant.slot_time(slot)
+        for step, phase, end in zip(*(c.tolist() for c in setup.stages[:3]), strict=True):
+            if step >= 0:
+                made = Step(slot, step, phase, repeats[phase], now, start + end)
+                now, repeats[phase] = made.end, repeats[phase] + 1
+                yield made
 
     def rows(self, stopped: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The events as EVENT rows, and how many come before each sample."""
@@ -196,7 +221,7 @@ class SlotEvents:
 
     def _send_all(self, step: Step) -> None:
         broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
-        pairs, up = self._pairs(step)
+        pairs, up = self._drawn.pop(0) if self._drawn else self._pairs(step)
         if broadcast:
             self._note((now, ROUND, -1, -1, -1, phase, NAN))
         for i, j in pairs:
@@ -231,10 +256,10 @@ class SlotEvents:
         return links, up if topology.directed else up | {(j, i) for i, j in listed}
 
     def _is_silent(self, way: Direction, step: Step) -> bool:
-        """Return True if the sender has stopped for good and sends no more in this step."""
-        if not self._setup.silences or step.step != self._setup.stages.stopping:
+        """Return True if the sender sends nothing in this step."""
+        if self._sent is None:
             return False
-        return bool(self._stopped[self._scenario.topology.index[way.ends[0]]] < step.slot)
+        return not self._sent[step.step, self._scenario.topology.index[way.ends[0]]]
 
     def _send(self, step: Step, way: Direction, draw: Draw | None) -> None:
         (sender, receiver), number, now = way.ends, way.messages, step.begin

@@ -260,6 +260,46 @@ def draw_pairs(
             draw_link_of_lane(c, b, active[r, s, e, k], fresh, up, s, e, q)
 
 
+@kernel
+def ask_all(lanes: Lanes, c: Channels, exchanged: np.ndarray, sent: np.ndarray) -> None:
+    """Write 1 into ``sent`` (B, S, E, N, L) for all nodes with links where they exchange."""
+    for b in range(sent.shape[0]):
+        for s in range(sent.shape[1]):
+            for e in range(sent.shape[2] if exchanged[s] else 0):
+                for link in range(len(c.ends)):
+                    for end in range(2):
+                        for q in range(len(lanes)):
+                            sent[b, s, e, c.ends[link, end], q] = 1
+
+
+@kernel
+def ask_pairs(
+    lanes: Lanes, c: Channels, active: np.ndarray, count: np.ndarray, sent: np.ndarray
+) -> None:
+    """``ask_all`` for the nodes of matchings, the first ``count`` of ``active``, see Drawn."""
+    for r in range(count.shape[0]):
+        for s in range(count.shape[1]):
+            for e in range(count.shape[2]):
+                for a in range(count[r, s, e]):
+                    for end in range(2):
+                        node = c.ends[active[r, s, e, a], end]
+                        sent[r // len(lanes), s, e, node, r % len(lanes)] = 1
+
+
+@kernel
+def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> None:
+    """Write the next number of each node that is asked into ``uniform`` (B, S, E, N, L), in the
+    order of steps, from the streams ``states`` (B, N, 4, L).
+    """
+    for b in range(sent.shape[0]):
+        for s in range(sent.shape[1]):
+            for e in range(sent.shape[2]):
+                for h in range(sent.shape[3]):
+                    for q in range(sent.shape[4]):
+                        if sent[b, s, e, h, q] == 1:
+                            uniform[b, s, e, h, q] = next_unit_of_lane(states, b, h, q)
+
+
 class Stages(NamedTuple):
     """What a slot does in its order: the ``step`` of an exchange or -1 where nodes read, its
     ``phase``, and when it ends (seconds after the slot begins), (K,) each; the step in which nodes
@@ -289,7 +329,7 @@ class SlotTimes(NamedTuple):
 class Hearing(NamedTuple):
     """Ids of all nodes (N,) and of those with sensors; the directions by receiver, as
     algorithms.kernels.slots.SlotLinks has them; the number of messages sent so far (W,) by a
-    recorded run; the slot in which each node stopped (B, N, L), and whether it sends no more then.
+    recorded run; the slot in which each node stopped (B, N, L).
     """
 
     nodes: np.ndarray
@@ -299,7 +339,6 @@ class Hearing(NamedTuple):
     way: np.ndarray
     sent: np.ndarray
     stopped: np.ndarray
-    silences: bool
 
 
 class Rows(NamedTuple):
@@ -317,12 +356,14 @@ class Rows(NamedTuple):
 
 class Drawn(NamedTuple):
     """Messages of S slots: ``up`` (B, S, E, W, L), links ``active`` in matchings (R, S, E, A), and
-    their number ``pairs`` (R, S, E).
+    their number ``pairs`` (R, S, E); who sends, ``sent`` (B, S, E, N, L), empty where filters do
+    not decide that.
     """
 
     up: np.ndarray
     active: np.ndarray
     pairs: np.ndarray
+    sent: np.ndarray
 
 
 class Moment(NamedTuple):
@@ -404,7 +445,7 @@ def _slot_rows(
                 for node in h.sensing:
                     at = note(rows, m, SENSE, node, -1, -1, NAN, at)
         elif times.exchanged[s]:
-            at = _sent(c, h, d, rows, m, pairwise, stages.stopping, at)
+            at = _sent(c, h, d, rows, m, pairwise, at)
             # Absorptions happen at the end of the step, when its inboxes close.
             now = times.start[s] + stages.end[k]
             closing = Moment(m.slot, s, m.step, m.phase, now)
@@ -413,16 +454,7 @@ def _slot_rows(
 
 
 @kernel
-def _sent(
-    c: Channels,
-    h: Hearing,
-    d: Drawn,
-    rows: Rows,
-    m: Moment,
-    pairwise: bool,
-    stopping: int,
-    at: int,
-) -> int:
+def _sent(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, at: int) -> int:
     """Write what is sent in a step, after the tick of each pair or one round; return the row."""
     if not pairwise:
         at = note(rows, m, ROUND, -1, -1, -1, NAN, at)
@@ -432,20 +464,16 @@ def _sent(
         if pairwise:
             i, j = h.nodes[c.ends[link, 0]], h.nodes[c.ends[link, 1]]
             at = note(rows, m, TICK, i, j, -1, NAN, at)
-        at = _link_rows(c, h, d, rows, m, link, stopping, at)
+        at = _link_rows(c, h, d, rows, m, link, at)
     return at
 
 
 @kernel
-def _link_rows(
-    c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, link: int, stopping: int, at: int
-) -> int:
+def _link_rows(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, link: int, at: int) -> int:
     """Write the messages sent on a link, each followed by its arrival or loss; return the row."""
     for end in range(c.ways):
         w, i = link * c.ways + end, c.ends[link, end]
-        # By the paper's rule a node that stopped in an earlier slot sends no more mass.
-        gone = h.silences and m.step == stopping and h.stopped[0, i, 0] < m.slot
-        if c.talks[m.step, w] == 0 or gone:
+        if c.talks[m.step, w] == 0 or is_silent(d, 0, m, i, 0):
             continue
         # Messages of a direction are numbered from 0, lost ones included.
         number, sender, receiver = h.sent[w], h.nodes[i], h.nodes[c.ends[link, 1 - end]]
@@ -456,6 +484,12 @@ def _link_rows(
         else:
             at = note(rows, m, LOST, sender, receiver, number, NAN, at)
     return at
+
+
+@kernel
+def is_silent(d: Drawn, b: int, m: Moment, node: int, q: int) -> bool:
+    """Return True if the node at a place sends nothing in a step, in the run of a lane."""
+    return len(d.sent) > 0 and d.sent[b, m.s, m.step, node, q] == 0
 
 
 @kernel
@@ -534,7 +568,7 @@ def count_step(
     """Count the events of one step of an exchange in the runs of a block."""
     stops = m.step == stopping
     if pairwise:
-        count_pairs(lanes, c, d, m, counts, b)
+        count_pairs(lanes, c, d, m, scratch, counts, b)
     else:
         add_count(lanes, scratch, ROUND, 1.0)
         sent = 0
@@ -542,8 +576,8 @@ def count_step(
             sent += c.talks[m.step, w]
         add_count(lanes, scratch, SEND, 1.0 * sent)
         add_count(lanes, scratch, LOST, 1.0 * sent)
-        if h.silences and stops:
-            count_silent(lanes, c, h, m, counts, b)
+        if len(d.sent) > 0:
+            count_silent(lanes, c, d, m, scratch, b)
     # Each message that arrives is one that was not lost.
     absorbed = came = spread(lanes, 0.0)
     for i in range(len(h.nodes)):
@@ -561,31 +595,41 @@ def count_step(
 
 
 @kernel
-def count_pairs(lanes: Lanes, c: Channels, d: Drawn, m: Moment, counts: np.ndarray, b: int) -> None:
+def count_pairs(
+    lanes: Lanes,
+    c: Channels,
+    d: Drawn,
+    m: Moment,
+    scratch: FloatArray,
+    counts: np.ndarray,
+    b: int,
+) -> None:
     """Count the pairs of a step in the runs of a block, and what they send."""
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
         pairs, sent = d.pairs[r, m.s, m.step], 0
         for a in range(pairs):
+            link = d.active[r, m.s, m.step, a]
             for way in range(c.ways):
-                sent += c.talks[m.step, d.active[r, m.s, m.step, a] * c.ways + way]
-        counts[r, TICK] += pairs
-        counts[r, SEND] += sent
-        counts[r, LOST] += sent
+                if not is_silent(d, b, m, c.ends[link, way], r - first):
+                    sent += c.talks[m.step, link * c.ways + way]
+        scratch[TICK, r - first] += pairs
+        scratch[SEND, r - first] += sent
+        scratch[LOST, r - first] += sent
 
 
 @kernel
 def count_silent(
-    lanes: Lanes, c: Channels, h: Hearing, m: Moment, counts: np.ndarray, b: int
+    lanes: Lanes, c: Channels, d: Drawn, m: Moment, scratch: FloatArray, b: int
 ) -> None:
-    """Take off the messages of nodes that stopped in an earlier slot and send no more."""
-    first = b * len(lanes)
-    for r in range(first, min(first + len(lanes), len(counts))):
-        for w in range(len(c.ends) * c.ways):
-            sender = c.ends[w // c.ways, w % c.ways]
-            if c.talks[m.step, w] == 1 and h.stopped[b, sender, r - first] < m.slot:
-                counts[r, SEND] -= 1
-                counts[r, LOST] -= 1
+    """Take off the messages that nodes do not send."""
+    silent = spread(lanes, 0.0)
+    for w in range(len(c.ends) * c.ways):
+        if c.talks[m.step, w] == 1:
+            sends = load_flags(lanes, d.sent, b, m.s, m.step, c.ends[w // c.ways, w % c.ways])
+            silent += select(sends, 0.0, 1.0)
+    add_count(lanes, scratch, SEND, -silent)
+    add_count(lanes, scratch, LOST, -silent)
 
 
 @kernel

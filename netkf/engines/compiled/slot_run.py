@@ -16,6 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.slots import (
+    ARRIVING,
+    SENDING,
+    WHOLE,
     ReadingBlock,
     SlotNodes,
     SlotPlan,
@@ -32,9 +35,12 @@ from netkf.engines.compiled.slot_messages import (
     Matchings,
     Rows,
     SlotTimes,
+    ask_all,
+    ask_pairs,
     count_events,
     draw_broadcasts,
     draw_matched,
+    draw_uniforms,
     make_rows,
 )
 from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
@@ -179,6 +185,9 @@ class SlotRuns:
         states = np.zeros((self.runs, 6), dtype=np.uint64)
         if drawn and protocol >= 0:
             states[:, :4] = StreamBatch(streams, "matching", [()]).states
+        if setup.algorithm.randomised:
+            nodes = StreamBatch(streams, "trigger", [(node,) for node in setup.nodes.tolist()])
+            self._triggers = nodes.in_lanes(self.runs)
         order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
         self._matchings = Matchings(protocol, chance, states, first, members, order, busy)
 
@@ -195,18 +204,9 @@ class SlotRuns:
         """Carry the filters through the next slots, of about so many ``rows`` of events at most (0:
         any number); events need slots that are ``timed``.
         """
-        setup, drawn = self.setup, None
-        if self._events is None:
-            # The kernels draw the messages of many slots and runs at once.
-            count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
-            times = self._times(count, timed)
-            drawn = self._draw_messages(times)
-        else:
-            # Python makes the messages: as many slots as gave about so many rows.
-            count, up = self._events.following(rows, self._stopped[0, :, 0])
-            times = self._times(count, True)
-            drawn = Drawn(_in_first_lane(up), *(np.zeros((0,) * d, dtype=np.int64) for d in (4, 3)))
-        local, absolute, rebased = self._states(count)
+        setup = self.setup
+        times, drawn = self._messages(rows, timed)
+        local, absolute, rebased = self._states(len(times.start))
         readings = self._readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
         shown = self.shown if self.shown is not None else self._space(len(sampled))
@@ -218,11 +218,36 @@ class SlotRuns:
             x, xhat, P, error, self._stopped, self._conserved, absolute, local, setup.frame > 0,
             self._total,
         )  # fmt: skip
-        plan = SlotPlan(self._slot, times.sensed, times.exchanged, times.sample, drawn.up)
-        kernel = type(setup.algorithm).slot_kernel
-        kernel(self._nodes, readings, plan, setup.links, samples, self._room, *self._extra)
-        self._slot += count
+        plan = SlotPlan(
+            self._slot, times.sensed, times.exchanged, times.sample, drawn.up, drawn.sent,
+            self._draw_uniforms(drawn.sent), WHOLE,
+        )  # fmt: skip
+        given = setup.links, samples, self._room, *self._extra
+        kernel = setup.algorithm.slot_kernel
+        if self._events is not None and setup.decides:
+            kernel(self._nodes, readings, plan._replace(part=SENDING), *given)
+            _, up = self._events.following(rows, drawn.sent[0, 0, :, :, 0])
+            drawn.up[..., 0], plan = up, plan._replace(part=ARRIVING)
+        kernel(self._nodes, readings, plan, *given)
+        self._slot += len(times.start)
         return SlotBlock(sampled, shown, times, drawn)
+
+    def _messages(self, rows: int, timed: bool) -> tuple[SlotTimes, Drawn]:
+        """The next slots, of about so many ``rows`` of events, and their messages."""
+        setup, events = self.setup, self._events
+        if events is None:
+            # The kernels draw the messages of many slots and runs at once.
+            count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
+            times = self._times(count, timed)
+            return times, self._draw_messages(times)
+        if setup.decides:
+            # One slot, and the filters say who sends before Python makes the messages.
+            sent = events.asked()
+            up = np.zeros((1, 1, len(sent), len(setup.directions)), dtype=np.uint8)
+            return self._times(1, True), _made(up, sent[None, None])
+        # As many slots as gave about so many rows.
+        count, up = events.following(rows, None)
+        return self._times(count, True), _made(up, np.zeros((0,) * 4, dtype=np.uint8))
 
     def _space(self, count: int) -> SampledStates:
         """Space for so many samples."""
@@ -273,16 +298,32 @@ class SlotRuns:
             np.zeros((self._blocks, *steps, len(setup.directions), LANES), dtype=np.uint8),
             np.empty((matched, *steps, pairs), dtype=np.int64),
             np.zeros((matched, *steps), dtype=np.int64),
+            np.zeros(
+                (self._blocks, *steps, len(setup.nodes), LANES) if setup.decides else (0,) * 5,
+                dtype=np.uint8,
+            ),
         )
         if not len(setup.directions):
             return drawn
         channels, exchanged, fresh = self._channels, times.exchanged, setup.fresh
         # Two kernels: a run compiles only the one that it needs.
         if matched:
-            draw_matched(MANY, channels, self._matchings, exchanged, fresh, *drawn)
+            draw_matched(MANY, channels, self._matchings, exchanged, fresh, *drawn[:3])
         else:
             draw_broadcasts(MANY, channels, exchanged, fresh, drawn.up)
+        if setup.decides and matched:
+            ask_pairs(MANY, channels, drawn.active, drawn.pairs, drawn.sent)
+        elif setup.decides:
+            ask_all(MANY, channels, exchanged, drawn.sent)
         return drawn
+
+    def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
+        """Numbers of the nodes that are asked (B, S, E, N, L), empty if filters need none."""
+        if not self.setup.algorithm.randomised or not self.setup.decides:
+            return np.zeros((0,) * 5)
+        uniform = np.zeros(sent.shape)
+        draw_uniforms(self._triggers, sent, uniform)
+        return uniform
 
     def _states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Local and absolute states (B, S, n, L), and where the origin moves (S,)."""
@@ -383,7 +424,7 @@ class SlotRuns:
         setup, heard = self.setup, self.setup.links
         return Hearing(
             setup.nodes, setup.sensing, heard.first, heard.sender, heard.way, self._sent,
-            self._stopped, setup.silences,
+            self._stopped,
         )  # fmt: skip
 
     def conserved(self) -> dict[str, FloatArray]:
@@ -398,11 +439,13 @@ class SlotRuns:
         return found
 
 
-def _in_first_lane(up: np.ndarray) -> np.ndarray:
-    """The messages (1, S, E, W, L) of one run, from (1, S, E, W)."""
-    wide = np.zeros((*up.shape, LANES), dtype=np.uint8)
-    wide[..., 0] = up
-    return wide
+def _made(up: np.ndarray, sent: np.ndarray) -> Drawn:
+    """The messages (1, S, E, W) of one run, which Python makes, and who sends."""
+    wide = [np.zeros((*part.shape, LANES), dtype=np.uint8) for part in (up, sent)]
+    for lanes, part in zip(wide, (up, sent), strict=True):
+        lanes[..., 0] = part
+    active, pairs = (np.zeros((0,) * d, dtype=np.int64) for d in (4, 3))
+    return Drawn(wide[0], active, pairs, wide[1])
 
 
 ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")

@@ -109,12 +109,12 @@ class SlotSetup:
                     step += 1
                 phase += 1
         numbers, phases, ends = zip(*stages, strict=True)
-        stopping, self.silences = algorithm.slot_stopping()
+        self.decides = algorithm.decides_in_slots()
         self.stages = Stages(
             np.array(numbers, dtype=np.int64),
             np.array(phases, dtype=np.int64),
             np.array(ends, dtype=np.float64),
-            stopping,
+            algorithm.slot_stopping(),
         )
         self.fresh = np.array(fresh, dtype=bool)
         self.phases = [phase for step, phase, _ in stages if step >= 0]
@@ -270,7 +270,8 @@ class SlotSetup:
         """Bytes that are drawn for one slot of one run."""
         floats = self.hosts * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.most_pairs + 8)
-        return 8 * floats + messages
+        asked = len(self.nodes) * (self.decides + 8 * self.algorithm.randomised)
+        return 8 * floats + messages + len(self.fresh) * asked
 
     def block_slots(self, runs: int, rows: int) -> int:
         """Slots of so many runs that one call takes; with about so many ``rows`` of events, if that
