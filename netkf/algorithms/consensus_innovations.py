@@ -7,10 +7,11 @@ pseudo-state y = G x, of which its pseudo-observation ``H_i' R_i^-1 z_i`` shows 
     yhat+ = yhat + sum_l B_il (yhat_l - yhat) + M_i (H_i' R_i^-1 z_i - H_i' R_i^-1 H_i G^+ yhat)
     xhat+ = xhat + K_i (yhat+ - G xhat)
 
-then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G^+ G) xhat+)``. The
-gains are those of the Gauss-Markov theorem: B and M minimise the mean square error of yhat+, and K
-that of xhat+. They follow from the joint covariance of the errors of all nodes, in which nothing
-depends on data, and which is computed as if no message were lost.
+then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G^+ G) xhat+)``
+(``kernels.pseudo_states`` computes both steps). The gains are those of the Gauss-Markov theorem: B
+and M minimise the mean square error of yhat+, and K that of xhat+. They follow from the joint
+covariance of the errors of all nodes, in which nothing depends on data, and which is computed as if
+no message were lost and no reading were missing.
 
 The text of the paper was not at hand: its construction (pseudo-states, gains by the Gauss-Markov
 theorem) is followed, without the numbers of its equations. The null space of G lies in that of each
@@ -27,10 +28,31 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.pseudo_states import (
+    correct_pseudo,
+    correct_state,
+    innovate,
+    predict_pseudo,
+    shift_pseudo,
+)
 from netkf.algorithms.kernels.root_update import lower_root
+from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotSamples,
+    SlotScratch,
+    predict_mean,
+    rebase,
+    show,
+    whiten_reading,
+)
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import require_common_start
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, store
 
 NEGLIGIBLE = 1e-6
 """Deviation of a difference, relative to those of its terms, that counts as rounding."""
@@ -64,6 +86,17 @@ class NodeGains(NamedTuple):
     M: FloatArray
     K: FloatArray
     predicted: FloatArray
+    root: FloatArray
+
+
+class GainTable(NamedTuple):
+    """Gains of all N nodes in K slots: B (K, W, n, n) of the W directions, by receiver and sender;
+    M, K and root (K, N, n, n) as ``NodeGains`` has them.
+    """
+
+    B: FloatArray
+    M: FloatArray
+    K: FloatArray
     root: FloatArray
 
 
@@ -115,6 +148,23 @@ class GainSequence:
             self._found.append(self._advance())
             self._settled = len(self._found) > 1 and self._is_settled(*self._found[-2:])
         return self._found[min(slot, len(self._found)) - 1]
+
+    def table(self, first: int, count: int) -> tuple[np.ndarray, GainTable]:
+        """Return the gains of so many slots from ``first`` on, with the place (count,) of each in
+        the table; settled ones are there once. Nothing happens in slot 0, whose gains are any.
+        """
+        slots = np.maximum(np.arange(first, first + count), 1)
+        self.at(int(slots[-1]))
+        slots = np.minimum(slots, len(self._found))
+        found = self._found[slots[0] - 1 : slots[-1]]
+        every = [one for gains in found for one in gains]
+        K, N, n = len(found), len(self._heard), self._n
+        B, *rest = (
+            np.concatenate([getattr(one, name).reshape(-1, n, n) for one in every])
+            for name in GainTable._fields
+        )
+        made = GainTable(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in rest))
+        return slots - slots[0], made
 
     @staticmethod
     def _is_settled(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
@@ -213,8 +263,8 @@ def gain_sequence(design: Design) -> GainSequence:
 
 class PseudoState(NamedTuple):
     """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance and the model; the estimate of the
-    pseudo-state, ``yhat`` (n,), and the matrices of ``pseudo``-states; the pseudo-observation (n,)
-    of this ``slot``; the ``design``, and the node's ``place`` in it.
+    pseudo-state, ``yhat`` (n,), and the matrices of ``pseudo``-states; the whitened ``reading``
+    y (p,), H (p, n) of this ``slot``; the ``design``, and the node's ``place`` in it.
     """
 
     xhat: FloatArray
@@ -222,7 +272,7 @@ class PseudoState(NamedTuple):
     model: Any
     yhat: FloatArray
     pseudo: PseudoStates
-    observed: FloatArray | None
+    reading: tuple[FloatArray, FloatArray] | None
     slot: int
     design: Design
     place: int
@@ -246,6 +296,104 @@ class PseudoEstimate(NamedTuple):
     G: FloatArray
 
 
+class PseudoArrays(NamedTuple):
+    """Matrices and gains of all nodes, the place (S,) of each slot in the table of gains, the
+    estimates of pseudo-states yhat (B, H, n, L), and scratch: the ``corrected`` ones (H, n, L),
+    and ``state`` and ``z`` (n, L).
+    """
+
+    pseudo: PseudoStates
+    gains: GainTable
+    place: np.ndarray
+    yhat: FloatArray
+    corrected: FloatArray
+    state: FloatArray
+    z: FloatArray
+
+
+@kernel
+def pseudo_slots(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    scratch: SlotScratch,
+    arrays: PseudoArrays,
+) -> None:
+    """Carry filters by consensus plus innovations through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.sensed[s]:
+                for h in range(len(nodes.rows)):
+                    predict_pseudo(
+                        scratch.lanes, nodes.xhat, arrays.yhat, b, h, arrays.pseudo.A,
+                        arrays.pseudo.rest, scratch.moved_mean,
+                    )  # fmt: skip
+                    predict_mean(nodes, scratch, b, h)
+                correct_all(nodes, readings, plan, links, scratch, arrays, b, s)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
+            shift_pseudo(scratch.lanes, arrays.yhat, readings, arrays.pseudo.G, b, s)
+
+
+@kernel
+def correct_all(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: PseudoArrays,
+    b: int,
+    s: int,
+) -> None:
+    """Correct all filters of a block by their readings and what they hear in slot ``s``."""
+    lanes, k = scratch.lanes, arrays.place[s]
+    for h in range(len(nodes.rows)):
+        innovate(
+            lanes, arrays.yhat, b, h, nodes.rows[h], arrays.pseudo.inverse, readings, s,
+            arrays.state, arrays.z,
+        )  # fmt: skip
+        correct_pseudo(
+            lanes, arrays.yhat, b, h, links, plan.up, s, arrays.gains.B[k], arrays.gains.M[k],
+            arrays.z, arrays.corrected,
+        )  # fmt: skip
+    # Everyone has heard the estimates from before the exchange.
+    for h in range(len(nodes.rows)):
+        correct_state(
+            lanes, nodes.xhat, arrays.yhat, b, h, arrays.gains.K[k], arrays.pseudo.G,
+            arrays.corrected, arrays.state,
+        )  # fmt: skip
+        for i in range(nodes.xhat.shape[2]):
+            for j in range(i + 1):
+                store(lanes, nodes.root, b, h, i, j, arrays.gains.root[k, h, i, j])
+
+
+@kernel
+def predict_one(
+    x: FloatArray, y: FloatArray, A: FloatArray, rest: FloatArray, moved: FloatArray
+) -> None:
+    """Apply ``predict_pseudo`` to one node with one lane, x and y (1, 1, n, 1)."""
+    predict_pseudo(ONE, x, y, 0, 0, A, rest, moved)
+
+
+@kernel
+def correct_one(
+    x: FloatArray,
+    readings: ReadingBlock,
+    links: SlotLinks,
+    up: Any,
+    arrays: PseudoArrays,
+) -> None:
+    """Correct one node, the first of ``arrays.yhat`` (1, H, n, 1), with one lane."""
+    gains, pseudo = arrays.gains, arrays.pseudo
+    y, state, z = arrays.yhat, arrays.state, arrays.z
+    innovate(ONE, y, 0, 0, readings.y.shape[3], pseudo.inverse, readings, 0, state, z)
+    correct_pseudo(ONE, y, 0, 0, links, up, 0, gains.B[0], gains.M[0], z, arrays.corrected)
+    correct_state(ONE, x, y, 0, 0, gains.K[0], pseudo.G, arrays.corrected, state)
+
+
 @built_in("consensus-innovations")
 @dataclass(frozen=True, eq=False)
 class ConsensusInnovations(Filter):
@@ -264,6 +412,24 @@ class ConsensusInnovations(Filter):
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
     needs_network: ClassVar[bool] = True
+    slot_kernel = staticmethod(pseudo_slots)
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[PseudoArrays]:
+        """Return the first pseudo-states and scratch."""
+        H, n = len(states), len(states[0].xhat)
+        yhat = in_lanes(np.stack([state.yhat for state in states]), blocks_of(runs))
+        scratch = [aligned(shape) for shape in ((H, n, LANES), (n, LANES), (n, LANES))]
+        place, gains = gain_sequence(states[0].design).table(0, 1)
+        return (PseudoArrays(states[0].pseudo, gains, place, yhat, *scratch),)
+
+    def slot_gains(
+        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
+    ) -> tuple[PseudoArrays]:
+        """Return the arrays with the gains of so many slots from ``first`` on."""
+        place, gains = gain_sequence(states[0].design).table(first, count)
+        return (arrays[0]._replace(place=place, gains=gains),)
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where estimates do not begin alike."""
@@ -289,19 +455,20 @@ class ConsensusInnovations(Filter):
 
     def predict(self, state: PseudoState, gap: float) -> PseudoState:
         """Predict both estimates."""
-        pseudo, slot = state.pseudo, state.slot
-        xhat, yhat = state.xhat, state.yhat
+        slot, n = state.slot, len(state.xhat)
+        xhat, yhat = state.xhat, state.yhat.reshape(1, 1, n, 1).copy()
         for _ in range(round(gap / state.model.period)):
-            yhat = pseudo.A @ yhat + pseudo.rest @ xhat
+            x = np.array(xhat).reshape(1, 1, n, 1)
+            predict_one(x, yhat, state.pseudo.A, state.pseudo.rest, np.empty((n, 1)))
             xhat, slot = state.model.F @ xhat, slot + 1
-        state = state._replace(xhat=xhat, yhat=yhat, slot=slot, observed=None)
+        state = state._replace(xhat=xhat, yhat=yhat.reshape(n), slot=slot, reading=None)
         return state._replace(root=state.gains.predicted)
 
     def update(self, state: PseudoState, reading: Reading) -> PseudoState:
-        """Keep the pseudo-observation for the exchange of the slot."""
+        """Keep the reading for the exchange of the slot."""
         if not len(reading.y):
             return state
-        return state._replace(observed=reading.H.T @ np.linalg.solve(reading.R, reading.y))
+        return state._replace(reading=whiten_reading(reading.y, reading.H, reading.R))
 
     def emit(self, state: PseudoState, exchange: Exchange) -> tuple[PseudoState, PseudoEstimate]:
         """Send the prediction of the pseudo-state."""
@@ -310,31 +477,50 @@ class ConsensusInnovations(Filter):
     def absorb(
         self, state: PseudoState, messages: Sequence[Message], exchange: Exchange
     ) -> PseudoState:
-        """Correct the pseudo-state by what was heard and observed, and the state by that."""
-        gains, pseudo, place = state.gains, state.pseudo, state.place
-        order = state.design.heard[place]
-        yhat = state.yhat.copy()
-        for message in messages:
-            B = gains.B[order.index(message.payload.place)]
-            yhat += B @ (message.payload.yhat - state.yhat)
-        if state.observed is not None:
-            n = len(yhat)
-            own = np.frombuffer(state.design.information).reshape(-1, n, n)[place]
-            yhat += gains.M @ (state.observed - own @ pseudo.inverse @ state.yhat)
-        xhat = state.xhat + gains.K @ (yhat - pseudo.G @ state.xhat)
+        """Correct the pseudo-state by what was heard and read, and the state by that."""
+        gains, order = state.gains, state.design.heard[state.place]
+        places = [order.index(message.payload.place) for message in messages]
+        chosen = gains._replace(B=gains.B[places])
+        heard = [message.payload.yhat for message in messages]
+        xhat, yhat = correct_estimates(state, chosen, heard)
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
 
     def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
         """Return the state shifted by ``offset``: gains multiply differences."""
-        observed = state.observed
-        if observed is not None:
-            n = len(offset)
-            own = np.frombuffer(state.design.information).reshape(-1, n, n)[state.place]
-            observed = observed + own @ offset
+        reading = state.reading
+        if reading is not None:
+            reading = reading[0] + reading[1] @ offset, reading[1]
         return state._replace(
-            xhat=state.xhat + offset, yhat=state.yhat + state.pseudo.G @ offset, observed=observed
+            xhat=state.xhat + offset, yhat=state.yhat + state.pseudo.G @ offset, reading=reading
         )
 
     def shift_payload(self, payload: PseudoEstimate, offset: FloatArray) -> PseudoEstimate:
         """Move the pseudo-state."""
         return payload._replace(yhat=payload.yhat + payload.G @ offset)
+
+
+def correct_estimates(
+    state: PseudoState, gains: NodeGains, heard: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return xhat and yhat (n,) of a node after an exchange in which it ``heard`` the estimates of
+    pseudo-states to which the gains B belong.
+    """
+    # One receiver and its senders, as a star whose links are all up.
+    count, n = len(heard), len(state.xhat)
+    y, places = np.stack([state.yhat, *heard])[None, :, :, None], np.arange(count)
+    links = SlotLinks(np.array([0, count]), places + 1, places, np.ones(count))
+    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
+    seen, H = (np.zeros(0), np.zeros((0, n))) if state.reading is None else state.reading
+    readings = ReadingBlock(
+        seen.reshape(1, 1, 1, -1, 1),
+        H.reshape(1, 1, 1, -1, n, 1),
+        np.zeros((1, 1, n, 1)),
+        np.zeros(1, dtype=bool),
+    )
+    one = GainTable(*(np.array(getattr(gains, name)) for name in GainTable._fields))
+    table = GainTable(one.B[None], *(part[None, None] for part in one[1:]))
+    x = np.array(state.xhat).reshape(1, 1, n, 1)
+    scratch = np.empty((1, n, 1)), np.empty((n, 1)), np.empty((n, 1))
+    arrays = PseudoArrays(state.pseudo, table, np.zeros(1, dtype=np.int64), y, *scratch)
+    correct_one(x, readings, links, up, arrays)
+    return x.reshape(n), np.ascontiguousarray(y[0, 0, :, 0])

@@ -351,6 +351,15 @@ class Filter(Component):
         """
         return ()
 
+    def slot_gains(
+        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
+    ) -> tuple[Any, ...]:
+        """Return the ``arrays`` of ``slot_arrays`` as ``slot_kernel`` is given them for ``count``
+        slots from number ``first`` on: with gains of these slots, where they are known before the
+        run. ``states`` are those that runs start in.
+        """
+        return arrays
+
     def stopped(self, state: Any) -> bool:
         """Return True once the node has permanently frozen its network estimate."""
         return False

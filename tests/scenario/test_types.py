@@ -235,7 +235,7 @@ def test_mypy_accepts_classes_of_ones_own_and_finds_mistakes(tmp_path):
     assert "Found 3 errors in 1 file (checked 2 source files)" in found
 
 
-OF_KERNELS = {"sends_in_slots", "slot_stopping", "decides_in_slots", "slot_arrays"}
+OF_KERNELS = {"sends_in_slots", "slot_stopping", "decides_in_slots", "slot_arrays", "slot_gains"}
 
 
 def test_a_class_with_every_method_has_every_method():

@@ -222,14 +222,15 @@ class SlotRuns:
             self._slot, times.sensed, times.exchanged, times.sample, drawn.up, drawn.sent,
             self._draw_uniforms(drawn.sent), WHOLE,
         )  # fmt: skip
-        given = setup.links, samples, self._room, *self._extra
-        kernel = setup.algorithm.slot_kernel
+        count, algorithm = len(times.start), setup.algorithm
+        extra = algorithm.slot_gains(setup.states, self._extra, self._slot, count)
+        given, kernel = (setup.links, samples, self._room, *extra), algorithm.slot_kernel
         if self._events is not None and setup.decides:
             kernel(self._nodes, readings, plan._replace(part=SENDING), *given)
             _, up = self._events.following(rows, drawn.sent[0, 0, :, :, 0])
             drawn.up[..., 0], plan = up, plan._replace(part=ARRIVING)
         kernel(self._nodes, readings, plan, *given)
-        self._slot += len(times.start)
+        self._slot += count
         return SlotBlock(sampled, shown, times, drawn)
 
     def _messages(self, rows: int, timed: bool) -> tuple[SlotTimes, Drawn]:

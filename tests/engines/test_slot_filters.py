@@ -1,0 +1,98 @@
+"""Filters of the literature in slots: both engines make one run, and batches hold the single runs.
+
+What the formulas are is tested in tests/algorithms; here it is networks, sensors and frames.
+"""
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.engines.compiled.engine import CompiledEngine
+from tests.algorithms.test_literature import GRAPH, scenario_of
+from tests.engines.agreement import assert_agree
+from tests.engines.test_batches import assert_alone
+
+BROADCAST = {"kind": "broadcast"}
+LOSS = {"loss": {"kind": "bernoulli", "delivery": 0.6}}
+BURSTS = {"kind": "gilbert-elliott", "mean_loss": 0.4, "mean_burst": 3.0}
+ARROWS = [[0, 1], [1, 2], [2, 0], [3, 2], [2, 4], [4, 3], [1, 3]]
+NETWORKS = {
+    "lossless": {"graph": GRAPH},
+    "loss": {"graph": GRAPH, "channel": LOSS},
+    "each way": {"graph": GRAPH, "channel": {**LOSS, "symmetric": False}},
+    "one way": {"graph": {"kind": "edges", "edges": ARROWS, "directed": True}, "channel": LOSS},
+    "bursts": {"graph": GRAPH, "channel": {"loss": BURSTS, "symmetric": False}},
+    "tree": {"graph": {"kind": "star", "nodes": 6}, "channel": {**LOSS, "symmetric": False}},
+    "late": {"graph": GRAPH, "channel": {"delay": {"kind": "uniform", "low": 0.0, "high": 0.6}}},
+    "alone": {"graph": {"kind": "edges", "edges": [], "nodes": 5}},
+}
+LATE = {**BROADCAST, "phase": 0.3}
+FILTERS = {
+    "consensus-innovations": {"kind": "consensus-innovations"},
+}
+
+
+def network_of(name):
+    return {"activation": LATE if name == "late" else BROADCAST, **NETWORKS[name]}
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("name", FILTERS)
+def test_both_engines_make_the_same_run(name, network, tmp_path):
+    for seed, n in enumerate((1, 2, 4)):
+        scenario = scenario_of(FILTERS[name], tmp_path, seed, n, network=network_of(network))
+        run = assert_agree(scenario, replica=seed)
+        assert network in ("lossless", "alone") or run.count("lost") + run.count("late") > 5
+
+
+@pytest.mark.parametrize("network", ["loss", "one way", "tree"])
+@pytest.mark.parametrize("name", FILTERS)
+def test_batches_hold_the_single_runs(name, network, tmp_path):
+    """Nine runs are more than a block of lanes holds."""
+    scenario = scenario_of(FILTERS[name], tmp_path, 3, network=network_of(network))
+    assert_alone(scenario, CompiledEngine(), 5, range(2, 11), fingerprint=True)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_blocks_of_slots_do_not_matter(name, tmp_path, monkeypatch):
+    """A kernel is called for some slots at a time."""
+    scenario = scenario_of(FILTERS[name], tmp_path, 1, network=network_of("loss"), horizon=30.0)
+    whole = netkf.simulate(scenario, engine="compiled")
+    monkeypatch.setattr("netkf.engines.compiled.slot_setup.BLOCK_BYTES", 1 << 12)
+    parts = netkf.simulate(scenario, engine="compiled")
+    assert parts.fingerprint == whole.fingerprint
+    np.testing.assert_array_equal(parts.P, whole.P)
+    np.testing.assert_array_equal(parts.error, whole.error)
+
+
+UNSTABLE = {"kind": "linear", "F": [[1.3, 0.2], [0.0, 1.2]], "Q": [[0.1, 0.0], [0.0, 0.2]]}
+UNSTABLE |= {"cov": [[1.0, 0.2], [0.2, 2.0]], "period": 1.0}
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_errors_of_unstable_plants_are_exact(name, tmp_path):
+    """Where states have no digits left: both engines count from the same origins."""
+    more = {"plant": UNSTABLE, "horizon": 161.0, "probe": [0.0, 40.0, 90.0, 160.0]}
+    sensors = [{"nodes": [0, 1, 2, 3, 4], "H": [[1.0, 0.3], [0.2, 1.0]], "R": np.eye(2).tolist()}]
+    more |= {"sensors": sensors, "network": network_of("lossless")}
+    run = assert_agree(scenario_of(FILTERS[name], tmp_path, 2, **more))
+    assert run.exact_errors
+    assert np.abs(run.x).max() > 1e15
+    assert np.abs(run.error).max() < 50.0
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_recorded_sensors_may_miss_slots(name, tmp_path):
+    """Node 0 has two of them, of which one or both may have no row."""
+    for file, slots, node in (("a", (1, 2, 5), 0), ("b", (2, 3, 5), 0), ("c", (1, 3, 4, 6), 2)):
+        rows = "".join(f"{slot},{node},{0.3 * slot - node}\n" for slot in slots)
+        (tmp_path / f"{file}.csv").write_text("t,node,y0\n" + rows)
+    table = {"kind": "recorded", "R": [[0.4]]}
+    sensors = [
+        {**table, "path": "a.csv", "H": [[1.0, 0.2]], "nodes": [0]},
+        {**table, "path": "b.csv", "H": [[0.1, 0.8]], "nodes": [0]},
+        {**table, "path": "c.csv", "H": [[0.5, 1.0]], "nodes": [2]},
+        {"nodes": [3], "H": [[1.0, 0.0]], "R": [[0.2]]},
+    ]
+    more = {"sensors": sensors, "network": network_of("loss")}
+    assert_agree(scenario_of(FILTERS[name], tmp_path, 1, **more))
