@@ -19,7 +19,6 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading, State
 from netkf.algorithms.kernels.neighbours import copy_pairs
 from netkf.algorithms.kernels.pair_fusion import fuse_pair, fuse_tracks
-from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
     SlotLinks,
@@ -31,19 +30,28 @@ from netkf.algorithms.kernels.slots import (
     read_all,
     rebase,
     show,
+    whiten_reading,
+)
+from netkf.algorithms.kernels.tracks import (
+    TrackScratch,
+    combine_tracks,
+    predict_joint,
+    track_scratch,
+    update_joint,
 )
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import require_common_start
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, field
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import blocks_of, in_lanes, load, store
 
 TRACE, DETERMINANT = "trace", "determinant"
 INTERSECTION = 'rule = "ci"'
-NEGLIGIBLE = 1e-12
-"""Relative variance of differences of tracks that is rounding: these tracks are the same."""
+COMBINATIONS, MOST_BITS = 64, 62
+"""Combinations of tracks that are kept of a node in a slot, and directions that have a bit."""
 
 
 class FusionArrays(NamedTuple):
@@ -194,18 +202,18 @@ class InverseIntersection(PairFusion):
 
 
 class Track(NamedTuple):
-    """A payload: the sender's own track ``xhat`` (n,), and its sensors H (p, n) and R (p, p)."""
+    """A payload: the sender's own track ``xhat`` (n,), and its whitened sensors H (p, n)."""
 
     xhat: FloatArray
     H: FloatArray
-    R: FloatArray
 
 
 class TrackState(NamedTuple):
     """The node's own track ``xhat`` (n,) with ``root`` (n, n) and the model; ``fused`` (n,) and
-    ``fused_root`` (n, n) of what it shows; the ``slot``, and the sensors (H, R) of the ``senders``
-    it has heard of, its own first (sender -1); ``joint`` (m n, m n), the covariance of the errors
-    of these m tracks; and the covariance ``start`` (n, n) that all of them began with.
+    ``fused_root`` (n, n) of what it shows; the ``slot``, and the whitened sensors H of the
+    ``senders`` it has heard of, its own first (sender -1); ``joint`` (m, m, n, n), the covariances
+    of the errors of these m tracks; and the covariance ``start`` (n, n) that all of them began
+    with.
     """
 
     xhat: FloatArray
@@ -215,7 +223,7 @@ class TrackState(NamedTuple):
     fused_root: FloatArray
     slot: int
     senders: tuple[int, ...]
-    sensors: tuple[tuple[FloatArray, FloatArray], ...]
+    sensors: tuple[FloatArray, ...]
     joint: FloatArray
     start: FloatArray
 
@@ -223,6 +231,128 @@ class TrackState(NamedTuple):
     def P(self) -> FloatArray:
         """``fused_root fused_root'`` (n, n)."""
         return self.fused_root @ self.fused_root.T
+
+
+class CombinationCache(NamedTuple):
+    """Combinations of one node in one slot that are known, by the directions that it heard: their
+    bits as ``key`` (C,), -1 where there is none, how many differences were ``used`` (C,), ``gain``
+    (C, n, k n) and ``root`` (C, n, n).
+    """
+
+    key: np.ndarray
+    used: np.ndarray
+    gain: FloatArray
+    root: FloatArray
+
+
+class TrackArrays(NamedTuple):
+    """Own tracks ``xhat`` (B, H, n, L) and ``root`` (B, H, n, n, L), Q (n, n), whitened sensors H
+    (H, p, n), the covariances ``joint`` (H, H, n, n) of all tracks; and scratch: ``closed``
+    (H, n, n), ``near`` (H,), and what belongs to combinations.
+    """
+
+    xhat: FloatArray
+    root: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    joint: FloatArray
+    closed: FloatArray
+    near: np.ndarray
+    scratch: TrackScratch
+    cache: CombinationCache
+
+
+@kernel
+def track_slots(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    scratch: SlotScratch,
+    arrays: TrackArrays,
+) -> None:
+    """Carry filters that combine tracks through the slots of a plan."""
+    tracks = SlotNodes(arrays.xhat, arrays.root, nodes.F, nodes.root_Q, nodes.rows)
+    work = arrays.scratch.work
+    # Slot by slot: the covariances of tracks are the same in all runs.
+    for s in range(plan.up.shape[1]):
+        if plan.sensed[s]:
+            predict_joint(arrays.joint, nodes.F, arrays.Q, work)
+            update_joint(arrays.joint, arrays.H, nodes.rows, arrays.closed, work)
+            for b in range(plan.up.shape[0]):
+                predict_all(tracks, scratch, b)
+                read_all(tracks, readings, scratch, b, s)
+                show_tracks(nodes, tracks, scratch, b)
+            for h in range(len(nodes.rows)):
+                arrays.cache.key[:] = -1
+                for b in range(plan.up.shape[0]):
+                    for q in range(len(scratch.lanes)):
+                        combine_heard(nodes, plan, links, arrays, (b, s, h, q))
+        for b in range(plan.up.shape[0]):
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
+            rebase(tracks, readings, scratch, b, s)
+
+
+@kernel
+def show_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: int) -> None:
+    """Let all nodes of a block show their own tracks."""
+    for h in range(len(nodes.rows)):
+        for i in range(nodes.xhat.shape[2]):
+            store(scratch.lanes, nodes.xhat, b, h, i, load(scratch.lanes, tracks.xhat, b, h, i))
+            for j in range(i + 1):
+                entry = load(scratch.lanes, tracks.root, b, h, i, j)
+                store(scratch.lanes, nodes.root, b, h, i, j, entry)
+
+
+@kernel
+def combine_heard(
+    nodes: SlotNodes,
+    plan: SlotPlan,
+    links: SlotLinks,
+    arrays: TrackArrays,
+    place: tuple[int, int, int, int],
+) -> None:
+    """Show what filter h of lane q, at ``place`` [b, s, h, q], makes of the tracks it hears."""
+    b, s, h, q = place
+    n, count, heard = nodes.xhat.shape[2], 0, 0
+    arrays.near[0] = h
+    for m in range(links.first[h], links.first[h + 1]):
+        if plan.up[b, s, 0, links.way[m], q]:
+            count += 1
+            arrays.near[count] = links.sender[m]
+            heard += 1 << min(m - links.first[h], MOST_BITS)
+    if count == 0:
+        return
+    k = combination_of(arrays, heard, count, links.first[h + 1] - links.first[h])
+    gain, root = arrays.cache.gain[k], arrays.cache.root[k]
+    if arrays.cache.used[k] == 0:
+        return
+    for a in range(count):
+        for j in range(n):
+            gap = arrays.xhat[b, arrays.near[1 + a], j, q] - arrays.xhat[b, h, j, q]
+            for i in range(n):
+                nodes.xhat[b, h, i, q] += gain[i, a * n + j] * gap
+    for i in range(n):
+        for j in range(i + 1):
+            nodes.root[b, h, i, j, q] = root[i, j]
+
+
+@kernel
+def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> int:
+    """Return the place in the cache of the combination with ``count`` tracks ``near``, after it is
+    computed if it is not known; ``heard`` has a bit for each of the ``degree`` directions.
+    """
+    cache = arrays.cache
+    k = (heard ^ (heard >> 6) ^ (heard >> 12)) % len(cache.key)
+    # Directions beyond the bits of a number have no key of their own.
+    if degree > MOST_BITS or cache.key[k] != heard:
+        cache.key[k] = heard
+        cache.used[k] = combine_tracks(
+            arrays.joint, arrays.near, count, arrays.scratch, cache.gain[k], cache.root[k]
+        )
+    return k
 
 
 @built_in("track-fusion", rule="cross-covariance")
@@ -242,6 +372,38 @@ class BarShalomCampo(Filter):
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
+    slot_kernel = staticmethod(track_slots)
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[TrackArrays]:
+        """Return the tracks with their covariances, and scratch."""
+        H, n, start = len(states), len(states[0].xhat), states[0].start
+        most = max(info.degree for info in infos)
+        xhat, root = (
+            in_lanes(np.stack([getattr(state, name) for state in states]), blocks_of(runs))
+            for name in ("xhat", "root")
+        )
+        cache = CombinationCache(
+            np.full(COMBINATIONS, -1),
+            np.zeros(COMBINATIONS, dtype=np.int64),
+            np.zeros((COMBINATIONS, n, max(most, 1) * n)),
+            np.zeros((COMBINATIONS, n, n)),
+        )
+        sensors, _ = stacked_sensors([state.sensors[0] for state in states])
+        return (
+            TrackArrays(
+                xhat,
+                root,
+                np.array(states[0].model.Q),
+                sensors,
+                np.tile(start, (H, H, 1, 1)),
+                np.zeros((H, n, n)),
+                np.zeros(H, dtype=np.int64),
+                track_scratch(most, n),
+                cache,
+            ),
+        )
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where tracks do not begin alike or H varies."""
@@ -262,13 +424,14 @@ class BarShalomCampo(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TrackState:
         """Return the first state of a node, which shows its own track."""
-        root = first_root(cov)
-        return TrackState(mean, root, model, mean, root, 0, (-1,), ((model.H, model.R),), cov, cov)
+        root, joint = first_root(cov), np.array(cov)[None, None]
+        sensors = (whitened_sensors(model),)
+        return TrackState(mean, root, model, mean, root, 0, (-1,), sensors, joint, joint[0, 0])
 
     def predict(self, state: TrackState, gap: float) -> TrackState:
         """Predict the tracks."""
         xhat, root = state.model.predict(state.xhat, state.root, gap)
-        joint = predict_joint(state.joint, state.model)
+        joint = predicted_joint(state.joint, state.model)
         return state._replace(
             xhat=xhat, root=root, fused=xhat, fused_root=root, joint=joint, slot=state.slot + 1
         )
@@ -276,12 +439,12 @@ class BarShalomCampo(Filter):
     def update(self, state: TrackState, reading: Reading) -> TrackState:
         """Update the own track by the reading, and the covariances of all."""
         tracked: TrackState = super().update(state, reading)
-        joint = update_joint(state.joint, state.sensors, len(state.xhat))
+        joint = updated_joint(state.joint, state.sensors)
         return tracked._replace(joint=joint, fused=tracked.xhat, fused_root=tracked.root)
 
     def emit(self, state: TrackState, exchange: Exchange) -> tuple[TrackState, Track]:
         """Send the own track."""
-        return state, Track(state.xhat, *state.sensors[0])
+        return state, Track(state.xhat, state.sensors[0])
 
     def absorb(
         self, state: TrackState, messages: Sequence[Message], exchange: Exchange
@@ -290,11 +453,9 @@ class BarShalomCampo(Filter):
         if not messages:
             return state
         state = with_senders(state, messages)
-        n = len(state.xhat)
-        places = [state.senders.index(message.sender) for message in messages]
-        blocks = state.joint.reshape(len(state.senders), n, -1, n)
+        near = [0, *(state.senders.index(message.sender) for message in messages)]
         gaps = np.concatenate([message.payload.xhat - state.xhat for message in messages])
-        gain, root = best_combination(blocks, places, state.root)
+        gain, root = best_combination(state.joint, near, state.root)
         return state._replace(fused=state.xhat + gain @ gaps, fused_root=root)
 
     def estimate(self, state: TrackState) -> tuple[FloatArray, FloatArray]:
@@ -306,33 +467,39 @@ class BarShalomCampo(Filter):
         return state._replace(xhat=state.xhat + offset, fused=state.fused + offset)
 
 
-def predict_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
-    """Return the covariance (m n, m n) of the errors of m tracks one slot later: all of them have
-    the same process noise.
-    """
-    n = len(model.F)
-    m = len(joint) // n
-    moved = np.einsum("ab,ibjc,dc->iajd", model.F, joint.reshape(m, n, m, n), model.F)
-    return np.asarray((moved + model.Q[None, :, None, :]).reshape(m * n, m * n))
+def whitened_sensors(model: SlotModel) -> FloatArray:
+    """Return H (p, n) of a node's sensors over the deviations of their noise."""
+    H: FloatArray = np.asarray(model.H, dtype=np.float64)
+    return whiten_reading(np.zeros(len(H)), H, model.R)[1] if len(H) else H
 
 
-def update_joint(
-    joint: FloatArray, sensors: Sequence[tuple[FloatArray, FloatArray]], n: int
-) -> FloatArray:
-    """Return the covariance (m n, m n) of the errors of m tracks after each has used a reading of
-    its own ``sensors`` (H, R), ``P_ij+ = (I - K_i H_i) P_ij (I - K_j H_j)'``.
+def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarray]:
+    """Return whitened sensors of several nodes as (m, p, n), with zeros below, and the rows (m,) of
+    each.
     """
-    m, eye = len(sensors), np.eye(n)
-    blocks = joint.reshape(m, n, m, n)
-    closed, noise = np.zeros((m, n, n)), np.zeros((m, n, n))
-    for k, (H, R) in enumerate(sensors):
-        P = blocks[k, :, k]
-        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-        closed[k], noise[k] = eye - K @ H, K @ R @ K.T
-    found = np.einsum("iab,ibjc,jdc->iajd", closed, blocks, closed)
-    # Noises of different nodes are independent.
-    found[range(m), :, range(m)] += noise
-    return np.asarray(found.reshape(m * n, m * n))
+    rows = np.array([len(H) for H in sensors])
+    stack = np.zeros((len(sensors), max(int(rows.max()), 1), sensors[0].shape[1]))
+    for k, H in enumerate(sensors):
+        stack[k, : len(H)] = H
+    return stack, rows
+
+
+def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
+    """Return the covariances (m, m, n, n) of the errors of m tracks one slot later: all of them
+    have the same process noise.
+    """
+    moved, F, Q = (np.array(part, order="C") for part in (joint, model.F, model.Q))
+    predict_joint(moved, F, Q, np.empty(F.shape))
+    return moved
+
+
+def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArray:
+    """Return the covariances (m, m, n, n) of the errors of m tracks after each has used a reading
+    of its own whitened ``sensors``, ``P_ij+ = (I - K_i H_i) P_ij (I - K_j H_j)'``.
+    """
+    found, (H, rows) = np.array(joint, order="C"), stacked_sensors(sensors)
+    update_joint(found, H, rows, np.empty((len(H), *found.shape[2:])), np.empty(found.shape[2:]))
+    return found
 
 
 def with_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
@@ -341,37 +508,25 @@ def with_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
     if not new:
         return state
     senders = (*state.senders, *(message.sender for message in new))
-    sensors = (*state.sensors, *((m.payload.H, m.payload.R) for m in new))
+    sensors = (*state.sensors, *(message.payload.H for message in new))
     # Nothing of the joint covariance depends on data: it is made up for from the start on.
-    joint = np.tile(state.start, (len(senders), len(senders)))
+    joint = np.tile(state.start, (len(senders), len(senders), 1, 1))
     for _ in range(state.slot):
-        joint = update_joint(predict_joint(joint, state.model), sensors, len(state.xhat))
+        joint = updated_joint(predicted_joint(joint, state.model), sensors)
     return state._replace(senders=senders, sensors=sensors, joint=joint)
 
 
 def best_combination(
-    blocks: FloatArray, places: Sequence[int], own_root: FloatArray
+    joint: FloatArray, near: Sequence[int], own_root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gain (n, k n) by which differences of k tracks at ``places`` to the own one, place
-    0, correct it with the least covariance, and the root (n, n) of that covariance.
+    """Return the gain (n, k n) by which the differences of k tracks to the own one correct it with
+    the least covariance, and the root (n, n) of that covariance, ``own_root`` if they are the same.
 
-    ``blocks`` (m, n, m, n) are the covariances of the errors of tracks. For one other track it is
-    the gain ``(P_i - P_ij) (P_i + P_j - P_ij - P_ji)^-1`` of Bar-Shalom and Campo.
+    ``joint`` (m, m, n, n) are the covariances of the errors of tracks, ``near`` the places of the
+    own one and of the k others.
     """
-    m, n = blocks.shape[:2]
-    # d = (e_i - e_j) for each j: rows of differences of the errors of all tracks.
-    differences = np.zeros((len(places), n, m, n))
-    for k, place in enumerate(places):
-        differences[k, :, 0] += np.eye(n)
-        differences[k, :, place] -= np.eye(n)
-    rows, joint = differences.reshape(len(places) * n, m * n), blocks.reshape(m * n, m * n)
-    cross, spread = joint[:n] @ rows.T, rows @ joint @ rows.T
-    values, vectors = np.linalg.eigh(spread)
-    # Tracks that are the same, such as those of two blind nodes, leave nothing to choose.
-    used = values > NEGLIGIBLE * max(float(values[-1]), float(np.trace(joint)))
-    gain = (cross @ vectors[:, used] / values[used]) @ vectors[:, used].T
-    # The covariance of e_i - G d, as a product, so that it stays positive semidefinite.
-    errors = -gain @ rows
-    errors[:, :n] += np.eye(n)
-    root = square_root(np.asarray(errors @ joint @ errors.T)) if used.any() else own_root
-    return np.asarray(gain), lower_root(root)
+    n, k = joint.shape[2], len(near) - 1
+    gain, root = np.zeros((n, k * n)), np.zeros((n, n))
+    scratch = track_scratch(k, n)
+    used = combine_tracks(np.array(joint, order="C"), np.array(near), k, scratch, gain, root)
+    return gain, root if used else own_root

@@ -23,12 +23,14 @@ NETWORKS = {
     "one way": {"graph": {"kind": "edges", "edges": ARROWS, "directed": True}, "channel": LOSS},
     "bursts": {"graph": GRAPH, "channel": {"loss": BURSTS, "symmetric": False}},
     "tree": {"graph": {"kind": "star", "nodes": 6}, "channel": {**LOSS, "symmetric": False}},
+    "dense": {"graph": {"kind": "complete", "nodes": 9}, "channel": {**LOSS, "symmetric": False}},
     "late": {"graph": GRAPH, "channel": {"delay": {"kind": "uniform", "low": 0.0, "high": 0.6}}},
     "alone": {"graph": {"kind": "edges", "edges": [], "nodes": 5}},
 }
 LATE = {**BROADCAST, "phase": 0.3}
 FILTERS = {
     "consensus-innovations": {"kind": "consensus-innovations"},
+    "cross-covariance": {"kind": "track-fusion", "rule": "cross-covariance"},
 }
 
 
@@ -45,7 +47,7 @@ def test_both_engines_make_the_same_run(name, network, tmp_path):
         assert network in ("lossless", "alone") or run.count("lost") + run.count("late") > 5
 
 
-@pytest.mark.parametrize("network", ["loss", "one way", "tree"])
+@pytest.mark.parametrize("network", ["loss", "one way", "dense"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_batches_hold_the_single_runs(name, network, tmp_path):
     """Nine runs are more than a block of lanes holds."""
@@ -96,3 +98,11 @@ def test_recorded_sensors_may_miss_slots(name, tmp_path):
     ]
     more = {"sensors": sensors, "network": network_of("loss")}
     assert_agree(scenario_of(FILTERS[name], tmp_path, 1, **more))
+
+
+def test_more_neighbours_than_a_number_has_bits(tmp_path):
+    """Combinations of tracks are found again by whom a node has heard."""
+    graph = {"kind": "star", "nodes": 70}
+    network = {"graph": graph, "activation": BROADCAST, "channel": {**LOSS, "symmetric": False}}
+    scenario = scenario_of(FILTERS["cross-covariance"], tmp_path, n=1, network=network)
+    assert_agree(scenario.replace({"horizon": 4.0, "probe": [0.0, 1.0, 2.0, 3.0]}))

@@ -12,8 +12,9 @@ from netkf.algorithms.track_fusion import (
     BarShalomCampo,
     PairFusion,
     best_combination,
-    predict_joint,
-    update_joint,
+    predicted_joint,
+    updated_joint,
+    whitened_sensors,
 )
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
@@ -73,16 +74,16 @@ class TrackRule(ErrorRule):
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         super().__init__(scenario, errors)
         self._models = scenario.slot_models
-        self._sensors = [(model.H, model.R) for model in self._models]
+        self._sensors = [whitened_sensors(model) for model in self._models]
         nodes = range(errors.hosts)
-        self._joint = np.tile(scenario.start(scenario.nodes[0])[1], (len(nodes), len(nodes)))
+        start = scenario.start(scenario.nodes[0])[1]
+        self._joint = np.tile(start, (len(nodes), len(nodes), 1, 1))
         for host in nodes:
             errors.copy(host, _track(host), host)
 
     def sense(self, time: float, observations: HostObservations) -> None:
         """Update the tracks; a node that hears nothing shows its own."""
-        joint = predict_joint(self._joint, self._models[0])
-        self._joint = update_joint(joint, self._sensors, self.errors.n)
+        self._joint = updated_joint(predicted_joint(self._joint, self._models[0]), self._sensors)
         columns = self.errors.reading_noises(observations)
         for host, observation in observations.items():
             self.errors.update(_track(host), observation, columns[host])
@@ -101,13 +102,11 @@ class TrackRule(ErrorRule):
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
         for host, senders in heard.items():
             order = [host, *sorted(set(senders))]
-            joint = self._joint.reshape(errors.hosts, n, errors.hosts, n)
-            blocks = joint[order][:, :, order]
             own = errors.roots[_track(host)]
             terms: list[Term] = [(_track(host), np.eye(n))]
             root = own
             if len(order) > 1:
-                gain, root = best_combination(blocks, range(1, len(order)), own)
+                gain, root = best_combination(self._joint, order, own)
                 parts = np.split(gain, len(order) - 1, axis=1)
                 # e = e_i - sum_j G_j (e_i - e_j)
                 terms = [(_track(host), np.eye(n) - sum(parts))]

@@ -38,13 +38,12 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model is not the true one")
     joint, radius = steady_tracks(scenario)
-    N, n = len(scenario.nodes), scenario.plant.n
-    blocks = joint.reshape(N, n, N, n)
-    return radius, np.stack([_mean_shown_covariance(scenario, blocks, i) for i in range(N)])
+    nodes = range(len(scenario.nodes))
+    return radius, np.stack([_mean_shown_covariance(scenario, joint, i) for i in nodes])
 
 
 def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
-    """Return the joint covariance (N n, N n) of the errors of all steady tracks, and the radius."""
+    """Return the covariances (N, N, n, n) of the errors of all steady tracks, and the radius."""
     (F, Q), n = scenario.slot_belief, scenario.plant.n
     closed, noises = [], []
     for node in scenario.nodes:
@@ -53,18 +52,18 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
         K = np.linalg.solve(H @ M @ H.T + R, H @ M).T if len(H) else np.zeros((n, 0))
         closed.append(np.eye(n) - K @ H)
         noises.append(K @ R @ K.T)
-    joint = np.zeros((len(closed), n, len(closed), n))
+    joint = np.zeros((len(closed), len(closed), n, n))
     for (i, C), (j, D) in itertools.combinations_with_replacement(enumerate(closed), 2):
         driven = C @ Q @ D.T + (noises[i] if i == j else 0.0)
         block = np.linalg.solve(np.eye(n * n) - np.kron(C @ F, D @ F), driven.reshape(-1))
-        joint[i, :, j] = block.reshape(n, n)
-        joint[j, :, i] = block.reshape(n, n).T
+        joint[i, j] = block.reshape(n, n)
+        joint[j, i] = block.reshape(n, n).T
     radius = max(float(np.abs(scipy.linalg.eigvals(C @ F)).max()) for C in closed)
-    return joint.reshape(len(closed) * n, -1), radius**2
+    return joint, radius**2
 
 
-def _mean_shown_covariance(scenario: Scenario, blocks: FloatArray, i: int) -> FloatArray:
-    """Return the mean covariance (n, n) of what node i shows; ``blocks`` (N, n, N, n)."""
+def _mean_shown_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
+    """Return the mean covariance (n, n) of what node i shows; ``joint`` (N, N, n, n)."""
     probabilities = _hearing_probabilities(scenario, scenario.nodes[i])
     sure = [j for j, p in probabilities.items() if p == 1.0]
     unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
@@ -73,14 +72,14 @@ def _mean_shown_covariance(scenario: Scenario, blocks: FloatArray, i: int) -> Fl
             f"node {scenario.nodes[i]} hears {len(unsure)} nodes with losses; at most "
             f"{MAX_NEIGHBOURS} are looked at, in all combinations"
         )
-    total = np.zeros_like(blocks[i, :, i])
+    total: FloatArray = np.zeros_like(joint[i, i])
     for up in itertools.product((True, False), repeat=len(unsure)):
         outcomes = list(zip(unsure, up, strict=True))
         probability = math.prod(
             probabilities[j] if one else 1.0 - probabilities[j] for j, one in outcomes
         )
         order = [i, *sure, *(j for j, one in outcomes if one)]
-        total += probability * _fuse(blocks[order][:, :, order])
+        total += probability * _fuse(joint, order)
     return total
 
 
@@ -100,10 +99,10 @@ def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
     }
 
 
-def _fuse(blocks: FloatArray) -> FloatArray:
+def _fuse(joint: FloatArray, order: list[int]) -> FloatArray:
     """Return the covariance (n, n) of the best combination of tracks, the first one the own."""
-    own = blocks[0, :, 0]
-    if len(blocks) == 1:
+    own: FloatArray = joint[order[0], order[0]]
+    if len(order) == 1:
         return own
-    root = best_combination(blocks, range(1, len(blocks)), square_root(own))[1]
+    root = best_combination(joint, order, square_root(own))[1]
     return np.asarray(root @ root.T)

@@ -1,0 +1,280 @@
+"""Tracks of several nodes in kernels: how their errors are correlated, and their best combination.
+
+``joint`` (m, m, n, n) holds the covariances ``P_ij = E[e_i e_j']`` of the errors of m tracks, each
+of which uses the readings of its own sensors: the common process noise and the common start
+correlate them (Bar-Shalom and Campo 1986). Each block is computed from itself and the two tracks'
+own covariances alone, so that its bits do not depend on which other tracks are there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+
+NEGLIGIBLE = 1e-12
+"""Variance of a difference of tracks, relative to those of its terms, that is rounding."""
+
+
+class TrackScratch(NamedTuple):
+    """Scratch for k tracks beside the own one: ``spread`` and ``factor`` (k n, k n), the covariance
+    of their differences to it and its factor; ``cross`` and ``parts`` (n, k n), the covariance of
+    the own error with both; ``sizes`` (k n,) and ``order`` (k n,) of pivots; ``weights``
+    (n, (k + 1) n) of all errors, ``work`` (n, n).
+    """
+
+    spread: FloatArray
+    factor: FloatArray
+    cross: FloatArray
+    parts: FloatArray
+    sizes: FloatArray
+    order: np.ndarray
+    weights: FloatArray
+    work: FloatArray
+
+
+def track_scratch(k: int, n: int) -> TrackScratch:
+    """Return scratch for at most k tracks of n states."""
+    K = max(k, 1) * n
+    shapes = [(K, K), (K, K), (n, K), (n, K), (K,), (n, K + n), (n, n)]
+    spread, factor, cross, parts, sizes, weights, work = (np.zeros(shape) for shape in shapes)
+    order = np.zeros(K, dtype=np.int64)
+    return TrackScratch(spread, factor, cross, parts, sizes, order, weights, work)
+
+
+@kernel
+def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray) -> None:
+    """Move all tracks to the next slot, ``F P_ij F' + Q``; ``work`` (n, n) is scratch."""
+    n = len(F)
+    for i in range(len(joint)):
+        for j in range(len(joint)):
+            for a in range(n):
+                for c in range(n):
+                    total = 0.0
+                    for m in range(n):
+                        total += F[a, m] * joint[i, j, m, c]
+                    work[a, c] = total
+            for a in range(n):
+                for c in range(n):
+                    total = Q[a, c]
+                    for m in range(n):
+                        total += work[a, m] * F[c, m]
+                    joint[i, j, a, c] = total
+
+
+@kernel
+def update_joint(
+    joint: FloatArray, H: FloatArray, rows: np.ndarray, closed: FloatArray, work: FloatArray
+) -> None:
+    """Let each track use a reading of its own sensors, ``P_ij+ = C_i P_ij C_j'``, with
+    ``C_i = I - K_i H_i`` written into ``closed`` (m, n, n).
+
+    ``H`` (m, p, n) are whitened and have so many ``rows`` (m,); ``work`` (n, n) is scratch.
+    """
+    m, n = len(joint), len(work)
+    for i in range(m):
+        close_track(joint[i, i], H[i], rows[i], closed[i], work)
+    for i in range(m):
+        for j in range(m):
+            # Noises of different nodes are independent. A blind node closes nothing.
+            if i == j or rows[i] + rows[j] == 0:
+                continue
+            for a in range(n):
+                for c in range(n):
+                    total = 0.0
+                    for k in range(n):
+                        total += closed[i, a, k] * joint[i, j, k, c]
+                    work[a, c] = total
+            for a in range(n):
+                for c in range(n):
+                    total = 0.0
+                    for k in range(n):
+                        total += work[a, k] * closed[j, c, k]
+                    joint[i, j, a, c] = total
+
+
+@kernel
+def close_track(
+    P: FloatArray, H: FloatArray, rows: int, closed: FloatArray, work: FloatArray
+) -> None:
+    """Update P (n, n) by a reading of whitened ``rows`` H (p, n); write ``I - K H`` into ``closed``
+    (n, n).
+    """
+    n = len(P)
+    for i in range(n):
+        for j in range(n):
+            closed[i, j] = 1.0 if i == j else 0.0
+    for r in range(rows):
+        close_row(P, H[r], closed, work[0])
+
+
+@kernel
+def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -> None:
+    """Update P by one whitened row h (n,), and multiply ``closed`` by ``I - k h``; ``k`` (n,) is
+    scratch for the gain ``P h' / (h P h' + 1)``.
+    """
+    n, size = len(P), 1.0
+    for i in range(n):
+        k[i] = 0.0
+        for j in range(n):
+            k[i] += P[i, j] * h[j]
+        size += h[i] * k[i]
+    for i in range(n):
+        k[i] /= size
+    # (I - k h) from the left of both.
+    for j in range(n):
+        seen = known = 0.0
+        for i in range(n):
+            seen += h[i] * P[i, j]
+            known += h[i] * closed[i, j]
+        for i in range(n):
+            P[i, j] -= k[i] * seen
+            closed[i, j] -= k[i] * known
+    # P (I - k h)' + k k', row by row, and the symmetric part of it.
+    for i in range(n):
+        seen = -k[i]
+        for j in range(n):
+            seen += P[i, j] * h[j]
+        for j in range(n):
+            P[i, j] -= seen * k[j]
+            if j < i:
+                P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
+
+
+@kernel
+def combine_tracks(
+    joint: FloatArray,
+    near: np.ndarray,
+    count: int,
+    scratch: TrackScratch,
+    gain: FloatArray,
+    root: FloatArray,
+) -> int:
+    """Write the gain (n, >= k n) by which the differences of ``count`` = k tracks to the own one
+    correct it with the least covariance, and the lower triangular ``root`` (n, n) of that; return
+    the number of differences that were used. If it is 0 all tracks are the same.
+
+    ``near`` (k + 1,) are the places of the own track and of the others in ``joint``. For one other
+    it is ``(P_i - P_ij) (P_i + P_j - P_ij - P_ji)^-1`` of Bar-Shalom and Campo.
+    """
+    n = len(root)
+    spread_tracks(joint, near, count, scratch)
+    used = factor_differences(n, count * n, scratch)
+    for q in range(count * n):
+        for i in range(n):
+            gain[i, q] = 0.0
+    # e_i is sum_t parts_t u_t, with d = factor u: the gain solves gain factor = parts.
+    for t in range(used - 1, -1, -1):
+        q = scratch.order[t]
+        for i in range(n):
+            total = scratch.parts[i, t]
+            for later in range(t + 1, used):
+                place = scratch.order[later]
+                total -= gain[i, place] * scratch.factor[place, t]
+            gain[i, q] = total / scratch.factor[q, t]
+    write_combined_root(joint, near, count, gain, scratch, root)
+    return used
+
+
+@kernel
+def spread_tracks(joint: FloatArray, near: np.ndarray, count: int, scratch: TrackScratch) -> None:
+    """Fill in the covariances of differences ``d_a = e_own - e_a``, and of e_own with them."""
+    n, own = joint.shape[2], near[0]
+    for a in range(count):
+        one = near[1 + a]
+        for i in range(n):
+            scratch.sizes[a * n + i] = joint[own, own, i, i] + joint[one, one, i, i]
+            for j in range(n):
+                scratch.cross[i, a * n + j] = joint[own, own, i, j] - joint[own, one, i, j]
+                for b in range(count):
+                    other = near[1 + b]
+                    first = joint[own, own, i, j] - joint[own, other, i, j]
+                    second = joint[one, own, i, j] - joint[one, other, i, j]
+                    scratch.spread[a * n + i, b * n + j] = first - second
+
+
+@kernel
+def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
+    """Factor ``spread`` = factor factor' with the pivots in ``order``, each the largest relative to
+    its size, and write the covariance of the own error with what they are factors of into
+    ``parts``; return how many there are. Both ``spread`` and ``cross`` are used up.
+    """
+    spread, factor = scratch.spread, scratch.factor
+    for t in range(K):
+        q, best = -1, NEGLIGIBLE
+        for place in range(K):
+            # Tracks that are the same, such as those of two blind nodes, leave nothing to choose.
+            if spread[place, place] > best * scratch.sizes[place]:
+                q, best = place, spread[place, place] / scratch.sizes[place]
+        if q < 0:
+            return t
+        scratch.order[t], pivot = q, math.sqrt(spread[q, q])
+        for place in range(K):
+            factor[place, t] = spread[place, q] / pivot
+        for i in range(n):
+            scratch.parts[i, t] = scratch.cross[i, q] / pivot
+        for place in range(K):
+            for other in range(K):
+                spread[place, other] -= factor[place, t] * factor[other, t]
+            for i in range(n):
+                scratch.cross[i, place] -= scratch.parts[i, t] * factor[place, t]
+        # Exactly nothing is left of a pivot.
+        spread[q, q] = 0.0
+    return K
+
+
+@kernel
+def write_combined_root(
+    joint: FloatArray,
+    near: np.ndarray,
+    count: int,
+    gain: FloatArray,
+    scratch: TrackScratch,
+    root: FloatArray,
+) -> None:
+    """Write the root of the covariance of ``e_own - gain d``, as a product of errors, so that it
+    stays positive semidefinite for any gain.
+    """
+    n, weights, P = len(root), scratch.weights, scratch.work
+    for i in range(n):
+        for j in range(n):
+            weights[i, j], P[i, j] = 1.0 if i == j else 0.0, 0.0
+            for a in range(count):
+                weights[i, (a + 1) * n + j] = gain[i, a * n + j]
+                weights[i, j] -= gain[i, a * n + j]
+    for a in range(count + 1):
+        for j in range(n):
+            for i in range(n):
+                # Row i of the weights times the column of error j of track a.
+                total = 0.0
+                for b in range(count + 1):
+                    for k in range(n):
+                        total += weights[i, b * n + k] * joint[near[b], near[a], k, j]
+                for c in range(i + 1):
+                    P[i, c] += total * weights[c, a * n + j]
+    take_root(P, root)
+
+
+@kernel
+def take_root(P: FloatArray, root: FloatArray) -> None:
+    """Write the lower triangular root (n, n) of P, of which the lower triangle is read; where P is
+    singular columns of zeros.
+    """
+    n = len(P)
+    for j in range(n):
+        size = P[j, j]
+        for k in range(j):
+            size -= root[j, k] * root[j, k]
+        # Nothing but rounding is left where P is singular.
+        pivot = math.sqrt(size) if size > 0.0 else 0.0
+        root[j, j] = pivot
+        for i in range(j + 1, n):
+            total = P[i, j]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            root[i, j] = total / pivot if pivot > 0.0 else 0.0
+            root[j, i] = 0.0
