@@ -112,16 +112,6 @@ def affine(found: Interval, scale: float, shift: float) -> Interval:
     return Interval(value, low, high, scale * found.detectable, again=limits)
 
 
-def widen(found: Interval, slack: float) -> Interval:
-    """Return the interval with both limits moved apart by ``slack``, which no sample reduces."""
-
-    def limits(value: float, factor: float) -> tuple[float, float]:
-        low, high = found.limits(value, factor)
-        return low - slack, high + slack
-
-    return found._replace(low=found.low - slack, high=found.high + slack, again=limits)
-
-
 def with_drawn(found: Interval, drawn: Callable[[float], float]) -> Interval:
     """Return the interval of samples that do not grow with the runs: a factor on the runs is one of
     ``drawn(factor)`` on them.
