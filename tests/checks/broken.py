@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from netkf.algorithms.baselines import Central
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.filter import Estimate
 from netkf.algorithms.gossip import Gossip
@@ -187,6 +188,15 @@ class TooSure(Hybrid):
             root = np.linalg.cholesky(P - gain @ P + 1e-9 * np.eye(len(P)))
             state = state._replace(xhat=state.xhat + gain @ (other.xhat - state.xhat), root=root)
         return state
+
+
+@dataclass(frozen=True, eq=False)
+class TooSureOfAll(Central):
+    """Counts every reading twice in its covariance."""
+
+    def update(self, state, reading):
+        once = super().update(state, reading)
+        return once._replace(root=super().update(once, reading).root)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import scipy.stats
 import netkf
 from netkf.checks import statistics
 from netkf.checks.check import check, judge_replicas, run_replica, with_check_times
-from netkf.checks.evidence import BROKEN, NOT_PROMISED, Finding, Promise, judge
+from netkf.checks.evidence import BROKEN, HOLDS, NOT_PROMISED, Finding, Promise, judge
 from netkf.core.errors import TheoryError
 from netkf.scenario.reading import from_table
 from tests.conftest import SCENARIOS
@@ -229,6 +229,24 @@ def test_nothing_is_promised_of_filters_written_from_scratch(tmp_path):
     filtering = {"kind": "tests.checks.broken:SwapsTooMuch"}
     found = rows_of(check(scenario_of(GOSSIP, tmp_path, filter=filtering), runs=10, workers=1))
     assert found["G (10), (19), Proposition 7"].verdict == BROKEN
+
+
+@pytest.mark.parametrize("table", [RING, GOSSIP], ids=["clocks", "slots"])
+@pytest.mark.parametrize("kind", ["local", "central"])
+def test_filters_that_hear_nobody_are_held_to_their_equations(kind, table, tmp_path):
+    found = check(scenario_of(table, tmp_path, filter={"kind": kind}), runs=40, workers=1)
+    assert found, [row for row in found.rows if row.verdict == BROKEN]
+    rows = {row.promise: row for row in found.rows}
+    assert rows["P follows the equations along the events of each run"].verdict == HOLDS
+    assert rows["errors have the covariance that the equations give them"].detectable < 0.3
+    # Rows about messages have nothing to look at.
+    assert not any("messages" in promise for promise in rows)
+
+
+def test_a_central_filter_that_is_too_sure_is_caught(tmp_path):
+    filtering = {"kind": "tests.checks.broken:TooSureOfAll"}
+    broken = broken_promises(scenario_of(GOSSIP, tmp_path, filter=filtering), 20)
+    assert "P follows the equations along the events of each run" in broken
 
 
 @pytest.mark.parametrize(
