@@ -17,45 +17,62 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.kernels.slots import whiten_reading
+from netkf.algorithms.kernels.beliefs import (
+    BeliefScratch,
+    add_part,
+    clear_part,
+    copy_part,
+    gather_evidence,
+    hear_evidence,
+    move_part,
+    recentre_part,
+    take_prior,
+)
+from netkf.algorithms.kernels.information import add_reading_pair
+from netkf.algorithms.kernels.intersection import finish_lanes
+from netkf.algorithms.kernels.slots import (
+    ReadingBlock,
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotSamples,
+    SlotScratch,
+    predict_all,
+    predict_mean,
+    rebase,
+    show,
+    whiten_reading,
+)
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import choice, field, integer
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, load, store
 
 MAX_STEPS = 10_000
 SLOT, ALL = "slot", "all"
 
 
-class ReadingEvidence(NamedTuple):
-    """All that some readings say of the state: ``y = H x + v``, cov(v) = I, with y (p,), H (p, n)
-    and p at most n; its information is ``H' H``.
-    """
-
-    y: FloatArray
-    H: FloatArray
-
-
 class HeardEvidence(NamedTuple):
-    """What a neighbour said last: its ``evidence``, and when it was ``sent``, seconds."""
+    """What a neighbour said last: its ``evidence`` (n, n + 1); ``sent`` at that time, seconds."""
 
-    evidence: ReadingEvidence
+    evidence: FloatArray
     sent: float
 
 
 class BeliefState(NamedTuple):
     """Belief ``xhat`` (n,) with ``root`` (n, n), and the model; the evidence of the estimate before
     all readings that are kept (``prior``) and of the node's ``own`` ones, and what neighbours told,
-    by ``senders``; the node's id.
+    by ``senders``; the node's id. Evidence (n, n + 1) counts from ``xhat``, see kernels.beliefs.
     """
 
     xhat: FloatArray
     root: FloatArray
     model: Any
-    prior: ReadingEvidence
-    own: ReadingEvidence
+    prior: FloatArray
+    own: FloatArray
     senders: tuple[int, ...]
     told: tuple[HeardEvidence, ...]
     node: int
@@ -67,13 +84,161 @@ class BeliefState(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """A payload: the evidence of the sender's ``own`` readings, and of each of its ``senders``;
-    a receiver leaves out what it has told itself.
+    """A payload: the evidence of the sender's ``own`` readings, and of each of its ``senders``,
+    which counts from its belief ``xhat`` (n,); a receiver leaves out what it has told itself.
     """
 
-    own: ReadingEvidence
+    xhat: FloatArray
+    own: FloatArray
     senders: tuple[int, ...]
-    heard: tuple[ReadingEvidence, ...]
+    heard: tuple[FloatArray, ...]
+
+
+class BeliefArrays(NamedTuple):
+    """Steps a slot, whether messages are kept from slot to slot, the inverse of F (n, n) if they
+    are; evidence of priors and own readings (B, H, n, n + 1, L) and of what was told on each
+    direction (B, W, n, n + 1, L), in one block if nothing is kept; scratch.
+    """
+
+    steps: int
+    keeps: bool
+    back: FloatArray
+    prior: FloatArray
+    own: FloatArray
+    told: FloatArray
+    scratch: BeliefScratch
+
+
+@kernel
+def belief_slots(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    scratch: SlotScratch,
+    arrays: BeliefArrays,
+) -> None:
+    """Carry filters by belief propagation through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
+        own, told = arrays.own[k], arrays.told[k]
+        for s in range(plan.up.shape[1]):
+            if plan.sensed[s]:
+                predict_beliefs(nodes, scratch, arrays, b)
+                for h in range(len(nodes.rows)):
+                    add_reading_pair(
+                        lanes, own[h], 1.0, readings.y, readings.H, (b, s, h), nodes.rows[h],
+                        scratch.xhat, arrays.scratch.work,
+                    )  # fmt: skip
+                for e in range(arrays.steps):
+                    for h in range(len(nodes.rows)):
+                        first, last = links.first[h], links.first[h + 1]
+                        gather_evidence(lanes, own, told, first, last, h, arrays.scratch)
+                    for h in range(len(nodes.rows)):
+                        hear_evidence(
+                            lanes, told, links, plan.up, (b, s, e), h, scratch.xhat, arrays.scratch
+                        )
+                for h in range(len(nodes.rows)):
+                    believe(nodes, links, scratch, arrays, b, h)
+            show(nodes, plan, samples, scratch, b, s)
+            # Evidence counts from the estimate, and moves along.
+            rebase(nodes, readings, scratch, b, s)
+
+
+@kernel
+def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays, b: int) -> None:
+    """Move all filters of a block to the next slot: evidence that is kept speaks about the present
+    state; else the belief is the prior, and nothing is known besides. Evidence counts from the
+    predictions, which are copied to ``scratch``.
+    """
+    lanes, room, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
+    if not arrays.keeps:
+        predict_all(nodes, scratch, b)
+    for h in range(len(nodes.rows)):
+        if arrays.keeps:
+            predict_mean(nodes, scratch, b, h)
+            move_part(lanes, arrays.prior[k, h], arrays.back, room.total, room.work)
+            move_part(lanes, arrays.own[k, h], arrays.back, room.total, room.work)
+        else:
+            take_prior(lanes, nodes.root, b, h, arrays.prior[k, h])
+            clear_part(lanes, arrays.own[k, h])
+        for i in range(nodes.xhat.shape[2]):
+            store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
+    for m in range(arrays.told.shape[1]):
+        if arrays.keeps:
+            move_part(lanes, arrays.told[k, m], arrays.back, room.total, room.work)
+        else:
+            clear_part(lanes, arrays.told[k, m])
+
+
+@kernel
+def believe(
+    nodes: SlotNodes,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: BeliefArrays,
+    b: int,
+    h: int,
+) -> None:
+    """Make the belief of filter ``h`` of a block from its prior and all evidence, which counts from
+    the belief then if it is kept.
+    """
+    lanes, room, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
+    copy_part(lanes, arrays.prior[k, h], room.total)
+    add_part(lanes, room.total, arrays.own[k, h], room.work)
+    for m in range(links.first[h], links.first[h + 1]):
+        add_part(lanes, room.total, arrays.told[k, m], room.work)
+    finish_lanes(
+        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, room.total, room.work, False
+    )  # fmt: skip
+    if arrays.keeps:
+        before, after = scratch.xhat[h], nodes.xhat[b, h]
+        for part in (arrays.prior[k, h], arrays.own[k, h]):
+            recentre_part(lanes, part, before, after, part)
+        for m in range(links.first[h], links.first[h + 1]):
+            recentre_part(lanes, arrays.told[k, m], before, after, arrays.told[k, m])
+
+
+@kernel
+def add_one(parts: FloatArray, total: FloatArray, work: FloatArray) -> None:
+    """Add all ``parts`` (K, n, n + 1, 1) to ``total`` (n, n + 1, 1) with one lane."""
+    for k in range(len(parts)):
+        add_part(ONE, total, parts[k], work)
+
+
+@kernel
+def read_one(
+    y: FloatArray, H: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
+) -> None:
+    """Add a whitened reading, y (1, 1, 1, p, 1), to ``total`` (n, n + 1, 1) with one lane."""
+    add_reading_pair(ONE, total, 1.0, y, H, (0, 0, 0), y.shape[3], centre, work)
+
+
+@kernel
+def move_one(part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray) -> None:
+    """Apply ``move_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
+    move_part(ONE, part, back, total, work)
+
+
+@kernel
+def recentre_one(part: FloatArray, before: FloatArray, after: FloatArray) -> None:
+    """Apply ``recentre_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
+    recentre_part(ONE, part, before, after, part)
+
+
+@kernel
+def take_one(root: FloatArray, part: FloatArray) -> None:
+    """Apply ``take_prior`` to one root (1, 1, n, n, 1) with one lane."""
+    take_prior(ONE, root, 0, 0, part)
+
+
+@kernel
+def finish_one(
+    root: FloatArray, x: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
+) -> None:
+    """Apply ``finish_lanes`` to one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
+    finish_lanes(ONE, root, x, 0, 0, centre, total, work, False)
 
 
 @built_in("belief-propagation")
@@ -101,6 +266,29 @@ class BeliefPropagation(Filter):
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
+    slot_kernel = staticmethod(belief_slots)
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[BeliefArrays]:
+        """Return the evidence that nodes begin with, and scratch."""
+        keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
+        W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
+        blocks = blocks_of(runs) if keeps else 1
+        part = n, n + 1, LANES
+        shapes = [(H, *part), (W, *part), (D + 1, *part), part, part]
+        model = states[0].model
+        return (
+            BeliefArrays(
+                self.steps,
+                keeps,
+                backward(model, model.period) if keeps else np.eye(n),
+                in_lanes(np.stack([state.prior for state in states]), blocks),
+                aligned((blocks, H, *part)),
+                aligned((blocks, W, *part)),
+                BeliefScratch(*(aligned(shape) for shape in shapes)),
+            ),
+        )
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where messages are kept and the plant has noise."""
@@ -132,8 +320,8 @@ class BeliefPropagation(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BeliefState:
         """Return the first state, in which nothing was read or heard."""
-        root, nothing = first_root(cov), ReadingEvidence(np.zeros(0), np.zeros((0, len(mean))))
-        prior = evidence_of(mean, root)
+        root = first_root(cov)
+        prior, nothing = evidence_of(root), np.zeros((len(mean), len(mean) + 1))
         return BeliefState(mean, root, model, prior, nothing, (), (), node.node)
 
     def predict(self, state: BeliefState, gap: float) -> BeliefState:
@@ -141,11 +329,8 @@ class BeliefPropagation(Filter):
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         state = state._replace(xhat=xhat, root=root)
         if isinstance(state.model, SlotModel) and self.memory == SLOT:
-            prior, nothing = (
-                evidence_of(xhat, root),
-                ReadingEvidence(state.own.y[:0], state.own.H[:0]),
-            )
-            return state._replace(prior=prior, own=nothing, senders=(), told=())
+            nothing = np.zeros_like(state.own)
+            return state._replace(prior=evidence_of(root), own=nothing, senders=(), told=())
         back = backward(state.model, gap)
         return with_all(state, lambda evidence: move_evidence(evidence, back))
 
@@ -153,14 +338,12 @@ class BeliefPropagation(Filter):
         """Add a reading to the own ones."""
         if not len(reading.y):
             return state
-        own = merge_evidence(
-            [state.own, ReadingEvidence(*whiten_reading(reading.y, reading.H, reading.R))]
-        )
-        return believing(state._replace(own=own))
+        return believing(state._replace(own=with_reading(state, reading)))
 
     def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:
         """Send what was read and heard."""
-        return state, Beliefs(state.own, state.senders, tuple(one.evidence for one in state.told))
+        heard = tuple(one.evidence for one in state.told)
+        return state, Beliefs(state.xhat, state.own, state.senders, heard)
 
     def absorb(
         self, state: BeliefState, messages: Sequence[Message], exchange: Exchange
@@ -176,19 +359,14 @@ class BeliefPropagation(Filter):
             evidence = evidence_for(state.node, message.payload)
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
                 evidence = move_evidence(evidence, backward(state.model, message.age))
+            centre, _ = state.model.extrapolate(message.payload.xhat, state.root, message.age)
+            evidence = recentred(evidence, centre, state.xhat)
             known[message.sender] = HeardEvidence(evidence, sent)
         senders = tuple(sorted(known))
         return believing(state._replace(senders=senders, told=tuple(known[j] for j in senders)))
 
-    def shift(self, state: BeliefState, offset: FloatArray) -> BeliefState:
-        """Return the state shifted by ``offset``: readings move with it."""
-        state = state._replace(xhat=state.xhat + offset)
-        return with_all(state, lambda evidence: shift_evidence(evidence, offset))
-
-    def shift_payload(self, payload: Beliefs, offset: FloatArray) -> Beliefs:
-        """Move all evidence."""
-        heard = tuple(shift_evidence(one, offset) for one in payload.heard)
-        return payload._replace(own=shift_evidence(payload.own, offset), heard=heard)
+    shift = Filter.shift  # evidence counts from the belief
+    shift_payload = Filter.shift_payload
 
 
 def is_forest(scenario: Any) -> bool:
@@ -198,39 +376,48 @@ def is_forest(scenario: Any) -> bool:
     return len(pairs) == len(topology.nodes) - len(topology.components)
 
 
-def merge_evidence(parts: Sequence[ReadingEvidence]) -> ReadingEvidence:
-    """Return the evidence of independent readings together, with at most n rows."""
-    rows = np.concatenate([np.column_stack([one.H, one.y]) for one in parts])
-    n = rows.shape[1] - 1
-    if len(rows) > n:
-        # |y - H x|^2 changes by a constant: the residual row says nothing about x.
-        rows = np.asarray(np.linalg.qr(rows, mode="r"))[:n]
-    return ReadingEvidence(np.ascontiguousarray(rows[:, n]), np.ascontiguousarray(rows[:, :n]))
+def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
+    """Return independent pieces of evidence (n, n + 1) together."""
+    stack = np.stack(parts)[..., None]
+    add_one(stack[1:], stack[0], np.empty(stack.shape[1:]))
+    return np.ascontiguousarray(stack[0, ..., 0])
 
 
-def evidence_for(node: int, payload: Beliefs) -> ReadingEvidence:
+def with_reading(state: BeliefState, reading: Reading) -> FloatArray:
+    """Return the evidence (n, n + 1) of a node's own readings together with a new one."""
+    y, H = whiten_reading(reading.y, reading.H, reading.R)
+    n, total = len(state.xhat), np.array(state.own)[..., None]
+    whole, centre = (y.reshape(1, 1, 1, -1, 1), H.reshape(1, 1, 1, -1, n, 1)), np.array(state.xhat)
+    read_one(*whole, centre.reshape(1, n, 1), total, np.empty(total.shape))
+    return np.ascontiguousarray(total[..., 0])
+
+
+def evidence_for(node: int, payload: Beliefs) -> FloatArray:
     """Return what a payload says to a node: all but what that node told."""
     others = zip(payload.senders, payload.heard, strict=True)
     return merge_evidence([payload.own, *(one for sender, one in others if sender != node)])
 
 
-def evidence_of(xhat: FloatArray, root: FloatArray) -> ReadingEvidence:
-    """Return an estimate (n,) with the root (n, n) of its covariance as evidence."""
-    inverse = np.asarray(np.linalg.inv(root))
-    return ReadingEvidence(inverse @ xhat, inverse)
+def evidence_of(root: FloatArray) -> FloatArray:
+    """Return an estimate with the root (n, n) of its covariance as evidence that counts from it."""
+    n = len(root)
+    part = np.zeros((n, n + 1, 1))
+    take_one(np.array(root).reshape(1, 1, n, n, 1), part)
+    return np.ascontiguousarray(part[..., 0])
 
 
 def believing(state: BeliefState) -> BeliefState:
     """Return the state with the belief that follows from its prior and all evidence."""
     # Not an update of the prior, which on an unstable plant is so far off that digits are lost.
-    y, H = merge_evidence([state.prior, state.own, *(one.evidence for one in state.told)])
-    root = np.asarray(np.linalg.inv(H))
-    return state._replace(xhat=root @ y, root=lower_root(root))
+    total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.told)])
+    n, before = len(total), state.xhat
+    x, root, centre = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.array(before)
+    finish_one(root, x, centre.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
+    state = state._replace(xhat=x.reshape(n), root=root.reshape(n, n))
+    return with_all(state, lambda evidence: recentred(evidence, before, state.xhat))
 
 
-def with_all(
-    state: BeliefState, change: Callable[[ReadingEvidence], ReadingEvidence]
-) -> BeliefState:
+def with_all(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
     """Return the state with all its evidence changed."""
     told = tuple(one._replace(evidence=change(one.evidence)) for one in state.told)
     return state._replace(prior=change(state.prior), own=change(state.own), told=told)
@@ -245,11 +432,16 @@ def backward(model: Any, gap: float) -> FloatArray:
     return inverse
 
 
-def move_evidence(evidence: ReadingEvidence, back: FloatArray) -> ReadingEvidence:
+def move_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
     """Return evidence about a later state, from which ``back`` (n, n) leads to the earlier one."""
-    return evidence._replace(H=evidence.H @ back)
+    moved = np.array(evidence)[..., None]
+    back = np.ascontiguousarray(back)
+    move_one(moved, back, np.empty(moved.shape), np.empty(moved.shape))
+    return np.ascontiguousarray(moved[..., 0])
 
 
-def shift_evidence(evidence: ReadingEvidence, offset: FloatArray) -> ReadingEvidence:
-    """Return evidence about the state plus ``offset``."""
-    return evidence._replace(y=evidence.y + evidence.H @ offset)
+def recentred(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return evidence that counts from ``before`` (n,) as it counts from ``after``."""
+    moved, old, new = (np.array(part)[..., None] for part in (evidence, before, after))
+    recentre_one(moved, old, new)
+    return np.ascontiguousarray(moved[..., 0])
