@@ -12,7 +12,7 @@ import netkf
 from netkf import theory
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.runs.promises import compute_promises, promises_text
-from netkf.theory.common import delayed_jumps
+from netkf.theory.common import delayed_jumps, mean_square
 from tests.algorithms.test_literature import ROTATION, discretised, scenario_of
 
 GAIN = [[0.4], [0.15]]
@@ -337,8 +337,11 @@ def test_delays_do_not_move_the_threshold_of_a_node_that_nobody_needs(tmp_path):
     a, w = 0.3, 0.5
     threshold, late = 2.0 * a / (w * (2.0 - w)), {"kind": "constant", "seconds": 0.7}
     for factor in (0.98, 1.02):
-        radius = theory.mean_square_radius(scalar(tmp_path, a, factor * threshold, delay=late))
+        scenario = scalar(tmp_path, a, factor * threshold, delay=late)
+        radius = theory.mean_square_radius(scenario)
         assert (radius < 1.0) == (factor > 1.0)
+        # The proof that needs no radius says the same.
+        assert mean_square.linear_errors(scenario).is_bounded == (factor > 1.0)
 
 
 def late_network(folder, at, channel, delay, edges=None, horizon=5.0, probe=1.0):
@@ -379,6 +382,19 @@ def test_large_and_small_problems_are_solved_alike(tmp_path, monkeypatch):
         monkeypatch.setattr(delayed_jumps, name, value)
         again = theory.steady_error_covariance(scenario.replace({"name": name}))
         np.testing.assert_allclose(again, small, rtol=1e-10)
+
+
+def test_nodes_of_a_ring_that_are_alike_have_one_mean_square(tmp_path):
+    """100 errors: the problem has no symmetry in it but that of the network."""
+    ring = {"kind": "cycle", "nodes": 50}
+    scenario = late_network(tmp_path, "links", "losses", 0.8, edges=[[0, 1]])
+    changes = {"network.graph": ring, "sensors.0.nodes": list(range(50))}
+    found = theory.steady_error_covariance(scenario.replace(changes))
+    np.testing.assert_allclose(found, np.broadcast_to(found[0], found.shape), rtol=1e-9)
+    # Of three nodes each hears two others, as here, but what they say is more alike.
+    changes = {"network.graph.nodes": 3, "sensors.0.nodes": [0, 1, 2]}
+    few = theory.steady_error_covariance(scenario.replace({"network.graph": ring}).replace(changes))
+    assert np.trace(found[0]) < np.trace(few[0]) < 1.1 * np.trace(found[0])
 
 
 def late_averages(folder, at, channel, horizon):

@@ -16,7 +16,9 @@ Time-Delay Systems, chapter 2, for systems of this form with white noise)
 
 a linear boundary value problem, solved by collocation at Chebyshev points (Trefethen 2000, Spectral
 Methods in MATLAB, chapters 6 and 12). Mean squares are bounded if the mean of the errors is stable
-and the map from Phi to inflow has a spectral radius below 1 (a renewal equation, derived).
+and the map T from Phi to inflow has a spectral radius below 1 (a renewal equation, derived). That
+is so if some positive definite Phi is T(Phi) and a positive definite rest, a problem of the same
+form in which Phi belongs to the unknowns.
 """
 
 from __future__ import annotations
@@ -39,8 +41,11 @@ MIN_POINTS, MAX_POINTS = 12, 80
 MAX_DENSE, MAX_DENSE_MEAN = 1200, 600
 """Unknowns up to which the boundary value problem, and the map of means over d, are matrices."""
 KRYLOV_VECTORS, MAX_ROUNDS = 40, 10
-TOLERANCE, CORRECTION = 1e-12, 1e-3
-"""Relative, of solutions of the boundary value problem and of what is added to refine them."""
+FIRST_TOLERANCE, TOLERANCE, CORRECTION = 1e-7, 1e-12, 1e-3
+"""Relative, of the first solution of the boundary value problem, of the last one, and of what is
+added to refine it."""
+PROOF_TOLERANCE = 1e-9
+"""Relative, of what rounding may leave of a semidefinite matrix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,19 +168,21 @@ class DelayedJumps:
         columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
         return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
 
-    def _right(self, Phi: FloatArray, noise: bool) -> FloatArray:
+    def _right(self, Phi: FloatArray, noise: bool, jumps: bool) -> FloatArray:
         """Return the inhomogeneous part (k + 1, M, M) of the problem, see ``_residual``."""
         found = np.zeros((self.points + 1, *Phi.shape))
         found[0] = Phi
+        if noise and jumps:
+            found[0] += self._inflow(self._moments(np.zeros_like(found), True))
         if noise:
             heard = self._mean[1] @ np.tile(self._common[0], (1, self.nodes, 1))
             found[0] += self.instant.noise + 2.0 * symmetric(heard[0])
             found[1:] = np.tensordot(self._integral, heard, 1)[1:]
         return found
 
-    def _residual(self, K: FloatArray, right: FloatArray) -> FloatArray:
+    def _residual(self, K: FloatArray, right: FloatArray, jumps: bool) -> FloatArray:
         """Return the residuals (k + 1, M, M) of the problem: that of its second equation, and those
-        of the integrated first one.
+        of the integrated first one. With ``jumps`` Phi is what they make of the unknowns.
         """
         k, M, _ = K.shape
         driven = (self._own @ K.reshape(k, self.nodes, -1, M)).reshape(K.shape)
@@ -183,6 +190,8 @@ class DelayedJumps:
         found = right + K[0] - K + np.tensordot(self._integral, driven + heard, 1)
         # Its antisymmetric part says that K(0) is symmetric.
         found[0] = right[0] + 2.0 * symmetric(driven[0] + heard[0]) + 0.5 * (K[0].T - K[0])
+        if jumps:
+            found[0] += self._inflow(self._moments(K, False))
         return np.asarray(found)
 
     @cached_property
@@ -196,25 +205,28 @@ class DelayedJumps:
         return self._moved(np.concatenate([first, right[1:] + first]))
 
     @cached_property
-    def _factors(self) -> Any:
-        """The LU factors of the problem, None if it is large."""
-        M = len(self.instant.drift)
-        size = (self.points + 1) * M * M
-        if size > MAX_DENSE:
-            return None
-        units = np.eye(size).reshape(size, -1, M, M)
-        columns = [-self._residual(one, np.zeros_like(one)).ravel() for one in units]
-        return scipy.linalg.lu_factor(np.stack(columns, axis=1))
+    def _factors(self) -> dict[bool, Any]:
+        """LU factors of the problem without and with jumps, once they are known."""
+        return {}
 
-    def _solved(self, right: FloatArray, tolerance: float) -> FloatArray:
+    def _by_elimination(self, right: FloatArray, jumps: bool) -> FloatArray:
+        """Return the solution K (k + 1, M, M) of a small problem."""
+        if jumps not in self._factors:
+            units = np.eye(right.size).reshape(right.size, *right.shape)
+            columns = [-self._residual(one, np.zeros_like(one), jumps).ravel() for one in units]
+            self._factors[jumps] = scipy.linalg.lu_factor(np.stack(columns, axis=1))
+        return np.asarray(
+            scipy.linalg.lu_solve(self._factors[jumps], right.ravel()).reshape(right.shape)
+        )
+
+    def _solved(self, right: FloatArray, jumps: bool, tolerance: float) -> FloatArray:
         """Return the solution K (k + 1, M, M) of the problem to a relative ``tolerance``."""
-        if self._factors is not None:
-            found = scipy.linalg.lu_solve(self._factors, right.ravel())
-            return np.asarray(found.reshape(right.shape))
+        if right.size <= MAX_DENSE:
+            return self._by_elimination(right, jumps)
         none = np.zeros_like(right)
 
         def apply(x: FloatArray) -> FloatArray:
-            return -self._alone(self._residual(x.reshape(right.shape), none)).ravel()
+            return -self._alone(self._residual(x.reshape(right.shape), none, jumps)).ravel()
 
         whole = scipy.sparse.linalg.LinearOperator((right.size, right.size), matvec=apply)
         start = self._alone(right).ravel()
@@ -223,22 +235,21 @@ class DelayedJumps:
         )
         return np.asarray(found).reshape(right.shape)
 
-    def autocovariances(self, Phi: FloatArray, noise: bool) -> FloatArray:
+    def autocovariances(self, Phi: FloatArray, noise: bool, jumps: bool = False) -> FloatArray:
         """Return K (k + 1, M, M) at the points for white noise Phi (M, M) a second, with or without
-        the noises of plant and readings. Raises TheoryError if it is not found.
+        the noises of plant and readings, and what jumps add. Raises TheoryError if it is not found.
         """
-        right = self._right(Phi, noise)
-        K = self._solved(right, TOLERANCE)
+        right = self._right(Phi, noise, jumps)
+        K = self._solved(right, jumps, FIRST_TOLERANCE)
         for _ in range(MAX_ROUNDS):
-            change = self._solved(self._residual(K, right), CORRECTION)
+            change = self._solved(self._residual(K, right, jumps), jumps, CORRECTION)
             K, size = K + change, float(np.abs(change).max())
             if size <= TOLERANCE * np.abs(K).max():
                 return K
         raise TheoryError(f"delayed mean squares were solved to {size:.1e} only")
 
-    def moments(self, Phi: FloatArray, noise: bool) -> FloatArray:
-        """Return E[(E, m) (E, m)'] (2 M, 2 M), see ``autocovariances``."""
-        K = self.autocovariances(Phi, noise)
+    def _moments(self, K: FloatArray, noise: bool) -> FloatArray:
+        """Return E[(E, m) (E, m)'] (2 M, 2 M) of K (k + 1, M, M)."""
         late = np.kron(np.eye(self.nodes), scipy.linalg.expm(self.delay * self.A))
         X, across = symmetric(K[0]), K[-1] @ late.T
         sent = late @ X @ late.T
@@ -248,15 +259,34 @@ class DelayedJumps:
             sent = sent + np.tile(Q, (self.nodes, self.nodes))
         return np.block([[X, across], [across.T, symmetric(sent)]])
 
+    def _inflow(self, moments: FloatArray) -> FloatArray:
+        """Return the Phi (M, M) that jumps make of moments (2 M, 2 M)."""
+        M, Z = len(moments) // 2, moments[None]
+        heard = self._ways.products(*self.instant.all_pairs, Z)[:, :M, :M]
+        return np.asarray(symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)[0])
+
     def excited(self, Phi: FloatArray, noise: bool = False) -> FloatArray:
         """Return the Phi (1, M, M) that jumps make of errors driven by one, a positive map."""
-        M, Z = Phi.shape[-1], self.moments(Phi[0], noise)[None]
-        heard = self._ways.products(*self.instant.all_pairs, Z)[:, :M, :M]
-        return symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)
+        return self._inflow(self._moments(self.autocovariances(Phi[0], noise), noise))[None]
 
-    def covariance(self, Phi: FloatArray) -> FloatArray:
-        """Return E[E E'] (1, M, M) under all noises and jumps of covariance Phi (1, M, M)."""
-        return symmetric(self.autocovariances(Phi[0], True)[:1])
+    @cached_property
+    def is_bounded(self) -> bool:
+        """True if it is proved that the radius of ``excited`` is below 1: it maps some positive
+        definite Phi to Phi - 1.
+        """
+        M = len(self.instant.drift)
+        try:
+            moments = self._moments(self.autocovariances(np.eye(M), False, jumps=True), False)
+        except TheoryError:  # near 1, or above it
+            return False
+        added = np.linalg.eigvalsh(self._inflow(moments))
+        return bool(added[0] >= -PROOF_TOLERANCE * max(1.0, added[-1]))
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """E[E E'] (1, M, M) under all noises and jumps."""
+        M = len(self.instant.drift)
+        return symmetric(self.autocovariances(np.zeros((M, M)), True, jumps=True)[:1])
 
     @cached_property
     def mean_is_stable(self) -> bool:
