@@ -16,8 +16,8 @@ FORWARDED = (
     "paper", "combination", "P_by_design", "slot_kernel",
     "shift_payload", "accepts", "max_measurement_interval", "steps", "exchange_steps",
     "redraws_links", "sends_in_slots", "payload_numbers", "slot_stopping", "decides_in_slots",
-    "slot_arrays", "slot_gains", "stopped", "conserved", "weight", "pair_weights",
-    "check_scenario", "scenario_notes", "largest_degree",
+    "moves_estimates", "carried_estimates", "slot_arrays", "slot_gains", "stopped", "conserved",
+    "weight", "pair_weights", "check_scenario", "scenario_notes", "largest_degree",
 )  # fmt: skip
 """What the wrapped filter says of itself; methods that take a state stand in Delegate."""
 

@@ -13,11 +13,44 @@ import numpy as np
 
 from netkf.algorithms.filter import Estimate, Exchange, Filter, Message, NodeInfo
 from netkf.algorithms.information_consensus import INFORMATION, Hcmci
+from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
 from netkf.algorithms.kernels.root_update import intersect_roots
+from netkf.algorithms.kernels.slots import (
+    ARRIVING,
+    SENDING,
+    ReadingBlock,
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotSamples,
+    SlotScratch,
+    move_mean,
+    predict_all,
+    predict_root,
+    read_all,
+    rebase,
+    show,
+    take_silent,
+)
+from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import Rule, field, number, row
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    LANES,
+    ONE,
+    Lanes,
+    aligned,
+    any_lane,
+    blocks_of,
+    load,
+    load_flags,
+    select,
+    spread,
+    store,
+)
 
 
 class Heard(NamedTuple):
@@ -48,6 +81,201 @@ class TriggeredState(NamedTuple):
         return self.root @ self.root.T
 
 
+class TriggeredCiArrays(NamedTuple):
+    """``alpha``, 1 + delta, and the share of a silent neighbour's information that counts; the
+    copies of all nodes, estimates ``x`` (B, W + 2 H, n, L) and ``root`` (B, W + 2 H, n, n, L):
+    those heard on W directions, of each node what it sends, and what it sent last; which of them
+    there are, ``known`` (B, W + 2 H, L). Scratch: ``mean`` (W + H, n, L) and ``inverse``
+    (W + H, n, n, L).
+    """
+
+    alpha: float
+    ratio: float
+    share: float
+    x: FloatArray
+    root: FloatArray
+    known: np.ndarray
+    mean: FloatArray
+    inverse: FloatArray
+
+
+@kernel
+def triggered_ci_slots(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    scratch: SlotScratch,
+    arrays: TriggeredCiArrays,
+) -> None:
+    """Carry filters by event-triggered consensus through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.part != ARRIVING and plan.sensed[s]:
+                predict_all(nodes, scratch, b)
+                predict_copies(nodes, scratch, arrays, b)
+                read_all(nodes, readings, scratch, b, s)
+            if plan.part != ARRIVING and plan.exchanged[s]:
+                for h in range(len(nodes.rows)):
+                    decide_estimate(nodes, plan, links, scratch, arrays, b, s, h)
+                take_silent(plan, links, b, s, 0)
+            if plan.part != SENDING:
+                if plan.exchanged[s]:
+                    for h in range(len(nodes.rows)):
+                        combine_copies(nodes, plan, links, scratch, arrays, b, s, h)
+                show(nodes, plan, samples, scratch, b, s)
+                rebase(nodes, readings, scratch, b, s)
+                if readings.rebased[s]:
+                    rebase_copies(readings, scratch.lanes, arrays, b, s)
+
+
+@kernel
+def predict_copies(
+    nodes: SlotNodes, scratch: SlotScratch, arrays: TriggeredCiArrays, b: int
+) -> None:
+    """Predict all copies of estimates, as those who sent them do."""
+    lanes = scratch.lanes
+    for k in range(arrays.x.shape[1]):
+        if any_lane(load_flags(lanes, arrays.known, b, k)):
+            move_mean(lanes, arrays.x, b, k, nodes.F, scratch.moved_mean)
+            predict_root(
+                lanes, arrays.root, b, k, nodes.F, nodes.root_Q, scratch.moved, scratch.noise
+            )
+
+
+@kernel
+def rebase_copies(
+    readings: ReadingBlock, lanes: Lanes, arrays: TriggeredCiArrays, b: int, s: int
+) -> None:
+    """Count copies from the state of slot ``s``, where a frame of coordinates begins."""
+    for k in range(arrays.x.shape[1]):
+        for i in range(arrays.x.shape[2]):
+            origin = load(lanes, readings.local, b, s, i)
+            store(lanes, arrays.x, b, k, i, load(lanes, arrays.x, b, k, i) - origin)
+
+
+@kernel(inlined=True)
+def copy_estimate(
+    lanes: Lanes,
+    to: tuple[FloatArray, FloatArray],
+    place: int,
+    x: FloatArray,
+    root: FloatArray,
+    sender: int,
+    b: int,
+    wanted: Any,
+) -> None:
+    """Write the pair of ``sender`` of a block to a ``place`` of other pairs, in the lanes where it
+    is ``wanted``.
+    """
+    for i in range(x.shape[2]):
+        before, now = load(lanes, to[0], b, place, i), load(lanes, x, b, sender, i)
+        store(lanes, to[0], b, place, i, select(wanted, now, before))
+        for j in range(i + 1):
+            before, now = load(lanes, to[1], b, place, i, j), load(lanes, root, b, sender, i, j)
+            store(lanes, to[1], b, place, i, j, select(wanted, now, before))
+
+
+@kernel
+def decide_estimate(
+    nodes: SlotNodes,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: TriggeredCiArrays,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Decide if node ``h`` sends its estimate, and keep what it sends."""
+    lanes, copies = scratch.lanes, (arrays.x, arrays.root)
+    own = len(links.sender) + h
+    last = own + len(nodes.rows)
+    near = is_near(
+        lanes, nodes.xhat, nodes.root, arrays.x, arrays.root, (b, h, last),
+        (arrays.alpha, arrays.ratio), scratch.total, scratch.noise,
+    )  # fmt: skip
+    store(lanes, scratch.row, 0, select(near, 1.0, 0.0))
+    for q in range(len(lanes)):
+        # The first estimate is sent in any case.
+        if scratch.row[0, q] == 1.0 and arrays.known[b, last, q] == 1:
+            plan.sent[b, s, 0, h, q] = 0
+        if plan.sent[b, s, 0, h, q] == 1:
+            arrays.known[b, last, q] = 1
+    sent = load_flags(lanes, plan.sent, b, s, 0, h)
+    copy_estimate(lanes, copies, last, nodes.xhat, nodes.root, h, b, sent)
+    # What all others hear, while estimates change one after the other.
+    everyone = spread(lanes, 1.0) > 0.0
+    copy_estimate(lanes, copies, own, nodes.xhat, nodes.root, h, b, everyone)
+
+
+@kernel
+def combine_copies(
+    nodes: SlotNodes,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: TriggeredCiArrays,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Combine what filter ``h`` of a block has with what it hears, and with its copies of what
+    those sent before who are silent.
+    """
+    lanes, ways, n = scratch.lanes, len(links.sender), nodes.xhat.shape[2]
+    own, heard = ways + h, spread(lanes, 0.0)
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        copies = (arrays.x, arrays.root)
+        if any_lane(arrived):
+            sender = ways + links.sender[m]
+            copy_estimate(lanes, copies, m, arrays.x, arrays.root, sender, b, arrived)
+        for q in range(len(lanes)):
+            if plan.up[b, s, 0, links.way[m], q] == 1:
+                arrays.known[b, m, q] = 1
+        heard += select(load_flags(lanes, arrays.known, b, m), links.weight[m], 0.0)
+        invert_lanes(lanes, arrays.inverse, arrays.root, b, m)
+        for i in range(n):
+            store(lanes, arrays.mean, m, i, load(lanes, arrays.x, b, m, i))
+    alone = heard == 0.0
+    if not any_lane(heard > 0.0):
+        return
+    invert_lanes(lanes, arrays.inverse, arrays.root, b, own)
+    for i in range(n):
+        x = load(lanes, arrays.x, b, own, i)
+        store(lanes, arrays.mean, own, i, x)
+        store(lanes, scratch.xhat, h, i, x)
+    rest = select(heard < 1.0, 1.0 - heard, 0.0)
+    whiten(lanes, scratch.total, rest, arrays.inverse, arrays.mean, own, own)
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        known = load_flags(lanes, arrays.known, b, m)
+        if any_lane(known):
+            # In place of a silent neighbour's pair there is a wider one.
+            weight = select(arrived, links.weight[m], arrays.share * links.weight[m])
+            weight = select(known, weight, 0.0)
+            whiten(lanes, scratch.whitened, weight, arrays.inverse, arrays.mean, m, own)
+            merge_lanes(lanes, scratch.total, scratch.whitened)
+    finish_lanes(
+        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, scratch.total, scratch.whitened, alone
+    )
+
+
+@kernel
+def is_near_one(
+    x: FloatArray,
+    root: FloatArray,
+    bounds: tuple[float, float],
+    ratio: FloatArray,
+    work: FloatArray,
+) -> bool:
+    """Return ``is_near`` of the first and the second of two estimates (1, 2, n, 1), one lane."""
+    near: bool = is_near(ONE, x, root, x, root, (0, 0, 1), bounds, ratio, work)
+    return near
+
+
 def _is_information_consensus(value: Any) -> Filter:
     if not isinstance(value, Hcmci) or type(value) is not Hcmci:
         raise TypeError
@@ -76,7 +304,7 @@ class EventTriggeredCi(Filter):
     inner       consensus on information with one step a slot
     thresholds  [alpha, delta]: a node is silent while ``(xhat - xbar)' P^-1 (xhat - xbar) < alpha``
                 where xbar and Pbar are what it sent last, predicted to now, and while
-                ``P <= (1 + delta) Pbar`` and ``Pbar <= (1 + delta) P``
+                ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``
 
     In place of a silent neighbour's pair there is xbar with ``(1 + alpha^1/2)^2 (1 + delta) Pbar``,
     which bounds the second moment of its error (derived): with d = xhat - xbar that of e + d is at
@@ -93,6 +321,37 @@ class EventTriggeredCi(Filter):
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
+    slot_kernel = staticmethod(triggered_ci_slots)
+
+    def decides_in_slots(self) -> bool:
+        """Return True."""
+        return True
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[TriggeredCiArrays]:
+        """Return the copies of estimates, none so far."""
+        (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
+        ways, alpha = sum(info.degree for info in infos), self.thresholds[0]
+        places = ways + 2 * H
+        return (
+            TriggeredCiArrays(
+                alpha,
+                1.0 + self.thresholds[1],
+                1.0 / self.widening**2,
+                aligned((blocks, places, n, LANES)),
+                aligned((blocks, places, n, n, LANES)),
+                np.zeros((blocks, places, LANES), dtype=np.uint8),
+                aligned((ways + H, n, LANES)),
+                aligned((ways + H, n, n, LANES)),
+            ),
+        )
+
+    @property
+    def widening(self) -> float:
+        """The factor of the root of a silent neighbour's pair."""
+        alpha, delta = self.thresholds
+        return (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note where messages may be lost."""
@@ -134,12 +393,11 @@ class EventTriggeredCi(Filter):
 
     def is_near(self, state: TriggeredState, sent: Estimate) -> bool:
         """Return True if the copy ``sent`` is within both thresholds of the estimate."""
-        gap = np.linalg.solve(state.root, state.xhat - sent.xhat)
-        # Eigenvalues of P^-1 Pbar, as squares of the singular values of S^-1 Sbar.
-        ratios = np.linalg.svd(np.linalg.solve(state.root, sent.root), compute_uv=False) ** 2
-        alpha, delta = self.thresholds
-        within = ratios.min() * (1.0 + delta) >= 1.0 and ratios.max() <= 1.0 + delta
-        return bool(gap @ gap < alpha and within)
+        (alpha, delta), n = self.thresholds, len(state.xhat)
+        x = np.stack([state.xhat, sent.xhat]).reshape(1, 2, n, 1)
+        root = np.stack([state.root, sent.root]).reshape(1, 2, n, n, 1)
+        ratio, work = np.empty((n, n + 1, 1)), np.empty((n, n, 1))
+        return bool(is_near_one(x, root, (alpha, 1.0 + delta), ratio, work))
 
     def absorb(
         self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
@@ -151,8 +409,7 @@ class EventTriggeredCi(Filter):
         if not known:
             return state
         senders = tuple(sorted(known))
-        alpha, delta = self.thresholds
-        wider = (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
+        wider = self.widening
         pairs = [(state.xhat, state.root)]
         pairs += [
             (known[j].xhat, known[j].root if j in fresh else wider * known[j].root) for j in senders

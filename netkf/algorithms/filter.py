@@ -337,6 +337,12 @@ class Filter(Component):
         """Return the exchange in which nodes may stop for good (-1: none); for compiled filters."""
         return -1
 
+    def moves_estimates(self, phase: int) -> bool:
+        """Return False if exchange number ``phase`` of a slot leaves all estimates as they are; for
+        compiled filters.
+        """
+        return True
+
     def decides_in_slots(self) -> bool:
         """Return True if a node may be silent because of what it knows: ``slot_kernel`` then writes
         who sends (kernels.slots.SlotPlan); for compiled filters.
@@ -359,6 +365,12 @@ class Filter(Component):
         run. ``states`` are those that runs start in.
         """
         return arrays
+
+    def carried_estimates(self, shown: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
+        """Return the estimates (B, H, n, L) that nodes go on with, where they are not those that
+        they show; ``arrays`` are those of ``slot_arrays``.
+        """
+        return shown
 
     def stopped(self, state: Any) -> bool:
         """Return True once the node has permanently frozen its network estimate."""

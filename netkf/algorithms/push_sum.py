@@ -523,6 +523,10 @@ class PushSum(Filter):
         # Without exchanges of mass there is nothing to stop.
         return MASS if not self.asymptotic and self.stop != "never" else -1
 
+    def moves_estimates(self, phase: int) -> bool:
+        """Return False for the exchange of mass."""
+        return phase == AVERAGE
+
     def decides_in_slots(self) -> bool:
         """Return True for the paper's rule: a node that has stopped sends no mass."""
         return not self.asymptotic and self.stop == "paper"

@@ -5,7 +5,6 @@ event-triggered sensor schedule for remote state estimation", IEEE Trans. Automa
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,11 +15,48 @@ import numpy as np
 from netkf.algorithms.delegate import FORWARDED, Delegate, forwarded
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.kernels.slots import (
+    ARRIVING,
+    SENDING,
+    WHOLE,
+    ReadingBlock,
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotSamples,
+    SlotScratch,
+    move_mean,
+    predict_all,
+    rebase,
+    rotate_lanes,
+    show,
+    take_silent,
+    use_reading,
+    whiten_reading,
+)
+from netkf.algorithms.kernels.triggers import NO_READING, chance_of_silence, weigh_news
 from netkf.algorithms.models import first_root, sample_update
-from netkf.algorithms.registry import built_in
+from netkf.algorithms.registry import built_in, built_in_filters
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import definite_covariance, either, field, instance, nested, positive
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    LANES,
+    ONE,
+    aligned,
+    any_lane,
+    blocks_of,
+    load,
+    load_flags,
+    select,
+    spread,
+    store,
+    store_flags,
+)
+
+NOWHERE = np.zeros(1, dtype=bool)
+"""Of a block of one slot: it is not there."""
 
 
 def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
@@ -33,14 +69,222 @@ def entries_at(scenario: Any, node: int) -> list[int]:
     return [place.entry for place in scenario.placed.get(node, ())]
 
 
+def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
+    """Return ``L' Y L`` (p, p) with ``L L' = R``, the trigger for whitened readings."""
+    root = np.linalg.cholesky(R)
+    return np.asarray(root.T @ trigger_matrix(Y, len(R)) @ root)
+
+
 def silence_noise(R: FloatArray, Y: float | FloatArray) -> FloatArray:
     """Return ``R + Y^-1`` (p, p), the noise of the reading that silence stands for."""
     return np.asarray(R + np.linalg.inv(trigger_matrix(Y, len(R))))
 
 
-def is_silent(z: FloatArray, Y: float | FloatArray, uniform: float) -> bool:
-    """Return True if an innovation z (p,) is not sent: with probability ``exp(-z' Y z / 2)``."""
-    return uniform < math.exp(-0.5 * float(z @ trigger_matrix(Y, len(z)) @ z))
+def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
+    """Return ``z' Y z`` with the innovation ``z = y - H xhat`` of a reading with p > 0 rows."""
+    y, H = whiten_reading(*reading[:3])
+    p, n = H.shape
+    readings = ReadingBlock(
+        y.reshape(1, 1, 1, p, 1), H.reshape(1, 1, 1, p, n, 1), np.zeros((1, 1, n, 1)), NOWHERE
+    )
+    trigger = np.ascontiguousarray(whitened_trigger(Y, reading.R))[None]
+    return news_of_one(
+        np.ascontiguousarray(xhat).reshape(1, 1, n, 1), readings, trigger, np.empty((p, 1))
+    )
+
+
+@kernel
+def news_of_one(x: FloatArray, readings: ReadingBlock, Y: FloatArray, z: FloatArray) -> float:
+    """Return ``weigh_news`` of one reading with one lane."""
+    news: float = weigh_news(ONE, x, readings, (0, 0, 0), len(z), Y, z)
+    return news
+
+
+def whitened_triggers(models: Sequence[Any], Y: float | FloatArray) -> FloatArray:
+    """Return ``L' Y L`` (H, p, p) of the readings of all nodes, zeros beyond their rows."""
+    p = max(1, *(len(model.R) for model in models))
+    weights = np.zeros((len(models), p, p))
+    for k, model in enumerate(models):
+        rows = len(model.R)
+        if rows:
+            weights[k, :rows, :rows] = whitened_trigger(Y, model.R)
+    return weights
+
+
+def silence_root(weight: FloatArray) -> FloatArray:
+    """Return C^-1 with the lower triangular ``C C' = I + W^-1``, by which whitened rows have noise
+    of variance 1 again when they stand for silence; W = ``weight`` (p, p), zeros beyond its rows.
+    """
+    rows, made = int((weight.diagonal() > 0.0).sum()), np.zeros(weight.shape)
+    noise = np.eye(rows) + np.linalg.inv(weight[:rows, :rows])
+    made[:rows, :rows] = np.linalg.inv(np.linalg.cholesky(noise))
+    return made
+
+
+class ScheduledArrays(NamedTuple):
+    """Of the sensors of each node, ``trigger`` (H, p, p) for whitened rows and ``wider`` (H, p, p),
+    see silence_root. Of the sensors that are ``known`` (B, W + H, L), by the direction on which
+    they were heard of, and a node's own: the whitened rows ``H`` (B, W + H, p, n, L). The
+    predictions of a slot, ``prior`` (B, H, n, L). Scratch: ``z`` (p, L) and ``seen`` (n, L).
+    """
+
+    trigger: FloatArray
+    wider: FloatArray
+    H: FloatArray
+    known: np.ndarray
+    prior: FloatArray
+    z: FloatArray
+    seen: FloatArray
+
+
+@kernel
+def scheduled_slots(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    scratch: SlotScratch,
+    arrays: ScheduledArrays,
+) -> None:
+    """Carry filters that broadcast readings through the slots of a plan, Han et al. (2015)."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            if plan.part != ARRIVING and plan.sensed[s]:
+                predict_all(nodes, scratch, b)
+                for h in range(len(nodes.rows)):
+                    for i in range(nodes.xhat.shape[2]):
+                        x = load(scratch.lanes, nodes.xhat, b, h, i)
+                        store(scratch.lanes, arrays.prior, b, h, i, x)
+            if plan.part != ARRIVING and plan.exchanged[s]:
+                for h in range(len(nodes.rows)):
+                    schedule_reading(nodes, readings, plan, links, scratch, arrays, b, s, h)
+                take_silent(plan, links, b, s, 0)
+            if plan.part != SENDING:
+                if plan.exchanged[s]:
+                    for h in range(len(nodes.rows)):
+                        hear_sensors(nodes, readings, plan, links, scratch, arrays, b, s, h)
+                show(nodes, plan, samples, scratch, b, s)
+                rebase(nodes, readings, scratch, b, s)
+
+
+@kernel
+def schedule_reading(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: ScheduledArrays,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Decide if node ``h`` sends its reading."""
+    lanes = scratch.lanes
+    news = weigh_news(
+        lanes, arrays.prior, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
+    )
+    store(lanes, scratch.row, 0, news)
+    for q in range(len(lanes)):
+        # The first reading is sent in any case.
+        chance = chance_of_silence(scratch.row[0, q])
+        known = arrays.known[b, len(links.sender) + h, q] == 1
+        silent = known and plan.uniform[b, s, 0, h, q] < chance
+        if scratch.row[0, q] == NO_READING or silent:
+            plan.sent[b, s, 0, h, q] = 0
+
+
+@kernel
+def hear_sensors(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: ScheduledArrays,
+    b: int,
+    s: int,
+    h: int,
+) -> None:
+    """Update filter ``h`` of a block with the readings that were sent, its own first, and the
+    silence of the other sensors that it knows.
+    """
+    sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
+    own = len(links.sender) + h
+    hear_one(nodes, readings, scratch, arrays, b, s, h, h, own, sent)
+    for m in range(links.first[h], links.first[h + 1]):
+        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.way[m])
+        hear_one(nodes, readings, scratch, arrays, b, s, h, links.sender[m], m, arrived)
+
+
+@kernel
+def hear_one(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    scratch: SlotScratch,
+    arrays: ScheduledArrays,
+    b: int,
+    s: int,
+    h: int,
+    sender: int,
+    place: int,
+    arrived: Any,
+) -> None:
+    """Update filter ``h`` of a block with what ``sender`` says, at a ``place`` of the sensors that
+    are known: its reading where that has ``arrived``, else its silence.
+    """
+    lanes, rows = scratch.lanes, nodes.rows[sender]
+    known = load_flags(lanes, arrays.known, b, place)
+    if any_lane(arrived):
+        d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
+        for k in range(rows):
+            for i in range(nodes.xhat.shape[2]):
+                before = load(lanes, arrays.H, b, place, k, i)
+                now = load(lanes, readings.H, d, t, sender, k, i)
+                store(lanes, arrays.H, b, place, k, i, select(arrived, now, before))
+        use_reading(nodes, readings, scratch, b, s, h, sender, arrived)
+    silent = select(arrived, 0.0, select(known, 1.0, 0.0)) > 0.0
+    if any_lane(silent):
+        use_silence(nodes, scratch, arrays, b, h, sender, place, silent)
+    store_flags(lanes, arrays.known, b, place, select(arrived, 1.0, select(known, 1.0, 0.0)) > 0.0)
+
+
+@kernel
+def use_silence(
+    nodes: SlotNodes,
+    scratch: SlotScratch,
+    arrays: ScheduledArrays,
+    b: int,
+    h: int,
+    sender: int,
+    place: int,
+    silent: Any,
+) -> None:
+    """Update filter ``h`` of a block with the reading ``H xbar`` with noise ``R + Y^-1``, in the
+    lanes where the ``sender`` is ``silent``.
+    """
+    lanes, n = scratch.lanes, nodes.xhat.shape[2]
+    for k in range(nodes.rows[sender]):
+        innovation = spread(lanes, 0.0)
+        for i in range(n):
+            total = spread(lanes, 0.0)
+            for j in range(k + 1):
+                total += arrays.wider[sender, k, j] * load(lanes, arrays.H, b, place, j, i)
+            store(lanes, arrays.seen, i, total)
+            # No innovation with respect to the prediction.
+            gap = load(lanes, arrays.prior, b, h, i) - load(lanes, nodes.xhat, b, h, i)
+            innovation += total * gap
+        for j in range(n):
+            total = spread(lanes, 0.0)
+            for i in range(j, n):
+                total += load(lanes, arrays.seen, i) * load(lanes, nodes.root, b, h, i, j)
+            store(lanes, scratch.row, j, select(silent, total, 0.0))
+        gains = scratch.gains
+        step = innovation * rotate_lanes(lanes, nodes.root, b, h, scratch.row, gains)
+        for i in range(n):
+            x = load(lanes, nodes.xhat, b, h, i)
+            store(lanes, nodes.xhat, b, h, i, x + load(lanes, gains, i) * step)
 
 
 class ScheduledState(NamedTuple):
@@ -81,6 +325,31 @@ class ScheduledReadings(Filter):
     one_way: ClassVar[bool] = True
     randomised: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
+    slot_kernel = staticmethod(scheduled_slots)
+
+    def decides_in_slots(self) -> bool:
+        """Return True."""
+        return True
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[ScheduledArrays]:
+        """Return what nodes know of each other's sensors, nothing so far."""
+        models, blocks = [state.model for state in states], blocks_of(runs)
+        (H, n), ways = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
+        weights = whitened_triggers(models, self.Y)
+        p, places = weights.shape[1], ways + H
+        return (
+            ScheduledArrays(
+                weights,
+                np.stack([silence_root(one) for one in weights]),
+                aligned((blocks, places, p, n, LANES)),
+                np.zeros((blocks, places, LANES), dtype=np.uint8),
+                aligned((blocks, H, n, LANES)),
+                aligned((p, LANES)),
+                aligned((n, LANES)),
+            ),
+        )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return the numbers of a message, a reading; sensors do not change and are not counted."""
@@ -106,10 +375,11 @@ class ScheduledReadings(Filter):
         reading = state.reading
         if reading is None:
             return state, None
-        z = reading.y - reading.H @ state.prior
         # The sender is known from its first message on: that is sent in any case.
-        if -1 in state.senders and is_silent(z, self.Y, exchange.uniform):
-            return state, None
+        if -1 in state.senders:
+            chance = chance_of_silence(news_of(reading, state.prior, self.Y))
+            if exchange.uniform < chance:
+                return state, None
         return state._replace(sent=True), reading
 
     def absorb(
@@ -146,16 +416,233 @@ class ScheduledReadings(Filter):
         return payload._replace(y=payload.y + payload.H @ offset)
 
 
+class TriggerArrays(NamedTuple):
+    """``trigger`` (H, p, p) for whitened rows; of the last reading of each node its ``news``
+    (B, H, L), and whether it is ``undecided`` if it is sent, and if not, ``silent``; whether a node
+    has ``begun`` to send after readings (B, H, L, each). Predictions ``x`` (B, H, n, L) and ``z``
+    (p, L) are scratch.
+    """
+
+    trigger: FloatArray
+    news: FloatArray
+    undecided: np.ndarray
+    silent: np.ndarray
+    begun: np.ndarray
+    x: FloatArray
+    z: FloatArray
+
+
+def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> TriggerArrays:
+    """Return the arrays of nodes that have read nothing."""
+    trigger, places = whitened_triggers(models, Y), (blocks_of(runs), len(models))
+    return TriggerArrays(
+        trigger,
+        np.full((*places, LANES), NO_READING),
+        undecided=np.ones((*places, LANES), dtype=np.uint8),
+        silent=np.zeros((*places, LANES), dtype=np.uint8),
+        begun=np.zeros((*places, LANES), dtype=np.uint8),
+        x=aligned((*places, len(models[0].F), LANES)),
+        z=aligned((trigger.shape[1], LANES)),
+    )
+
+
+class TriggerPlan(NamedTuple):
+    """How the slots of a filter go: the ``first`` step of an exchange after the reading; whether
+    estimates are ``predicted`` before it; whether frames begin before it (``framed``); whether an
+    exchange before it moves estimates, so that it must be ``split`` off.
+    """
+
+    first: int
+    predicted: bool
+    framed: bool
+    split: bool
+
+
+def trigger_plan(inner: Filter) -> TriggerPlan | None:
+    """Return how the slots of a filter go; None where innovations cannot be told from outside."""
+    schedule = inner.schedule or ()
+    before = schedule[: schedule.index("sense")]
+    early = before.count("exchange")
+    moves = any(inner.moves_estimates(phase) for phase in range(early))
+    # The exchanges of a slot are split from the rest by leaving one of both out.
+    if moves and (early < schedule.count("exchange") or "predict" in before):
+        return None
+    first = sum(inner.exchange_steps(phase) for phase in range(early))
+    return TriggerPlan(first, "predict" in before, inner.predicts, moves)
+
+
+@kernel
+def judge_slot(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: TriggerArrays,
+    order: TriggerPlan,
+    s: int,
+) -> None:
+    """Decide who sends in slot ``s``: before the reading by the last one, then by this."""
+    for b in range(plan.sent.shape[0]):
+        for e in range(order.first):
+            decide_step(plan, arrays, b, s, e)
+        if plan.sensed[s] and not order.split:
+            expect_all(nodes, readings, arrays, scratch, b, s, order.predicted, order.framed)
+        for e in range(order.first, plan.sent.shape[2]):
+            decide_step(plan, arrays, b, s, e)
+        for e in range(plan.sent.shape[2]):
+            take_silent(plan, links, b, s, e)
+
+
+@kernel
+def decide_step(plan: SlotPlan, arrays: TriggerArrays, b: int, s: int, e: int) -> None:
+    """Decide for all nodes of a block that are asked in a step."""
+    for h in range(plan.sent.shape[3]):
+        for q in range(plan.sent.shape[4]):
+            if plan.sent[b, s, e, h, q] == 0:
+                continue
+            if arrays.undecided[b, h, q] == 1:
+                # After the first reading a node sends in any case.
+                news, u = arrays.news[b, h, q], plan.uniform[b, s, e, h, q]
+                silent = arrays.begun[b, h, q] == 1 and u < chance_of_silence(news)
+                arrays.undecided[b, h, q], arrays.silent[b, h, q] = 0, silent
+                if news >= 0.0:
+                    arrays.begun[b, h, q] = 1
+            if arrays.silent[b, h, q] == 1:
+                plan.sent[b, s, e, h, q] = 0
+
+
+@kernel
+def expect_all(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    arrays: TriggerArrays,
+    scratch: SlotScratch,
+    b: int,
+    s: int,
+    predicted: bool,
+    framed: bool,
+) -> None:
+    """Keep the news of the readings of all nodes of a block in slot ``s``; estimates are still to
+    be ``predicted``, or counted from the origin that begins with the slot (``framed``).
+    """
+    lanes = scratch.lanes
+    for h in range(len(nodes.rows)):
+        for i in range(nodes.xhat.shape[2]):
+            x = load(lanes, nodes.xhat, b, h, i)
+            if framed and readings.rebased[s]:
+                x -= load(lanes, readings.local, b, s, i)
+            store(lanes, arrays.x, b, h, i, x)
+        if predicted:
+            move_mean(lanes, arrays.x, b, h, nodes.F, scratch.moved_mean)
+        news = weigh_news(
+            lanes, arrays.x, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
+        )
+        store(lanes, arrays.news, b, h, news)
+        for q in range(len(lanes)):
+            arrays.undecided[b, h, q], arrays.silent[b, h, q] = 1, 0
+
+
+@kernel
+def expect_slot(
+    nodes: SlotNodes, readings: ReadingBlock, arrays: TriggerArrays, scratch: SlotScratch
+) -> None:
+    """Apply ``expect_all`` to a block of one slot in which only the reading is left."""
+    for b in range(nodes.xhat.shape[0]):
+        expect_all(nodes, readings, arrays, scratch, b, 0, False, False)
+
+
+class TriggeredSlots:
+    """The kernel of a filter with a trigger: decisions, and the filter's own kernel with what is
+    sent, slot by slot.
+    """
+
+    def __init__(self, inner: Filter, order: TriggerPlan) -> None:
+        self._inner, self._kernel = inner, inner.slot_kernel
+        self._order, self._decides = order, inner.decides_in_slots()
+        self.__name__ = self._kernel.__name__
+
+    def __call__(
+        self,
+        nodes: SlotNodes,
+        readings: ReadingBlock,
+        plan: SlotPlan,
+        links: SlotLinks,
+        samples: SlotSamples,
+        scratch: SlotScratch,
+        arrays: TriggerArrays,
+        states: Sequence[Any],
+        *more: Any,
+    ) -> None:
+        """Carry the filters through the slots of a plan."""
+        carried = nodes._replace(xhat=self._inner.carried_estimates(nodes.xhat, more))
+        for s in range(plan.up.shape[1]):
+            asked = plan.sent[:, s : s + 1].copy()
+            if plan.part != ARRIVING:
+                judge_slot(carried, readings, plan, links, scratch, arrays, self._order, s)
+            if plan.part == SENDING and not self._decides:
+                continue
+            here, one, shown = slot_alone(readings, plan, samples, s)
+            if self._decides:
+                # The filter decides by itself, whatever the trigger says.
+                one = one._replace(sent=asked, part=plan.part)
+            given = links, shown, scratch, *self._inner.slot_gains(states, more, plan.first + s, 1)
+            if self._order.split:
+                self._kernel(nodes, here, one._replace(sensed=NOWHERE), *given)
+                if plan.sensed[s]:
+                    expect_slot(carried, here, arrays, scratch)
+                # The sample and the new origin come with the exchange.
+                here, never = here._replace(rebased=NOWHERE), np.full(1, -1)
+                one = one._replace(exchanged=NOWHERE, sample=never)
+            self._kernel(nodes, here, one, *given)
+            if self._decides:
+                plan.sent[:, s : s + 1] &= one.sent
+                plan.up[:, s : s + 1] = one.up
+
+
+def slot_alone(
+    readings: ReadingBlock, plan: SlotPlan, samples: SlotSamples, s: int
+) -> tuple[ReadingBlock, SlotPlan, SlotSamples]:
+    """Return readings, plan and samples of slot ``s`` alone, for a kernel whose filters do not
+    decide who sends.
+    """
+    here = slice(s, s + 1)
+
+    def taken(values: Any) -> Any:
+        return np.ascontiguousarray(values[:, here])
+
+    local, fixed = taken(readings.local), readings.H.shape[1] == 1
+    H = readings.H if fixed else taken(readings.H)
+    alone = ReadingBlock(taken(readings.y), H, local, readings.rebased[here])
+    nothing = np.zeros((0,) * 5, dtype=np.uint8), np.zeros((0,) * 5)
+    one = SlotPlan(
+        plan.first + s, plan.sensed[here], plan.exchanged[here], plan.sample[here], taken(plan.up),
+        *nothing, WHOLE,
+    )  # fmt: skip
+    shown = samples._replace(absolute=taken(samples.absolute), local=taken(samples.local))
+    return alone, one, shown
+
+
 class WrappedState(NamedTuple):
-    """The state of the wrapped filter, ``inner``; the innovation z (p,) of the last reading, None
-    without one; if the node has ``begun`` to send after readings; if it is ``silent`` until the
-    next one, None before that is decided.
+    """The state of the wrapped filter, ``inner``; the ``news`` z' Y z of the last reading,
+    NO_READING without one; if the node has ``begun`` to send after readings; if it is ``silent``
+    until the next one, None before that is decided.
     """
 
     inner: Any
-    z: FloatArray | None = None
+    news: float = NO_READING
     begun: bool = False
     silent: bool | None = None
+
+    @property
+    def xhat(self) -> FloatArray:
+        """The estimate (n,) of the filter."""
+        return np.asarray(self.inner.xhat)
+
+    @property
+    def root(self) -> FloatArray:
+        """The root (n, n) of its covariance."""
+        return np.asarray(self.inner.root)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,12 +662,37 @@ class TriggeredMessages(Filter):
     combination: ClassVar[str] = ""
     # Who is heard depends on data.
     P_by_design: ClassVar[tuple[str, str]] = ("", "")
-    slot_kernel: ClassVar[Any] = None
 
     @property
     def wrapped(self) -> Filter:
         """The filter that the trigger belongs to."""
         return self.inner
+
+    @cached_property
+    def slot_kernel(self) -> TriggeredSlots | None:
+        """The slots of the filter with the trigger, where the filter is compiled."""
+        inner, plan = self.inner, trigger_plan(self.inner)
+        # Of derived classes the kernel knows nothing.
+        known = type(inner) in built_in_filters().values() and inner.slot_kernel is not None
+        return TriggeredSlots(inner, plan) if known and plan is not None else None
+
+    def decides_in_slots(self) -> bool:
+        """Return True."""
+        return True
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[Any, ...]:
+        """Return the arrays of the trigger, the filter's states and its arrays."""
+        inner = [state.inner for state in states]
+        arrays = trigger_arrays([state.model for state in inner], self.Y, runs)
+        return (arrays, inner, *self.inner.slot_arrays(inner, infos, runs))
+
+    def slot_gains(
+        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
+    ) -> tuple[Any, ...]:
+        """Return the arrays: the filter's gains are asked for slot by slot."""
+        return arrays
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
         """Nothing is decided yet."""
@@ -191,26 +703,23 @@ class TriggeredMessages(Filter):
         return state._replace(inner=self.inner.predict(state.inner, gap))
 
     def update(self, state: WrappedState, reading: Reading) -> WrappedState:
-        """Keep the innovation for the decision, and use the reading."""
-        z = None
+        """Keep the news for the decision, and use the reading."""
+        news = NO_READING
         if len(reading.y):
-            z = reading.y - reading.H @ self.inner.estimate(state.inner)[0]
-        return WrappedState(self.inner.update(state.inner, reading), z, state.begun)
+            news = news_of(reading, self.inner.estimate(state.inner)[0], self.Y)
+        return WrappedState(self.inner.update(state.inner, reading), news, state.begun)
 
     def emit(self, state: WrappedState, exchange: Exchange) -> tuple[WrappedState, Any]:
         """Send what the filter sends, or nothing until the next reading."""
         silent = state.silent
         if silent is None:
             # After the first reading a node sends in any case.
-            silent = (
-                state.z is not None and state.begun and is_silent(state.z, self.Y, exchange.uniform)
-            )
-            begun = state.begun or state.z is not None
+            silent = state.begun and exchange.uniform < chance_of_silence(state.news)
+            begun = state.begun or state.news >= 0.0
             state = state._replace(silent=silent, begun=begun)
-        if silent:
-            return state, None
+        # As if the message were lost: the filter has sent it.
         inner, payload = self.inner.emit(state.inner, exchange)
-        return state._replace(inner=inner), payload
+        return state._replace(inner=inner), None if silent else payload
 
     def absorb(
         self, state: WrappedState, messages: Sequence[Message], exchange: Exchange

@@ -405,6 +405,11 @@ class BarShalomCampo(Filter):
             ),
         )
 
+    def carried_estimates(self, shown: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
+        """Return the own tracks."""
+        tracks: TrackArrays = arrays[0]
+        return tracks.xhat
+
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where tracks do not begin alike or H varies."""
         why = "where cross-covariances begin"

@@ -328,15 +328,23 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
 @kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
     """Move the estimate of a filter to the next slot, ``F xhat``."""
-    lanes, n = scratch.lanes, nodes.xhat.shape[2]
+    move_mean(scratch.lanes, nodes.xhat, b, h, nodes.F, scratch.moved_mean)
+
+
+@kernel(inlined=True)
+def move_mean(
+    lanes: Lanes, x: FloatArray, b: int, h: int, F: FloatArray, moved_mean: FloatArray
+) -> None:
+    """Make an estimate of ``x`` (B, H, n, L) ``F`` times that; ``moved_mean`` (n, L) is scratch."""
+    n = x.shape[2]
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(n):
-            total += nodes.F[i, j] * load(lanes, nodes.xhat, b, h, j)
-        store(lanes, scratch.moved_mean, i, total)
+            total += F[i, j] * load(lanes, x, b, h, j)
+        store(lanes, moved_mean, i, total)
     # F xhat needs all of the old xhat, hence the copy.
     for i in range(n):
-        store(lanes, nodes.xhat, b, h, i, load(lanes, scratch.moved_mean, i))
+        store(lanes, x, b, h, i, load(lanes, moved_mean, i))
 
 
 @kernel(inlined=True)
