@@ -13,11 +13,41 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.kernels.slots import whiten_reading
+from netkf.algorithms.kernels.slots import (
+    ARRIVING,
+    SENDING,
+    ReadingBlock,
+    SlotLinks,
+    SlotNodes,
+    SlotPlan,
+    SlotSamples,
+    SlotScratch,
+    predict_all,
+    rebase,
+    rotate_lanes,
+    show,
+    take_silent,
+    whiten_reading,
+)
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import (
+    LANES,
+    ONE,
+    Lanes,
+    aligned,
+    any_lane,
+    load,
+    load_flags,
+    root_of,
+    select,
+    spread,
+    store,
+)
+
+HALF_PI = math.pi / 2.0
 
 
 class Bits(NamedTuple):
@@ -47,6 +77,202 @@ class OneBitState(NamedTuple):
         return self.root @ self.root.T
 
 
+class BitArrays(NamedTuple):
+    """Scratch: the ``signs`` (p, L) that are sent in a slot."""
+
+    signs: FloatArray
+
+
+@kernel
+def one_bit_slots(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    samples: SlotSamples,
+    scratch: SlotScratch,
+    arrays: BitArrays,
+) -> None:
+    """Carry sign-of-innovations filters through the slots of a plan."""
+    for b in range(plan.up.shape[0]):
+        for s in range(plan.up.shape[1]):
+            turn = (plan.first + s) % len(nodes.rows)
+            if plan.exchanged[s] and plan.part != ARRIVING:
+                silence_others(plan, readings, nodes.rows, turn, b, s)
+                take_silent(plan, links, b, s, 0)
+            if plan.part == SENDING:
+                continue
+            if plan.sensed[s]:
+                predict_all(nodes, scratch, b)
+                share_bits(nodes, readings, plan, links, scratch, arrays, turn, b, s)
+            show(nodes, plan, samples, scratch, b, s)
+            rebase(nodes, readings, scratch, b, s)
+
+
+@kernel
+def silence_others(
+    plan: SlotPlan, readings: ReadingBlock, rows: np.ndarray, turn: int, b: int, s: int
+) -> None:
+    """Let all nodes be silent but the one whose ``turn`` it is, and that one where it has not read
+    anything.
+    """
+    for h in range(plan.sent.shape[3]):
+        if h != turn or not has_read(readings, rows[h], b, s, h):
+            plan.sent[b, s, 0, h] = 0
+
+
+@kernel
+def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
+    """Return True if filter ``h`` has a reading in slot ``s``, the same in all runs: of a recorded
+    sensor without a row y and H are zero.
+    """
+    if readings.H.shape[1] == 1:
+        return rows > 0
+    for k in range(rows):
+        if readings.y[b, s, h, k, 0] != 0.0:
+            return True
+        for i in range(readings.H.shape[4]):
+            if readings.H[b, s, h, k, i, 0] != 0.0:
+                return True
+    return False
+
+
+@kernel
+def has_links(links: SlotLinks, h: int) -> bool:
+    """Return True if filter ``h`` hears someone or is heard; others are not asked for messages."""
+    found = links.first[h] < links.first[h + 1]
+    for m in range(len(links.sender)):
+        found |= links.sender[m] == h
+    return bool(found)
+
+
+@kernel
+def share_bits(
+    nodes: SlotNodes,
+    readings: ReadingBlock,
+    plan: SlotPlan,
+    links: SlotLinks,
+    scratch: SlotScratch,
+    arrays: BitArrays,
+    turn: int,
+    b: int,
+    s: int,
+) -> None:
+    """Make and use the bits of the node whose ``turn`` it is, and use them where they are heard in
+    slot ``s``.
+    """
+    lanes, rows = scratch.lanes, nodes.rows[turn]
+    # Not what ``sent`` says: its own bits a node uses even if something keeps it from sending them.
+    if not has_links(links, turn) or not has_read(readings, rows, b, s, turn):
+        return
+    send_bits(
+        lanes, nodes.xhat, nodes.root, b, turn, rows, readings, s, arrays.signs, scratch.row,
+        scratch.gains,
+    )  # fmt: skip
+    for m in range(len(links.sender)):
+        if links.sender[m] != turn:
+            continue
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        for h in range(len(nodes.rows)):
+            if any_lane(arrived) and links.first[h] <= m < links.first[h + 1]:
+                for k in range(rows):
+                    use_bit(
+                        lanes, nodes.xhat, nodes.root, b, h, load(lanes, arrays.signs, k),
+                        readings, (s, turn, k), arrived, scratch.row, scratch.gains,
+                    )  # fmt: skip
+
+
+@kernel
+def send_bits(
+    lanes: Lanes,
+    x: FloatArray,
+    root: FloatArray,
+    b: int,
+    h: int,
+    rows: int,
+    readings: ReadingBlock,
+    s: int,
+    signs: FloatArray,
+    row: FloatArray,
+    gains: FloatArray,
+) -> None:
+    """Write the ``signs`` (p, L) of the innovations of filter ``h`` in slot ``s``, and use them;
+    ``row`` and ``gains`` (n, L) are scratch.
+    """
+    # H that is fixed has one block and one slot.
+    c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
+    for k in range(rows):
+        # Each row refers to the estimate that has used the bits of those before it.
+        innovation = load(lanes, readings.y, b, s, h, k)
+        for i in range(x.shape[2]):
+            innovation -= load(lanes, readings.H, c, t, h, k, i) * load(lanes, x, b, h, i)
+        store(lanes, signs, k, select(innovation >= 0.0, spread(lanes, 1.0), spread(lanes, -1.0)))
+        use_bit(
+            lanes, x, root, b, h, load(lanes, signs, k), readings, (s, h, k), True, row, gains
+        )  # fmt: skip
+
+
+@kernel
+def use_bit(
+    lanes: Lanes,
+    x: FloatArray,
+    root: FloatArray,
+    b: int,
+    h: int,
+    sign: Any,
+    readings: ReadingBlock,
+    place: tuple[int, int, int],
+    arrived: Any,
+    row: FloatArray,
+    gains: FloatArray,
+) -> None:
+    """Correct filter ``h`` by the ``sign`` of the innovation of the whitened row at ``place``
+    [s, sender, k] of H, in the lanes where it has ``arrived``.
+
+    With ``p = h P h'``, ``P - (2 / pi) P h' h P / (p + 1)`` is the Kalman update with noise
+    ``r = (pi / 2 - 1) p + pi / 2``, and ``P h' sqrt(2 / pi / (p + 1))`` is its gain times
+    ``sqrt(pi / 2 (p + 1))``.
+    """
+    s, sender, k = place
+    n = x.shape[2]
+    c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
+    square = spread(lanes, 0.0)
+    for j in range(n):
+        total = spread(lanes, 0.0)
+        for i in range(j, n):
+            total += load(lanes, readings.H, c, t, sender, k, i) * load(lanes, root, b, h, i, j)
+        # A row of zeros changes nothing.
+        total = select(arrived, total, 0.0)
+        square += total * total
+        store(lanes, row, j, total)
+    scale = 1.0 / root_of((HALF_PI - 1.0) * square + HALF_PI)
+    for j in range(n):
+        store(lanes, row, j, scale * load(lanes, row, j))
+    over = rotate_lanes(lanes, root, b, h, row, gains)
+    step = sign * over * scale * root_of(HALF_PI * (square + 1.0))
+    for i in range(n):
+        store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, gains, i) * step)
+
+
+@kernel
+def send_one(
+    x: FloatArray, root: FloatArray, readings: ReadingBlock, signs: FloatArray, work: FloatArray
+) -> None:
+    """Apply ``send_bits`` to one node with one lane, x (1, 1, n, 1)."""
+    send_bits(ONE, x, root, 0, 0, len(signs), readings, 0, signs, work[0], work[1])
+
+
+@kernel
+def hear_one(
+    x: FloatArray, root: FloatArray, readings: ReadingBlock, signs: FloatArray, work: FloatArray
+) -> None:
+    """Apply ``use_bit`` to one node with one lane for each of its rows."""
+    for k in range(len(signs)):
+        use_bit(
+            ONE, x, root, 0, 0, load(ONE, signs, k), readings, (0, 0, k), True, work[0], work[1]
+        )  # fmt: skip
+
+
 @built_in("one-bit")
 @dataclass(frozen=True, eq=False)
 class OneBit(Filter):
@@ -63,6 +289,17 @@ class OneBit(Filter):
     clocks: ClassVar[tuple[str, ...]] = ()
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
+    slot_kernel = staticmethod(one_bit_slots)
+
+    def decides_in_slots(self) -> bool:
+        """Return True: nodes are silent but in their turn."""
+        return True
+
+    def slot_arrays(
+        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
+    ) -> tuple[BitArrays]:
+        """Return space for the bits of one reading."""
+        return (BitArrays(aligned((max(1, *(len(s.model.H) for s in states)), LANES))),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:
         """Return the numbers of a message: a bit for each row."""
@@ -81,20 +318,16 @@ class OneBit(Filter):
         if state.reading is None or exchange.slot % state.nodes != state.turn:
             return state, None
         y, H = whiten_reading(*state.reading[:3])
-        signs = np.empty(len(y))
-        for k in range(len(y)):
-            # Each row refers to the estimate that has used the bits of those before it.
-            signs[k] = 1.0 if y[k] >= H[k] @ state.xhat else -1.0
-            state = use_bit(state, float(signs[k]), H[k])
-        return state, Bits(signs, H)
+        signs = np.zeros(len(y))
+        return corrected(state, send_one, y, H, signs), Bits(signs, H)
 
     def absorb(
         self, state: OneBitState, messages: Sequence[Message], exchange: Exchange
     ) -> OneBitState:
         """Correct by the bits of the sender whose turn it is."""
         for message in messages:
-            for sign, h in zip(message.payload.signs.tolist(), message.payload.H, strict=True):
-                state = use_bit(state, sign, h)
+            signs, H = message.payload
+            state = corrected(state, hear_one, np.zeros(len(signs)), H, signs)
         return state
 
     shift = Filter.shift  # signs of innovations do not depend on the origin
@@ -104,16 +337,20 @@ class OneBit(Filter):
         return payload
 
 
-def use_bit(state: OneBitState, sign: float, h: FloatArray) -> OneBitState:
-    """Return the state after the sign of the innovation of a row h (n,) with noise variance 1."""
-    S = state.root
-    seen = S.T @ h
-    size = float(seen @ seen) + 1.0
-    gain = S @ seen / math.sqrt(size)
-    # P - (2 / pi) g g' = S (I - c seen seen') S' with c = (2 / pi) / size, whose root is
-    # S (I - a seen seen') with a |seen|^2 = 1 - sqrt(1 - c |seen|^2).
-    square = float(seen @ seen)
-    c = 2.0 / math.pi / size
-    a = c / (1.0 + math.sqrt(1.0 - c * square))
-    root = lower_root(S - a * np.outer(S @ seen, seen))
-    return state._replace(xhat=state.xhat + math.sqrt(2.0 / math.pi) * sign * gain, root=root)
+def corrected(
+    state: OneBitState, use: Any, y: FloatArray, H: FloatArray, signs: FloatArray
+) -> OneBitState:
+    """Return the state after the bits of a whitened reading y (p,), H (p, n): ``send_one`` makes
+    the ``signs`` (p,), ``hear_one`` takes them.
+    """
+    n = len(state.xhat)
+    x = np.array(state.xhat).reshape(1, 1, n, 1)
+    root = np.array(state.root).reshape(1, 1, n, n, 1)
+    readings = ReadingBlock(
+        y.reshape(1, 1, 1, -1, 1),
+        np.ascontiguousarray(H).reshape(1, 1, 1, -1, n, 1),
+        np.zeros((1, 1, n, 1)),
+        np.zeros(1, dtype=bool),
+    )
+    use(x, root, readings, signs[:, None], np.empty((2, n, 1)))
+    return state._replace(xhat=x.reshape(n), root=np.tril(root.reshape(n, n)))

@@ -23,6 +23,7 @@ NETWORKS = {
     "one way": {"graph": {"kind": "edges", "edges": ARROWS, "directed": True}, "channel": LOSS},
     "bursts": {"graph": GRAPH, "channel": {"loss": BURSTS, "symmetric": False}},
     "tree": {"graph": {"kind": "star", "nodes": 6}, "channel": {**LOSS, "symmetric": False}},
+    "complete": {"graph": {"kind": "complete", "nodes": 5}},
     "dense": {"graph": {"kind": "complete", "nodes": 9}, "channel": {**LOSS, "symmetric": False}},
     "late": {"graph": GRAPH, "channel": {"delay": {"kind": "uniform", "low": 0.0, "high": 0.6}}},
     "alone": {"graph": {"kind": "edges", "edges": [], "nodes": 5}},
@@ -33,6 +34,7 @@ FILTERS = {
     "cross-covariance": {"kind": "track-fusion", "rule": "cross-covariance"},
     "belief-propagation": {"kind": "belief-propagation", "steps": 3},
     "beliefs that are kept": {"kind": "belief-propagation", "steps": 2, "memory": "all"},
+    "one-bit": {"kind": "one-bit"},
 }
 
 
@@ -55,10 +57,12 @@ def made(name, folder, seed=0, n=2, **more):
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("name", FILTERS)
 def test_both_engines_make_the_same_run(name, network, tmp_path):
+    missing = 0
     for seed, n in enumerate((1, 2, 4)):
         scenario = made(name, tmp_path, seed, n, network=network_of(network))
         run = assert_agree(scenario, replica=seed)
-        assert network in ("lossless", "alone") or run.count("lost") + run.count("late") > 5
+        missing += run.count("lost") + run.count("late")
+    assert (missing > 5) == (network not in ("lossless", "complete", "alone"))
 
 
 @pytest.mark.parametrize("network", ["loss", "one way", "dense"])
@@ -94,7 +98,8 @@ def test_errors_of_unstable_plants_are_exact(name, tmp_path):
     run = assert_agree(made(name, tmp_path, 2, **more))
     assert run.exact_errors
     assert np.abs(run.x).max() > 1e15
-    assert np.abs(run.error).max() < 50.0
+    # One bit a slot does not hold a state that grows by 30 %.
+    assert (np.abs(run.error).max() < 50.0) == (name != "one-bit")
 
 
 @pytest.mark.parametrize("name", FILTERS)

@@ -30,6 +30,7 @@ INNER = {
     },
     "push-sum-totals": {"kind": "push-sum", "gamma": 2, "delta": 5.0, "running_sums": True},
     "push-sum-asymptotic": {"kind": "push-sum", "gamma": 2, "delta": 5.0, "asymptotic": True},
+    "one-bit": {"kind": "one-bit"},
     "consensus": CONSENSUS,
 }
 """Push-sum exchanges before and after the reading; diffusion and gossip predict last."""
