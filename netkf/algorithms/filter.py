@@ -321,8 +321,9 @@ class Filter(Component):
         return True
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return False if a node never sends anything in exchange number ``phase``; for compiled
-        filters, ``emit`` says it for the others.
+        """Return False if a node with or without a sensor sends nothing in exchange number
+        ``phase``; in slots in which its recorded sensors have no row it is like one without. For
+        compiled filters, ``emit`` says it for the others.
         """
         return True
 

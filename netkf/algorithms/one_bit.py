@@ -126,13 +126,13 @@ def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
     """Return True if filter ``h`` has a reading in slot ``s``, the same in all runs: of a recorded
     sensor without a row y and H are zero.
     """
-    if readings.H.shape[1] == 1:
-        return rows > 0
+    # H that is fixed has one block and one slot.
+    c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(rows):
         if readings.y[b, s, h, k, 0] != 0.0:
             return True
         for i in range(readings.H.shape[4]):
-            if readings.H[b, s, h, k, i, 0] != 0.0:
+            if readings.H[c, t, h, k, i, 0] != 0.0:
                 return True
     return False
 

@@ -29,6 +29,7 @@ NETWORKS = {
     "alone": {"graph": {"kind": "edges", "edges": [], "nodes": 5}},
 }
 LATE = {**BROADCAST, "phase": 0.3}
+TRIGGERED = {"kind": "event-triggered", "trigger": "stochastic", "Y": 1.0}
 FILTERS = {
     "consensus-innovations": {"kind": "consensus-innovations"},
     "cross-covariance": {"kind": "track-fusion", "rule": "cross-covariance"},
@@ -102,10 +103,23 @@ def test_errors_of_unstable_plants_are_exact(name, tmp_path):
     assert (np.abs(run.error).max() < 50.0) == (name != "one-bit")
 
 
-@pytest.mark.parametrize("name", FILTERS)
-def test_recorded_sensors_may_miss_slots(name, tmp_path):
-    """Node 0 has two of them, of which one or both may have no row."""
-    for file, slots, node in (("a", (1, 2, 5), 0), ("b", (2, 3, 5), 0), ("c", (1, 3, 4, 6), 2)):
+READINGS = {
+    "intermittent": {"kind": "intermittent"},
+    "diffusion-kalman": {"kind": "diffusion-kalman"},
+    "kcf": {"kind": "kcf"},
+    "hcmci": {"kind": "hcmci"},
+    "track-fusion": {"kind": "track-fusion", "rule": "ci"},
+    "scheduled": {**TRIGGERED, "inner": {"kind": "intermittent"}},
+    "triggered": {**TRIGGERED, "inner": {"kind": "diffusion-kalman"}},
+}
+
+
+@pytest.mark.parametrize("network", ["loss", "one way", "late"])
+@pytest.mark.parametrize("name", [*FILTERS, *READINGS])
+def test_recorded_sensors_may_miss_slots(name, network, tmp_path):
+    """Node 0 has two of them, of which one or both may have no row; node 3 always reads one."""
+    files = {"a": (1, 2, 5), "b": (2, 3, 5), "c": (1, 3, 4, 6), "d": (2, 3)}
+    for (file, slots), node in zip(files.items(), (0, 0, 2, 3), strict=True):
         rows = "".join(f"{slot},{node},{0.3 * slot - node}\n" for slot in slots)
         (tmp_path / f"{file}.csv").write_text("t,node,y0\n" + rows)
     table = {"kind": "recorded", "R": [[0.4]]}
@@ -113,10 +127,17 @@ def test_recorded_sensors_may_miss_slots(name, tmp_path):
         {**table, "path": "a.csv", "H": [[1.0, 0.2]], "nodes": [0]},
         {**table, "path": "b.csv", "H": [[0.1, 0.8]], "nodes": [0]},
         {**table, "path": "c.csv", "H": [[0.5, 1.0]], "nodes": [2]},
+        {**table, "path": "d.csv", "H": [[0.5, 0.3]], "nodes": [3]},
         {"nodes": [3], "H": [[1.0, 0.0]], "R": [[0.2]]},
     ]
-    more = {"sensors": sensors, "network": network_of("loss")}
-    assert_agree(made(name, tmp_path, 1, **more))
+    more = {"sensors": sensors, "network": network_of(network)}
+    if name in FILTERS:
+        scenario = made(name, tmp_path, 1, **more)
+    else:
+        scenario = scenario_of(READINGS[name], tmp_path, 1, **more)
+    assert_agree(scenario)
+    if network != "late":
+        assert_alone(scenario, CompiledEngine(), 5, range(2, 12), fingerprint=True)
 
 
 def test_more_neighbours_than_a_number_has_bits(tmp_path):

@@ -106,6 +106,7 @@ class SlotEvents:
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
         self._rows: list[Row | Closed | None] = []
         self._sent: np.ndarray | None = None
+        self._unread = np.zeros((0, 0), dtype=bool)
         # Pairs of the exchanges of a slot that are drawn before its messages, in their order.
         self._drawn: list[tuple[list[Link], set[Link] | None]] = []
 
@@ -139,6 +140,8 @@ class SlotEvents:
     def _one_slot(self) -> np.ndarray:
         setup, algorithm, slot = self._setup, self._algorithm, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
+        if setup.may_miss:
+            self._unread = setup.unread(slot, 1)[0]
         start = self._scenario.slot_plant.slot_time(slot)
         sampled = bool(np.isin(slot, setup.samples))
         # First what arrived since the slot before, at the latest at this very time.
@@ -257,9 +260,10 @@ class SlotEvents:
 
     def _is_silent(self, way: Direction, step: Step) -> bool:
         """Return True if the sender sends nothing in this step."""
-        if self._sent is None:
-            return False
-        return not self._sent[step.step, self._scenario.topology.index[way.ends[0]]]
+        node = self._scenario.topology.index[way.ends[0]]
+        if self._sent is not None and not self._sent[step.step, node]:
+            return True
+        return bool(self._setup.may_miss and self._unread[step.step, node])
 
     def _send(self, step: Step, way: Direction, draw: Draw | None) -> None:
         (sender, receiver), number, now = way.ends, way.messages, step.begin

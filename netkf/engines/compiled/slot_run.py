@@ -225,11 +225,16 @@ class SlotRuns:
         count, algorithm = len(times.start), setup.algorithm
         extra = algorithm.slot_gains(setup.states, self._extra, self._slot, count)
         given, kernel = (setup.links, samples, self._room, *extra), algorithm.slot_kernel
+        unread = self._unread(drawn, count)
         if self._events is not None and setup.decides:
             kernel(self._nodes, readings, plan._replace(part=SENDING), *given)
+            drawn.sent[:, unread] = 0
             _, up = self._events.following(rows, drawn.sent[0, 0, :, :, 0])
             drawn.up[..., 0], plan = up, plan._replace(part=ARRIVING)
         kernel(self._nodes, readings, plan, *given)
+        if len(drawn.sent):
+            # Only now: filters decide for all nodes that are asked.
+            drawn.sent[:, unread] = 0
         self._slot += count
         return SlotBlock(sampled, shown, times, drawn)
 
@@ -293,6 +298,7 @@ class SlotRuns:
     def _draw_messages(self, times: SlotTimes) -> Drawn:
         setup = self.setup
         steps, pairs = (len(times.start), len(setup.fresh)), setup.most_pairs
+        masked = setup.decides or setup.may_miss
         # Without matchings nobody looks at pairs.
         matched = self.runs if setup.matching[0] >= 0 else 0
         drawn = Drawn(
@@ -300,7 +306,7 @@ class SlotRuns:
             np.empty((matched, *steps, pairs), dtype=np.int64),
             np.zeros((matched, *steps), dtype=np.int64),
             np.zeros(
-                (self._blocks, *steps, len(setup.nodes), LANES) if setup.decides else (0,) * 5,
+                (self._blocks, *steps, len(setup.nodes), LANES) if masked else (0,) * 5,
                 dtype=np.uint8,
             ),
         )
@@ -312,11 +318,23 @@ class SlotRuns:
             draw_matched(MANY, channels, self._matchings, exchanged, fresh, *drawn[:3])
         else:
             draw_broadcasts(MANY, channels, exchanged, fresh, drawn.up)
-        if setup.decides and matched:
+        if masked and matched:
             ask_pairs(MANY, channels, drawn.active, drawn.pairs, drawn.sent)
-        elif setup.decides:
+        elif masked:
             ask_all(MANY, channels, exchanged, drawn.sent)
         return drawn
+
+    def _unread(self, drawn: Drawn, count: int) -> np.ndarray:
+        """Take the messages of nodes that have no reading to send in the next slots out of ``up``;
+        return who they are, (S, E, N).
+        """
+        setup = self.setup
+        if not setup.may_miss:
+            return np.zeros((count, len(setup.fresh), len(setup.nodes)), dtype=bool)
+        unread = setup.unread(self._slot, count)
+        senders = setup.ends[:, : setup.ways].reshape(-1)
+        drawn.up[:, unread[:, :, senders]] = 0
+        return unread
 
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
         """Numbers of the nodes that are asked (B, S, E, N, L), empty if filters need none."""

@@ -244,6 +244,37 @@ class SlotSetup:
             for phase in self.phases
         ]
         self.talks = np.array(talks, dtype=np.uint8).reshape(len(talks), len(self.directions))
+        # Steps in which nodes send what they have read, and those that may have read nothing.
+        self.of_readings = np.array(
+            [sends(phase, True) and not sends(phase, False) for phase in self.phases], dtype=bool
+        )
+        self._recorded_slots = self._slots_with_rows(scenario) if self.of_readings.any() else {}
+
+    def _slots_with_rows(self, scenario: Scenario) -> dict[int, set[int]]:
+        """The slots in which nodes that have recorded sensors alone read, by place of the node."""
+        found: dict[int, set[int]] = {}
+        for s in self.recorded:
+            sensor: Any = scenario.sensors[s.place.entry]
+            rows = sensor.table(s.node, scenario.slot_plant.period)
+            found.setdefault(scenario.topology.index[s.node], set()).update(rows)
+        for s in self.drawn:
+            found.pop(scenario.topology.index[s.node], None)
+        return found
+
+    @property
+    def may_miss(self) -> bool:
+        """True if there are slots in which a node has no reading to send."""
+        return bool(self._recorded_slots)
+
+    def unread(self, first: int, count: int) -> np.ndarray:
+        """Whether nodes send nothing in the steps of so many slots from ``first`` on because they
+        have not read anything, (S, E, N).
+        """
+        missed = np.zeros((count, len(self.nodes)), dtype=bool)
+        for place, slots in self._recorded_slots.items():
+            missed[:, place] = [slot not in slots for slot in range(first, first + count)]
+        unread: np.ndarray = missed[:, None] & self.of_readings[:, None]
+        return unread
 
     def _draws_everything(self, scenario: Scenario) -> bool:
         """Return True if kernels can draw all messages, else they are made one by one."""
@@ -270,7 +301,8 @@ class SlotSetup:
         """Bytes that are drawn for one slot of one run."""
         floats = self.hosts * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.most_pairs + 8)
-        asked = len(self.nodes) * (self.decides + 8 * self.algorithm.randomised)
+        mask = self.decides or self.may_miss
+        asked = len(self.nodes) * (mask + 8 * self.algorithm.randomised)
         return 8 * floats + messages + len(self.fresh) * asked
 
     def block_slots(self, runs: int, rows: int) -> int:
