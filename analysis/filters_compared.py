@@ -53,6 +53,7 @@ def filters_of(scenario: netkf.Scenario) -> dict[str, object]:
         },
         "belief propagation, 3 steps": {"kind": "belief-propagation", "steps": 3},
         "consensus + innovations": "consensus-innovations",
+        "one-bit": "one-bit",
         "hybrid": {"kind": "hybrid", "epsilon": 1.0 / (1.0 + degree)},
         "intermittent": {"kind": "intermittent"},
         "local": "local",
@@ -98,7 +99,10 @@ def _quality(found: Any, k: int) -> str:
 
 def _traffic(found: Any, k: int) -> str:
     row = found.rows[k]
-    return f"{row.bytes / 60.0:,.0f}" if row.ran else "-"
+    if not row.ran:
+        return "-"
+    rate = row.bytes / 60.0
+    return f"{rate:.2f}" if 0.0 < rate < 1.0 else f"{rate:,.0f}"
 
 
 if __name__ == "__main__":

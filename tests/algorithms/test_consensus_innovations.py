@@ -5,6 +5,7 @@ import pytest
 
 import netkf
 from netkf import theory
+from netkf.algorithms.filter import Exchange, Reading
 from netkf.theory.common.errors import error_law
 from tests.algorithms.test_literature import (
     CENTRAL,
@@ -165,6 +166,24 @@ def test_a_pseudo_state_that_hides_a_direction(tmp_path):
     np.testing.assert_allclose(run.P, P, rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
     close(theory.error_covariance(scenario, run), run.P, 1e-9)
+
+
+def test_a_reading_of_which_a_row_is_missing_is_compared_with_the_rest(tmp_path):
+    """Node 2 has a sensor of one row and one of two; in the slot the first has no reading."""
+    scenario = scenario_of(FILTER, tmp_path, 1, 3)
+    node, algorithm = 2, scenario.filter.algorithm
+    model, info = scenario.slot_models[node], scenario.node_infos[node]
+    state = algorithm.predict(algorithm.init(model, *scenario.start(node), info), 1.0)
+    y, H, R = np.array([0.7, -0.4]), model.H[1:], model.R[1:, 1:]
+    after = algorithm.absorb(algorithm.update(state, Reading(y, H, R)), [], Exchange())
+    z = H.T @ np.linalg.inv(R) @ (y - H @ state.pseudo.inverse @ state.yhat)
+    yhat = state.yhat + state.gains.M @ z
+    np.testing.assert_allclose(after.yhat, yhat, rtol=1e-12)
+    xhat = state.xhat + state.gains.K @ (yhat - state.pseudo.G @ state.xhat)
+    np.testing.assert_allclose(after.xhat, xhat, rtol=1e-12)
+    # Without a reading and messages it stays.
+    silent = algorithm.absorb(state, [], Exchange())
+    np.testing.assert_array_equal(silent.yhat, state.yhat)
 
 
 def test_better_than_gains_that_are_not_optimal_and_no_better_than_central(tmp_path):

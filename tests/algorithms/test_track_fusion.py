@@ -10,6 +10,7 @@ import scipy.optimize
 import netkf
 from netkf import theory
 from netkf.algorithms.kernels.pair_fusion import fuse_tracks
+from netkf.algorithms.track_fusion import best_combination
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.theory.common.errors import error_law
 from tests.algorithms.test_literature import (
@@ -248,6 +249,30 @@ def test_estimates_of_tracks_by_the_plain_formula(network, tmp_path):
         assert run.count("lost") > 1
         np.testing.assert_allclose(run.P, P, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(run.xhat, xhat, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_units_of_states_do_not_decide_which_differences_count(seed):
+    """Three tracks, the last two of blind nodes and so the same; states of 1e-8 beside some of 1e8,
+    and a variance of differences of 1e-10 of that of the tracks.
+    """
+    random, n = np.random.default_rng(seed), 3
+    common, own = random.standard_normal((n, 2 * n)), 1e-5 * random.standard_normal((n, 2 * n))
+    zero = np.zeros((n, 2 * n))
+    factors = [np.hstack(pair) for pair in ((common, own), (common, zero), (common, zero))]
+    units = np.array([1e-8, 1.0, 1e8])
+    for scale in (np.ones(n), units):
+        scaled = [scale[:, None] * factor for factor in factors]
+        joint = np.stack([[a @ b.T for b in scaled] for a in scaled])
+        gain, root = best_combination(joint, [0, 1, 2], np.linalg.cholesky(joint[0, 0]))
+        # What the own track adds to the common error is noise: the others have none.
+        P = root @ root.T / np.outer(scale, scale)
+        np.testing.assert_allclose(P, common @ common.T, rtol=1e-4, atol=1e-6)
+        weights = gain[:, :n] + gain[:, n:]
+        np.testing.assert_allclose(weights * scale / scale[:, None], np.eye(n), atol=0.1)
+    same = best_combination(joint, [1, 2], np.eye(n))
+    assert not same[0].any()
+    np.testing.assert_array_equal(same[1], np.eye(n))
 
 
 def test_tracks_know_their_errors_and_checks_say_so(tmp_path):

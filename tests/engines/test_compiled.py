@@ -212,6 +212,20 @@ SLOT_FILTERS = st.sampled_from(
     ]
 )
 
+LITERATURE = st.sampled_from(
+    [
+        {"kind": "icf", "steps": 2},
+        {"kind": "kcf", "epsilon": 0.3},
+        {"kind": "diffusion-kalman"},
+        {"kind": "one-bit"},
+        {"kind": "track-fusion", "rule": "ci"},
+        {"kind": "track-fusion", "rule": "cross-covariance"},
+        {"kind": "belief-propagation", "steps": 2},
+        {"kind": "consensus-innovations"},
+        {"kind": "event-triggered", "trigger": "consensus"},
+    ]
+)
+
 STOPS = st.fixed_dictionaries(
     {
         "kind": st.just("push-sum"),
@@ -259,6 +273,16 @@ def slotted(draw, filters=SLOT_FILTERS):
         "network": network,
         "filter": algorithm,
     }
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(slotted(LITERATURE))
+def test_drawn_scenarios_of_the_literature_agree(tables):
+    try:
+        scenario = from_table(tables, SCENARIOS)
+    except ScenarioError:
+        reject()
+    assert_agree(scenario)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
