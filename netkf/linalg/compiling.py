@@ -177,6 +177,8 @@ def _for_any_number(function: Any) -> None:
 
 def _moderately_optimised(made: Any, config: Any) -> None:
     """Let LLVM work at its level 2: level 3 takes a quarter longer and gains nothing here."""
+    from numba.core.errors import NumbaError as numba_error  # noqa: N813
+
     compile_for = made._compile_for_args
 
     def moderately(*args: Any, **kwargs: Any) -> Any:
@@ -184,7 +186,12 @@ def _moderately_optimised(made: Any, config: Any) -> None:
         config.OPT = type(before)(2)
         try:
             # One link step for the function and all that it calls, see linking.
-            with linked_once(), without_collection():
+            try:
+                with linked_once(), without_collection():
+                    return compile_for(*args, **kwargs)
+            except numba_error:
+                # Once more as numba does it, to be told where in the function the error is.
+                made._cache.release()
                 return compile_for(*args, **kwargs)
         finally:
             config.OPT = before

@@ -38,6 +38,10 @@ def without_collection() -> Iterator[None]:
         yield
     finally:
         if enabled:
+            # All objects become old ones, unlooked at: the next collection would visit each.
+            if not gc.get_freeze_count():
+                gc.freeze()
+                gc.unfreeze()
             gc.enable()
 
 
@@ -73,14 +77,23 @@ def kernel_compiler(lean: bool) -> Any:
 
 def shortcuts() -> list[Patch]:
     """Return replacements of numba's methods: owner, name, method."""
-    from numba.core import config, event
+    from numba.core import config, event, ir, lowering, typeinfer
+    from numba.core.base import BaseContext
     from numba.core.codegen import CPUCodeLibrary
+    from numba.core.postproc import PostProcessor
     from numba.core.types.functions import BaseFunction
     from numba.np import arrayobj
 
     return [
+        (PostProcessor, "run", _without_liveness(PostProcessor.run)),
+        (BaseContext, "get_abi_sizeof", _measured_once(BaseContext.get_abi_sizeof)),
         (BaseFunction, "get_call_type", _found_once(BaseFunction.get_call_type)),
         (event, "install_timer", _no_timer),
+        (event, "start_event", _if_anyone_listens(event.start_event)),
+        (event, "end_event", _if_anyone_listens(event.end_event)),
+        (ir.Inst, "_rec_list_vars", _variables_of()),
+        (lowering, "new_error_context", _no_context),
+        (typeinfer, "new_error_context", _no_context),
         (arrayobj, "fix_integer_index", _in_order(arrayobj.fix_integer_index)),
         (
             CPUCodeLibrary,
@@ -108,6 +121,41 @@ def _found_once(find: Callable[..., Any]) -> Callable[..., Any]:
     return found
 
 
+def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Leave out which variables are alive where blocks begin, which numba finds after each of six
+    passes: generators and functions of Python objects need it, and kernels are neither.
+    """
+    from numba.core import postproc, transforms
+
+    lifetime, in_order = postproc.VariableLifetime, transforms.canonicalize_cfg
+
+    def run_lightly(self: Any, emit_dels: bool = False, **how: Any) -> None:
+        function = self.func_ir
+        if function.is_generator:
+            run(self, emit_dels, **how)
+            return
+        function.blocks = in_order(function.blocks)
+        function.variable_lifetime = lifetime(function.blocks)
+        function.generator_info = None
+        if emit_dels:
+            self._insert_var_dels(**how)
+
+    return run_lightly
+
+
+def _measured_once(size_of: Callable[..., Any]) -> Callable[..., Any]:
+    """Remember the sizes of types: numba has LLVM read a module for each."""
+    known: dict[tuple[Any, str], int] = {}
+
+    def size(context: Any, kind: Any) -> int:
+        key = context, str(kind)
+        if key not in known:
+            known[key] = size_of(context, kind)
+        return known[key]
+
+    return size
+
+
 def _in_order(wrapped: Callable[..., Any]) -> Callable[..., Any]:
     """Ask of no place that is computed if it is negative, see ``lean_lowering.is_in_order``."""
     from numba import types
@@ -125,6 +173,71 @@ def _in_order(wrapped: Callable[..., Any]) -> Callable[..., Any]:
 def _no_timer(*_: Any) -> AbstractContextManager[None]:
     """Each function that is being compiled would time each call of LLVM for its statistics."""
     return nullcontext()
+
+
+def _if_anyone_listens(tell: Callable[..., Any]) -> Callable[..., Any]:
+    """Tell of no event if nobody listens: each call of LLVM is two."""
+    from numba.core import event
+
+    listeners: Any = event._registered
+
+    def told(*args: Any, **kwargs: Any) -> None:
+        if any(listeners.values()):
+            tell(*args, **kwargs)
+
+    return told
+
+
+class _NoContext:
+    """Adds nothing to an error: ``compiling`` asks numba for the whole message if there is one."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+_NO_CONTEXT = _NoContext()
+
+
+def _no_context(*_: Any, **__: Any) -> _NoContext:
+    """Errors would be told where they happen, for each instruction."""
+    return _NO_CONTEXT
+
+
+def _variables_of() -> Callable[..., Any]:
+    """Return a search for the variables of an instruction that looks at each type once."""
+    from numba.core import ir
+
+    leaf, variable, instruction, entries, values = range(5)
+    known: dict[type, int] = {}
+
+    def role_of(part: Any) -> int:
+        if isinstance(part, ir.Var):
+            return variable
+        if isinstance(part, ir.Inst):
+            return instruction
+        return entries if isinstance(part, list | tuple) else values * isinstance(part, dict)
+
+    def collect(part: Any, found: list[Any]) -> None:
+        role = known.get(type(part))
+        if role is None:
+            role = known[type(part)] = role_of(part)
+        if role == variable:
+            found.append(part)
+        elif role == instruction:
+            found += part.list_vars()
+        elif role != leaf:
+            for each in part if role == entries else part.values():
+                collect(each, found)
+
+    def variables(_: Any, part: Any) -> list[Any]:
+        found: list[Any] = []
+        collect(part, found)
+        return found
+
+    return variables
 
 
 def _at_first_level(optimize: Callable[..., Any], config: Any) -> Callable[..., Any]:
