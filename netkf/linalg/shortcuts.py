@@ -127,7 +127,8 @@ def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
     """
     from numba.core import postproc, transforms
 
-    lifetime, in_order = postproc.VariableLifetime, transforms.canonicalize_cfg
+    lifetime: Any = postproc.VariableLifetime
+    in_order: Any = transforms.canonicalize_cfg
 
     def run_lightly(self: Any, emit_dels: bool = False, **how: Any) -> None:
         function = self.func_ir
