@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import scipy.linalg
 
+from netkf.algorithms.closed_loops import closed_loop, gain_rate, sample_maps
 from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo
+from netkf.algorithms.kernels.constant_gains import correct_by_innovation, correct_by_moments
 from netkf.algorithms.kernels.neighbours import combine_convex_roots, copy_pairs
-from netkf.algorithms.kernels.root_update import combine_roots, lower_root
+from netkf.algorithms.kernels.root_update import combine_roots
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
     SlotLinks,
@@ -28,42 +28,30 @@ from netkf.algorithms.kernels.slots import (
     SlotScratch,
     predict_all,
     predict_root,
+    predict_root_alone,
     rebase,
     show,
 )
-from netkf.algorithms.models import SlotModel, first_root, usable
+from netkf.algorithms.models import FlowModel, SlotModel, first_root, usable
 from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, either, field, matrix, nested, several
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, store
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedLoop:
-    """A filter with constant gain L (n, p) over increments: A and Q of the plant (n, n), H (p, n)
-    and R (p, p) of the sensors, as the filter believes them.
-    """
-
-    A: FloatArray
-    Q: FloatArray
-    H: FloatArray
-    R: FloatArray
-    L: FloatArray
-
-
 class ConstantGainState(NamedTuple):
     """Estimate ``xhat`` (n,), ``root`` (n, n) of P, the model, the ``gain`` (n, p) of the node, and
-    its ``loop`` where its sensors give increments.
+    the model of its closed ``loop`` where its sensors give increments.
     """
 
     xhat: FloatArray
     root: FloatArray
     model: Any
     gain: FloatArray
-    loop: ClosedLoop | None
+    loop: FlowModel | None
 
     @property
     def P(self) -> FloatArray:
@@ -174,9 +162,8 @@ class ConstantGain(Filter):
         for k, state in enumerate(states):
             p = len(state.model.H)
             if p:
-                scaled = state.gain @ np.linalg.cholesky(state.model.R)
-                closed[k] = np.eye(n) - state.gain @ state.model.H
-                noise[k], gain[k, :, :p] = lower_root(scaled), scaled
+                closed[k], noise[k] = sample_maps(state.gain, state.model.H, state.model.R)
+                gain[k, :, :p] = state.gain @ np.linalg.cholesky(state.model.R)
         return (ConstantGainArrays(closed, noise, gain),)
 
     def init(
@@ -185,7 +172,7 @@ class ConstantGain(Filter):
         """Return the first state of a node, which has its gain."""
         gain = self.gain_of(node.place)
         increments = not isinstance(model, SlotModel) and len(model.H)
-        loop = ClosedLoop(model.A, model.Q, model.H, model.R, gain) if increments else None
+        loop = closed_loop(model, gain) if increments else None
         return ConstantGainState(mean, first_root(cov), model, gain, loop)
 
     def gain_of(self, index: int) -> FloatArray:
@@ -197,24 +184,27 @@ class ConstantGain(Filter):
         if state.loop is None:
             xhat, root = state.model.predict(state.xhat, state.root, gap)
             return state._replace(xhat=xhat, root=root)
-        flow = closed_flow(state.loop, gap)
-        root = lower_root(np.concatenate([flow.closed @ state.root, flow.noise], axis=1))
-        return state._replace(xhat=flow.open @ state.xhat, root=root)
+        xhat, _ = state.model.extrapolate(state.xhat, state.root, gap)
+        _, root = state.loop.predict(state.xhat, state.root, gap)
+        return state._replace(xhat=xhat, root=root)
 
     def update(self, state: ConstantGainState, reading: Any) -> ConstantGainState:
         """Use a sample or the increments of the gap that just passed."""
         if isinstance(reading, Increments):
             assert state.loop is not None
-            flow = closed_flow(state.loop, reading.gap)
-            innovation = reading.moments - flow.predictor @ state.xhat
-            return state._replace(xhat=state.xhat + flow.gains @ innovation)
+            model, n = state.model, len(state.xhat)
+            x = state.xhat.reshape(1, n).copy()
+            correct_by_moments(
+                x, 0, model.A, state.loop.A, model.H, state.gain, reading.moments.copy(),
+                reading.gap, np.empty((6, n, n)),
+            )  # fmt: skip
+            return state._replace(xhat=x[0])
         if not len(reading.y):
             return state
-        closed = np.eye(len(state.xhat)) - state.gain @ reading.H
-        noise = state.gain @ np.linalg.cholesky(reading.R)
-        root = lower_root(np.concatenate([closed @ state.root, noise], axis=1))
-        xhat = state.xhat + state.gain @ (reading.y - reading.H @ state.xhat)
-        return state._replace(xhat=xhat, root=root)
+        closed, noise = sample_maps(state.gain, reading.H, reading.R)
+        x, H = state.xhat.reshape(1, -1).copy(), np.ascontiguousarray(reading.H)
+        correct_by_innovation(x, 0, H, state.gain, reading.y, np.empty(len(state.xhat)))
+        return state._replace(xhat=x[0], root=predict_root_alone(state.root, closed, noise))
 
     def absorb(
         self, state: ConstantGainState, messages: Sequence[Message], exchange: Exchange
@@ -230,8 +220,7 @@ class ConstantGain(Filter):
 
     def max_measurement_interval(self, state: ConstantGainState) -> float:
         """Return the seconds in which the gain lets the estimate follow the readings."""
-        loop = state.loop
-        return usable(float(np.linalg.norm(loop.L @ loop.H)) if loop is not None else 0.0)
+        return usable(gain_rate(state.gain, state.model.H) if state.loop is not None else 0.0)
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where gains do not fit the readings of the nodes."""
@@ -269,57 +258,3 @@ def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
             None,
             "give it one sensor, or another filter",
         )
-
-
-class ClosedFlow(NamedTuple):
-    """Maps over a gap: ``open`` e^{A g} and ``closed`` e^{(A - L H) g} (n, n), ``noise``, a root
-    (n, n) of what both noises add to P; ``gains`` (n, 2 p) of the two moments of a reading and
-    ``predictor`` (2 p, n), the moments that the prediction at the end says it should have.
-    """
-
-    open: FloatArray
-    closed: FloatArray
-    noise: FloatArray
-    gains: FloatArray
-    predictor: FloatArray
-
-
-@lru_cache(maxsize=4096)
-def closed_flow(loop: ClosedLoop, gap: float) -> ClosedFlow:
-    """Return the maps of a filter with constant gain over ``gap`` seconds."""
-    closed = loop.A - loop.L @ loop.H
-    # The weight e^{(A - L H)(b - s)} L of dy(s) is projected on the Legendre polynomials P_0, P_1.
-    first, second = _moments(closed, gap)
-    gains = np.concatenate([first @ loop.L / gap, 3.0 * second @ loop.L / gap], axis=1)
-    back = _moments(-loop.A, gap)
-    predictor = np.concatenate([loop.H @ part for part in back])
-    E = np.asarray(scipy.linalg.expm(gap * closed))
-    W = _accumulated(closed, loop.Q + loop.L @ loop.R @ loop.L.T, gap)
-    return ClosedFlow(
-        np.asarray(scipy.linalg.expm(gap * loop.A)), E, square_root(W), gains, predictor
-    )
-
-
-def _moments(M: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``int_0^g e^{M u} P_j(1 - 2 u / g) du`` (n, n) for the polynomials P_0 and P_1."""
-    n, eye = len(M), np.eye(len(M))
-    block = np.zeros((3 * n, 3 * n))
-    block[:n, :n], block[:n, n : 2 * n], block[n : 2 * n, 2 * n :] = M, eye, eye
-    made = scipy.linalg.expm(gap * block)
-    # J_1 = int e^{M u} du and J_2 = int (g - u) e^{M u} du (Van Loan 1978).
-    J1, J2 = made[:n, n : 2 * n], made[:n, 2 * n :]
-    return J1, 2.0 * J2 / gap - J1
-
-
-def _accumulated(M: FloatArray, Q: FloatArray, gap: float) -> FloatArray:
-    """Return ``int_0^g e^{M u} Q e^{M' u} du`` (n, n), by halves where the gap is long."""
-    n = len(M)
-    if np.abs(M).sum(axis=0).max() * gap > 1.0:
-        half = _accumulated(M, Q, 0.5 * gap)
-        E = scipy.linalg.expm(0.5 * gap * M)
-        return np.asarray(half + E @ half @ E.T)
-    block = np.zeros((2 * n, 2 * n))
-    block[:n, :n], block[:n, n:], block[n:, n:] = -M, Q, M.T
-    made = scipy.linalg.expm(gap * block)
-    whole = made[n:, n:].T @ made[:n, n:]
-    return np.asarray(0.5 * (whole + whole.T))

@@ -18,6 +18,15 @@ FILTERS = {
 }
 """Kinds of filters, and what may make their nodes transmit."""
 
+ANYHOW = ("links", "directions", "nodes", "readings")
+LITERATURE = {
+    "track-fusion ci": ANYHOW,
+    "track-fusion ici": ANYHOW,
+    "constant-gain": ANYHOW,
+    "kcf": ("directions", "nodes", "readings"),
+}
+"""Those of the literature, drawn by themselves."""
+
 
 class Draw:
     """Values of a scenario from a generator; files go to a folder."""
@@ -42,24 +51,26 @@ class Draw:
         return path.name
 
 
-def drawn_table(seed, folder, sizes):
+def drawn_table(seed, folder, sizes, filters=FILTERS):
     """The table of the scenario of a seed, with as many states as one of ``sizes``; all kinds of
-    filters come in turn.
+    ``filters`` come in turn.
     """
     draw = Draw(seed, folder)
-    kind = list(FILTERS)[seed % len(FILTERS)]
-    at = FILTERS[kind][seed // len(FILTERS) % len(FILTERS[kind])]
+    kind = list(filters)[seed % len(filters)]
+    at = filters[kind][seed // len(filters) % len(filters[kind])]
     n, nodes = int(draw.one(*sizes)), int(draw.random.integers(2, 6))
     horizon = draw.number(3.0, 6.0, 1)
     links, graph = _graph(draw, nodes, at)
+    probe, plant = _probe(draw, horizon), _plant(draw, n)
+    sensors = _sensors(draw, n, nodes, horizon, kind, at)
     return {
         "format": 1,
         "name": f"drawn-{seed}",
         "seed": seed,
         "horizon": horizon,
-        "probe": _probe(draw, horizon),
-        "plant": _plant(draw, n),
-        "sensors": _sensors(draw, n, nodes, horizon, kind, at),
+        "probe": probe,
+        "plant": plant,
+        "sensors": sensors,
         "network": {
             "graph": graph,
             "activation": _activation(draw, nodes, links, horizon, at),
@@ -69,13 +80,13 @@ def drawn_table(seed, folder, sizes):
                 "symmetric": draw.chance(0.5),
             },
         },
-        "filter": _filter(draw, kind, nodes),
+        "filter": _filter(draw, kind, nodes, sensors, n),
     }
 
 
-def drawn_scenario(seed, folder, sizes):
+def drawn_scenario(seed, folder, sizes, filters=FILTERS):
     """The scenario of a seed."""
-    return from_table(drawn_table(seed, folder, sizes), folder)
+    return from_table(drawn_table(seed, folder, sizes, filters), folder)
 
 
 def _graph(draw, nodes, at):
@@ -118,7 +129,9 @@ def _plant(draw, n):
 
 
 def _sensors(draw, n, nodes, horizon, kind, at):
-    samples_only = kind in ("intermittent", "push-sum")
+    samples_only = kind in ("intermittent", "push-sum", "kcf")
+    if kind == "constant-gain":
+        return _sensors_with_gains(draw, n, nodes, horizon, at)
     found = []
     for k in range(int(draw.random.integers(1, 4))):
         p = int(draw.random.integers(1, 3))
@@ -132,6 +145,23 @@ def _sensors(draw, n, nodes, horizon, kind, at):
         if must_sample or draw.chance(0.5):
             sensor = _sampled(draw, sensor, n, horizon, kind == "push-sum")
         found.append(sensor)
+    return found
+
+
+def _sensors_with_gains(draw, n, nodes, horizon, at):
+    """One sensor that samples at a node, or up to two that give increments; a node without any."""
+    found = []
+    for node in range(nodes - 1):
+        sampled = draw.chance(0.5) or (at == "readings" and node == 0)
+        for _ in range(1 if sampled else int(draw.random.integers(1, 3))):
+            p = int(draw.random.integers(1, 3))
+            H = draw.random.normal(size=(p, n)).round(2).tolist()
+            sensor = {"nodes": [node], "H": H, "R": _covariance(draw, p)}
+            while sampled and "sampling" not in sensor:
+                # Recorded readings may be missing, for which there is no gain.
+                made = _sampled(draw, sensor, n, horizon, True)
+                sensor = made if made.get("kind") != "recorded" else sensor
+            found.append(sensor)
     return found
 
 
@@ -222,8 +252,18 @@ def _delay(draw, links):
     }[kind]
 
 
-def _filter(draw, kind, nodes):
+def _filter(draw, kind, nodes, sensors, n):
+    kind, *rule = kind.split(" ")
     chosen = {"kind": kind}
+    if kind == "track-fusion":
+        chosen |= {"rule": rule[0], "minimise": draw.one("trace", "determinant")}
+    if kind == "kcf":
+        chosen |= {"epsilon": draw.one(0.1, 0.5), "share_readings": draw.chance(0.7)}
+    if kind == "constant-gain":
+        rows = [sum(len(s["H"]) for s in sensors if node in s["nodes"]) for node in range(nodes)]
+        chosen["gain"] = [
+            (0.3 * draw.random.normal(size=(n, max(1, p)))).round(2).tolist() for p in rows
+        ]
     if kind in ("hybrid", "covariance-intersection"):
         chosen["epsilon"] = draw.one(0.1, 0.2)
     if kind == "diffusion":

@@ -2,23 +2,26 @@
 
 import collections
 
+import numpy as np
 import pytest
 
+import netkf
+from netkf.engines.compiled.engine import CompiledEngine
 from tests.engines.agreement import assert_agree
-from tests.engines.drawn import FILTERS, drawn_scenario
+from tests.engines.drawn import FILTERS, LITERATURE, drawn_scenario
 
 FEW, MANY, TOGETHER = 64, 360, 8
 SIZES = 1, 2, 5
 """Numbers of states: loops are unrolled up to 4, by code that is compiled for each."""
 
 
-def agree(seeds, folder, sizes=SIZES):
+def agree(seeds, folder, sizes=SIZES, filters=FILTERS):
     """Runs of the scenarios of these seeds."""
     runs = {}
     for seed in seeds:
         place = folder / str(seed)
         place.mkdir()
-        scenario = drawn_scenario(seed, place, sizes)
+        scenario = drawn_scenario(seed, place, sizes, filters)
         runs[seed] = scenario, assert_agree(scenario)
     return runs
 
@@ -26,6 +29,23 @@ def agree(seeds, folder, sizes=SIZES):
 @pytest.mark.parametrize("first", range(0, FEW, TOGETHER))
 def test_drawn_scenarios_agree(first, tmp_path):
     agree(range(first, first + TOGETHER), tmp_path)
+
+
+@pytest.mark.parametrize("first", range(0, FEW, TOGETHER))
+def test_filters_of_the_literature_agree(first, tmp_path):
+    """Fusion with the best weight, constant gains, consensus on predictions."""
+    for scenario, run in agree(
+        range(first, first + TOGETHER), tmp_path, filters=LITERATURE
+    ).values():
+        # Runs side by side have the same bits.
+        for batch in CompiledEngine().run_many(scenario, scenario.seed, range(2)):
+            alone = [netkf.simulate(scenario, replica=k) for k in batch.replicas]
+            for one, k in zip(alone, range(len(alone)), strict=True):
+                count = len(one.times)
+                np.testing.assert_array_equal(batch.xhat[k, :count], one.xhat)
+                np.testing.assert_array_equal(batch.P[k, :count], one.P)
+                assert batch.counts[k].sum() == len(one.log)
+        assert run.engine == "compiled"
 
 
 @pytest.mark.slow

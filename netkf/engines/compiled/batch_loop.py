@@ -87,7 +87,7 @@ def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, begun: bo
     """
     # numba identifies an array much faster than a struct.
     if run == ALONE:
-        return event_loop(state, None, None)
+        return event_loop(state, None, None, None)
     return simulate_from(state, struct_at(batch_memory, BatchArrays), run, begun)
 
 
@@ -102,7 +102,7 @@ def simulate_from(state: Simulation, batch: BatchArrays, run: int, begun: bool) 
             begin(state, batch, run)
         begun, wanted = False, -1
         while wanted != DONE:
-            wanted = event_loop(state, None, None)
+            wanted = event_loop(state, None, None, None)
             if wanted == WANT_MESSAGES:
                 return run
         finish(state, batch, run)

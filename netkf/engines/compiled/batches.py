@@ -24,7 +24,7 @@ from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.poisson import all_ticks, window_of
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.state import Filters, PathBlock, Sensing
+from netkf.engines.compiled.state import SPECIAL, Filters, PathBlock, Sensing
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES
@@ -74,7 +74,7 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
         draws = BatchDraws(scenario, seed, replicas)
         # Both have state outside the Simulation, which simulate_batch() does not carry. Origins are
         # moved by Python, run by run.
-        special = scenario.hosted.combination in ("sums", "readings")
+        special = scenario.hosted.combination in SPECIAL
         if len(draws.paths.frame_times) or special:
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
         return _all_at_once(scenario, workspace, draws)

@@ -20,6 +20,16 @@ from netkf.algorithms.kernels.root_update import (
     end_intersection,
     scale_root,
 )
+from netkf.engines.compiled.extras import (
+    Extras,
+    add_consensus,
+    fuse_mail,
+    keep_prediction,
+    predict_with_gain,
+    sample_with_gain,
+    send_prediction,
+    use_readings_heard,
+)
 from netkf.engines.compiled.increments import predict_with_increments
 from netkf.engines.compiled.late_readings import (
     History,
@@ -33,9 +43,11 @@ from netkf.engines.compiled.running_totals import Totals, add_reading, hear, off
 from netkf.engines.compiled.state import (
     AFTER_READINGS,
     CONVEX,
+    GAINS,
     INTERSECTION,
     LINKS,
     NODES,
+    PREDICTIONS,
     READINGS,
     SHARES,
     SWAP,
@@ -60,7 +72,9 @@ NEVER = math.inf
 
 
 @kernel
-def event_loop(state: Simulation, totals: Totals | None, history: History | None) -> int:
+def event_loop(
+    state: Simulation, totals: Totals | None, history: History | None, extras: Extras | None
+) -> int:
     """Simulate until the loop needs something from Python, and return what (WANT_... or DONE)."""
     while True:
         # Nothing changes before the loop knows that the event has all that it needs: it may stop
@@ -74,19 +88,19 @@ def event_loop(state: Simulation, totals: Totals | None, history: History | None
             state.piece += 1
         # Participants are predicted first.
         lost = event == ON_TICK and totals is None and history is None and is_lost(state)
-        predict_participants(state, event, lost, now)
+        predict_participants(state, extras, event, lost, now)
         if event == ON_TICK:
-            on_tick(state, totals, now)
+            on_tick(state, totals, extras, now)
             # The next events, unless there are others at this instant.
             alone = totals is None and history is None and ends_instant(state, now)
             if alone:
-                absorb_messages(state, totals, history, now)
+                absorb_messages(state, totals, history, extras, now)
         elif event == ON_ABSORB:
-            on_absorb(state, totals, history, now)
+            on_absorb(state, totals, history, extras, now)
         elif event == ON_SENSE:
             on_sense(state, now)
         elif event == ON_SAMPLE:
-            on_sample(state, totals, history, now)
+            on_sample(state, totals, history, extras, now)
         elif event == ON_DELIVER:
             on_deliver(state, now)
         elif event == ON_REBASE:
@@ -161,13 +175,15 @@ def next_of(times: FloatArray, k: int) -> float:
 
 
 @kernel
-def predict_participants(state: Simulation, event: int, lost: bool, now: float) -> None:
+def predict_participants(
+    state: Simulation, extras: Extras | None, event: int, lost: bool, now: float
+) -> None:
     """Predict the nodes that take part in an event; ``lost``: all messages of the tick are."""
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
         # The sender of a message that is lost needs no prediction, unless it reads increments.
         if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
-            predict(state, h, now)
+            predict(state, extras, h, now)
 
 
 @kernel
@@ -242,7 +258,7 @@ def note_age(
 
 
 @kernel
-def predict(state: Simulation, h: int, time: float) -> None:
+def predict(state: Simulation, extras: Extras | None, h: int, time: float) -> None:
     """Predict node ``h`` to ``time``, unless it is there already."""
     node, now = state.nodes[h], state.now[h]
     # ``not <`` also stops at a time that is not a number.
@@ -250,12 +266,16 @@ def predict(state: Simulation, h: int, time: float) -> None:
         return
     state.now[h] = time
     # With increment sensors the gap is cut into stretches.
-    if node.sensors > node.sensor:
+    if extras is not None and extras.kind == GAINS and node.sensors > node.sensor:
+        predict_with_gain(state, extras, h, now, time)
+    elif node.sensors > node.sensor:
         predict_with_increments(state, state.run, h, h, state.piece, now, time)
     else:
         # One step of the Riccati flow, exact for a gap of any length.
         gap = time - now
         move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
+    if extras is not None and extras.kind == PREDICTIONS:
+        keep_prediction(state, extras, h)
 
 
 @kernel
@@ -272,7 +292,11 @@ def on_sense(state: Simulation, now: float) -> None:
 
 @kernel
 def on_sample(
-    state: Simulation, totals: Totals | None, history: History | None, now: float
+    state: Simulation,
+    totals: Totals | None,
+    history: History | None,
+    extras: Extras | None,
+    now: float,
 ) -> None:
     """A node uses all its samples of an instant."""
     given, instant = state.instants, state.instant_at
@@ -286,6 +310,8 @@ def on_sample(
         add_reading(state, totals, h, instant)
     elif history is not None:
         use_reading(state, history, h, instant)
+    elif extras is not None and extras.kind == GAINS:
+        sample_with_gain(state, extras, h, instant)
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
     # The newest sample: what a filter of readings sends after this event.
@@ -294,7 +320,7 @@ def on_sample(
 
 
 @kernel
-def on_tick(state: Simulation, totals: Totals | None, now: float) -> None:
+def on_tick(state: Simulation, totals: Totals | None, extras: Extras | None, now: float) -> None:
     """A clock ticks, or a node has used a sample: who transmits sends to each receiver."""
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     # The record lists directed links, so that one tick may send on several.
@@ -314,11 +340,18 @@ def on_tick(state: Simulation, totals: Totals | None, now: float) -> None:
     # Outcomes of a tick lie one after the other in the order of its directed links.
     first = state.delays + ticks.at[k] - entity.first
     for m in range(entity.first, entity.after):
-        send(state, totals, state.hearing[m], ticks.delay[first + m], now)
+        send(state, totals, extras, state.hearing[m], ticks.delay[first + m], now)
 
 
 @kernel
-def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: float) -> None:
+def send(
+    state: Simulation,
+    totals: Totals | None,
+    extras: Extras | None,
+    w: int,
+    delay: float,
+    now: float,
+) -> None:
     """Send one message on a directed link; ``delay`` is LOST or nan where it is lost."""
     way, pool = state.ways[w], state.pool
     number, h = way.messages, way.sender
@@ -341,6 +374,8 @@ def send(state: Simulation, totals: Totals | None, w: int, delay: float, now: fl
         message.tag = totals.rounds[h] - 1
         for k in range(totals.sent.shape[1]):
             totals.offered[m, k] = totals.sent[h, k]
+    elif extras is not None and extras.kind == PREDICTIONS:
+        send_prediction(state, extras, m, h)
     elif state.kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
@@ -377,13 +412,17 @@ def ends_instant(state: Simulation, now: float) -> bool:
 
 @kernel
 def absorb_messages(
-    state: Simulation, totals: Totals | None, history: History | None, now: float
+    state: Simulation,
+    totals: Totals | None,
+    history: History | None,
+    extras: Extras | None,
+    now: float,
 ) -> None:
     """Let all receivers absorb their mail."""
     sort_places(state.waiting, state.receivers)
     while state.receivers > 0:
-        predict(state, state.waiting[state.absorbing], now)
-        on_absorb(state, totals, history, now)
+        predict(state, extras, state.waiting[state.absorbing], now)
+        on_absorb(state, totals, history, extras, now)
 
 
 @kernel
@@ -417,7 +456,11 @@ def arrive(state: Simulation, m: int, now: float) -> None:
 
 @kernel
 def on_absorb(
-    state: Simulation, totals: Totals | None, history: History | None, now: float
+    state: Simulation,
+    totals: Totals | None,
+    history: History | None,
+    extras: Extras | None,
+    now: float,
 ) -> None:
     """A node uses all that arrived at this instant, in the order of senders."""
     pool, h = state.pool, state.waiting[state.absorbing]
@@ -430,6 +473,8 @@ def on_absorb(
         hear(state, totals, h, now)
     elif history is not None:
         use_messages(state, history, h, now)
+    elif extras is not None:
+        combine_by_extras(state, extras, h, now)
     else:
         combine(state, h, now)
     # Messages go back to the pool only now, because handlers read them through the inbox.
@@ -461,8 +506,24 @@ def use_messages(state: Simulation, history: History, h: int, now: float) -> Non
 
 
 @kernel
-def combine(state: Simulation, h: int, now: float) -> None:
-    """Estimates of other nodes, predicted to now without readings where they took time."""
+def combine_by_extras(state: Simulation, extras: Extras, h: int, now: float) -> None:
+    """What node ``h`` heard, by rules of its own."""
+    if extras.kind == PREDICTIONS:
+        use_readings_heard(state, h, now)
+    heard = bring_to_now(state, h, now)
+    if extras.kind == PREDICTIONS:
+        add_consensus(state, extras, h)
+    elif extras.kind == GAINS:
+        combine_convex(state, h, max(0.0, 1.0 - heard))
+    else:
+        fuse_mail(state, extras, h)
+
+
+@kernel
+def bring_to_now(state: Simulation, h: int, now: float) -> float:
+    """Predict the estimates that node ``h`` heard to now without readings, where they took time;
+    return the sum of their weights.
+    """
     # The last model of the table has no sensors: prediction alone, as readings since then are
     # unknown here.
     pool, ways, model = state.pool, state.ways, len(state.table.unit) - 1
@@ -474,6 +535,13 @@ def combine(state: Simulation, h: int, now: float) -> None:
             move_root(state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch)
         heard += ways[pool[m].way].weight
         m = pool[m].next
+    return heard
+
+
+@kernel
+def combine(state: Simulation, h: int, now: float) -> None:
+    """Estimates of other nodes, predicted to now."""
+    heard = bring_to_now(state, h, now)
     if state.kind == CONVEX:
         # Lost weight goes to the node itself, so that weights sum to 1.
         combine_convex(state, h, max(0.0, 1.0 - heard))

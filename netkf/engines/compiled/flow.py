@@ -28,6 +28,7 @@ from netkf.engines.compiled.event_loop import (
     WANT_TICKS,
     event_loop,
 )
+from netkf.engines.compiled.extras import extras_of
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.late_readings import History, add_past, empty_history
 from netkf.engines.compiled.origins import move_origin
@@ -40,6 +41,7 @@ from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
     CLOCKS,
     COMBINATIONS,
+    SPECIAL,
     SUMS,
     Filters,
     Instants,
@@ -190,7 +192,7 @@ class Workspace:
         self._visits: Visits | None = None
         # Code for each n makes runs of filters that combine estimates 1.5 times faster. Filters of
         # sums and of readings gain nothing: one event loop is compiled for every n.
-        self._unrolled = scenario.hosted.combination not in ("sums", "readings")
+        self._unrolled = scenario.hosted.combination not in SPECIAL
 
     @property
     def filters(self) -> Filters:
@@ -317,6 +319,7 @@ class FlowRun:
         self._visits = workspace.visits() if is_immediate(scenario) else None
         self._totals = _totals(scenario, self._state)
         self._history = _history(scenario, self._state)
+        self._extras = extras_of(scenario, self._state)
 
     def to_the_end(self) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
@@ -342,9 +345,9 @@ class FlowRun:
     def _advance(self) -> int:
         if self._visits is not None:
             return advance_alone(self._state, self._visits)
-        if self._totals is None and self._history is None:
+        if self._scenario.hosted.combination not in SPECIAL:
             return run_alone(self._state)
-        return int(event_loop(self._state, self._totals, self._history))
+        return int(event_loop(self._state, self._totals, self._history, self._extras))
 
     def _give(self, wanted: int) -> None:
         state = self._state
@@ -373,7 +376,7 @@ class FlowRun:
         # The past of each node gets one entry: the frame that begins.
         if self._history is not None and self._history.free[1] < len(state.nodes):
             add_past(self._history, len(state.nodes))
-        move_origin(self._scenario, state, self._totals, self._history, k, offset)
+        move_origin(self._scenario, state, self._totals, self._history, self._extras, k, offset)
         state.frame_at = k + 1
 
     def _more_messages(self) -> None:

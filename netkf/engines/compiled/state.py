@@ -52,9 +52,16 @@ MESSAGE = _record("way number next order tag", "sent arrival")
 instant of a reading that is sent, or the number of a running sum.
 """
 
-CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT = range(7)
-COMBINATIONS = ("convex", "intersection", "swap", "shares", "readings", "sums", "none")
+(CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT, BEST, INVERSE, GAINS,
+ PREDICTIONS) = range(11)  # fmt: skip
+COMBINATIONS = (
+    *("convex", "intersection", "swap", "shares", "readings", "sums", "none"),
+    *("best intersection", "inverse intersection", "constant gain", "predictions"),
+)
 """``Filter.combination`` in the order of the numbers by which the event loop knows it."""
+
+SPECIAL = ("readings", "sums", *COMBINATIONS[BEST:])
+"""Combinations that have state outside a Simulation."""
 
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")

@@ -1,0 +1,29 @@
+"""Models of filters with constant gains: how P moves where readings are used by a given gain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.algorithms.kernels.root_update import lower_root
+from netkf.algorithms.models import FlowModel
+from netkf.linalg.arrays import FloatArray
+
+
+def closed_loop(model: FlowModel, gain: FloatArray) -> FlowModel:
+    """Return the model by which P moves with constant gain L (n, p) over the increments of a model:
+    that of ``A - L H`` with the noise ``Q + L R L'``, and nothing to read.
+    """
+    noise, nothing = model.Q + gain @ model.R @ gain.T, model.H[:0]
+    closed = np.ascontiguousarray(model.A - gain @ model.H)
+    return FlowModel(closed, noise, nothing, model.R[:0, :0], model.horizon, model.interval)
+
+
+def sample_maps(L: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``I - L H`` (n, n) and the lower triangular root (n, n) of ``L R L'``."""
+    closed = np.eye(len(L)) - L @ H
+    return closed, lower_root(np.asarray(L @ np.linalg.cholesky(R)))
+
+
+def gain_rate(L: FloatArray, H: FloatArray) -> float:
+    """Return how fast increments move an estimate by the gain L (n, p), 1/s."""
+    return float(np.linalg.norm(L @ H))

@@ -1,0 +1,245 @@
+"""What some combinations of messages need beside a Simulation: scratch, gains, predictions.
+
+``Extras.kind`` is that of the Simulation: estimates that are fused one by one with the best weight
+(BEST, INVERSE), constant gains (GAINS), or consensus on predictions, with readings (PREDICTIONS).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.closed_loops import closed_loop, gain_rate, sample_maps
+from netkf.algorithms.flow import stretch_end
+from netkf.algorithms.kernels.constant_gains import correct_by_innovation, correct_by_moments
+from netkf.algorithms.kernels.neighbours import scale_by_covariance
+from netkf.algorithms.kernels.pair_fusion import fuse_pair
+from netkf.algorithms.kernels.root_flow import (
+    FlowScratch,
+    FlowTable,
+    flow_scratch,
+    move_root,
+    stack_tables,
+)
+from netkf.algorithms.kernels.slots import predict_root
+from netkf.algorithms.models import usable
+from netkf.engines.base import LONGER, SHORTEST_SHARE
+from netkf.engines.compiled.increments import fill_readings
+from netkf.engines.compiled.late_readings import copy_state, use_instant
+from netkf.engines.compiled.state import BEST, GAINS, INVERSE, PREDICTIONS, Simulation
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
+from netkf.linalg.structs import Struct
+from netkf.scenario.scenario import Scenario
+
+
+class Extras(Struct):
+    """Of N nodes: predictions ``prior`` (N, n) of this instant with ``prior_root`` (N, n, n), of
+    which ``prior_lanes`` (1, N, n, n, 1) is another view; the consensus term ``moved`` (N, n, 1),
+    its strength ``epsilon``, and whether readings are sent (``share``).
+
+    Gains ``L`` (N, n, p); for increments the rows ``H`` (N, p, n), the ``table`` of closed loops
+    with the ``model`` (N,) of each node and its ``closed`` (N, n, n), and how fast they are
+    (``rate``, (N,)), for the plant ``A`` (n, n); for samples the maps ``sampled`` and their
+    ``noise`` (N, n, n), and the roots of the Simulation as ``lanes`` (1, N, n, n, 1).
+
+    ``trace``: the best weight minimises the trace, else the determinant. Scratch: ``pair``
+    (2 n + 2, n), ``x`` (1, n), ``root`` (1, n, n), ``maps`` (6, n, n), ``work`` (2, n, n, 1), and
+    that of flows.
+    """
+
+    kind: int
+    trace: int
+    share: int
+    epsilon: float
+    prior: FloatArray
+    prior_root: FloatArray
+    prior_lanes: FloatArray
+    moved: FloatArray
+    A: FloatArray
+    L: FloatArray
+    H: FloatArray
+    closed: FloatArray
+    sampled: FloatArray
+    noise: FloatArray
+    rate: FloatArray
+    model: IntArray
+    table: FlowTable
+    lanes: FloatArray
+    pair: FloatArray
+    x: FloatArray
+    root: FloatArray
+    maps: FloatArray
+    work: FloatArray
+    flow_scratch: FlowScratch
+
+
+def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
+    """Return what the combination of a scenario needs besides, if anything."""
+    if state.kind not in (BEST, INVERSE, GAINS, PREDICTIONS):
+        return None
+    algorithm: Any = scenario.hosted
+    (N, n), root = state.xhat.shape, np.ascontiguousarray(state.root)
+    assert root is state.root or np.shares_memory(root, state.root)
+    prior_root = state.root.copy()
+    gains = _gains(scenario, state)
+    return Extras(
+        kind=state.kind,
+        trace=getattr(algorithm, "minimise", "") == "trace",
+        share=getattr(algorithm, "share_readings", False),
+        epsilon=getattr(algorithm, "epsilon", 0.0),
+        prior=state.xhat.copy(),
+        prior_root=prior_root,
+        prior_lanes=prior_root.reshape(1, N, n, n, 1),
+        moved=np.zeros((N, n, 1)),
+        lanes=root.reshape(1, N, n, n, 1),
+        pair=np.zeros((2 * n + 2, n)),
+        x=np.zeros((1, n)),
+        root=np.zeros((1, n, n)),
+        maps=np.zeros((6, n, n)),
+        work=np.zeros((2, n, n, 1)),
+        flow_scratch=flow_scratch(gains["table"]),
+        **gains,
+    )
+
+
+def _gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
+    """Gains of all nodes and what follows from them; nothing for other combinations."""
+    N, n = state.xhat.shape
+    algorithm: Any = scenario.hosted
+    given = [algorithm.gain_of(k) if state.kind == GAINS else np.zeros((n, 0)) for k in range(N)]
+    p = max(1, *(one.shape[1] for one in given))
+    found: dict[str, Any] = {
+        "A": np.array(scenario.models[0].A),
+        "L": np.zeros((N, n, p)),
+        "H": np.zeros((N, p, n)),
+        "closed": np.zeros((N, n, n)),
+        "sampled": np.zeros((N, n, n)),
+        "noise": np.zeros((N, n, n)),
+        "rate": np.zeros(N),
+        "model": np.zeros(N, dtype=np.int64),
+    }
+    tables: list[FlowTable] = []
+    for k, (node, model) in enumerate(zip(scenario.nodes, scenario.models, strict=True)):
+        rows = len(model.H)
+        found["L"][k, :, : given[k].shape[1]] = given[k]
+        if state.kind == GAINS and rows:
+            loop = closed_loop(model, given[k])
+            found["H"][k, :rows], found["closed"][k] = model.H, loop.A
+            found["rate"][k] = gain_rate(given[k], model.H)
+            found["model"][k] = len(tables)
+            tables.append(loop.flow)
+        elif state.kind == GAINS and node in scenario.sampled_sensors:
+            # A node that takes samples has one sensor.
+            (place,) = scenario.sampled_sensors[node]
+            H, R = scenario.sensors[place.entry].H, scenario.noise(place.entry, believed=True)
+            found["sampled"][k], found["noise"][k] = sample_maps(given[k], H, R)
+    found["table"] = stack_tables(tables) if tables else state.table
+    return found
+
+
+@kernel
+def keep_prediction(state: Simulation, extras: Extras, h: int) -> None:
+    """Keep the prediction of node ``h``, before anything of this instant is used."""
+    copy_state(state.size, extras.prior, extras.prior_root, h, state.xhat, state.root, h)
+    # A reading of an earlier instant is not sent any more.
+    state.nodes[h].reading = -1
+
+
+@kernel
+def predict_with_gain(state: Simulation, extras: Extras, h: int, now: float, time: float) -> None:
+    """Bring node ``h`` with increments to ``time`` by its constant gain, in stretches that the gain
+    can follow.
+    """
+    piece, m, stretch = state.piece, extras.model[h], usable(extras.rate[h])
+    least = SHORTEST_SHARE * (time - now)
+    while now < time:
+        end = time
+        if stretch < time - now:
+            end = stretch_end(now, time, max(stretch, least))
+            least *= LONGER
+        gap = end - now
+        # The mean moves as if nothing were read, and P by the closed loop, which counts that.
+        for i in range(extras.x.shape[1]):
+            extras.x[0, i] = state.xhat[h, i]
+            for j in range(extras.x.shape[1]):
+                extras.root[0, i, j] = 0.0
+        blind = len(state.table.unit) - 1
+        move_root(state.table, blind, extras.root, extras.x, 0, gap, state.flow_scratch)
+        move_root(extras.table, m, state.root, state.xhat, h, gap, extras.flow_scratch)
+        for i in range(extras.x.shape[1]):
+            state.xhat[h, i] = extras.x[0, i]
+        readings = state.scratch.moments[: state.gains.moments[state.nodes[h].model]]
+        fill_readings(state, state.run, h, piece, now, end, readings)
+        correct_by_moments(
+            state.xhat, h, extras.A, extras.closed[h], extras.H[h], extras.L[h], readings, gap,
+            extras.maps,
+        )  # fmt: skip
+        now = end
+
+
+@kernel
+def sample_with_gain(state: Simulation, extras: Extras, h: int, instant: int) -> None:
+    """Use the sample of node ``h`` by its constant gain."""
+    given = state.instants
+    s = given.first[instant]
+    p = given.rows[given.sensor[s]]
+    correct_by_innovation(
+        state.xhat, h, given.H[given.matrix[s]], extras.L[h], given.y[s, :p], extras.x[0]
+    )
+    # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
+    predict_root(
+        ONE, extras.lanes, 0, h, extras.sampled[h], extras.noise[h], extras.work[0], extras.work[1]
+    )
+
+
+@kernel
+def fuse_mail(state: Simulation, extras: Extras, h: int) -> None:
+    """Fuse the estimate of node ``h`` with each that it heard, one after the other, with the best
+    weight.
+    """
+    m = state.nodes[h].inbox
+    while m != -1:
+        fuse_pair(
+            state.xhat[h], state.root[h], state.pool_x[m], state.pool_root[m],
+            extras.kind == INVERSE, extras.trace == 1, extras.pair,
+        )  # fmt: skip
+        m = state.pool[m].next
+
+
+@kernel
+def send_prediction(state: Simulation, extras: Extras, m: int, h: int) -> None:
+    """Put the prediction of node ``h`` into a message, and its reading of this instant."""
+    copy_state(state.size, state.pool_x, state.pool_root, m, extras.prior, extras.prior_root, h)
+    state.pool[m].tag = state.nodes[h].reading if extras.share == 1 else -1
+
+
+@kernel
+def use_readings_heard(state: Simulation, h: int, now: float) -> None:
+    """Use the readings that node ``h`` hears without delay."""
+    m = state.nodes[h].inbox
+    while m != -1:
+        message = state.pool[m]
+        # A late one belongs to another instant.
+        if message.tag >= 0 and now - message.sent <= 0.0:
+            use_instant(state, message.tag, state.root, state.xhat, h, 1.0)
+        m = message.next
+
+
+@kernel
+def add_consensus(state: Simulation, extras: Extras, h: int) -> None:
+    """Add the consensus term on predictions to the estimate of node ``h``."""
+    n = state.xhat.shape[1]
+    for i in range(n):
+        total, m = 0.0, state.nodes[h].inbox
+        while m != -1:
+            total += state.pool_x[m, i] - extras.prior[h, i]
+            m = state.pool[m].next
+        extras.moved[h, i, 0] = total
+    scale_by_covariance(
+        ONE, extras.prior_lanes, 0, h, extras.epsilon, extras.moved, extras.work[0, 0]
+    )
+    for i in range(n):
+        state.xhat[h, i] += extras.moved[h, i, 0]
