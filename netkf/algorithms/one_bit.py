@@ -118,7 +118,8 @@ def silence_others(
     """
     for h in range(plan.sent.shape[3]):
         if h != turn or not has_read(readings, rows[h], b, s, h):
-            plan.sent[b, s, 0, h] = 0
+            for q in range(plan.sent.shape[4]):
+                plan.sent[b, s, 0, h, q] = 0
 
 
 @kernel

@@ -47,6 +47,7 @@ from netkf.core.fields import choice, field
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import blocks_of, in_lanes, load, store
+from netkf.linalg.small import copy_matrix
 
 TRACE, DETERMINANT = "trace", "determinant"
 INTERSECTION = 'rule = "ci"'
@@ -247,8 +248,10 @@ class CombinationCache(NamedTuple):
 
 class TrackArrays(NamedTuple):
     """Own tracks ``xhat`` (B, H, n, L) and ``root`` (B, H, n, n, L), Q (n, n), whitened sensors H
-    (H, p, n), the covariances ``joint`` (H, H, n, n) of all tracks; and scratch: ``closed``
-    (H, n, n), ``near`` (H,), and what belongs to combinations.
+    (H, p, n), the covariances ``joint`` (K, n, n) of the ``pairs`` (K, 2) of tracks that some node
+    may combine, those of track i from ``first[i]`` (H + 1,) on; and scratch: ``closed`` (H, n, n),
+    ``near`` (D + 1,) tracks and their covariances ``block`` (D + 1, D + 1, n, n), and what belongs
+    to combinations.
     """
 
     xhat: FloatArray
@@ -256,8 +259,11 @@ class TrackArrays(NamedTuple):
     Q: FloatArray
     H: FloatArray
     joint: FloatArray
+    pairs: np.ndarray
+    first: np.ndarray
     closed: FloatArray
     near: np.ndarray
+    block: FloatArray
     scratch: TrackScratch
     cache: CombinationCache
 
@@ -279,13 +285,16 @@ def track_slots(
     for s in range(plan.up.shape[1]):
         if plan.sensed[s]:
             predict_joint(arrays.joint, nodes.F, arrays.Q, work)
-            update_joint(arrays.joint, arrays.H, nodes.rows, arrays.closed, work)
+            update_joint(
+                arrays.joint, arrays.pairs, arrays.H, nodes.rows, arrays.closed, work
+            )  # fmt: skip
             for b in range(plan.up.shape[0]):
                 predict_all(tracks, scratch, b)
                 read_all(tracks, readings, scratch, b, s)
                 show_tracks(nodes, tracks, scratch, b)
             for h in range(len(nodes.rows)):
-                arrays.cache.key[:] = -1
+                for k in range(len(arrays.cache.key)):
+                    arrays.cache.key[k] = -1
                 for b in range(plan.up.shape[0]):
                     for q in range(len(scratch.lanes)):
                         combine_heard(nodes, plan, links, arrays, (b, s, h, q))
@@ -349,10 +358,27 @@ def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> 
     # Directions beyond the bits of a number have no key of their own.
     if degree > MOST_BITS or cache.key[k] != heard:
         cache.key[k] = heard
+        for a in range(count + 1):
+            for b in range(count + 1):
+                pair = pair_of(arrays, arrays.near[a], arrays.near[b])
+                copy_matrix(arrays.block[a, b], arrays.joint[pair])
         cache.used[k] = combine_tracks(
-            arrays.joint, arrays.near, count, arrays.scratch, cache.gain[k], cache.root[k]
+            arrays.block, count, arrays.scratch, cache.gain[k], cache.root[k]
         )
     return k
+
+
+@kernel
+def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
+    """Return the place of a pair of tracks, which are in the order of the second of them."""
+    low, high = arrays.first[i], arrays.first[i + 1] - 1
+    while low < high:
+        middle = (low + high) // 2
+        if arrays.pairs[middle, 1] < j:
+            low = middle + 1
+        else:
+            high = middle
+    return int(low)
 
 
 @built_in("track-fusion", rule="cross-covariance")
@@ -372,6 +398,7 @@ class BarShalomCampo(Filter):
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
+    needs_network: ClassVar[bool] = True  # for the compiled slots alone
     slot_kernel = staticmethod(track_slots)
 
     def slot_arrays(
@@ -391,15 +418,20 @@ class BarShalomCampo(Filter):
             np.zeros((COMBINATIONS, n, n)),
         )
         sensors, _ = stacked_sensors([state.sensors[0] for state in states])
+        pairs = combined_pairs(infos)
+        first = np.searchsorted(pairs[:, 0], np.arange(H + 1))
         return (
             TrackArrays(
                 xhat,
                 root,
                 np.array(states[0].model.Q),
                 sensors,
-                np.tile(start, (H, H, 1, 1)),
+                np.tile(start, (len(pairs), 1, 1)),
+                pairs,
+                first,
                 np.zeros((H, n, n)),
-                np.zeros(H, dtype=np.int64),
+                np.zeros(most + 1, dtype=np.int64),
+                np.zeros((most + 1, most + 1, n, n)),
                 track_scratch(most, n),
                 cache,
             ),
@@ -489,12 +521,21 @@ def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarr
     return stack, rows
 
 
+def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
+    """Return the pairs of tracks (K, 2) of which some node may have both, in their order."""
+    network, N = infos[0].network, len(infos)
+    assert network is not None
+    near = [np.array([h, *heard]) for h, heard in enumerate(network.heard)]
+    codes = np.unique(np.concatenate([np.add.outer(N * one, one).reshape(-1) for one in near]))
+    return np.ascontiguousarray(np.stack(np.divmod(codes, N), axis=1))
+
+
 def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
     """Return the covariances (m, m, n, n) of the errors of m tracks one slot later: all of them
     have the same process noise.
     """
     moved, F, Q = (np.array(part, order="C") for part in (joint, model.F, model.Q))
-    predict_joint(moved, F, Q, np.empty(F.shape))
+    predict_joint(moved.reshape(-1, *F.shape), F, Q, np.empty(F.shape))
     return moved
 
 
@@ -503,7 +544,10 @@ def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArra
     of its own whitened ``sensors``, ``P_ij+ = (I - K_i H_i) P_ij (I - K_j H_j)'``.
     """
     found, (H, rows) = np.array(joint, order="C"), stacked_sensors(sensors)
-    update_joint(found, H, rows, np.empty((len(H), *found.shape[2:])), np.empty(found.shape[2:]))
+    m, n = len(H), H.shape[2]
+    pairs = np.ascontiguousarray(np.indices((m, m)).reshape(2, -1).T)
+    work = np.empty((m, n, n)), np.empty((n, n))
+    update_joint(found.reshape(-1, n, n), pairs, H, rows, *work)
     return found
 
 
@@ -532,6 +576,6 @@ def best_combination(
     """
     n, k = joint.shape[2], len(near) - 1
     gain, root = np.zeros((n, k * n)), np.zeros((n, n))
-    scratch = track_scratch(k, n)
-    used = combine_tracks(np.array(joint, order="C"), np.array(near), k, scratch, gain, root)
+    block = np.ascontiguousarray(joint[np.ix_(near, near)])
+    used = combine_tracks(block, k, track_scratch(k, n), gain, root)
     return gain, root if used else own_root

@@ -1,9 +1,10 @@
 """Tracks of several nodes in kernels: how their errors are correlated, and their best combination.
 
-``joint`` (m, m, n, n) holds the covariances ``P_ij = E[e_i e_j']`` of the errors of m tracks, each
-of which uses the readings of its own sensors: the common process noise and the common start
-correlate them (Bar-Shalom and Campo 1986). Each block is computed from itself and the two tracks'
-own covariances alone, so that its bits do not depend on which other tracks are there.
+The covariances ``P_ij = E[e_i e_j']`` of the errors of tracks, each of which uses the readings of
+its own sensors, are ``joint`` (K, n, n) for K ``pairs`` of tracks (K, 2): the common process noise
+and the common start correlate them (Bar-Shalom and Campo 1986). Each is computed from itself and
+the own covariances of the two tracks alone, so that its bits do not depend on which other pairs are
+there; pairs of a track with itself are.
 """
 
 from __future__ import annotations
@@ -49,52 +50,54 @@ def track_scratch(k: int, n: int) -> TrackScratch:
 @kernel
 def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray) -> None:
     """Move all tracks to the next slot, ``F P_ij F' + Q``; ``work`` (n, n) is scratch."""
-    n = len(F)
-    for i in range(len(joint)):
-        for j in range(len(joint)):
-            for a in range(n):
-                for c in range(n):
-                    total = 0.0
-                    for m in range(n):
-                        total += F[a, m] * joint[i, j, m, c]
-                    work[a, c] = total
-            for a in range(n):
-                for c in range(n):
-                    total = Q[a, c]
-                    for m in range(n):
-                        total += work[a, m] * F[c, m]
-                    joint[i, j, a, c] = total
+    for k in range(len(joint)):
+        multiply_both(F, joint[k], F, work)
+        for a in range(len(Q)):
+            for c in range(len(Q)):
+                joint[k, a, c] += Q[a, c]
+
+
+@kernel(inlined=True)
+def multiply_both(left: FloatArray, P: FloatArray, right: FloatArray, work: FloatArray) -> None:
+    """Make P (n, n) ``left P right'``; ``work`` (n, n) is scratch."""
+    n = len(P)
+    for a in range(n):
+        for c in range(n):
+            total = 0.0
+            for m in range(n):
+                total += left[a, m] * P[m, c]
+            work[a, c] = total
+    for a in range(n):
+        for c in range(n):
+            total = 0.0
+            for m in range(n):
+                total += work[a, m] * right[c, m]
+            P[a, c] = total
 
 
 @kernel
 def update_joint(
-    joint: FloatArray, H: FloatArray, rows: np.ndarray, closed: FloatArray, work: FloatArray
+    joint: FloatArray,
+    pairs: np.ndarray,
+    H: FloatArray,
+    rows: np.ndarray,
+    closed: FloatArray,
+    work: FloatArray,
 ) -> None:
-    """Let each track use a reading of its own sensors, ``P_ij+ = C_i P_ij C_j'``, with
+    """Let each of m tracks use a reading of its own sensors, ``P_ij+ = C_i P_ij C_j'``, with
     ``C_i = I - K_i H_i`` written into ``closed`` (m, n, n).
 
     ``H`` (m, p, n) are whitened and have so many ``rows`` (m,); ``work`` (n, n) is scratch.
     """
-    m, n = len(joint), len(work)
-    for i in range(m):
-        close_track(joint[i, i], H[i], rows[i], closed[i], work)
-    for i in range(m):
-        for j in range(m):
-            # Noises of different nodes are independent. A blind node closes nothing.
-            if i == j or rows[i] + rows[j] == 0:
-                continue
-            for a in range(n):
-                for c in range(n):
-                    total = 0.0
-                    for k in range(n):
-                        total += closed[i, a, k] * joint[i, j, k, c]
-                    work[a, c] = total
-            for a in range(n):
-                for c in range(n):
-                    total = 0.0
-                    for k in range(n):
-                        total += work[a, k] * closed[j, c, k]
-                    joint[i, j, a, c] = total
+    for k in range(len(joint)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        if i == j:
+            close_track(joint[k], H[i], rows[i], closed[i], work)
+    for k in range(len(joint)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        # Noises of different nodes are independent. Blind nodes close nothing.
+        if i != j and rows[i] + rows[j] > 0:
+            multiply_both(closed[i], joint[k], closed[j], work)
 
 
 @kernel
@@ -147,22 +150,18 @@ def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -
 
 @kernel
 def combine_tracks(
-    joint: FloatArray,
-    near: np.ndarray,
-    count: int,
-    scratch: TrackScratch,
-    gain: FloatArray,
-    root: FloatArray,
+    joint: FloatArray, count: int, scratch: TrackScratch, gain: FloatArray, root: FloatArray
 ) -> int:
     """Write the gain (n, >= k n) by which the differences of ``count`` = k tracks to the own one
     correct it with the least covariance, and the lower triangular ``root`` (n, n) of that; return
     the number of differences that were used. If it is 0 all tracks are the same.
 
-    ``near`` (k + 1,) are the places of the own track and of the others in ``joint``. For one other
-    it is ``(P_i - P_ij) (P_i + P_j - P_ij - P_ji)^-1`` of Bar-Shalom and Campo.
+    ``joint`` (>= k + 1, >= k + 1, n, n) has the covariances of the own track, in place 0, and the
+    others. For one other it is ``(P_i - P_ij) (P_i + P_j - P_ij - P_ji)^-1`` of Bar-Shalom and
+    Campo.
     """
     n = len(root)
-    spread_tracks(joint, near, count, scratch)
+    spread_tracks(joint, count, scratch)
     used = factor_differences(n, count * n, scratch)
     for q in range(count * n):
         for i in range(n):
@@ -176,24 +175,22 @@ def combine_tracks(
                 place = scratch.order[later]
                 total -= gain[i, place] * scratch.factor[place, t]
             gain[i, q] = total / scratch.factor[q, t]
-    write_combined_root(joint, near, count, gain, scratch, root)
+    write_combined_root(joint, count, gain, scratch, root)
     return used
 
 
 @kernel
-def spread_tracks(joint: FloatArray, near: np.ndarray, count: int, scratch: TrackScratch) -> None:
+def spread_tracks(joint: FloatArray, count: int, scratch: TrackScratch) -> None:
     """Fill in the covariances of differences ``d_a = e_own - e_a``, and of e_own with them."""
-    n, own = joint.shape[2], near[0]
+    n = joint.shape[2]
     for a in range(count):
-        one = near[1 + a]
         for i in range(n):
-            scratch.sizes[a * n + i] = joint[own, own, i, i] + joint[one, one, i, i]
+            scratch.sizes[a * n + i] = joint[0, 0, i, i] + joint[1 + a, 1 + a, i, i]
             for j in range(n):
-                scratch.cross[i, a * n + j] = joint[own, own, i, j] - joint[own, one, i, j]
+                scratch.cross[i, a * n + j] = joint[0, 0, i, j] - joint[0, 1 + a, i, j]
                 for b in range(count):
-                    other = near[1 + b]
-                    first = joint[own, own, i, j] - joint[own, other, i, j]
-                    second = joint[one, own, i, j] - joint[one, other, i, j]
+                    first = joint[0, 0, i, j] - joint[0, 1 + b, i, j]
+                    second = joint[1 + a, 0, i, j] - joint[1 + a, 1 + b, i, j]
                     scratch.spread[a * n + i, b * n + j] = first - second
 
 
@@ -229,12 +226,7 @@ def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
 
 @kernel
 def write_combined_root(
-    joint: FloatArray,
-    near: np.ndarray,
-    count: int,
-    gain: FloatArray,
-    scratch: TrackScratch,
-    root: FloatArray,
+    joint: FloatArray, count: int, gain: FloatArray, scratch: TrackScratch, root: FloatArray
 ) -> None:
     """Write the root of the covariance of ``e_own - gain d``, as a product of errors, so that it
     stays positive semidefinite for any gain.
@@ -253,7 +245,7 @@ def write_combined_root(
                 total = 0.0
                 for b in range(count + 1):
                     for k in range(n):
-                        total += weights[i, b * n + k] * joint[near[b], near[a], k, j]
+                        total += weights[i, b * n + k] * joint[b, a, k, j]
                 for c in range(i + 1):
                     P[i, c] += total * weights[c, a * n + j]
     take_root(P, root)
