@@ -28,6 +28,7 @@ from netkf.algorithms.kernels.beliefs import (
     recentre_part,
     take_prior,
 )
+from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.information import add_reading_pair
 from netkf.algorithms.kernels.intersection import finish_lanes
 from netkf.algorithms.kernels.slots import (
@@ -428,8 +429,9 @@ def backward(model: Any, gap: float) -> FloatArray:
     if isinstance(model, SlotModel):
         power = np.linalg.matrix_power(model.F, round(gap / model.period))
         return np.asarray(np.linalg.inv(power), dtype=np.float64)
-    inverse: FloatArray = model.backward(gap).inverse
-    return inverse
+    maps = np.empty((6, *model.A.shape))
+    fill_inverse_transition(model.A, gap, maps)
+    return np.asarray(maps[0])
 
 
 def move_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:

@@ -383,8 +383,5 @@ def test_what_does_not_go_together_is_refused_by_name(tmp_path):
         scenario_of(wrong, tmp_path)
     with pytest.raises(netkf.ScenarioError, match=r"filter\.weights: column 0"):
         scenario_of({"kind": "diffusion-kalman", "weights": (2.0 * np.eye(5)).tolist()}, tmp_path)
-    still = {**ROTATION, "B": [[0.0], [0.0]]}
-    belief = clocked({"kind": "belief-propagation"}, tmp_path, nodes, each, plant=still)
-    assert netkf.simulate(belief).engine == "simpy"
-    with pytest.raises(netkf.EngineError, match="'belief-propagation' under clocks"):
-        netkf.simulate(belief, engine="compiled")
+    kcf = clocked({"kind": "kcf"}, tmp_path, nodes, each)
+    assert netkf.simulate(kcf).engine == "compiled"

@@ -31,9 +31,9 @@ def test_drawn_scenarios_agree(first, tmp_path):
     agree(range(first, first + TOGETHER), tmp_path)
 
 
-@pytest.mark.parametrize("first", range(0, FEW, TOGETHER))
+@pytest.mark.parametrize("first", range(0, FEW + 2 * TOGETHER, TOGETHER))
 def test_filters_of_the_literature_agree(first, tmp_path):
-    """Fusion with the best weight, constant gains, consensus on predictions."""
+    """Fusion with the best weight, constant gains, consensus on predictions, beliefs."""
     for scenario, run in agree(
         range(first, first + TOGETHER), tmp_path, filters=LITERATURE
     ).values():

@@ -233,11 +233,16 @@ def test_a_silent_node_with_running_sums_loses_no_mass(tmp_path):
             assert after == pytest.approx(before, rel=1e-12)
 
 
-def test_filters_of_ones_own_inside_are_not_compiled():
+class Own(Kcf):
+    """A filter of one's own."""
+
+
+def test_filters_of_ones_own_inside_are_not_compiled(tmp_path):
     """A class that derives from a built-in one may differ from its kernel."""
-
-    class Own(Kcf):
-        pass
-
     assert StochasticTrigger(Kcf(), 1.0).slot_kernel is not None
     assert StochasticTrigger(Own(), 1.0).slot_kernel is None
+    scenario = scenario_of(triggered({"kind": "kcf"}), tmp_path)
+    own = scenario.replace({"filter": StochasticTrigger(Own(), 1.0)})
+    assert (netkf.simulate(scenario).engine, netkf.simulate(own).engine) == ("compiled", "simpy")
+    with pytest.raises(netkf.EngineError, match="has no code for the filter"):
+        netkf.simulate(own, engine="compiled")

@@ -92,6 +92,12 @@ def double_gap(step: float, first: FloatArray, work: FloatArray) -> None:
 
 
 @kernel
+def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None:
+    """Write ``e^{-A g}`` (n, n) into the first of ``maps`` (6, n, n); the others are scratch."""
+    fill_moments_of(A, -1.0, gap, maps[4], maps[5], maps[:4])
+
+
+@kernel
 def correct_by_moments(
     x: FloatArray,
     k: int,

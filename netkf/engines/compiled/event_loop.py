@@ -20,6 +20,12 @@ from netkf.algorithms.kernels.root_update import (
     end_intersection,
     scale_root,
 )
+from netkf.engines.compiled.evidence import (
+    add_samples,
+    hear_evidence_now,
+    move_evidence,
+    send_evidence,
+)
 from netkf.engines.compiled.extras import (
     Extras,
     add_consensus,
@@ -42,6 +48,7 @@ from netkf.engines.compiled.message_queue import pop, push, put, release, sort_p
 from netkf.engines.compiled.running_totals import Totals, add_reading, hear, offer_round
 from netkf.engines.compiled.state import (
     AFTER_READINGS,
+    BELIEFS,
     CONVEX,
     GAINS,
     INTERSECTION,
@@ -276,6 +283,8 @@ def predict(state: Simulation, extras: Extras | None, h: int, time: float) -> No
         move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
     if extras is not None and extras.kind == PREDICTIONS:
         keep_prediction(state, extras, h)
+    elif extras is not None and extras.kind == BELIEFS:
+        move_evidence(extras.evidence, h, time - now)
 
 
 @kernel
@@ -312,6 +321,8 @@ def on_sample(
         use_reading(state, history, h, instant)
     elif extras is not None and extras.kind == GAINS:
         sample_with_gain(state, extras, h, instant)
+    elif extras is not None and extras.kind == BELIEFS:
+        add_samples(state, extras.evidence, h, instant)
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
     # The newest sample: what a filter of readings sends after this event.
@@ -376,6 +387,8 @@ def send(
             totals.offered[m, k] = totals.sent[h, k]
     elif extras is not None and extras.kind == PREDICTIONS:
         send_prediction(state, extras, m, h)
+    elif extras is not None and extras.kind == BELIEFS:
+        send_evidence(state, extras.evidence, m, h)
     elif state.kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
@@ -515,6 +528,8 @@ def combine_by_extras(state: Simulation, extras: Extras, h: int, now: float) -> 
         add_consensus(state, extras, h)
     elif extras.kind == GAINS:
         combine_convex(state, h, max(0.0, 1.0 - heard))
+    elif extras.kind == BELIEFS:
+        hear_evidence_now(state, extras.evidence, h, now)
     else:
         fuse_mail(state, extras, h)
 

@@ -1,7 +1,8 @@
 """What some combinations of messages need beside a Simulation: scratch, gains, predictions.
 
 ``Extras.kind`` is that of the Simulation: estimates that are fused one by one with the best weight
-(BEST, INVERSE), constant gains (GAINS), or consensus on predictions, with readings (PREDICTIONS).
+(BEST, INVERSE), constant gains (GAINS), consensus on predictions, with readings (PREDICTIONS), or
+belief propagation (BELIEFS).
 """
 
 from __future__ import annotations
@@ -25,9 +26,17 @@ from netkf.algorithms.kernels.root_flow import (
 from netkf.algorithms.kernels.slots import predict_root
 from netkf.algorithms.models import usable
 from netkf.engines.base import LONGER, SHORTEST_SHARE
+from netkf.engines.compiled.evidence import Evidence, empty_evidence
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.late_readings import copy_state, use_instant
-from netkf.engines.compiled.state import BEST, GAINS, INVERSE, PREDICTIONS, Simulation
+from netkf.engines.compiled.state import (
+    BELIEFS,
+    BEST,
+    GAINS,
+    INVERSE,
+    PREDICTIONS,
+    Simulation,
+)
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
@@ -47,7 +56,7 @@ class Extras(Struct):
 
     ``trace``: the best weight minimises the trace, else the determinant. Scratch: ``pair``
     (2 n + 2, n), ``x`` (1, n), ``root`` (1, n, n), ``maps`` (6, n, n), ``work`` (2, n, n, 1), and
-    that of flows.
+    that of flows. ``evidence``: see there.
     """
 
     kind: int
@@ -74,11 +83,12 @@ class Extras(Struct):
     maps: FloatArray
     work: FloatArray
     flow_scratch: FlowScratch
+    evidence: Evidence
 
 
 def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
     """Return what the combination of a scenario needs besides, if anything."""
-    if state.kind not in (BEST, INVERSE, GAINS, PREDICTIONS):
+    if state.kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
     algorithm: Any = scenario.hosted
     (N, n), root = state.xhat.shape, np.ascontiguousarray(state.root)
@@ -101,6 +111,7 @@ def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
         maps=np.zeros((6, n, n)),
         work=np.zeros((2, n, n, 1)),
         flow_scratch=flow_scratch(gains["table"]),
+        evidence=empty_evidence(state, scenario.models[0].A, root.reshape(1, N, n, n, 1)),
         **gains,
     )
 

@@ -28,6 +28,7 @@ from netkf.engines.compiled.event_loop import (
     WANT_TICKS,
     event_loop,
 )
+from netkf.engines.compiled.evidence import more_evidence
 from netkf.engines.compiled.extras import extras_of
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.late_readings import History, add_past, empty_history
@@ -386,6 +387,8 @@ class FlowRun:
             grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
             grown[: len(self._totals.offered)] = self._totals.offered
             self._totals.offered = grown
+        if self._extras is not None:
+            more_evidence(self._extras.evidence, len(self._state.pool))
 
     def _make_rows(self) -> None:
         least = max(recording.BLOCK, 2 * self._state.most_rows)

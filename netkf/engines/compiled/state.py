@@ -53,10 +53,10 @@ instant of a reading that is sent, or the number of a running sum.
 """
 
 (CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT, BEST, INVERSE, GAINS,
- PREDICTIONS) = range(11)  # fmt: skip
+ PREDICTIONS, BELIEFS) = range(12)  # fmt: skip
 COMBINATIONS = (
     *("convex", "intersection", "swap", "shares", "readings", "sums", "none"),
-    *("best intersection", "inverse intersection", "constant gain", "predictions"),
+    *("best intersection", "inverse intersection", "constant gain", "predictions", "beliefs"),
 )
 """``Filter.combination`` in the order of the numbers by which the event loop knows it."""
 
