@@ -38,7 +38,15 @@ from netkf.algorithms.kernels.triggers import NO_READING, chance_of_silence, wei
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in, built_in_filters
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import definite_covariance, either, field, instance, nested, positive
+from netkf.core.fields import (
+    SourceFile,
+    definite_covariance,
+    either,
+    field,
+    instance,
+    nested,
+    positive,
+)
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
@@ -791,7 +799,17 @@ class StochasticTrigger(Delegate):
         if not isinstance(self.Y, np.ndarray):
             return
         for node in scenario.nodes:
-            rows = sum(len(scenario.sensors[k].R) for k in entries_at(scenario, node))
+            sensors = [scenario.sensors[k] for k in entries_at(scenario, node)]
+            rows = sum(len(sensor.R) for sensor in sensors)
+            recorded = [isinstance(getattr(one, "path", None), SourceFile) for one in sensors]
+            if len(sensors) > 1 and any(recorded):
+                raise ScenarioError(
+                    "filter.Y",
+                    f"must be a number, because some rows of the readings of node {node} may be "
+                    "missing in a record",
+                    "a matrix",
+                    "write a number, or use one sensor",
+                )
             if rows not in (0, len(self.Y)):
                 raise ScenarioError(
                     "filter.Y",

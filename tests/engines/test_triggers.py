@@ -163,6 +163,13 @@ def test_readings_that_are_missing(name, tmp_path):
         network=network_of(name, **CHANNELS["lossy"]),
     )  # fmt: skip
     assert_agree(scenario)
+    both = [{**sensor, "nodes": [2]} for sensor in sensors]
+    (tmp_path / "read.csv").write_text("t,node,y0,y1\n1,2,0.1,0.2\n")
+    with pytest.raises(netkf.ScenarioError, match=r"filter\.Y: must be a number, because some"):
+        scenario_of(
+            triggered(INNER[name], np.eye(3).tolist()), tmp_path, horizon=30.0, sensors=both,
+            network=network_of(name),
+        )  # fmt: skip
 
 
 def test_exchanges_that_are_listed(tmp_path):
