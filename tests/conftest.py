@@ -42,6 +42,7 @@ LONGEST = (
     "studies/test_studies.py",
     "engines/test_compiled.py",
     "engines/test_clocked.py",
+    "engines/test_triggers.py",
     "engines/test_batches.py",
     "testing/test_filters.py",
     "benchmarks/test_by_hand.py",
