@@ -112,8 +112,9 @@ def test_a_broken_promise_fails_with_its_row():
 
 
 def test_where_nothing_is_promised_theory_says_so(build):
-    with pytest.raises(TheoryError):
-        testing.assert_promises(build(filter={"kind": "local"}))
+    filtering = {"kind": "tests.engines.former_filters:OwnReset", "epsilon": 0.3}
+    with pytest.raises(TheoryError, match="nothing is promised of OwnReset"):
+        testing.assert_promises(build(filter=filtering))
 
 
 def test_the_names_are_public():
