@@ -68,12 +68,12 @@ class LouderBy(LinearSensor):
 
 @dataclass(frozen=True, eq=False)
 class BiasedBy(LinearSensor):
-    """Has a bias of so many standard deviations."""
+    """Has a bias of so many standard deviations at one of its nodes, as its row speaks of one."""
 
     size: float = 0.0
 
     def slot_path(self, node, period, generator):
-        shift = self.size * math.sqrt(self.R[0, 0])
+        shift = self.size * math.sqrt(self.R[0, 0]) if node == 0 else 0.0
         return Wrong(self.H, self.R, generator("noise"), change=lambda y, seen: y + shift)
 
 
