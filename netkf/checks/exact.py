@@ -170,21 +170,35 @@ def _pool_times(
 
 
 def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
-    """Return the sum of ``e' P^-1 e`` over all times and hosts, and its weights given the events,
-    (1 + K M n,); all nan if some P has no inverse.
+    """Return the sum of ``e' P^-1 e`` over all times and hosts, each in units of its expected value
+    over n, and its weights given the events, (1 + K M n,); all nan if some P has no inverse.
 
-    ``e`` is (K, M, n) less its mean, ``P`` (K, M, n, n) that of the run; the weights are those for
-    the P that the events should give.
+    ``e`` is (K, M, n) less its mean, ``P`` (K, M, n, n) that of the run; expected values and
+    weights are those for the P that the events should give. In these units a node that is far too
+    sure for a moment does not outweigh all others.
     """
     if _nearly_singular(P).any() or _nearly_singular(law.P).any():
         return np.full(1 + e.size, np.nan)
     n = e.shape[-1]
-    total = np.einsum("kia,kia->", e, np.linalg.solve(P, e[..., None])[..., 0])
     # e' D e with D = L L' has the weights of the eigenvalues of L' C L.
     L = np.linalg.inv(np.linalg.cholesky(law.P)).reshape(-1, n, n)
     blocks = law.covariance.reshape(len(L), n, len(L), n)
+    share = nees_shares(np.einsum("iab,ibic,idc->iad", L, blocks, L, optimize=True))
+    each = np.einsum("kia,kia->ki", e, np.linalg.solve(P, e[..., None])[..., 0])
+    total = (share * each.ravel()).sum()
+    L = np.sqrt(share)[:, None, None] * L
     moved = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(e.size, e.size)
     return np.append(total, np.maximum(np.linalg.eigvalsh(moved), 0.0))
+
+
+def nees_shares(whitened: FloatArray) -> FloatArray:
+    """Return n over the expected NEES (K,), the traces of ``whitened`` (K, n, n); 0 where that is
+    0.
+    """
+    expected = np.trace(whitened, axis1=-2, axis2=-1)
+    return np.asarray(
+        np.divide(whitened.shape[-1], expected, out=np.zeros(len(expected)), where=expected > 0)
+    )
 
 
 def _nearly_singular(P: FloatArray) -> np.ndarray:
@@ -366,11 +380,11 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
 
 @gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
-    """Compare the mean NEES with its expected value given the events of each run.
+    """Compare the NEES with its expected value given the events of each run.
 
     NEES is then a quadratic form of Gaussian errors, whose weights are the eigenvalues of
     P^-1 Sigma, and so is its sum over runs: nothing is estimated. Errors that have a mean count
-    less that mean.
+    less that mean. Sums are in units of the expected values, which may differ widely.
     """
     runs, n = samples.runs, samples.scenario.plant.n
     most = most_replayed(samples.scenario)
@@ -389,10 +403,11 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
         return find_nothing(NEES_TOLERANCE)
     if not len(known):
         return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)
-    found = []
+    found, sizes = [], weights.sum(axis=2, keepdims=True)
+    units = np.divide(n, sizes, out=np.zeros(sizes.shape), where=sizes > 0.0)
     for k in known.tolist():
-        total, share = float(nees[:, k].sum()), 0.5 * level / len(known)
-        ratio = quadratic_interval(total, weights[:, k].ravel(), share)
+        total, share = float((units[:, k, 0] * nees[:, k]).sum()), 0.5 * level / len(known)
+        ratio = quadratic_interval(total, (units * weights)[:, k].ravel(), share)
         found.append((deviation_interval(1.0, ratio), f"at {samples.point_labels[k]}"))
     message = (
         f"mean NEES {nees[:, known].mean():.4g}, exact errors say "

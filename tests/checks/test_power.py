@@ -10,11 +10,12 @@ import pytest
 import scipy.stats
 
 from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
-from netkf.checks.exact import _compare_pooled, check_expected_nees, most_replayed
+from netkf.checks.exact import _compare_pooled, _pool_nees, check_expected_nees, most_replayed
 from netkf.checks.parts.clock_rows import _count_interval
 from netkf.checks.points import check_times, errors_at_once, sample_times
 from netkf.checks.samples import stack_summaries
 from netkf.scenario.reading import load
+from netkf.theory.common.replay import ErrorLaw
 from tests.checks.power import STUDIES, measured_power
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -114,14 +115,29 @@ def test_the_expected_nees_of_all_errors_is_exact(samples):
     z = (quadratic[:, 0] - weights.sum(axis=1)) / np.sqrt(2.0 * (weights**2).sum(axis=1))
     assert abs(z.mean()) < 4.0 / math.sqrt(FEW)
     assert 0.3 < z.std() < 2.0
-    # The weights of one time alone are those of P^-1 Sigma there.
-    shares = np.linalg.inv(samples.runs.replayed) @ samples.runs.Sigma
-    at_checked = np.trace(shares, axis1=-2, axis2=-1).sum(axis=(1, 2))
-    share = len(check_times(samples.scenario)) / len(sample_times(samples.scenario))
-    assert weights.shape[1] == len(sample_times(samples.scenario)) * errors_at_once(
-        samples.scenario
-    )
-    assert np.allclose(at_checked / weights.sum(axis=1), share, rtol=0.2)
+    # Each NEES counts in units of its expected value over n, that of a right P.
+    times, errors = len(sample_times(samples.scenario)), errors_at_once(samples.scenario)
+    np.testing.assert_allclose(weights.sum(axis=1), times * errors, rtol=1e-9)
+
+
+def test_sums_of_nees_are_those_of_a_plain_loop():
+    random = np.random.default_rng(7)
+    times, hosts, n = 3, 2, 2
+    size = times * hosts * n
+    root = random.standard_normal((size, size))
+    C, e = root @ root.T, random.standard_normal((times, hosts, n))
+    P = np.array([2.0 * np.eye(n) + 0.3 * k for k in range(times * hosts)]).reshape(3, 2, n, n)
+    law = ErrorLaw(np.zeros(size), C, P)
+    total, D = 0.0, np.zeros((size, size))
+    for k, (x, one) in enumerate(zip(e.reshape(-1, n), P.reshape(-1, n, n), strict=True)):
+        own = slice(k * n, (k + 1) * n)
+        inverse = np.linalg.inv(one)
+        unit = n / np.trace(inverse @ C[own, own])
+        total += unit * x @ inverse @ x
+        D[own, own] = unit * inverse
+    found = _pool_nees(e, P, law)
+    assert found[0] == pytest.approx(total, rel=1e-12)
+    np.testing.assert_allclose(found[1:], np.sort(np.linalg.eigvals(D @ C).real), rtol=1e-9)
 
 
 @pytest.mark.parametrize(("factor", "broken"), [(1.0, False), (1.6, True), (0.6, True)])
