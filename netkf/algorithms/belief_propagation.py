@@ -26,6 +26,7 @@ from netkf.algorithms.kernels.beliefs import (
     hear_evidence,
     move_part,
     recentre_part,
+    take_one_prior,
     take_prior,
 )
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
@@ -229,12 +230,6 @@ def recentre_one(part: FloatArray, before: FloatArray, after: FloatArray) -> Non
 
 
 @kernel
-def take_one(root: FloatArray, part: FloatArray) -> None:
-    """Apply ``take_prior`` to one root (1, 1, n, n, 1) with one lane."""
-    take_prior(ONE, root, 0, 0, part)
-
-
-@kernel
 def finish_one(
     root: FloatArray, x: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
@@ -403,7 +398,7 @@ def evidence_of(root: FloatArray) -> FloatArray:
     """Return an estimate with the root (n, n) of its covariance as evidence that counts from it."""
     n = len(root)
     part = np.zeros((n, n + 1, 1))
-    take_one(np.array(root).reshape(1, 1, n, n, 1), part)
+    take_one_prior(np.array(root).reshape(1, 1, n, n, 1), 0, part)
     return np.ascontiguousarray(part[..., 0])
 
 

@@ -43,9 +43,11 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    block_of_reading,
     predict_mean,
     rebase,
     show,
+    star_of,
     whiten_reading,
 )
 from netkf.algorithms.registry import built_in
@@ -505,18 +507,9 @@ def correct_estimates(
     """Return xhat and yhat (n,) of a node after an exchange in which it ``heard`` the estimates of
     pseudo-states to which the gains B belong.
     """
-    # One receiver and its senders, as a star whose links are all up.
-    count, n = len(heard), len(state.xhat)
-    y, places = np.stack([state.yhat, *heard])[None, :, :, None], np.arange(count)
-    links = SlotLinks(np.array([0, count]), places + 1, places, np.ones(count))
-    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
-    seen, H = (np.zeros(0), np.zeros((0, n))) if state.reading is None else state.reading
-    readings = ReadingBlock(
-        seen.reshape(1, 1, 1, -1, 1),
-        H.reshape(1, 1, 1, -1, n, 1),
-        np.zeros((1, 1, n, 1)),
-        np.zeros(1, dtype=bool),
-    )
+    n, y = len(state.xhat), np.stack([state.yhat, *heard])[None, :, :, None]
+    links, up = star_of([1.0] * len(heard))
+    readings = block_of_reading(*(state.reading or (np.zeros(0), np.zeros((0, n)))))
     one = GainTable(*(np.array(getattr(gains, name)) for name in GainTable._fields))
     table = GainTable(one.B[None], *(part[None, None] for part in one[1:]))
     x = np.array(state.xhat).reshape(1, 1, n, 1)

@@ -22,6 +22,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     rebase,
     show,
+    star_of,
 )
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
@@ -171,11 +172,8 @@ class DiffusionKalman(Filter):
 
 def combine_estimates(psi: FloatArray, messages: Sequence[Message]) -> FloatArray:
     """Return ``sum_l c_l psi_l`` (n,) with the weights of the messages and the rest for psi."""
-    # One receiver and its senders, as a star whose links are all up.
-    count, n = len(messages), len(psi)
-    x, places = np.stack([psi, *(m.payload for m in messages)])[None, :, :, None], np.arange(count)
-    weights = np.array([message.weight for message in messages], dtype=np.float64)
-    links = SlotLinks(np.array([0, count]), places + 1, places, weights)
+    n, x = len(psi), np.stack([psi, *(m.payload for m in messages)])[None, :, :, None]
+    links, up = star_of([message.weight for message in messages])
     moved = np.empty((1, n, 1))
-    move_one(x, links, np.ones((1, 1, 1, count, 1), dtype=np.uint8), moved)
+    move_one(x, links, up, moved)
     return np.asarray(psi + moved.reshape(n))

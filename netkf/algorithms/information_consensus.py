@@ -34,10 +34,12 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    block_of_reading,
     predict_all,
     rebase,
     show,
     slot_scratch,
+    star_of,
     whiten_reading,
 )
 from netkf.algorithms.models import SlotModel, first_root
@@ -349,12 +351,7 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
         state.model.root_Q,
         np.array([len(y)]),
     )
-    readings = ReadingBlock(
-        np.ascontiguousarray(y).reshape(1, 1, 1, -1, 1),
-        np.ascontiguousarray(H).reshape(1, 1, 1, -1, n, 1),
-        np.zeros((1, 1, n, 1)),
-        np.zeros(1, dtype=bool),
-    )
+    readings = block_of_reading(y, H)
     shares, counts = state.recipe
     parts = np.zeros((2, len(shares), 1, n, n + 1, 1))
     begin_one(nodes, readings, slot_scratch(1, n, ONE), ConsensusArrays(1, shares, counts, parts))
@@ -363,17 +360,13 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
 
 def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
     """Return the roots (K, n, n + 1) of a node's pairs after a consensus step."""
-    # One receiver and its senders, as a star whose links are all up.
-    count, (K, n, _) = len(messages), parts.shape
-    stack = np.zeros((2, K, 1 + count, n, n + 1, 1))
+    K, n, _ = parts.shape
+    stack = np.zeros((2, K, 1 + len(messages), n, n + 1, 1))
     centre = np.stack([xhat, *(message.payload.xhat for message in messages)])[..., None]
     stack[0, :, 0, :, :, 0] = parts
     for m, message in enumerate(messages):
         stack[0, :, 1 + m, :, :, 0] = message.payload.parts
-    places = np.arange(count)
-    weights = np.array([message.weight for message in messages], dtype=np.float64)
-    links = SlotLinks(np.array([0, count]), places + 1, places, weights)
-    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
+    links, up = star_of([message.weight for message in messages])
     mix_one(stack, links, up, np.ascontiguousarray(centre), np.empty((2, n, n + 1, 1)))
     return stack[1, :, 0, :, :, 0]
 

@@ -27,6 +27,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     rebase,
     show,
+    star_of,
 )
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
@@ -197,11 +198,8 @@ def consensus_term(
     prior: FloatArray, root: FloatArray, heard: Sequence[FloatArray], epsilon: float
 ) -> FloatArray:
     """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) for the predictions that were heard."""
-    # One receiver and its senders, as a star whose links are all up.
-    count, n = len(heard), len(prior)
-    x, places = np.stack([prior, *heard])[None, :, :, None], np.arange(count)
-    links = SlotLinks(np.array([0, count]), places + 1, places, np.ones(count))
-    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
+    n, x = len(prior), np.stack([prior, *heard])[None, :, :, None]
+    links, up = star_of([1.0] * len(heard))
     moved, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)
     term_of_one(x, links, up, S, epsilon, moved, np.empty((n, 1)))
     return moved.reshape(n)

@@ -22,6 +22,7 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    block_of_reading,
     predict_all,
     rebase,
     rotate_lanes,
@@ -347,11 +348,5 @@ def corrected(
     n = len(state.xhat)
     x = np.array(state.xhat).reshape(1, 1, n, 1)
     root = np.array(state.root).reshape(1, 1, n, n, 1)
-    readings = ReadingBlock(
-        y.reshape(1, 1, 1, -1, 1),
-        np.ascontiguousarray(H).reshape(1, 1, 1, -1, n, 1),
-        np.zeros((1, 1, n, 1)),
-        np.zeros(1, dtype=bool),
-    )
-    use(x, root, readings, signs[:, None], np.empty((2, n, 1)))
+    use(x, root, block_of_reading(y, H), signs[:, None], np.empty((2, n, 1)))
     return state._replace(xhat=x.reshape(n), root=np.tril(root.reshape(n, n)))

@@ -41,6 +41,7 @@ from netkf.algorithms.kernels.slots import (
     rebase,
     show,
     slot_scratch,
+    star_of,
     take_silent,
     whiten_reading,
 )
@@ -849,11 +850,8 @@ def correct_one_root(root: FloatArray, information: FloatArray) -> FloatArray:
 
 def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
     """Return z plus 1 / delta of the differences to the estimates that arrived, P (9)."""
-    # One receiver and its senders, as a star whose links are all up.
-    x, count = np.stack([z, *received])[None, :, :, None], len(received)
-    places = np.arange(count)
-    links = SlotLinks(np.array([0, count]), places + 1, places, np.zeros(count))
-    up = np.ones((1, 1, 1, count, 1), dtype=np.uint8)
+    x = np.stack([z, *received])[None, :, :, None]
+    links, up = star_of([0.0] * len(received))
     average(ONE, x, 0, links, up, 0, 0, np.empty((1, len(z), 1)), 1.0 / delta)
     return np.asarray(x[0, 0, :, 0])
 

@@ -25,6 +25,7 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    block_of_reading,
     move_mean,
     predict_all,
     rebase,
@@ -92,9 +93,7 @@ def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
     """Return ``z' Y z`` with the innovation ``z = y - H xhat`` of a reading with p > 0 rows."""
     y, H = whiten_reading(*reading[:3])
     p, n = H.shape
-    readings = ReadingBlock(
-        y.reshape(1, 1, 1, p, 1), H.reshape(1, 1, 1, p, n, 1), np.zeros((1, 1, n, 1)), NOWHERE
-    )
+    readings = block_of_reading(y, H)
     trigger = np.ascontiguousarray(whitened_trigger(Y, reading.R))[None]
     return news_of_one(
         np.ascontiguousarray(xhat).reshape(1, 1, n, 1), readings, trigger, np.empty((p, 1))

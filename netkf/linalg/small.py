@@ -118,3 +118,15 @@ def copy_matrix(target: FloatArray, source: FloatArray) -> None:
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
+
+
+@kernel
+def multiply_square(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """Write ``a b`` into another array ``out``, all (n, n)."""
+    n = len(a)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(n):
+                total += a[i, r] * b[r, j]
+            out[i, j] = total

@@ -15,7 +15,7 @@ from netkf.algorithms.kernels.intersection import merge_lanes
 from netkf.algorithms.kernels.slots import SlotLinks
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import Lanes, any_lane, load, load_flags, select, spread, store
+from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, spread, store
 
 
 class BeliefScratch(NamedTuple):
@@ -112,6 +112,12 @@ def take_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray)
             store(lanes, part, i, j, value * inverse)
         store(lanes, part, i, i, inverse)
         store(lanes, part, i, n, 0.0)
+
+
+@kernel
+def take_one_prior(roots: FloatArray, h: int, part: FloatArray) -> None:
+    """Apply ``take_prior`` to one of the ``roots`` (1, H, n, n, 1) with one lane."""
+    take_prior(ONE, roots, 0, h, part)
 
 
 @kernel

@@ -8,20 +8,9 @@ from __future__ import annotations
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.small import multiply_square
 
 TERMS = 18  # of the exponential, for a norm of at most 1/2
-
-
-@kernel
-def multiply_matrices(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
-    """Write ``a b`` (n, n) into ``out``."""
-    n = len(a)
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for r in range(n):
-                total += a[i, r] * b[r, j]
-            out[i, j] = total
 
 
 @kernel
@@ -64,7 +53,7 @@ def fill_series(
             E[i, j] = term[i, j] = one
             first[i, j], later[i, j] = step * one, 0.5 * step * step * one
     for k in range(1, TERMS):
-        multiply_matrices(moved, term, M)
+        multiply_square(moved, term, M)
         for i in range(n):
             for j in range(n):
                 term[i, j] = sign * moved[i, j] * step / k
@@ -77,15 +66,15 @@ def fill_series(
 def double_gap(step: float, first: FloatArray, work: FloatArray) -> None:
     """Make what ``fill_series`` wrote for a step that of two steps."""
     n, E, moved, later = len(first), work[0], work[2], work[3]
-    multiply_matrices(moved, E, later)
+    multiply_square(moved, E, later)
     for i in range(n):
         for j in range(n):
             later[i, j] += step * first[i, j] + moved[i, j]
-    multiply_matrices(moved, E, first)
+    multiply_square(moved, E, first)
     for i in range(n):
         for j in range(n):
             first[i, j] += moved[i, j]
-    multiply_matrices(moved, E, E)
+    multiply_square(moved, E, E)
     for i in range(n):
         for j in range(n):
             E[i, j] = moved[i, j]

@@ -16,6 +16,7 @@ for y and H, so that the noise of each row has variance 1 and rows are used one 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,6 +168,27 @@ def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatAr
     # One solve for y and H together.
     made = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
     return np.ascontiguousarray(made[:, 0]), np.ascontiguousarray(made[:, 1:])
+
+
+def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
+    """Return a whitened reading y (p,), H (p, n) as that of one filter in one slot, one lane."""
+    n = H.shape[1]
+    return ReadingBlock(
+        np.ascontiguousarray(y).reshape(1, 1, 1, -1, 1),
+        np.ascontiguousarray(H).reshape(1, 1, 1, -1, n, 1),
+        np.zeros((1, 1, n, 1)),
+        np.zeros(1, dtype=bool),
+    )
+
+
+def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
+    """Return the links of one receiver, in place 0, that hears senders in places 1, 2, ... with
+    these ``weights``, and messages (1, 1, 1, W, 1) that all arrive.
+    """
+    count = len(weights)
+    places = np.arange(count)
+    links = SlotLinks(np.array([0, count]), places + 1, places, np.array(weights, dtype=np.float64))
+    return links, np.ones((1, 1, 1, count, 1), dtype=np.uint8)
 
 
 @kernel

@@ -520,7 +520,7 @@ def use_messages(state: Simulation, history: History, h: int, now: float) -> Non
 
 @kernel
 def combine_by_extras(state: Simulation, extras: Extras, h: int, now: float) -> None:
-    """What node ``h`` heard, by rules of its own."""
+    """Use what node ``h`` heard by the rule of a combination that needs extras."""
     if extras.kind == PREDICTIONS:
         use_readings_heard(state, h, now)
     heard = bring_to_now(state, h, now)

@@ -13,7 +13,7 @@ from netkf.algorithms.kernels.beliefs import (
     copy_part,
     move_part,
     recentre_part,
-    take_prior,
+    take_one_prior,
 )
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.information import add_reading_pair
@@ -93,12 +93,6 @@ def more_evidence(evidence: Evidence, capacity: int) -> None:
     grown = np.zeros((capacity, *evidence.carried.shape[1:]))
     grown[: len(evidence.carried)] = evidence.carried
     evidence.carried = grown
-
-
-@kernel
-def take_one_prior(roots: FloatArray, h: int, part: FloatArray) -> None:
-    """Write the estimate of node ``h`` at the start as evidence."""
-    take_prior(ONE, roots, 0, h, part)
 
 
 @kernel

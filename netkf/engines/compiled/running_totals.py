@@ -17,6 +17,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.jacobi import diagonalise
 from netkf.linalg.lanes import ONE
+from netkf.linalg.small import multiply_square
 from netkf.linalg.structs import Struct
 
 TERMS = 18  # of the exponential, for a norm of at most 1/2
@@ -69,18 +70,6 @@ def empty_totals(
 
 
 @kernel
-def multiply(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
-    """``out = a b`` of (n, n)."""
-    n = len(a)
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for r in range(n):
-                total += a[i, r] * b[r, j]
-            out[i, j] = total
-
-
-@kernel
 def fill_inverse(totals: Totals, gap: float) -> None:
     """Write ``e^{-A gap}`` into ``scratch[0]``: the power series of a part of the gap, squared."""
     A, out, term, moved = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
@@ -98,13 +87,13 @@ def fill_inverse(totals: Totals, gap: float) -> None:
         norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
     # A norm of 0 leaves the identity.
     for k in range(1, TERMS if norm > 0.0 else 1):
-        multiply(moved, term, A)
+        multiply_square(moved, term, A)
         for i in range(n):
             for j in range(n):
                 term[i, j] = moved[i, j] * step / k
                 out[i, j] += term[i, j]
     for _ in range(halvings):
-        multiply(moved, out, out)
+        multiply_square(moved, out, out)
         for i in range(n):
             for j in range(n):
                 out[i, j] = moved[i, j]

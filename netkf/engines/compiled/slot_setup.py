@@ -267,8 +267,8 @@ class SlotSetup:
         return bool(self._recorded_slots)
 
     def unread(self, first: int, count: int) -> np.ndarray:
-        """Whether nodes send nothing in the steps of so many slots from ``first`` on because they
-        have not read anything, (S, E, N).
+        """Return (S, E, N) whether nodes send nothing in the steps of so many slots from ``first``
+        on because they have not read anything.
         """
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
         for place, slots in self._recorded_slots.items():

@@ -126,8 +126,12 @@ class DelayedJumps:
     @cached_property
     def _coupling(self) -> scipy.sparse.csr_array:
         """H (M, M)."""
-        late = scipy.linalg.expm(self.delay * self.A)
-        return scipy.sparse.csr_array(self._mean[1] @ np.kron(np.eye(self.nodes), late))
+        return scipy.sparse.csr_array(self._mean[1] @ self._late)
+
+    @cached_property
+    def _late(self) -> FloatArray:
+        """What a delay makes of the errors of all nodes (M, M), e^{A d} for each."""
+        return np.asarray(np.kron(np.eye(self.nodes), scipy.linalg.expm(self.delay * self.A)))
 
     @cached_property
     def _moves(self) -> FloatArray:
@@ -168,17 +172,21 @@ class DelayedJumps:
         columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
         return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
 
-    def _right(self, Phi: FloatArray, noise: bool, jumps: bool) -> FloatArray:
-        """Return the inhomogeneous part (k + 1, M, M) of the problem, see ``_residual``."""
+    def _driven_by(self, Phi: FloatArray) -> FloatArray:
+        """Return the inhomogeneous part (k + 1, M, M) of the problem, see ``_residual``, for white
+        noise Phi (M, M) a second.
+        """
         found = np.zeros((self.points + 1, *Phi.shape))
         found[0] = Phi
-        if noise and jumps:
-            found[0] += self._inflow(self._moments(np.zeros_like(found), True))
-        if noise:
-            heard = self._mean[1] @ np.tile(self._common[0], (1, self.nodes, 1))
-            found[0] += self.instant.noise + 2.0 * symmetric(heard[0])
-            found[1:] = np.tensordot(self._integral, heard, 1)[1:]
         return found
+
+    def _driven_by_noises(self) -> FloatArray:
+        """Return the same for the noises of plant and readings, and what jumps make of them."""
+        heard = self._mean[1] @ np.tile(self._common[0], (1, self.nodes, 1))
+        found = np.tensordot(self._integral, heard, 1)
+        added = self._inflow(self._moments(np.zeros_like(found), True))
+        found[0] = self.instant.noise + 2.0 * symmetric(heard[0]) + added
+        return np.asarray(found)
 
     def _residual(self, K: FloatArray, right: FloatArray, jumps: bool) -> FloatArray:
         """Return the residuals (k + 1, M, M) of the problem: that of its second equation, and those
@@ -235,11 +243,10 @@ class DelayedJumps:
         )
         return np.asarray(found).reshape(right.shape)
 
-    def autocovariances(self, Phi: FloatArray, noise: bool, jumps: bool = False) -> FloatArray:
-        """Return K (k + 1, M, M) at the points for white noise Phi (M, M) a second, with or without
-        the noises of plant and readings, and what jumps add. Raises TheoryError if it is not found.
+    def _autocovariances(self, right: FloatArray, jumps: bool) -> FloatArray:
+        """Return K (k + 1, M, M) at the points for an inhomogeneous part, with or without what
+        jumps add. Raises TheoryError if it is not found.
         """
-        right = self._right(Phi, noise, jumps)
         K = self._solved(right, jumps, FIRST_TOLERANCE)
         for _ in range(MAX_ROUNDS):
             change = self._solved(self._residual(K, right, jumps), jumps, CORRECTION)
@@ -250,8 +257,8 @@ class DelayedJumps:
 
     def _moments(self, K: FloatArray, noise: bool) -> FloatArray:
         """Return E[(E, m) (E, m)'] (2 M, 2 M) of K (k + 1, M, M)."""
-        late = np.kron(np.eye(self.nodes), scipy.linalg.expm(self.delay * self.A))
-        X, across = symmetric(K[0]), K[-1] @ late.T
+        late, X = self._late, symmetric(K[0])
+        across = K[-1] @ late.T
         sent = late @ X @ late.T
         if noise:
             F, Q = self._common
@@ -265,18 +272,19 @@ class DelayedJumps:
         heard = self._ways.products(*self.instant.all_pairs, Z)[:, :M, :M]
         return np.asarray(symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)[0])
 
-    def excited(self, Phi: FloatArray, noise: bool = False) -> FloatArray:
+    def excited(self, Phi: FloatArray) -> FloatArray:
         """Return the Phi (1, M, M) that jumps make of errors driven by one, a positive map."""
-        return self._inflow(self._moments(self.autocovariances(Phi[0], noise), noise))[None]
+        K = self._autocovariances(self._driven_by(Phi[0]), False)
+        return self._inflow(self._moments(K, False))[None]
 
     @cached_property
     def is_bounded(self) -> bool:
         """True if it is proved that the radius of ``excited`` is below 1: it maps some positive
         definite Phi to Phi - 1.
         """
-        M = len(self.instant.drift)
+        unit = self._driven_by(np.eye(len(self.instant.drift)))
         try:
-            moments = self._moments(self.autocovariances(np.eye(M), False, jumps=True), False)
+            moments = self._moments(self._autocovariances(unit, True), False)
         except TheoryError:  # near 1, or above it
             return False
         added = np.linalg.eigvalsh(self._inflow(moments))
@@ -285,8 +293,7 @@ class DelayedJumps:
     @cached_property
     def covariance(self) -> FloatArray:
         """E[E E'] (1, M, M) under all noises and jumps."""
-        M = len(self.instant.drift)
-        return symmetric(self.autocovariances(np.zeros((M, M)), True, jumps=True)[:1])
+        return symmetric(self._autocovariances(self._driven_by_noises(), True)[:1])
 
     @cached_property
     def mean_is_stable(self) -> bool:

@@ -76,7 +76,9 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
-    """Return the radius, and the covariances (N, n, n) if it is below 1."""
+    """Return the radius, and the covariances (N, n, n) if it is below 1; with delays a radius of 0
+    stands for one that is only proved to be.
+    """
     solve = _solver(scenario)
     if solve is not None:
         _require_known_law(scenario)
@@ -103,6 +105,7 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
     return radius, np.repeat(found, len(scenario.nodes) // system.nodes, axis=0)
 
 
+@lru_cache(maxsize=8)
 def _system(scenario: Scenario) -> LinearErrors:
     """Return the errors as a linear system of which mean squares can be computed."""
     system = linear_errors(scenario)
