@@ -15,7 +15,7 @@ from numba.core import ir as numba_ir
 from numba.core.compiler_machinery import register_pass
 from numba.core.ir_utils import get_definition, guard
 from numba.core.lowering import Lower
-from numba.core.typed_passes import NativeLowering
+from numba.core.typed_passes import IRLegalization, NativeLowering
 from numba.np.arrayobj import load_item, store_item
 
 I64 = ir.IntType(64)
@@ -38,6 +38,29 @@ def entry_pointer(builder: Any, kind: Any, array: Any, places: Any) -> Any:
         step = length if step is ONE else builder.mul(step, length)
         at = builder.add(builder.mul(places[axis - 1], step), at)
     return builder.gep(builder.extract_value(array, DATA), [at], inbounds=True)
+
+
+def array_without_owner(builder: Any, kind: Any, data: Any, shape: Any, itemsize: int) -> Any:
+    """Return a C-contiguous array, whose references nobody counts, of LLVM's type ``kind``."""
+    strides = [ir.Constant(I64, itemsize)]
+    # Row-major strides, from the last axis to the first.
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(strides[0], length))
+    items = shape[0]
+    for length in shape[1:]:
+        items = builder.mul(items, length)
+    parts: list[tuple[Any, Any]] = [
+        (ITEMS, items),
+        (ITEMSIZE, ir.Constant(I64, itemsize)),
+        (DATA, data),
+    ]
+    parts += [(field, ir.Constant(kind.elements[field], None)) for field in (MEMINFO, PARENT)]
+    parts += [((SHAPE, axis), length) for axis, length in enumerate(shape)]
+    parts += [((STRIDES, axis), stride) for axis, stride in enumerate(strides)]
+    made = ir.Constant(kind, ir.Undefined)
+    for field, value in parts:
+        made = builder.insert_value(made, value, field)
+    return made
 
 
 def is_in_order(place: Any) -> bool:
@@ -178,3 +201,16 @@ class KernelLowering(NativeLowering):
     def lowering_class(self) -> Any:
         """The class that writes the code."""
         return KernelLower
+
+
+@register_pass(mutates_CFG=False, analysis_only=True)
+class KernelLegalization(IRLegalization):
+    """Says after which instruction a variable is no longer used only where references are counted:
+    elsewhere nothing would happen there, and LLVM would have to find that out.
+    """
+
+    _name = "kernel_legalization"
+
+    def run_pass(self, state: Any) -> bool:
+        """Add what is missing to numba's language."""
+        return bool(state.flags.nrt and super().run_pass(state))

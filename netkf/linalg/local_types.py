@@ -15,6 +15,7 @@ from numba.core import cgutils
 from numba.extending import lower_builtin, type_callable
 
 from netkf.linalg.lanes import ALIGNMENT
+from netkf.linalg.lean_lowering import DATA, I64, array_without_owner
 from netkf.linalg.local import (
     local_lanes_matrix,
     local_lanes_vector,
@@ -22,8 +23,6 @@ from netkf.linalg.local import (
     local_vector,
 )
 from netkf.linalg.structs import WORD
-
-I64 = ir.IntType(64)
 
 
 def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> None:
@@ -50,20 +49,13 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
     def _on_stack(context: Any, builder: Any, sig: Any, _args: Any) -> Any:
         n, kind = len(sig.args[0]), sig.return_type
         shape = [n] * dimensions + [len(part) for part in sig.args[1:-1]]
-        array = context.make_array(kind)(context, builder)
-        items = math.prod(shape)
-        data = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), items))
+        array = context.get_value_type(kind)
+        memory = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), math.prod(shape)))
         # Lines of the cache, for values of several lanes.
-        data.align = ALIGNMENT if lanes else WORD
-        array.data = builder.bitcast(data, array.data.type)
-        array.nitems, array.itemsize = ir.Constant(I64, items), ir.Constant(I64, WORD)
-        strides = [WORD * math.prod(shape[k + 1 :]) for k in range(len(shape))]
-        array.shape = cgutils.pack_array(builder, [ir.Constant(I64, k) for k in shape], I64)
-        array.strides = cgutils.pack_array(builder, [ir.Constant(I64, k) for k in strides], I64)
-        # No owner: numba counts no references.
-        array.meminfo = ir.Constant(array.meminfo.type, None)
-        array.parent = ir.Constant(array.parent.type, None)
-        return array._getvalue()
+        memory.align = ALIGNMENT if lanes else WORD
+        data = builder.bitcast(memory, array.elements[DATA])
+        lengths = [ir.Constant(I64, length) for length in shape]
+        return array_without_owner(builder, array, data, lengths, WORD)
 
     @lower_builtin(function, types.Array, *between, types.Array)
     def _in_memory(_context: Any, _builder: Any, _sig: Any, args: Any) -> Any:

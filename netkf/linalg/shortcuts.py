@@ -53,7 +53,7 @@ def kernel_compiler(lean: bool) -> Any:
     from numba.core import config
     from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
-    from netkf.linalg.lean_lowering import KernelLowering
+    from netkf.linalg.lean_lowering import KernelLegalization, KernelLowering
 
     builder: Any = DefaultPassBuilder
     # Bounds are checked by numba's own code.
@@ -65,10 +65,10 @@ def kernel_compiler(lean: bool) -> Any:
         def define_pipelines(self) -> list[Any]:
             pipeline = builder.define_nopython_pipeline(self.state)
             steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
-            pipeline.passes = [
-                (KernelLowering if short and step.__name__ == "NativeLowering" else step, said)
-                for step, said in steps
-            ]
+            own: dict[str, Any] = {"IRLegalization": KernelLegalization}
+            if short:
+                own["NativeLowering"] = KernelLowering
+            pipeline.passes = [(own.get(step.__name__, step), said) for step, said in steps]
             pipeline.finalize()
             return [pipeline]
 
@@ -77,15 +77,19 @@ def kernel_compiler(lean: bool) -> Any:
 
 def shortcuts() -> list[Patch]:
     """Return replacements of numba's methods: owner, name, method."""
-    from numba.core import config, event, ir, lowering, typeinfer
+    from numba.core import base, config, event, ir, lowering, typeinfer
     from numba.core.base import BaseContext
     from numba.core.codegen import CPUCodeLibrary
+    from numba.core.compiler_machinery import PassManager
     from numba.core.postproc import PostProcessor
     from numba.core.types.functions import BaseFunction
     from numba.np import arrayobj
 
     return [
+        (PassManager, "_runPass", _run_pass),
         (PostProcessor, "run", _without_liveness(PostProcessor.run)),
+        (BaseContext, "refresh", _if_anything_is_new(BaseContext.refresh)),
+        (base, "_has_loc", cache(base._has_loc)),
         (BaseContext, "get_abi_sizeof", _measured_once(BaseContext.get_abi_sizeof)),
         (BaseFunction, "get_call_type", _found_once(BaseFunction.get_call_type)),
         (event, "install_timer", _no_timer),
@@ -119,6 +123,32 @@ def _found_once(find: Callable[..., Any]) -> Callable[..., Any]:
         return known[call]
 
     return found
+
+
+def _run_pass(manager: Any, _: int, step: Any, state: Any) -> None:
+    """Run a pass without a description of it for whoever listens, and times that nobody reads."""
+    step.analysis = manager._analysis
+    for part in (step.run_initialization, step.run_pass, step.run_finalizer):
+        part(state)
+
+
+def _if_anything_is_new(refresh: Callable[..., Any]) -> Callable[..., Any]:
+    """Look for new definitions only if there are some: numba imports thirty modules each time."""
+    known: dict[int, int] = {}
+
+    def size_of(context: Any) -> int:
+        registries = [*context._registries, *context.typing_context._registries]
+        lists = ("functions", "getattrs", "setattrs", "casts", "constants", "attributes", "globals")
+        return sum(len(getattr(each, name, ())) for each in registries for name in lists)
+
+    def refresh_if_new(context: Any) -> None:
+        # Contexts of single functions share what they know.
+        key = id(context._registries)
+        if known.get(key) != size_of(context):
+            refresh(context)
+            known[key] = size_of(context)
+
+    return refresh_if_new
 
 
 def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:

@@ -29,9 +29,8 @@ from numba.extending import (
 )
 from numba.np.numpy_support import from_dtype
 
+from netkf.linalg.lean_lowering import DATA, I64, array_without_owner
 from netkf.linalg.structs import WORD, Struct, StructClass, struct_at
-
-I64 = ir.IntType(64)
 
 
 class StructType(types.Type):
@@ -119,25 +118,15 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
     # Numbers are loaded; a struct inside a struct is the address that is stored.
     if not isinstance(kind, types.Array):
         return builder.load(_field_pointer(builder, address, offset, context.get_value_type(kind)))
-    itemsize = context.get_abi_sizeof(context.get_data_type(kind.dtype))
-    array = context.make_array(kind)(context, builder)
-    data = builder.load(_field_pointer(builder, address, offset, array.data.type))
+    array, itemsize = (
+        context.get_value_type(kind),
+        context.get_abi_sizeof(context.get_data_type(kind.dtype)),
+    )
+    data = builder.load(_field_pointer(builder, address, offset, array.elements[DATA]))
     first = _field_pointer(builder, address, offset + WORD, I64)
     shape = [builder.load(builder.gep(first, [ir.Constant(I64, k)])) for k in range(kind.ndim)]
-    # Row-major strides from the last dimension to the first.
-    strides = [ir.Constant(I64, itemsize)]
-    for size in reversed(shape[1:]):
-        strides.insert(0, builder.mul(strides[0], size))
-    items = shape[0]
-    for size in shape[1:]:
-        items = builder.mul(items, size)
-    array.data, array.nitems, array.itemsize = data, items, ir.Constant(I64, itemsize)
-    array.shape = cgutils.pack_array(builder, shape, I64)
-    array.strides = cgutils.pack_array(builder, strides, I64)
-    # No owner: numba counts no references, and Python keeps the array alive.
-    array.meminfo = ir.Constant(array.meminfo.type, None)
-    array.parent = ir.Constant(array.parent.type, None)
-    return array._getvalue()
+    # No owner: Python keeps the array alive.
+    return array_without_owner(builder, array, data, shape, itemsize)
 
 
 @lower_setattr_generic(StructType)

@@ -4,6 +4,7 @@ import gc
 import weakref
 
 import numba
+import numpy as np
 import pytest
 from numba.core import event
 from numba.core.errors import TypingError
@@ -93,3 +94,42 @@ def test_names_of_numba_are_as_expected():
     names = {name for owner, name, _ in shortcuts() if name in owner.__dict__}
     assert {"_rec_list_vars", "get_abi_sizeof", "new_error_context", "start_event"} <= names
     assert len(names) == len({name for _, name, _ in shortcuts()})
+
+
+def test_what_is_registered_between_two_compilations_is_known_in_the_second():
+    def twice(x):
+        raise NotImplementedError
+
+    with linked_once():
+        assert numba.njit(lambda x: x + 1.0)(2.0) == 3.0
+
+    @numba.extending.overload(twice)
+    def _twice(x):
+        return lambda x: 2.0 * x
+
+    with linked_once():
+        assert numba.njit(lambda x: twice(x) + 1.0)(2.0) == 5.0
+
+
+@kernel(allocates=True)
+def sums_of_parts(n: int) -> float:
+    """A kernel that makes arrays, some of them in a loop and one that is returned to another."""
+    total = 0.0
+    for k in range(n):
+        part = np.ones(k + 1)
+        part = part + 1.0
+        total += part.sum()
+    return total
+
+
+def test_arrays_that_kernels_make_are_freed():
+    memory = numba.core.runtime._nrt_python
+    assert sums_of_parts(3) == 12.0
+    memory.memsys_enable_stats()
+    try:
+        before = numba.core.runtime.rtsys.get_allocation_stats()
+        assert sums_of_parts(10) == 110.0
+        after = numba.core.runtime.rtsys.get_allocation_stats()
+    finally:
+        memory.memsys_disable_stats()
+    assert after.alloc - before.alloc == after.free - before.free > 0
