@@ -112,13 +112,14 @@ class Transmitter:
             self._timeline.call_at(now + delay, Rank.DELIVER, way.entity, callback)
 
     def _arrive(
-        self, way: DirectedLink, phase: int, envelope: Envelope, _: simpy.Event | None
+        self, way: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
         now, (sender, receiver) = self._timeline.now, way.link
-        # The stored envelope may have been shifted since it was sent.
-        envelope = self._flying.pop((way.link, envelope.number), envelope)
-        # Its age at arrival.
-        envelope = envelope._replace(age=now - envelope.sent)
+        # A message without delay arrives inside the tick, and keeps its age of 0.
+        if arrival is not None:
+            # The stored envelope may have been shifted since it was sent.
+            envelope = self._flying.pop((way.link, envelope.number))
+            envelope = envelope._replace(age=now - envelope.sent)
         arrives_in_time = way.receiver.in_time(envelope)
         # After the horizon only the last slot is finished, for its sample: it leaves no events.
         if now < self._horizon or envelope.sent == now:
